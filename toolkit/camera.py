@@ -1,0 +1,271 @@
+"""Cameras: intrinsics, lens models, rigid poses, similarities, rays. The only place where conventions live.
+
+Ours: OpenCV axes (x right, y down, z forward), `world_from_camera` 4×4 float64, pixel centres at (u + 0.5, v + 0.5),
+depth along z. What other tools use is turned into this by the functions below, called by readers and writers only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from toolkit.errors import InputError
+
+Array = NDArray[Any]
+
+PINHOLE = "pinhole"
+OPENCV = "opencv"  # k1, k2, p1, p2[, k3[, k4, k5, k6]] as in OpenCV
+FISHEYE = "fisheye"  # k1, k2, k3, k4 of OpenCV's equidistant model
+LENSES = (PINHOLE, OPENCV, FISHEYE)
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A camera's interior: size in pixels, focal lengths and principal point (pixel centres at +0.5), lens."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    lens: str = PINHOLE
+    distortion: tuple[float, ...] = ()
+
+    def matrix(self) -> Array:
+        """(3, 3) K with pixel centres at +0.5."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
+
+    def matrix_integer_centres(self) -> Array:
+        """(3, 3) K with pixel centres at whole numbers, as OpenCV's image functions and Open3D expect."""
+        return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1]], dtype=np.float64)
+
+    def scaled(self, width: int, height: int) -> Intrinsics:
+        """The same camera for the image resized to width × height."""
+        sx, sy = width / self.width, height / self.height
+        return replace(self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy)
+
+    def pinhole(self) -> Intrinsics:
+        """The same camera without its lens."""
+        return replace(self, lens=PINHOLE, distortion=())
+
+    @property
+    def distorted(self) -> bool:
+        return self.lens == FISHEYE or any(abs(value) > 0 for value in self.distortion)
+
+    def checked(self, where: str) -> Intrinsics:
+        """Self, when it is a usable camera.
+
+        Raises:
+            InputError: naming `where` the camera came from.
+        """
+        numbers = [self.fx, self.fy, self.cx, self.cy, *self.distortion]
+        if not np.all(np.isfinite(numbers)):
+            raise InputError(f"{where}: the intrinsics hold a value that is not finite; correct or remove them")
+        if self.fx <= 0 or self.fy <= 0:
+            raise InputError(f"{where}: the focal length is {min(self.fx, self.fy):g} pixels, it must be positive; correct it")
+        if self.width < 1 or self.height < 1:
+            raise InputError(f"{where}: the image size {self.width}×{self.height} is not usable")
+        if self.lens not in LENSES:
+            raise InputError(f"{where}: the lens model {self.lens!r} is not known; known are {', '.join(LENSES)}")
+        return self
+
+    def to_dict(self) -> dict[str, Any]:
+        return {**asdict(self), "distortion": list(self.distortion)}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Intrinsics:
+        return cls(**{**data, "distortion": tuple(data.get("distortion", ()))})
+
+
+# --------------------------------------------------------------------------------------------------- lens
+
+
+def distort(intrinsics: Intrinsics, points: Array) -> Array:
+    """(N, 2) ideal image-plane points (x/z, y/z) → (N, 2) distorted image-plane points."""
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    if not intrinsics.distorted or len(points) == 0:
+        return points.copy()
+    rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    coefficients = np.array(intrinsics.distortion, dtype=np.float64)
+    if intrinsics.lens == FISHEYE:
+        out, _ = cv2.fisheye.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), np.eye(3), coefficients[:4])
+    else:
+        out, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), coefficients)
+    return out.reshape(-1, 2)
+
+
+def undistort_maps(intrinsics: Intrinsics, width: int, height: int) -> tuple[Intrinsics, Array, Array, Array]:
+    """Maps that undistort and resize in one `cv2.remap`, so that an image is resampled once.
+
+    Returns:
+        the pinhole camera of the result (width × height), map x and map y (height, width) float32 into the source image in
+        OpenCV's whole-number pixel coordinates, and a (height, width) bool mask of pixels that have a source.
+    """
+    target = intrinsics.pinhole().scaled(width, height)
+    v, u = np.mgrid[0:height, 0:width].astype(np.float64)
+    ideal = np.stack([(u + 0.5 - target.cx) / target.fx, (v + 0.5 - target.cy) / target.fy], axis=-1).reshape(-1, 2)
+    bent = distort(intrinsics, ideal)
+    map_x = (bent[:, 0] * intrinsics.fx + intrinsics.cx - 0.5).reshape(height, width)
+    map_y = (bent[:, 1] * intrinsics.fy + intrinsics.cy - 0.5).reshape(height, width)
+    valid = (map_x >= -0.5) & (map_x <= intrinsics.width - 0.5) & (map_y >= -0.5) & (map_y <= intrinsics.height - 0.5)
+    return target, map_x.astype(np.float32), map_y.astype(np.float32), valid
+
+
+# --------------------------------------------------------------------------------------------------- poses
+
+
+def world_from_opengl(pose: Array) -> Array:
+    """OpenGL/Blender camera-to-world (x right, y up, z back) → world_from_camera in OpenCV axes."""
+    return np.asarray(pose, dtype=np.float64) @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+opengl_from_world = world_from_opengl  # flipping two axes is its own inverse
+
+
+def world_from_llff(pose: Array) -> Array:
+    """LLFF camera-to-world, (3, 4) with axes (down, right, back) → world_from_camera in OpenCV axes."""
+    pose = np.asarray(pose, dtype=np.float64)
+    down, right, back, centre = pose[:, 0], pose[:, 1], pose[:, 2], pose[:, 3]
+    out = np.eye(4)
+    out[:3] = np.stack([right, down, -back, centre], axis=1)
+    return out
+
+
+def invert(pose: Array) -> Array:
+    """Inverse of rigid (..., 4, 4) poses."""
+    pose = np.asarray(pose, dtype=np.float64)
+    rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
+    out = np.zeros_like(pose)
+    out[..., :3, :3] = rotation
+    out[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, pose[..., :3, 3])
+    out[..., 3, 3] = 1
+    return out
+
+
+def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
+    """A rigid float64 (4, 4) pose, re-orthonormalised, or a clear refusal.
+
+    Raises:
+        InputError: wrong shape, not finite, singular, mirrored or not rigid (beyond `tolerance`).
+    """
+    pose = np.asarray(pose, dtype=np.float64)
+    if pose.shape == (3, 4):
+        pose = np.concatenate([pose, [[0, 0, 0, 1]]])
+    if pose.shape != (4, 4):
+        raise InputError(f"{where}: the pose has shape {pose.shape}, it must be 4×4")
+    if not np.all(np.isfinite(pose)):
+        raise InputError(f"{where}: the pose holds a value that is not finite; remove this frame or correct it")
+    rotation = pose[:3, :3]
+    if abs(np.linalg.det(rotation)) < 1e-6:
+        raise InputError(f"{where}: the pose's rotation is singular; remove this frame or correct it")
+    if np.linalg.det(rotation) < 0:
+        raise InputError(f"{where}: the pose mirrors space (its rotation has determinant < 0); its axis convention is not what this kind of capture uses")
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > tolerance:
+        raise InputError(f"{where}: the pose is not rigid (its rotation is scaled or sheared by more than {tolerance:g}); correct it")
+    u, _, vt = np.linalg.svd(rotation)
+    out = np.eye(4)
+    out[:3, :3] = u @ vt
+    out[:3, 3] = pose[:3, 3]
+    return out
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x_to = scale · rotation · x_from + translation, float64. Kept with a run: working frame from the input's frame."""
+
+    scale: float
+    rotation: Array  # (3, 3)
+    translation: Array  # (3,)
+
+    @classmethod
+    def identity(cls) -> Similarity:
+        return cls(1.0, np.eye(3), np.zeros(3))
+
+    def points(self, points: Array) -> Array:
+        """(..., 3) → (..., 3)."""
+        return self.scale * (np.asarray(points, dtype=np.float64) @ self.rotation.T) + self.translation
+
+    def directions(self, directions: Array) -> Array:
+        """(..., 3) unit vectors (normals) → (..., 3)."""
+        return np.asarray(directions, dtype=np.float64) @ self.rotation.T
+
+    def poses(self, poses: Array) -> Array:
+        """(..., 4, 4) rigid world_from_camera → the same cameras in the other frame, still rigid."""
+        poses = np.asarray(poses, dtype=np.float64)
+        out = poses.copy()
+        out[..., :3, :3] = self.rotation @ poses[..., :3, :3]
+        out[..., :3, 3] = self.points(poses[..., :3, 3])
+        return out
+
+    def inverse(self) -> Similarity:
+        rotation = self.rotation.T
+        return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
+    def after(self, first: Similarity) -> Similarity:
+        """The similarity that applies `first`, then self."""
+        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self.points(first.translation))
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"scale": self.scale, "rotation": self.rotation.tolist(), "translation": self.translation.tolist()}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Similarity:
+        return cls(float(data["scale"]), np.array(data["rotation"], dtype=np.float64), np.array(data["translation"], dtype=np.float64))
+
+
+# --------------------------------------------------------------------------------------------------- rays
+
+
+def project(intrinsics: Intrinsics, world_from_camera: Array, points: Array) -> tuple[Array, Array]:
+    """(N, 3) world points → (N, 2) pixels (centres at +0.5, through the lens) and (N,) depth along z.
+
+    Points at or behind the camera get depth ≤ 0 and a pixel of NaN.
+    """
+    camera = np.asarray(points, dtype=np.float64) @ invert(world_from_camera)[:3, :3].T + invert(world_from_camera)[:3, 3]
+    depth = camera[:, 2]
+    pixels = np.full((len(camera), 2), np.nan)
+    front = depth > 1e-12
+    bent = distort(intrinsics, camera[front, :2] / depth[front, None])
+    pixels[front] = bent * [intrinsics.fx, intrinsics.fy] + [intrinsics.cx, intrinsics.cy]
+    return pixels, depth
+
+
+def unproject(intrinsics: Intrinsics, world_from_camera: Array, pixels: Array, depth: Array) -> Array:
+    """(N, 2) pixels (centres at +0.5) of a pinhole camera and (N,) z-depth → (N, 3) world points."""
+    pixels = np.asarray(pixels, dtype=np.float64)
+    depth = np.asarray(depth, dtype=np.float64)
+    x = (pixels[:, 0] - intrinsics.cx) / intrinsics.fx * depth
+    y = (pixels[:, 1] - intrinsics.cy) / intrinsics.fy * depth
+    camera = np.stack([x, y, depth], axis=1)
+    return camera @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+
+
+def pixel_grid(width: int, height: int) -> Array:
+    """(height · width, 2) pixel centres, row by row."""
+    v, u = np.mgrid[0:height, 0:width]
+    return np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=1)
+
+
+def rays(intrinsics: Intrinsics, world_from_camera: Array, pixels: Array) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Rays of a pinhole camera through (N, 2) pixels.
+
+    Returns:
+        origins (N, 3) and unit directions (N, 3) float32, and (N,) float32 cosines: depth along z = distance × cosine.
+    """
+    x = (pixels[:, 0] - intrinsics.cx) / intrinsics.fx
+    y = (pixels[:, 1] - intrinsics.cy) / intrinsics.fy
+    camera = np.stack([x, y, np.ones_like(x)], axis=1)
+    cosine = 1.0 / np.linalg.norm(camera, axis=1)
+    directions = (camera * cosine[:, None]) @ world_from_camera[:3, :3].T
+    origins = np.broadcast_to(world_from_camera[:3, 3], directions.shape)
+    return (
+        torch.from_numpy(np.ascontiguousarray(origins, dtype=np.float32)),
+        torch.from_numpy(directions.astype(np.float32)),
+        torch.from_numpy(cosine.astype(np.float32)),
+    )

@@ -1,0 +1,91 @@
+"""What every reader returns: a `Capture` of `Frame`s, plain data that is also a JSON file; and `Views`, the pixels made ready."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from toolkit.camera import Array, Intrinsics
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture of a capture. Paths are absolute; nothing is decoded yet."""
+
+    name: str  # unique within the capture; frames are sorted by it (natural order: 2 before 10)
+    image: Path  # the picture, or the video that holds it
+    intrinsics: Intrinsics | None = None  # None: unknown, poses are to find it
+    world_from_camera: Array | None = None  # (4, 4) float64, OpenCV axes, the input's own frame; None: unknown
+    depth: Path | None = None  # picture of z-depth
+    depth_intrinsics: Intrinsics | None = None  # None: the same camera as the picture
+    mask: Path | None = None  # picture; 0 = do not use this pixel
+    split: str | None = None  # "train" or "test" when the source says so
+    video_index: int | None = None  # frame number when `image` is a video
+    focal_prior: float | None = None  # pixels, from EXIF, when intrinsics are unknown
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A source as found on disk, in its own frame of reference."""
+
+    kind: str  # "video", "photos", "transforms", "blender", "colmap", "7scenes", "tum", "scannet", "llff", "dtu", "redwood"
+    root: Path
+    frames: tuple[Frame, ...]
+    ordered: bool = False  # neighbours in the list are neighbours in time
+    metric: bool = False  # one unit of the poses is one metre
+    depth_scale: float = 1000.0  # stored depth values per unit of length
+    alpha: bool = False  # pictures carry alpha that separates object from nothing
+    up: tuple[float, float, float] | None = None  # up-direction in the input's frame, when the source defines it
+    points: Array | None = None  # (N, 3) sparse points in the input's frame, when the source has them
+    warnings: tuple[str, ...] = ()
+    extra: dict[str, Any] = field(default_factory=dict)  # facts for reports, e.g. {"listed": 67, "missing": 17, "fps": 30.0}
+
+    @property
+    def posed(self) -> bool:
+        return bool(self.frames) and all(frame.world_from_camera is not None and frame.intrinsics is not None for frame in self.frames)
+
+    @property
+    def has_depth(self) -> bool:
+        return any(frame.depth is not None for frame in self.frames)
+
+    def with_frames(self, frames: list[Frame] | tuple[Frame, ...], *warnings: str) -> Capture:
+        return replace(self, frames=tuple(frames), warnings=self.warnings + tuple(warnings))
+
+
+@dataclass
+class Views:
+    """Pictures made ready for fitting and measuring: undistorted once, resized once, in the working frame.
+
+    All lists have one entry a frame. Pictures may differ in size.
+    """
+
+    names: list[str]
+    images: list[Array]  # (H, W, 3) uint8 RGB; captures with alpha are already composited on `background`
+    intrinsics: list[Intrinsics]  # pinhole, for exactly these sizes
+    world_from_camera: Array  # (N, 4, 4) float64, working frame
+    test: Array  # (N,) bool: held out; nothing that fits appearance may look at these
+    valid: list[Array | None] = field(default_factory=list)  # (H, W) bool, None: every pixel
+    alpha: list[Array | None] = field(default_factory=list)  # (H, W) uint8, None: opaque
+    depths: list[Array | None] = field(default_factory=list)  # (H, W) float32 along z, working units, 0 = missing; aligned to the picture
+    background: tuple[float, float, float] | None = None  # colour behind everything for captures with alpha; None: unknown
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def subset(self, indices: list[int] | Array) -> Views:
+        """The views at `indices`, sharing the pixels."""
+        keep = [int(i) for i in indices]
+        return Views(
+            names=[self.names[i] for i in keep],
+            images=[self.images[i] for i in keep],
+            intrinsics=[self.intrinsics[i] for i in keep],
+            world_from_camera=self.world_from_camera[keep],
+            test=np.asarray(self.test)[keep],
+            valid=[self.valid[i] for i in keep] if self.valid else [],
+            alpha=[self.alpha[i] for i in keep] if self.alpha else [],
+            depths=[self.depths[i] for i in keep] if self.depths else [],
+            background=self.background,
+        )

@@ -1,0 +1,211 @@
+"""Settings: typed dataclasses with defaults, YAML files and `key=value` pairs merged over them by OmegaConf.
+
+Only what differs from these defaults stands in `configs/*.yaml`.
+"""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from toolkit.errors import InputError
+
+
+@dataclass
+class CaptureSettings:
+    image_size: int | None = None  # long side in pixels; None: 640, or the picture's own when smaller
+    holdout: int = 8  # every n-th frame by name is a test view; 0: none (the source's own split wins)
+    max_frames: int = 150  # frames taken from a video
+
+
+@dataclass
+class PosesSettings:
+    source: str = "auto"  # auto | given | sfm: `sfm` ignores poses that the capture brings
+    matching: str = "auto"  # auto | exhaustive | sequential
+    image_size: int = 1600  # long side for feature extraction
+    max_features: int = 4096
+
+
+@dataclass
+class FieldSettings:
+    channels: int = 16  # features a voxel
+    decoder: str = "deferred"  # deferred | per_sample (the paper's)
+    hidden: int = 32  # width of the decoder
+    background: str = "auto"  # auto | on | off: contract what lies outside the region of interest
+    resolution: int | None = None  # voxels along the longest side of the volume; None: by preset and picture size
+    init: str = "classical"
+
+
+@dataclass
+class FitSettings:
+    budget: float | None = None  # seconds; None: by preset
+    max_rays: int = 8192  # rays a step at the finest level
+    rate_density: float = 0.3
+    rate_feature: float = 0.05
+    rate_decoder: float = 3e-3
+    distortion: float = 0.01  # weight of the distortion loss
+    prune_weight: float = 0.05  # voxels whose largest seen weight stays below are removed
+
+
+@dataclass
+class TsdfSettings:
+    enabled: str = "auto"  # auto (when the capture has depth) | on | off
+    voxel_size: float | None = None  # working units; None: from the capture's depth
+    depth_max: float | None = None  # working units; None: from the capture's depth
+
+
+@dataclass
+class ExportSettings:
+    formats: list[str] = field(default_factory=lambda: ["points", "ply", "obj", "glb", "cameras", "video"])
+    mesh_views: int = 60  # views whose rendered depth is fused into the mesh
+    video_frames: int = 90
+
+
+@dataclass
+class Settings:
+    """Everything that a run can be told. `budget`, `image_size` and friends of the command line land here too."""
+
+    preset: str = "balanced"
+    engine: str = "torch"
+    device: str = "auto"
+    threads: int | None = None  # None: all cores
+    seed: int = 0
+    capture: CaptureSettings = field(default_factory=CaptureSettings)
+    poses: PosesSettings = field(default_factory=PosesSettings)
+    field: FieldSettings = field(default_factory=FieldSettings)
+    fit: FitSettings = field(default_factory=FitSettings)
+    tsdf: TsdfSettings = field(default_factory=TsdfSettings)
+    export: ExportSettings = field(default_factory=ExportSettings)
+
+
+# Flags of the command line that have a home in a group: both names work in --set.
+SHORT_NAMES = {
+    "image_size": "capture.image_size",
+    "holdout": "capture.holdout",
+    "budget": "fit.budget",
+    "decoder": "field.decoder",
+    "background": "field.background",
+    "init": "field.init",
+}
+CHOICES = {
+    "preset": ("fast", "balanced", "quality"),
+    "engine": ("torch",),
+    "device": ("auto", "cpu", "cuda"),
+    "poses.source": ("auto", "given", "sfm"),
+    "poses.matching": ("auto", "exhaustive", "sequential"),
+    "field.decoder": ("deferred", "per_sample"),
+    "field.background": ("auto", "on", "off"),
+    "field.init": ("classical",),
+    "tsdf.enabled": ("auto", "on", "off"),
+}
+
+
+def _keys(node: DictConfig, prefix: str = "") -> list[str]:
+    out = []
+    for key, value in node.items():
+        name = f"{prefix}{key}"
+        out += _keys(value, f"{name}.") if isinstance(value, DictConfig) else [name]
+    return out
+
+
+def _set(config: DictConfig, key: str, value: Any, where: str) -> None:
+    known = _keys(config)
+    full = SHORT_NAMES.get(key, key)
+    if full not in known:
+        near = difflib.get_close_matches(key, known + list(SHORT_NAMES), n=1, cutoff=0.3)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise InputError(f"{where}: there is no setting {key!r}{hint}")
+    try:
+        OmegaConf.update(config, full, value)
+    except (OmegaConfBaseException, ValueError) as error:
+        raise InputError(f"{where}: {value!r} does not fit the setting {key!r} ({str(error).splitlines()[0]})") from error
+
+
+def _flatten(data: Any, where: str, prefix: str = "") -> list[tuple[str, Any]]:
+    if not isinstance(data, dict):
+        raise InputError(f"{where}: settings must be `key: value` pairs")
+    pairs: list[tuple[str, Any]] = []
+    for key, value in data.items():
+        name = f"{prefix}{key}"
+        pairs += _flatten(value, where, f"{name}.") if isinstance(value, dict) else [(name, value)]
+    return pairs
+
+
+def _read_yaml(text: str, where: str) -> list[tuple[str, Any]]:
+    try:
+        data = OmegaConf.to_container(OmegaConf.create(text or "{}"), resolve=False)
+    except Exception as error:  # the YAML parser raises its own family
+        raise InputError(f"{where} is not valid YAML: {str(error).splitlines()[0]}") from error
+    return _flatten(data, where)
+
+
+def load_settings(preset: str = "balanced", file: Path | None = None, pairs: list[str] | None = None, flags: dict[str, Any] | None = None) -> Settings:
+    """Defaults, then the preset's YAML, then `file`, then `key=value` pairs, then flags that are not None.
+
+    Raises:
+        InputError: unknown key (with the nearest name), a value that does not fit, an unreadable file.
+    """
+    wanted = [pair for pair in pairs or [] if pair.startswith("preset=")]
+    preset = wanted[-1].split("=", 1)[1] if wanted else preset
+    if preset not in CHOICES["preset"]:
+        raise InputError(f"there is no preset {preset!r}; known are {', '.join(CHOICES['preset'])}")
+    config: DictConfig = OmegaConf.structured(Settings)
+    source = resources.files("configs").joinpath(f"{preset}.yaml")
+    layers = [(f"configs/{preset}.yaml", _read_yaml(source.read_text(encoding="utf-8"), f"configs/{preset}.yaml"))]
+    if file is not None:
+        try:
+            layers.append((str(file), _read_yaml(Path(file).read_text(encoding="utf-8"), str(file))))
+        except OSError as error:
+            raise InputError(f"cannot read the settings file {file}: {error.strerror}") from error
+    for pair in pairs or []:
+        key, separator, value = pair.partition("=")
+        if not separator:
+            raise InputError(f"--set {pair!r} must have the form key=value")
+        layers.append(("--set", [(key.strip(), _read_yaml(f"value: {value}", f"--set {pair!r}")[0][1])]))
+    layers.append(("command line", [(key, value) for key, value in (flags or {}).items() if value is not None]))
+    for where, entries in layers:
+        for key, value in entries:
+            _set(config, key, value, where)
+    config.preset = preset
+    for key, choices in CHOICES.items():
+        value = OmegaConf.select(config, key)
+        if value not in choices:
+            near = difflib.get_close_matches(str(value), choices, n=1)
+            raise InputError(f"{key} is {value!r}; it must be one of {', '.join(choices)}" + (f" (did you mean {near[0]!r}?)" if near else ""))
+    settings = OmegaConf.to_object(config)
+    assert isinstance(settings, Settings)
+    _check_ranges(settings)
+    return settings
+
+
+def _check_ranges(settings: Settings) -> None:
+    positive = {
+        "capture.image_size": settings.capture.image_size,
+        "fit.budget": settings.fit.budget,
+        "threads": settings.threads,
+        "field.channels": settings.field.channels,
+        "field.hidden": settings.field.hidden,
+        "field.resolution": settings.field.resolution,
+        "capture.max_frames": settings.capture.max_frames,
+        "tsdf.voxel_size": settings.tsdf.voxel_size,
+    }
+    for name, value in positive.items():
+        if value is not None and not 0 < value < 1e9:
+            raise InputError(f"{name} is {value:g}; it must be a positive number")
+    if settings.capture.holdout < 0 or settings.capture.holdout == 1:
+        raise InputError(f"holdout is {settings.capture.holdout}; it must be 0 (no test views) or at least 2")
+    if settings.capture.image_size is not None and settings.capture.image_size < 16:
+        raise InputError(f"image_size is {settings.capture.image_size}; at least 16 pixels are needed")
+
+
+def settings_dict(settings: Settings) -> dict[str, Any]:
+    """Plain data of all settings, for stage keys and reports."""
+    data = OmegaConf.to_container(OmegaConf.structured(settings))
+    assert isinstance(data, dict)
+    return {str(key): value for key, value in data.items()}
