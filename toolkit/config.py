@@ -6,7 +6,8 @@ Only what differs from these defaults stands in `configs/*.yaml`.
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field as default
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,7 @@ class TsdfSettings:
 
 @dataclass
 class ExportSettings:
-    formats: list[str] = field(default_factory=lambda: ["points", "ply", "obj", "glb", "cameras", "video"])
+    formats: list[str] = default(default_factory=lambda: ["points", "ply", "obj", "glb", "cameras", "video"])
     mesh_views: int = 60  # views whose rendered depth is fused into the mesh
     video_frames: int = 90
 
@@ -76,12 +77,12 @@ class Settings:
     device: str = "auto"
     threads: int | None = None  # None: all cores
     seed: int = 0
-    capture: CaptureSettings = field(default_factory=CaptureSettings)
-    poses: PosesSettings = field(default_factory=PosesSettings)
-    field: FieldSettings = field(default_factory=FieldSettings)
-    fit: FitSettings = field(default_factory=FitSettings)
-    tsdf: TsdfSettings = field(default_factory=TsdfSettings)
-    export: ExportSettings = field(default_factory=ExportSettings)
+    capture: CaptureSettings = default(default_factory=CaptureSettings)
+    poses: PosesSettings = default(default_factory=PosesSettings)
+    field: FieldSettings = default(default_factory=FieldSettings)
+    fit: FitSettings = default(default_factory=FitSettings)
+    tsdf: TsdfSettings = default(default_factory=TsdfSettings)
+    export: ExportSettings = default(default_factory=ExportSettings)
 
 
 # Flags of the command line that have a home in a group: both names work in --set.
