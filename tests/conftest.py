@@ -1,0 +1,23 @@
+"""Shared helpers of the tests: where the optional real captures are."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+torch.set_num_threads(2)
+
+
+def shared_data(name: str) -> Path:
+    """The folder (or file) of a real capture, or skip the test with the reason.
+
+    Looked for in $FIELDFUSE_DATA, else in `../shared/data` beside the repository.
+    """
+    root = Path(os.environ.get("FIELDFUSE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+    path = root / name
+    if not path.exists():
+        pytest.skip(f"the real capture {name} is not here (set FIELDFUSE_DATA to the folder that holds it)")
+    return path
