@@ -1,0 +1,250 @@
+"""Which blocks there are and which rows lie beside which: find, halos, neighbours, distances. Torch only, CPU and CUDA.
+
+A block is 8×8×8 voxels. Block `keys[s]` = (bx, by, bz) owns rows s·512 … s·512 + 511 of every value array; inside a block rows are
+z-major, row = ((s·8 + z)·8 + y)·8 + x, and the voxel sits at the lattice corner (key·8 + (x, y, z)) · voxel_size of the caller's frame.
+Value arrays that are read through `lookup_rows` or `halo_rows` carry one more row at the end, the zero row, at index blocks·512.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+BLOCK = 8
+VOXELS = BLOCK**3
+LOOKUP = (BLOCK + 1) ** 3
+HALO = (BLOCK + 2) ** 3
+MAX_TABLE_CELLS = 2**26
+MAX_BLOCKS = 2**31 // VOXELS - 2
+KEY_LOW, KEY_HIGH = -(2**31), 2**31 - 1
+SELF = 13  # the block itself among the 27 of `around`
+
+
+class Topology:
+    """An immutable set of blocks.
+
+    Args:
+        keys: (M, 3) integer block keys (bx, by, bz), each within int32, none twice.
+        max_table_cells: the dense block table is built when the keys' bounding box (with a margin of one block) has at most
+            this many cells; otherwise `find` searches sorted codes and `table` is None.
+
+    Attributes:
+        keys: (M, 3) int32.
+        table: (Sz, Sy, Sx) int32 slot or −1, or None; cell (z, y, x) is block key table_origin + (x, y, z).
+        table_origin: (x, y, z) of the table's first cell, Python integers. The outermost layer of cells is always empty.
+        table_size: (Sx, Sy, Sz), Python integers.
+
+    Raises:
+        ValueError: wrong shape, keys beyond int32, a key twice, or too many blocks for int32 rows.
+    """
+
+    def __init__(self, keys: Tensor, max_table_cells: int = MAX_TABLE_CELLS) -> None:
+        if keys.ndim != 2 or keys.shape[1] != 3 or keys.is_floating_point():
+            raise ValueError(f"block keys must be an integer (M, 3) tensor, not {keys.dtype} {tuple(keys.shape)}")
+        if len(keys) > MAX_BLOCKS:
+            raise ValueError(f"{len(keys)} blocks are more than int32 rows can number ({MAX_BLOCKS})")
+        wide = keys.to(torch.int64)
+        if len(keys) and bool(((wide < KEY_LOW) | (wide > KEY_HIGH)).any()):
+            raise ValueError("block keys must fit into int32")
+        self.keys = keys.to(torch.int32).contiguous()
+        self._max_table_cells = max_table_cells
+        low = wide.amin(0).tolist() if len(keys) else [0, 0, 0]
+        high = wide.amax(0).tolist() if len(keys) else [0, 0, 0]
+        self.table_origin = (low[0] - 1, low[1] - 1, low[2] - 1)
+        self.table_size = (high[0] - low[0] + 3, high[1] - low[1] + 3, high[2] - low[2] + 3)
+        sx, sy, sz = self.table_size
+        self.table: Tensor | None = None
+        self._codes: _Codes | None = None
+        if sx * sy * sz <= max_table_cells:
+            slots = torch.arange(len(keys), dtype=torch.int32, device=keys.device)
+            flat = torch.full((sx * sy * sz,), -1, dtype=torch.int32, device=keys.device)
+            cells = self._cells(wide)
+            flat[cells] = slots
+            unique = bool((flat[cells] == slots).all())
+            self.table = flat.view(sz, sy, sx)
+        else:
+            self._codes = _Codes(wide)
+            unique = self._codes.unique
+        if not unique:
+            raise ValueError("block keys must be unique")
+
+    @property
+    def blocks(self) -> int:
+        """M, the number of blocks."""
+        return len(self.keys)
+
+    @property
+    def zero_row(self) -> int:
+        """The row that stands for every absent voxel: blocks · 512, one past the blocks' own rows."""
+        return self.blocks * VOXELS
+
+    @property
+    def device(self) -> torch.device:
+        return self.keys.device
+
+    def to(self, device: torch.device | str) -> Topology:
+        """The same blocks in the same order on another device (self when already there)."""
+        return self if torch.device(device) == self.device else Topology(self.keys.to(device), self._max_table_cells)
+
+    def _cells(self, wide: Tensor) -> Tensor:
+        """(..., 3) int64 keys inside the table's box → (...) flat cell."""
+        (ox, oy, oz), (sx, sy, _) = self.table_origin, self.table_size
+        return ((wide[..., 2] - oz) * sy + (wide[..., 1] - oy)) * sx + (wide[..., 0] - ox)
+
+    def find(self, query: Tensor) -> Tensor:
+        """(..., 3) integer block keys → (...) int64 slots, −1 where there is no such block."""
+        wide = query.to(torch.int64)
+        if self.table is None:
+            assert self._codes is not None
+            return self._codes.find(wide)
+        low = torch.tensor(self.table_origin, device=wide.device)
+        high = low + torch.tensor(self.table_size, device=wide.device) - 1
+        # Far keys are moved to the table's empty margin, so no mask is needed afterwards.
+        return self.table.view(-1)[self._cells(torch.minimum(torch.maximum(wide, low), high))].to(torch.int64)
+
+    @cached_property
+    def around(self) -> Tensor:
+        """(M, 27) int64 slots of the 3×3×3 blocks around each, −1 absent; column (dz+1)·9 + (dy+1)·3 + (dx+1), itself in column 13."""
+        wide = self.keys.to(torch.int64)
+        offset = torch.arange(-1, 2, device=self.device)
+        dz, dy, dx = torch.meshgrid(offset, offset, offset, indexing="ij")
+        shifts = torch.stack([dx, dy, dz], dim=-1).view(27, 3)
+        if self.table is None:
+            return self.find(wide[:, None] + shifts)
+        sx, sy, _ = self.table_size
+        steps = (shifts[:, 2] * sy + shifts[:, 1]) * sx + shifts[:, 0]  # the margin keeps every step inside the table
+        return self.table.view(-1)[self._cells(wide)[:, None] + steps].to(torch.int64)
+
+    @property
+    def neighbours(self) -> Tensor:
+        """(M, 26) int64 slots of the blocks that share a face, edge or corner, −1 absent; columns of `around` without the block itself."""
+        return torch.cat([self.around[:, :SELF], self.around[:, SELF + 1 :]], dim=1)
+
+    @property
+    def face_neighbours(self) -> Tensor:
+        """(M, 6) int64 slots of the blocks at −x, +x, −y, +y, −z, +z, −1 absent."""
+        return self.around[:, [12, 14, 10, 16, 4, 22]]
+
+    def _rows(self, start: int, stop: int, first: int, size: int) -> Tensor:
+        """(stop − start, size³) int32 rows of the lattice corners first … first + size − 1 along each axis of blocks start … stop."""
+        line = torch.arange(first, first + size, device=self.device)
+        side, local = (line // BLOCK + 1), line % BLOCK
+        which = ((side[:, None, None] * 3 + side[:, None]) * 3 + side).view(-1)
+        inner = ((local[:, None, None] * BLOCK + local[:, None]) * BLOCK + local).view(-1).to(torch.int32)
+        around = self.around[start:stop]
+        base = torch.where(around < 0, self.zero_row, around * VOXELS).to(torch.int32)
+        # Absent blocks start at the zero row; whatever is added to that is clamped back to it.
+        return base.index_select(1, which).add_(inner).clamp_max_(self.zero_row)
+
+    def lookup_chunk(self, start: int, stop: int) -> Tensor:
+        """`lookup_rows` of blocks start … stop − 1 only, not kept."""
+        return self._rows(start, min(stop, self.blocks), 0, BLOCK + 1)
+
+    def halo_chunk(self, start: int, stop: int) -> Tensor:
+        """`halo_rows` of blocks start … stop − 1 only, not kept."""
+        return self._rows(start, min(stop, self.blocks), -1, BLOCK + 2)
+
+    @cached_property
+    def lookup_rows(self) -> Tensor:
+        """(M, 729) int32 rows of each block's 9×9×9 lattice corners, column (z·9 + y)·9 + x; absent ones point at `zero_row`."""
+        return self.lookup_chunk(0, self.blocks)
+
+    @cached_property
+    def halo_rows(self) -> Tensor:
+        """(M, 1000) int32 rows of the corners −1 … 8 along each axis, column ((z+1)·10 + y+1)·10 + x+1; absent ones point at `zero_row`."""
+        return self.halo_chunk(0, self.blocks)
+
+    def dilated_keys(self, steps: int = 1) -> Tensor:
+        """(M', 3) int32 keys grown by `steps` blocks in the 26-neighbourhood: these keys first, in their order, then new ones by (z, y, x)."""
+        if self.blocks == 0 or steps < 1:
+            return self.keys.clone()
+        sx, sy, sz = (size + 2 * steps for size in self.table_size)
+        low = torch.tensor(self.table_origin, device=self.device) - steps
+        if sx * sy * sz <= self._max_table_cells:
+            grown = torch.zeros((sz, sy, sx), dtype=torch.bool, device=self.device)
+            relative = self.keys.to(torch.int64) - low
+            grown[relative[:, 2], relative[:, 1], relative[:, 0]] = True
+            for _ in range(steps):
+                grown = _spread(grown)
+            grown[relative[:, 2], relative[:, 1], relative[:, 0]] = False
+            new = grown.nonzero().flip(1) + low
+        else:
+            new = self.keys.to(torch.int64)
+            reach = torch.arange(-steps, steps + 1, device=self.device)
+            for axis in range(3):
+                shift = torch.zeros((len(reach), 3), dtype=torch.int64, device=self.device)
+                shift[:, axis] = reach
+                new = torch.unique((new[:, None] + shift).view(-1, 3).flip(1), dim=0).flip(1)
+            new = new[self.find(new) < 0]
+        new = new[((new >= KEY_LOW) & (new <= KEY_HIGH)).all(1)]
+        return torch.cat([self.keys, new.to(torch.int32)])
+
+    def occupied_distance(self, occupied: Tensor, most: int = 15) -> Tensor:
+        """Chebyshev distance in blocks from every table cell to the nearest occupied block, for skipping empty space.
+
+        Args:
+            occupied: (M,) bool, blocks that hold something.
+            most: distances are capped here (1 … 255).
+
+        Returns:
+            (Sz, Sy, Sx) uint8 like `table`: 0 in occupied blocks, `most` where none is nearer.
+
+        Raises:
+            ValueError: there is no dense table (the keys are too far apart).
+        """
+        if self.table is None:
+            raise ValueError("distances need the dense block table, and these keys are too far apart for one")
+        reached = torch.zeros_like(self.table, dtype=torch.bool)
+        reached.view(-1)[self._cells(self.keys[occupied.to(torch.bool)].to(torch.int64))] = True
+        distance = torch.where(reached, 0, most).to(torch.uint8)
+        for step in range(1, most):
+            grown = _spread(reached)
+            fresh = grown & ~reached
+            if not bool(fresh.any()):
+                break
+            distance.masked_fill_(fresh, step)
+            reached = grown
+        return distance
+
+
+def _spread(mask: Tensor) -> Tensor:
+    """(Z, Y, X) bool grown by one cell in the 26-neighbourhood: one OR along each axis after the other."""
+    for axis in range(3):
+        grown = mask.clone()
+        length = mask.shape[axis] - 1
+        grown.narrow(axis, 0, length).logical_or_(mask.narrow(axis, 1, length))
+        grown.narrow(axis, 1, length).logical_or_(mask.narrow(axis, 0, length))
+        mask = grown
+    return mask
+
+
+class _Codes:
+    """Keys that lie too far apart for a table: each axis is replaced by ranks, so that a key packs into 64 bits whatever its range."""
+
+    def __init__(self, wide: Tensor) -> None:
+        self.axes = [torch.unique(wide[:, axis]) for axis in range(3)]
+        ranks = [torch.searchsorted(values, wide[:, axis].contiguous()) for axis, values in enumerate(self.axes)]
+        pairs = ranks[0] * len(self.axes[1]) + ranks[1]
+        self.pairs = torch.unique(pairs)  # at most M of them, so pair rank × z rank stays below M² < 2⁶³
+        codes = torch.searchsorted(self.pairs, pairs) * len(self.axes[2]) + ranks[2]
+        self.codes, self.slots = torch.sort(codes)
+        self.unique = not bool((self.codes[1:] == self.codes[:-1]).any())
+
+    def find(self, wide: Tensor) -> Tensor:
+        """(..., 3) int64 → (...) int64 slots, −1 absent."""
+        if len(self.slots) == 0:  # only with max_table_cells below the empty set's own 27 cells
+            return torch.full(wide.shape[:-1], -1, dtype=torch.int64, device=wide.device)
+        x, in_x = _rank(self.axes[0], wide[..., 0].contiguous())
+        y, in_y = _rank(self.axes[1], wide[..., 1].contiguous())
+        z, in_z = _rank(self.axes[2], wide[..., 2].contiguous())
+        pair, in_pair = _rank(self.pairs, x * len(self.axes[1]) + y)
+        place, in_codes = _rank(self.codes, pair * len(self.axes[2]) + z)
+        return torch.where(in_x & in_y & in_z & in_pair & in_codes, self.slots[place], -1)
+
+
+def _rank(values: Tensor, query: Tensor) -> tuple[Tensor, Tensor]:
+    """Place of each query in sorted `values` (some valid place when absent), and whether it is there."""
+    place = torch.searchsorted(values, query).clamp_max_(len(values) - 1)
+    return place, values[place] == query
