@@ -1,0 +1,56 @@
+"""Radiance decoders: from voxel features (and a viewing direction) to colour.
+
+`Deferred` decodes once a ray: features are composited along it first. `PerSample` is the paper's R: it decodes density and colour at
+every sample (NeRFusion eq. 5, section 3.3). The field's first three features are a colour of their own, so both start from something sensible.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from toolkit.networks.encoding import positional, spherical_harmonics
+
+Tensor = torch.Tensor
+FREQUENCIES = 5
+
+
+class Deferred(nn.Module):
+    """(rays, C) composited features, (rays, 1) opacity and (rays, 3) directions → (rays, 3) colour in [0, 1]."""
+
+    def __init__(self, channels: int, hidden: int) -> None:
+        super().__init__()
+        self.channels, self.hidden = channels, hidden
+        self.net = nn.Sequential(nn.Linear(channels + 9, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 3))
+        nn.init.zeros_(self.net[-1].weight)  # the start is the features' own colour
+        nn.init.zeros_(self.net[-1].bias)
+
+    def forward(self, features: Tensor, directions: Tensor) -> Tensor:
+        """Colour of an opaque ray with these mean features."""
+        view = spherical_harmonics(directions)
+        return torch.sigmoid(features[:, :3] + self.net(torch.cat([features, view], 1)))
+
+
+class PerSample(nn.Module):
+    """(samples, C) features and (samples, 3) directions → (samples,) raw density and (samples, 3) colour in [0, 1]."""
+
+    def __init__(self, channels: int, hidden: int) -> None:
+        super().__init__()
+        self.channels, self.hidden = channels, hidden
+        width = channels * (1 + 2 * FREQUENCIES)
+        self.body = nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU())
+        self.density = nn.Linear(hidden, 1)
+        self.colour = nn.Sequential(nn.Linear(hidden + 9, hidden), nn.ReLU(), nn.Linear(hidden, 3))
+        nn.init.zeros_(self.density.weight)
+        nn.init.zeros_(self.density.bias)
+
+    def forward(self, features: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        hidden = self.body(positional(features, FREQUENCIES))
+        raw = self.density(hidden).squeeze(1)
+        colour = torch.sigmoid(features[:, :3] + self.colour(torch.cat([hidden, spherical_harmonics(directions)], 1)))
+        return raw, colour
+
+
+def make_decoder(kind: str, channels: int, hidden: int) -> Deferred | PerSample:
+    """`kind` is "deferred" or "per_sample"."""
+    return Deferred(channels, hidden) if kind == "deferred" else PerSample(channels, hidden)
