@@ -1,0 +1,113 @@
+"""What the header of a picture file says, and whether the file is whole, before anything is decoded."""
+
+from __future__ import annotations
+
+import io
+import threading
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image, UnidentifiedImageError
+
+from toolkit.errors import InputError
+
+MAX_PIXELS = 200_000_000
+_ORIENTATION = 0x0112  # EXIF tag, 1 to 8
+_pillow_limit = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Header:
+    """Stored size (before any EXIF turn), file format in Pillow's name for it, EXIF orientation (1: as stored)."""
+
+    width: int
+    height: int
+    format: str
+    orientation: int
+
+
+def read_bytes(path: Path) -> bytes:
+    """The whole file.
+
+    Raises:
+        InputError: missing, unreadable or empty.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read the picture {path}: {error.strerror or error}") from error
+    if not data:
+        raise InputError(f"the picture {path} is empty (0 bytes); copy it again or remove it")
+    return data
+
+
+def read_header(data: bytes, path: Path) -> Header:
+    """Size, format and orientation of the picture in `data` (of the file `path`), with nothing decoded.
+
+    Raises:
+        InputError: not a picture, more than `MAX_PIXELS` pixels, or the file ends before the picture does.
+    """
+    try:
+        # Pillow's own limit is lower than ours and global; it is lifted for the header only, and ours is applied below.
+        with _pillow_limit, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+            try:
+                with Image.open(io.BytesIO(data)) as picture:
+                    width, height = picture.size
+                    kind = picture.format or ""
+                    orientation = _orientation(picture)
+            finally:
+                Image.MAX_IMAGE_PIXELS = limit
+    except UnidentifiedImageError as error:
+        raise InputError(f"{path} is not a picture that can be read; convert it to JPEG or PNG, or remove it") from error
+    except (OSError, ValueError, SyntaxError, EOFError, KeyError, TypeError) as error:  # what Pillow's parsers raise on damaged headers
+        raise InputError(f"the header of the picture {path} is damaged; copy it again or remove it") from error
+    if width * height > MAX_PIXELS:
+        raise InputError(f"the picture {path} has {width}×{height} pixels, more than the {MAX_PIXELS // 10**6} megapixels that are read; make it smaller")
+    if width < 1 or height < 1:
+        raise InputError(f"the picture {path} has no pixels ({width}×{height}); remove it")
+    if not _complete(data, kind):
+        raise InputError(f"the picture {path} is cut short (the file ends before the picture does); copy it again or remove it")
+    return Header(width, height, kind, orientation)
+
+
+def _orientation(picture: Image.Image) -> int:
+    try:
+        value = int(picture.getexif().get(_ORIENTATION, 1))
+    except Exception:  # damaged EXIF raises about anything, and a picture is usable without it
+        return 1
+    return value if 1 <= value <= 8 else 1
+
+
+def _complete(data: bytes, kind: str) -> bool:
+    if kind in ("JPEG", "MPO"):
+        return _jpeg_ends(data)
+    if kind == "PNG":
+        return data.rfind(b"IEND") > 0
+    if kind == "WEBP":
+        return len(data) >= 8 + int.from_bytes(data[4:8], "little")
+    return True  # other decoders notice by themselves
+
+
+def _jpeg_ends(data: bytes) -> bool:
+    """Whether an end-of-image marker follows the picture's own data (ITU T.81, B.1.1).
+
+    Segments are walked up to the first scan, because EXIF holds a thumbnail with an end marker of its own. Bytes behind the
+    marker (motion photos, padding) are allowed.
+    """
+    position = 2
+    while position + 4 <= len(data):
+        if data[position] != 0xFF:
+            return False
+        marker = data[position + 1]
+        if marker == 0xFF:  # fill byte
+            position += 1
+        elif marker == 0xDA:  # start of scan: in what follows, FF is always stuffed, so FF D9 can only be the end
+            return data.find(b"\xff\xd9", position) > 0
+        elif marker == 0x01 or 0xD0 <= marker <= 0xD7:  # markers without a length
+            position += 2
+        else:
+            position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+    return False

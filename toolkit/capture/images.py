@@ -1,0 +1,130 @@
+"""Pixels of a frame: the picture as RGB(A), its depth in the input's units, its mask. Nothing is resized or undistorted here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from toolkit.camera import Array
+from toolkit.capture.headers import MAX_PIXELS, read_bytes, read_header
+from toolkit.capture.types import Capture, Frame
+from toolkit.capture.video import iterate_video
+from toolkit.errors import InputError
+
+
+def turns_by_exif(capture: Capture) -> bool:
+    """Whether this capture's pictures are turned upright by their EXIF orientation.
+
+    Only plain photo folders are: every other source brings cameras that were made for the pixels as they are stored.
+    """
+    return capture.kind == "photos"
+
+
+def load_image(frame: Frame, *, exif: bool = False) -> Array:
+    """The frame's picture, (H, W, 3) or with alpha (H, W, 4), uint8 RGB(A), alpha not premultiplied.
+
+    Grey pictures become RGB; 16-bit ones are rounded to 8 bits; floating-point ones are taken as 0 to 1. With `exif` the EXIF
+    orientation is applied (see `turns_by_exif`), without it the pixels stay as stored.
+
+    Raises:
+        InputError: naming the file, when it is missing, no picture, cut short or too large.
+    """
+    if frame.video_index is not None:
+        for _, picture in iterate_video(frame.image, {frame.video_index}):
+            return picture
+        raise InputError(f"frame {frame.video_index} of the video {frame.image} cannot be decoded; the file may be damaged")
+    picture, orientation = _decode(frame.image)
+    return upright(to_rgba(picture), orientation if exif else 1)
+
+
+def load_depth(frame: Frame, capture: Capture) -> Array:
+    """The frame's depth map, (H, W) float32 along z in units of the input's poses, 0 = missing.
+
+    Stored values are divided by `capture.depth_scale`. 0, negative, NaN and infinite values are missing, and so is 65535 in
+    16-bit pictures. Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, and .npy arrays.
+
+    Raises:
+        InputError: naming the file, when it is missing, damaged, or not one value a pixel.
+    """
+    if frame.depth is None:
+        raise InputError(f"the frame {frame.name} has no depth map")
+    path = frame.depth
+    raw = _load_npy(path) if path.suffix.lower() == ".npy" else _decode(path)[0]
+    if raw.ndim == 3 and raw.shape[2] == 1:
+        raw = raw[:, :, 0]
+    if raw.ndim != 2 or raw.size == 0:
+        raise InputError(f"the depth map {path} has the shape {raw.shape}, it must hold one value a pixel; store it as 16-bit grey PNG or float .npy")
+    depth = raw.astype(np.float32) / np.float32(capture.depth_scale)
+    missing = ~np.isfinite(depth) | (depth <= 0)
+    if raw.dtype == np.uint16:
+        missing |= raw == 65535
+    depth[missing] = 0
+    return depth
+
+
+def load_mask(frame: Frame) -> Array | None:
+    """(H, W) bool, True where the pixel may be used; None when the frame has no mask. A pixel is masked where every channel is 0.
+
+    Raises:
+        InputError: naming the file, when it is missing or damaged.
+    """
+    if frame.mask is None:
+        return None
+    mask, _ = _decode(frame.mask)
+    if mask.ndim == 3:
+        mask = mask[:, :, : min(mask.shape[2], 3)].max(axis=2)
+    return np.asarray(mask > 0)
+
+
+def to_rgba(picture: Array) -> Array:
+    """A decoded picture of any depth and number of channels (BGR order) → (H, W, 3) or (H, W, 4) uint8 RGB(A)."""
+    if picture.dtype == np.uint16:
+        picture = cv2.convertScaleAbs(picture, alpha=1 / 257)
+    elif picture.dtype != np.uint8:
+        finite = np.nan_to_num(picture.astype(np.float32), nan=0.0, posinf=1.0, neginf=0.0)
+        picture = np.round(np.clip(finite, 0, 1) * 255).astype(np.uint8)
+    if picture.ndim == 3 and picture.shape[2] == 1:
+        picture = picture[:, :, 0]
+    if picture.ndim == 2:
+        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB))
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGRA2RGBA if picture.shape[2] == 4 else cv2.COLOR_BGR2RGB))
+
+
+def upright(picture: Array, orientation: int) -> Array:
+    """Apply an EXIF orientation (1 to 8, TIFF 6.0 tag 274) to (H, W, ...) pixels."""
+    if orientation in (5, 6, 7, 8):
+        picture = picture.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        picture = picture[::-1]
+    if orientation in (2, 3, 6, 7):
+        picture = picture[:, ::-1]
+    return np.ascontiguousarray(picture)
+
+
+def _decode(path: Path) -> tuple[Array, int]:
+    """The pixels as stored (OpenCV's channel order and depth), and the EXIF orientation."""
+    data = read_bytes(path)
+    header = read_header(data, path)
+    try:
+        # UNCHANGED keeps alpha and 16 bits, and leaves the orientation to us.
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        picture = None
+    if picture is None:
+        raise InputError(f"the picture {path} ({header.format}) is damaged or of a kind that cannot be decoded; copy it again or convert it to PNG")
+    return np.asarray(picture), header.orientation
+
+
+def _load_npy(path: Path) -> Array:
+    try:
+        # Mapped, not read: a header that promises more than the file holds is refused before memory is taken for it.
+        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+    except OSError as error:
+        raise InputError(f"cannot read the depth map {path}: {error.strerror or error}") from error
+    except (ValueError, EOFError, TypeError, SyntaxError) as error:
+        raise InputError(f"the depth map {path} is not a plain .npy array of numbers, or it is cut short; write it with numpy.save") from error
+    if not isinstance(mapped, np.ndarray) or mapped.dtype.kind not in "fiu" or mapped.size > MAX_PIXELS:
+        raise InputError(f"the depth map {path} is not an array of numbers of at most {MAX_PIXELS // 10**6} megapixels")
+    return np.array(mapped)

@@ -1,0 +1,182 @@
+"""Videos: what one holds, and an iterator over its frames, upright and in RGB."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+# FFmpeg inside OpenCV reads this when the first video is opened; -8 is its "quiet". Damaged videos are reported by us, once.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+import cv2
+import numpy as np
+
+from toolkit.camera import Array
+from toolkit.capture.types import Capture, Frame
+from toolkit.errors import InputError
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".wmv")
+_PLAYLISTS = (b"#EXTM3U", b"ffconcat")  # text that makes FFmpeg open other files or addresses
+
+
+def read_video(path: Path) -> Capture:
+    """Describe a video: one `Frame` for each frame it announces, cameras and poses unknown.
+
+    Only the header and the first frame are decoded; the announced number of frames is not a promise, `iterate_video` yields
+    what can really be read. Frames are upright: rotation metadata is applied by the decoder, and `extra["rotation"]` only tells
+    what it was. `extra` also has `fps`, `width`, `height` (upright) and `seconds`.
+
+    Raises:
+        InputError: no such file, not a video, cut short, or no frame can be decoded.
+    """
+    path = Path(path).resolve()
+    _check_container(path)
+    stream = _open(path)
+    try:
+        ok, first = stream.read()
+        if not ok or first is None:
+            raise InputError(f"not one frame of the video {path} can be decoded; convert it (for instance with ffmpeg to H.264 mp4) and try again")
+        announced = stream.get(cv2.CAP_PROP_FRAME_COUNT)
+        fps = stream.get(cv2.CAP_PROP_FPS)
+        rotation = stream.get(cv2.CAP_PROP_ORIENTATION_META)
+        count = int(announced) if math.isfinite(announced) and 0 < announced < 1e8 else _count(stream) + 1
+    finally:
+        stream.release()
+    fps = float(fps) if math.isfinite(fps) and 0 < fps < 1e4 else 0.0
+    frames = tuple(Frame(name=f"frame_{index:06d}", image=path, video_index=index) for index in range(count))
+    extra = {
+        "fps": fps,
+        "rotation": int(rotation) % 360 if math.isfinite(rotation) else 0,
+        "width": int(first.shape[1]),
+        "height": int(first.shape[0]),
+        "seconds": count / fps if fps else None,
+    }
+    return Capture(kind="video", root=path.parent, frames=frames, ordered=True, extra=extra)
+
+
+def iterate_video(path: Path, indices: Collection[int] | None = None) -> Iterator[tuple[int, Array]]:
+    """Decode a video from its start and yield (index, picture), picture (H, W, 3) uint8 RGB, upright.
+
+    Frames are counted in decoding order rather than sought by time, so an index always means the same picture. With `indices`
+    only those are converted and yielded, and decoding ends after the last of them.
+
+    Raises:
+        InputError: the video cannot be opened.
+    """
+    wanted = None if indices is None else set(indices)
+    last = -1 if wanted is None else max(wanted, default=-1)
+    stream = _open(Path(path))
+    try:
+        index = 0
+        while (wanted is None or index <= last) and stream.grab():
+            if wanted is None or index in wanted:
+                ok, picture = stream.retrieve()
+                if not ok or picture is None:
+                    break
+                yield index, to_rgb(picture)
+            index += 1
+    finally:
+        stream.release()
+
+
+def to_rgb(picture: Array) -> Array:
+    """A decoder's (H, W), (H, W, 3) BGR or (H, W, 4) BGRA uint8 → (H, W, 3) RGB uint8."""
+    if picture.ndim == 2:
+        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB))
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGRA2RGB if picture.shape[2] == 4 else cv2.COLOR_BGR2RGB))
+
+
+def _open(path: Path) -> cv2.VideoCapture:
+    # FFmpeg only: other backends would take a single picture, or a name with "%03d", for a video.
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    if not stream.isOpened():
+        stream.release()
+        raise InputError(f"{path} is not a video that can be read; give an mp4, mov, avi or mkv file (one that was not cut off while copying)")
+    # The one place where rotation metadata is applied: the decoder turns each frame before it hands it out.
+    stream.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+    return stream
+
+
+def _count(stream: cv2.VideoCapture) -> int:
+    count = 0
+    while stream.grab():
+        count += 1
+    return count
+
+
+# --------------------------------------------------------------------------------------------- is the file whole
+
+
+def _check_container(path: Path) -> None:
+    """Refuse what is no file, empty, a playlist, or shorter than its container says.
+
+    A cut-off video often opens, announces all its frames and stops half-way, so the sizes in the container are compared with
+    the file's: the boxes of mp4 and mov, the RIFF header of avi, the segment of Matroska.
+    """
+    if not path.is_file():
+        raise InputError(f"there is no video {path}; check the name")
+    size = path.stat().st_size
+    if size == 0:
+        raise InputError(f"the video {path} is empty (0 bytes); copy it again from the camera")
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+            if head.startswith(_PLAYLISTS):
+                raise InputError(f"{path} is a playlist, not a video; give the video file itself")
+            expected = _expected_size(file, head, size)
+    except OSError as error:
+        raise InputError(f"cannot read the video {path}: {error.strerror or error}") from error
+    if expected is not None and expected > size:
+        raise InputError(f"the video {path} is cut short (it has {size} bytes and announces at least {expected}); copy it again from the camera")
+
+
+def _expected_size(file: BinaryIO, head: bytes, size: int) -> int | None:
+    """Bytes that the container says the file has, None when it does not say or is of another kind."""
+    if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot"):
+        return _end_of_boxes(file, size)
+    if head[:4] == b"RIFF" and head[8:12] == b"AVI ":
+        return 8 + int.from_bytes(head[4:8], "little")
+    if head[:4] == b"\x1a\x45\xdf\xa3":
+        return _end_of_matroska(file)
+    return None
+
+
+def _end_of_boxes(file: BinaryIO, size: int) -> int | None:
+    """Where the last box of an ISO base media file ends (ISO/IEC 14496-12, 4.2): 32-bit size, type, 64-bit size when it is 1."""
+    position = 0
+    while position + 8 <= size:
+        file.seek(position)
+        header = file.read(16)
+        length = int.from_bytes(header[:4], "big")
+        if length == 1 and len(header) == 16:
+            length = int.from_bytes(header[8:16], "big")
+        if length == 0:  # "to the end of the file"
+            return None
+        if length < 8 or not header[4:8].isascii():  # padding or junk behind the last box
+            return None
+        position += length
+    return position
+
+
+def _end_of_matroska(file: BinaryIO) -> int | None:
+    """Where the segment ends (RFC 8794: an element is an id, a size of 1 to 8 bytes, then data), None for live streams."""
+    position = 0
+    for _ in range(2):  # the EBML header, then the segment that holds everything
+        file.seek(position)
+        raw = file.read(12)
+        if len(raw) < 5 or raw[4] == 0:
+            return None
+        width = 9 - raw[4].bit_length()
+        length = int.from_bytes(raw[4 : 4 + width], "big") & ((1 << (7 * width)) - 1)
+        if length == (1 << (7 * width)) - 1:  # all ones: unknown
+            return None
+        position += 4 + width + length
+    return position
