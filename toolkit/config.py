@@ -146,8 +146,14 @@ def _read_yaml(text: str, where: str) -> list[tuple[str, Any]]:
     return _flatten(data, where)
 
 
-def load_settings(preset: str = "balanced", file: Path | None = None, pairs: list[str] | None = None, flags: dict[str, Any] | None = None) -> Settings:
-    """Defaults, then the preset's YAML, then `file`, then `key=value` pairs, then flags that are not None.
+def load_settings(
+    preset: str = "balanced",
+    file: Path | None = None,
+    pairs: list[str] | None = None,
+    flags: dict[str, Any] | None = None,
+    stored: dict[str, Any] | None = None,
+) -> Settings:
+    """Defaults, then the preset's YAML, then `stored` (an earlier run's), then `file`, then `key=value` pairs, then flags that are not None.
 
     Raises:
         InputError: unknown key (with the nearest name), a value that does not fit, an unreadable file.
@@ -159,6 +165,8 @@ def load_settings(preset: str = "balanced", file: Path | None = None, pairs: lis
     config: DictConfig = OmegaConf.structured(Settings)
     source = resources.files("configs").joinpath(f"{preset}.yaml")
     layers = [(f"configs/{preset}.yaml", _read_yaml(source.read_text(encoding="utf-8"), f"configs/{preset}.yaml"))]
+    if stored is not None:
+        layers.append(("run.json", _flatten(stored, "run.json")))
     if file is not None:
         try:
             layers.append((str(file), _read_yaml(Path(file).read_text(encoding="utf-8"), str(file))))
