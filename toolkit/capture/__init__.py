@@ -1,0 +1,23 @@
+"""Captures: one reader a source kind, one file each, all returning a `Capture` of `Frame`s."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from toolkit.capture.types import Capture, Frame, Views
+
+__all__ = ["Capture", "Frame", "Views", "open_capture"]
+
+
+def open_capture(source: Path | str) -> Capture:
+    """The capture at `source`: a video, a folder of a known layout, or one of a layout's JSON files. Found by looking.
+
+    Only listings, metadata and picture headers are read; no pixels are decoded.
+
+    Raises:
+        InputError: nothing there, nothing known, or the layout's own files are broken.
+    """
+    # Imported late: training and rendering need the types above on machines without Pillow.
+    from toolkit.capture.detect import read_source
+
+    return read_source(Path(source))

@@ -1,0 +1,83 @@
+"""Which kind of capture lies at a path, found by looking at names (and, between two layouts, at two picture headers).
+
+The order is deliberate: what somebody wrote for this very purpose goes before what another step left behind.
+1. `transforms.json`: nerfstudio leaves its COLMAP model beside it;
+2. Blender's `transforms_train.json`;
+3. RGB-D layouts, whose depth would be lost by reading them as anything else (ScanNet before 7-Scenes: they share file names);
+4. DTU's `cameras*.npz`;
+5. a COLMAP model before LLFF's `poses_bounds.npy`: sets that have both keep lens and points only in the model, but only
+   when its pictures are there (sets at 1/8 size often come without them);
+6. photos; 7. one video alone in a folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from toolkit.capture.blender import looks_like_blender, read_blender
+from toolkit.capture.colmap import image_folders, looks_like_colmap, read_colmap
+from toolkit.capture.dtu import looks_like_dtu, read_dtu
+from toolkit.capture.listing import pictures_in, require_folder
+from toolkit.capture.llff import looks_like_llff, read_llff
+from toolkit.capture.photos import looks_like_photos, read_photos
+from toolkit.capture.redwood import looks_like_redwood, read_redwood
+from toolkit.capture.scannet import looks_like_scannet, read_scannet
+from toolkit.capture.seven_scenes import looks_like_seven_scenes, read_seven_scenes
+from toolkit.capture.transforms import looks_like_transforms, read_transforms
+from toolkit.capture.tum import looks_like_tum, read_tum
+from toolkit.capture.types import Capture
+from toolkit.capture.video import VIDEO_SUFFIXES, read_video
+from toolkit.errors import InputError
+
+
+def _colmap_without_llff(path: Path) -> bool:
+    if not looks_like_colmap(path):
+        return False
+    return not looks_like_llff(path) or any(pictures_in(folder) for folder in image_folders(path))
+
+
+READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ...] = (
+    ("transforms", looks_like_transforms, read_transforms),
+    ("blender", looks_like_blender, read_blender),
+    ("tum", looks_like_tum, read_tum),
+    ("redwood", looks_like_redwood, read_redwood),
+    ("scannet", looks_like_scannet, read_scannet),
+    ("7scenes", looks_like_seven_scenes, read_seven_scenes),
+    ("dtu", looks_like_dtu, read_dtu),
+    ("colmap", _colmap_without_llff, read_colmap),
+    ("llff", looks_like_llff, read_llff),
+    ("photos", looks_like_photos, read_photos),
+)
+
+
+def detect_kind(folder: Path) -> str | None:
+    """The name of the first layout that `folder` has, None when it has none of them."""
+    return next((kind for kind, looks_like, _ in READERS if looks_like(folder)), None)
+
+
+def read_source(path: Path) -> Capture:
+    """The capture at `path`: a folder of any known layout, a video, or a `transforms*.json`.
+
+    Raises:
+        InputError: nothing there, nothing known, or the layout's own files are broken.
+    """
+    path = path.absolute()
+    if path.is_file():
+        if path.suffix.lower() == ".json":
+            return read_blender(path.parent) if path.name.startswith("transforms_") else read_transforms(path)
+        return read_video(path)
+    folder = require_folder(path)
+    try:
+        for _, looks_like, read in READERS:
+            if looks_like(folder):
+                return read(folder)
+        videos = pictures_in(folder, VIDEO_SUFFIXES)
+    except OSError as error:
+        raise InputError(f"cannot read {error.filename or folder}: {error.strerror or error}") from error
+    if len(videos) == 1:
+        return read_video(videos[0])
+    if videos:
+        raise InputError(f"{folder} holds {len(videos)} videos; give one of them, for instance {videos[0]}")
+    held = ", ".join(sorted(child.name for child in folder.iterdir())[:4])
+    raise InputError(f"{folder} holds no capture of a known kind (it holds {held}); give a video, a folder of photos, or a posed capture as the README lists")

@@ -1,0 +1,222 @@
+"""What all readers share: natural order, picture headers, small text files, unique names, and the checks at the end."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from toolkit import files
+from toolkit.camera import Array, Intrinsics
+from toolkit.capture.types import Capture, Frame
+from toolkit.errors import InputError
+
+PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+MAX_TEXT_BYTES = 64 * 2**20
+
+
+def natural_key(text: str) -> tuple[list[str | int], str]:
+    """Sort key under which `2` comes before `10`. Ties (`1` and `01`) are broken by the text itself."""
+    parts = re.split(r"([0-9]+)", text.lower())
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], text
+
+
+def counted(number: int, one: str, many: str | None = None) -> str:
+    """`1 picture`, `2 pictures`."""
+    return f"{number} {one if number == 1 else many or one + 's'}"
+
+
+# --------------------------------------------------------------------------------------------------- folders
+
+
+def require_folder(path: Path | str) -> Path:
+    """The absolute folder.
+
+    Raises:
+        InputError: missing, not a folder, not readable, or empty.
+    """
+    path = Path(path).absolute()
+    if not path.exists():
+        raise InputError(f"{path} does not exist; give a video, a folder of photos, or a capture folder")
+    if not path.is_dir():
+        raise InputError(f"{path} is not a folder; give the folder that holds the capture")
+    try:
+        if not any(path.iterdir()):
+            raise InputError(f"the folder {path} is empty; put a video, photos or a capture there")
+    except OSError as error:
+        raise InputError(f"cannot list the folder {path}: {error.strerror or error}") from error
+    return path
+
+
+def is_file(path: Path) -> bool:
+    """Whether a file is there; False also for names that the file system refuses (too long)."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def pictures_in(folder: Path, suffixes: Sequence[str] = PICTURES) -> list[Path]:
+    """Pictures directly in `folder`, in natural order; an absent folder holds none. Hidden files are left out."""
+    if not folder.is_dir():
+        return []
+    found = [path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith(".") and path.is_file()]
+    return sorted(found, key=lambda path: natural_key(path.name))
+
+
+def unique_names(paths: Sequence[Path]) -> list[str]:
+    """A short name for each picture: its stem; with its folders, then its suffix, where stems repeat."""
+    stems = [path.stem for path in paths]
+    if len(set(stems)) == len(stems):
+        return stems
+    depth = min(len(path.parts) for path in paths)
+    common = 0
+    while common < depth - 1 and len({path.parts[common] for path in paths}) == 1:
+        common += 1
+    short = ["_".join([*path.parts[common:-1], path.stem]) for path in paths]
+    if len(set(short)) == len(short):
+        return short
+    return ["_".join(path.parts[common:]) for path in paths]
+
+
+# --------------------------------------------------------------------------------------------------- picture headers
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a picture's header tells, as stored: EXIF orientation is not applied."""
+
+    width: int
+    height: int
+    alpha: bool
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.width, self.height
+
+
+def picture_header(path: Path) -> Header:
+    """Size and alpha of a picture (or the shape of a 2-D `.npy`); nothing is decoded.
+
+    Raises:
+        InputError: not a picture that can be read.
+    """
+    try:
+        if path.suffix.lower() == ".npy":
+            height, width = np.load(path, mmap_mode="r", allow_pickle=False).shape[:2]
+            return Header(int(width), int(height), False)
+        with Image.open(path) as picture:
+            width, height = picture.size
+            return Header(width, height, picture.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in picture.info)
+    except Exception as error:  # Pillow's and NumPy's parsers raise many families on broken files
+        raise InputError(f"{path} cannot be read as a picture; remove it or replace it") from error
+
+
+def fitted(intrinsics: Intrinsics, size: tuple[int, int], where: str) -> Intrinsics:
+    """The camera for a picture of `size` (width, height): itself, or scaled when the aspect ratio agrees.
+
+    Raises:
+        InputError: the picture has another shape (cropped, or turned).
+    """
+    width, height = size
+    if (width, height) == (intrinsics.width, intrinsics.height):
+        return intrinsics
+    expected = intrinsics.height * width / intrinsics.width
+    if abs(expected - height) > max(2.0, 0.005 * height):
+        raise InputError(
+            f"{where}: the picture is {width}×{height} but its intrinsics are for {intrinsics.width}×{intrinsics.height}, which is another shape; "
+            "give pictures that are neither cropped nor turned, or correct the intrinsics"
+        )
+    return intrinsics.scaled(width, height)
+
+
+# --------------------------------------------------------------------------------------------------- small files
+
+
+def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """A text file that may come from anybody.
+
+    Raises:
+        InputError: missing, too large, or not text.
+    """
+    try:
+        if path.stat().st_size > max_bytes:
+            raise InputError(f"{path} is larger than {max_bytes / 2**20:.0f} MB, too large for a text file of a capture")
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not a text file; check how it was written") from error
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def read_numbers(path: Path) -> Array:
+    """All numbers of a text file, float64; values may be infinite or NaN.
+
+    Raises:
+        InputError: missing, not text, or a word that is not a number.
+    """
+    try:
+        return np.array([float(word) for word in read_text(path).split()], dtype=np.float64)
+    except ValueError as error:
+        raise InputError(f"{path} must hold numbers only ({error}); check how it was written") from error
+
+
+def read_matrix(path: Path, *shapes: tuple[int, int]) -> Array:
+    """A small matrix in one of `shapes`, told apart by how many numbers there are.
+
+    Raises:
+        InputError: not such a matrix.
+    """
+    numbers = read_numbers(path)
+    for shape in shapes:
+        if numbers.size == shape[0] * shape[1]:
+            return numbers.reshape(shape)
+    known = " or ".join(f"{rows}×{columns}" for rows, columns in shapes)
+    raise InputError(f"{path} holds {counted(numbers.size, 'number')}, a {known} matrix is expected; check how it was written")
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """A JSON file whose top level is an object.
+
+    Raises:
+        InputError: missing, too large, not JSON, not an object.
+    """
+    try:
+        data = files.read_json(path)
+    except ValueError as error:  # whole numbers of thousands of digits
+        raise InputError(f"{path} is not valid JSON ({error}); check how it was written") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{path} must hold a JSON object at its top level; check how it was written")
+    return data
+
+
+# --------------------------------------------------------------------------------------------------- at the end
+
+
+def same_count(pictures: int, poses: int, where: Path) -> None:
+    """Raises: InputError: the numbers of pictures and poses differ."""
+    if pictures != poses:
+        raise InputError(
+            f"{where} holds {counted(pictures, 'picture')} but {counted(poses, 'pose')}; each picture needs exactly one pose, add or remove what does not belong"
+        )
+
+
+def assemble(kind: str, root: Path, frames: list[Frame], warnings: Sequence[str] = (), **facts: Any) -> Capture:
+    """The capture, frames in natural order of their names.
+
+    Raises:
+        InputError: no frame is left, or two frames have one name.
+    """
+    if not frames:
+        raise InputError(f"no usable picture was found in {root}; check the folder's layout")
+    names = [frame.name for frame in frames]
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{root}: the picture {twice!r} is listed twice; list each picture once")
+    ordered = sorted(frames, key=lambda frame: natural_key(frame.name))
+    return replace(Capture(kind=kind, root=root, frames=tuple(ordered)), warnings=tuple(warnings), **facts)

@@ -1,0 +1,71 @@
+"""LLFF: `poses_bounds.npy` and pictures in `images/`, `images_4/`, `images_8/`, …
+
+Each row holds a 3×5 matrix (camera-to-world with axes down, right, back; then height, width, focal) and the nearest and farthest
+depth. Rows belong to the pictures in plain alphabetical order. The principal point is the picture's centre; there is no lens.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from toolkit.camera import Array, Intrinsics, checked_pose, world_from_llff
+from toolkit.capture.listing import assemble, counted, fitted, picture_header, pictures_in, require_folder, unique_names
+from toolkit.capture.types import Capture, Frame
+from toolkit.errors import InputError
+
+NAME = "poses_bounds.npy"
+
+
+def looks_like_llff(path: Path) -> bool:
+    return (path / NAME).is_file()
+
+
+def read_llff(path: Path | str) -> Capture:
+    """Posed pictures; `extra` has `near` and `far`, the extreme depth bounds.
+
+    Raises:
+        InputError: the array is not of this kind, no folder has one picture a row, or a pose or focal length is not usable.
+    """
+    root = require_folder(path)
+    rows = _read_rows(root / NAME)
+    pictures = _pictures(root, len(rows))
+    frames = []
+    for index, (picture, name) in enumerate(zip(pictures, unique_names(pictures), strict=True)):
+        where = f"{root / NAME}, row {index} ({picture.name})"
+        matrix = rows[index, :15].reshape(3, 5)
+        pose = checked_pose(world_from_llff(matrix[:, :4]), where)
+        height, width, focal = matrix[:, 4]
+        if not (1 <= width < 1e6 and 1 <= height < 1e6):
+            raise InputError(f"{where}: the picture size {width:g}×{height:g} is not usable; correct it")
+        camera = Intrinsics(round(width), round(height), float(focal), float(focal), float(width) / 2, float(height) / 2).checked(where)
+        frames.append(Frame(name=name, image=picture, intrinsics=fitted(camera, picture_header(picture).size, where), world_from_camera=pose))
+    bounds = rows[:, 15:]
+    extra = {"near": float(bounds[:, 0].min()), "far": float(bounds[:, 1].max())} if np.isfinite(bounds).all() else {}
+    return assemble("llff", root, frames, extra=extra)
+
+
+def _read_rows(path: Path) -> Array:
+    try:
+        rows = np.array(np.load(path, mmap_mode="r", allow_pickle=False))
+        if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != 17:
+            raise ValueError(f"shape {rows.shape}, type {rows.dtype}")
+    except Exception as error:  # NumPy's parser raises many families on broken files
+        raise InputError(f"{path} is not an LLFF array of 17 numbers a picture ({error}); check how it was written") from error
+    return rows.astype(np.float64)
+
+
+def _pictures(root: Path, rows: int) -> list[Path]:
+    """One picture a row, in alphabetical order: `images/` first, else the folder with the largest pictures."""
+    counts: dict[str, int] = {}
+    candidates: list[tuple[bool, int, list[Path]]] = []
+    for folder in sorted(path for path in root.iterdir() if path.is_dir() and (path.name == "images" or path.name.startswith("images_"))):
+        found = sorted(pictures_in(folder), key=lambda path: path.name)
+        counts[folder.name] = len(found)
+        if found and len(found) == rows:
+            candidates.append((folder.name == "images", picture_header(found[0]).width, found))
+    if not candidates:
+        held = ", ".join(f"{name}/ holds {counted(count, 'picture')}" for name, count in counts.items()) or "there is no images/ folder"
+        raise InputError(f"{root / NAME} has {counted(rows, 'pose')} but {held}; each pose needs exactly one picture")
+    return max(candidates, key=lambda candidate: candidate[:2])[2]

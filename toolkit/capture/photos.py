@@ -1,0 +1,82 @@
+"""A folder of photos. Poses are unknown; a focal length in pixels comes from EXIF where a photo has one.
+
+EXIF orientation: `images.load_image` turns pictures upright for this kind only, never for captures that bring poses (their
+intrinsics are for the stored pixels). The focal length in pixels is the same either way, so nothing about it is carried here.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from toolkit.capture.listing import assemble, pictures_in, require_folder, unique_names
+from toolkit.capture.types import Capture, Frame
+from toolkit.errors import InputError
+
+FOLDERS = (".", "images", "input")
+FILM_DIAGONAL = math.hypot(36.0, 24.0)  # mm
+EXIF_FOLDER = 0x8769
+FOCAL_LENGTH, FOCAL_LENGTH_35 = 0x920A, 0xA405
+PLANE_X_RESOLUTION, PLANE_UNIT, STORED_WIDTH, STORED_HEIGHT = 0xA20E, 0xA210, 0xA002, 0xA003
+PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+
+
+def looks_like_photos(path: Path) -> bool:
+    return any(pictures_in(path / folder) for folder in FOLDERS)
+
+
+def read_photos(path: Path | str) -> Capture:
+    """Photos directly in the folder, or in its `images/` or `input/` (whichever holds most).
+
+    Raises:
+        InputError: missing or empty folder, no photo, or a file that is not a picture.
+    """
+    root = require_folder(path)
+    pictures = max((pictures_in(root / folder) for folder in FOLDERS), key=len)
+    if not pictures:
+        raise InputError(f"no photo (jpg, png, webp, bmp, tif) was found in {root}; give the folder that holds them")
+    frames = [Frame(name=name, image=picture, focal_prior=focal_from_exif(picture)) for name, picture in zip(unique_names(pictures), pictures, strict=True)]
+    return assemble("photos", root, frames)
+
+
+def focal_from_exif(path: Path) -> float | None:
+    """The focal length in pixels of the stored picture, or None when EXIF does not tell a believable one.
+
+    From the 35 mm equivalent (which compares diagonals), else from the focal length and the sensor's resolution.
+
+    Raises:
+        InputError: the file is not a picture.
+    """
+    try:
+        with Image.open(path) as picture:
+            width, height = picture.size
+            try:
+                exif = dict(picture.getexif().get_ifd(EXIF_FOLDER))
+            except Exception:  # broken metadata in a good picture; Pillow raises many families
+                return None
+    except Exception as error:
+        raise InputError(f"{path} cannot be read as a picture; remove it or replace it") from error
+    equivalent = _positive(exif.get(FOCAL_LENGTH_35))
+    focal: float | None = None
+    if equivalent:
+        focal = equivalent / FILM_DIAGONAL * math.hypot(width, height)
+    else:
+        length, resolution = _positive(exif.get(FOCAL_LENGTH)), _positive(exif.get(PLANE_X_RESOLUTION))
+        unit = PLANE_UNIT_MM.get(exif.get(PLANE_UNIT, 2))
+        if length and resolution and unit:
+            stored = max(_positive(exif.get(STORED_WIDTH)) or 0.0, _positive(exif.get(STORED_HEIGHT)) or 0.0) or max(width, height)
+            focal = length * resolution / unit * max(width, height) / stored  # the resolution is for the size that the camera wrote
+    if focal is None or not 0.1 < focal / max(width, height) < 50:
+        return None
+    return focal
+
+
+def _positive(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None

@@ -1,0 +1,75 @@
+"""Vertex positions of a PLY file that lies beside a capture: sparse points from structure from motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from toolkit.camera import Array
+from toolkit.errors import InputError
+
+MAX_BYTES = 2**30
+MAX_HEADER = 2**16
+TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+
+
+def read_ply_points(path: Path) -> Array:
+    """(N, 3) float64 vertex positions; points that are not finite are left out.
+
+    Raises:
+        InputError: not a PLY file whose first element is a plain list of vertices.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path} is larger than {MAX_BYTES / 2**20:.0f} MB; give a sparse point cloud, or none")
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    try:
+        points = _parse(content)
+    except (ValueError, KeyError, IndexError, OverflowError, MemoryError) as error:
+        raise InputError(f"{path} is not a PLY file that can be read ({error}); correct it or remove it from the capture") from error
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def _parse(content: bytes) -> Array:
+    end = content.find(b"end_header", 0, MAX_HEADER)
+    start = content.find(b"\n", end) + 1
+    if not content.startswith(b"ply") or end < 0 or start == 0:
+        raise ValueError("no PLY header")
+    order, count, element = "", 0, ""
+    columns: list[tuple[str, str]] = []
+    for line in content[:end].decode("ascii", errors="replace").splitlines()[1:]:
+        words = line.split()
+        if not words or words[0] in ("comment", "obj_info"):
+            continue
+        if words[0] == "format":
+            order = words[1]
+        elif words[0] == "element":
+            if not element and words[1] != "vertex":
+                raise ValueError("vertices must come first")
+            element = words[1]
+            count = int(words[2]) if element == "vertex" else count
+        elif words[0] == "property" and element == "vertex":
+            columns.append((words[2], ORDERS[order] + TYPES[words[1]]))
+    indices = [[name for name, _ in columns].index(axis) for axis in "xyz"]
+    if count < 0:
+        raise ValueError("a negative number of vertices")
+    if order == "ascii":
+        lines = content[start:].decode("ascii", errors="replace").split("\n", count)[:count]
+        table = [[float(words[i]) for i in indices] for words in (line.split() for line in lines)]
+        points = np.array(table, dtype=np.float64).reshape(-1, 3)
+    else:
+        layout = np.dtype(columns)
+        if start + count * layout.itemsize > len(content):
+            raise ValueError("fewer vertices than the header tells")
+        rows = np.frombuffer(content, dtype=layout, count=count, offset=start)
+        points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    if len(points) != count:
+        raise ValueError("fewer vertices than the header tells")
+    return points

@@ -1,0 +1,138 @@
+"""TUM RGB-D: `rgb.txt`, `depth.txt`, `groundtruth.txt`, associated by nearest time (20 ms at most).
+
+`groundtruth.txt` has `time tx ty tz qx qy qz qw`, world_from_camera in OpenCV axes, metres, z up. Depth is stored 5000 to the
+metre, registered to the colour picture. Cameras are those of the set's own calibration page, told apart by the folder's name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from toolkit import files
+from toolkit.camera import OPENCV, Array, Intrinsics, checked_pose
+from toolkit.capture.calibration import PRIMESENSE, find_json
+from toolkit.capture.listing import assemble, counted, fitted, is_file, picture_header, read_text, require_folder, unique_names
+from toolkit.capture.quaternion import rigid
+from toolkit.capture.types import Capture, Frame
+from toolkit.errors import InputError
+
+MAX_GAP = 0.02  # seconds
+DEPTH_SCALE = 5000.0
+CAMERAS = {
+    "freiburg1": Intrinsics(640, 480, 517.3, 516.5, 319.1, 255.8, OPENCV, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "freiburg2": Intrinsics(640, 480, 520.9, 521.0, 325.6, 250.2, OPENCV, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "freiburg3": Intrinsics(640, 480, 535.4, 539.2, 320.6, 248.1),
+}
+
+
+@dataclass(frozen=True)
+class _Listing:
+    times: Array  # (N,) seconds, ascending
+    values: list[list[str]]
+
+    def nearest(self, time: float) -> list[str] | None:
+        """The entry nearest in time, None when none is near enough."""
+        if len(self.times) == 0:
+            return None
+        at = int(np.searchsorted(self.times, time))
+        best = min((i for i in (at - 1, at) if 0 <= i < len(self.times)), key=lambda i: abs(self.times[i] - time))
+        return self.values[best] if abs(self.times[best] - time) <= MAX_GAP else None
+
+
+def looks_like_tum(path: Path) -> bool:
+    return (path / "rgb.txt").is_file() and (path / "groundtruth.txt").is_file()
+
+
+def read_tum(path: Path | str) -> Capture:
+    """RGB-D frames that have a pose near in time. Pictures without one, or that do not exist, are counted and left out.
+
+    Raises:
+        InputError: a list is not readable, no picture has a pose, or a pose is not usable.
+    """
+    root = require_folder(path)
+    colours = _read_list(root / "rgb.txt", 1)
+    poses = _read_list(root / "groundtruth.txt", 7)
+    depths = _read_list(root / "depth.txt", 1) if (root / "depth.txt").is_file() else _Listing(np.zeros(0), [])
+    camera, warnings = _camera(root)
+    images: list[Path] = []
+    frames: list[Frame] = []
+    missing, unposed = 0, 0
+    for time, (listed, *_) in zip(colours.times, colours.values, strict=True):
+        image = files.inside(root, listed)
+        if not is_file(image):
+            missing += 1
+            continue
+        pose = poses.nearest(time)
+        if pose is None:
+            unposed += 1
+            continue
+        size = picture_header(image).size
+        intrinsics = fitted(camera, size, str(image))
+        depth_entry = depths.nearest(time)
+        depth = files.inside(root, depth_entry[0]) if depth_entry is not None else None
+        depth = depth if depth is not None and is_file(depth) else None
+        depth_size = picture_header(depth).size if depth is not None else size
+        images.append(image)
+        frames.append(
+            Frame(
+                name="",
+                image=image,
+                intrinsics=intrinsics,
+                world_from_camera=_pose(pose, f"{root / 'groundtruth.txt'} at {time:.4f} s"),
+                depth=depth,
+                depth_intrinsics=None if depth_size == size else fitted(intrinsics, depth_size, str(depth)),
+            )
+        )
+    total = len(colours.values)
+    if not frames:
+        raise InputError(
+            f"none of the {counted(total, 'picture')} in {root / 'rgb.txt'} has both a file and a pose within {MAX_GAP * 1000:.0f} ms; check the three lists"
+        )
+    if missing:
+        warnings.append(f"{missing} of the {total} listed pictures do not exist; the others are used")
+    if unposed:
+        warnings.append(f"{unposed} of the {total} listed pictures have no pose within {MAX_GAP * 1000:.0f} ms and are left out")
+    named = [replace(frame, name=name) for frame, name in zip(frames, unique_names(images), strict=True)]
+    extra = {"listed": total, "missing": missing, "unposed": unposed}
+    return assemble("tum", root, named, warnings, ordered=True, metric=True, depth_scale=DEPTH_SCALE, up=(0.0, 0.0, 1.0), extra=extra)
+
+
+def _camera(root: Path) -> tuple[Intrinsics, list[str]]:
+    found = find_json(root)
+    if found is not None:
+        return found[0], []
+    name = root.name.lower()
+    for key, camera in CAMERAS.items():
+        if key in name or f"fr{key[-1]}" in name:
+            return camera, []
+    return PRIMESENSE, ["the folder's name does not tell which TUM camera it is (freiburg1, 2 or 3); the default of 525 pixels is used"]
+
+
+def _read_list(path: Path, values: int) -> _Listing:
+    entries: list[tuple[float, list[str]]] = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        words = line.replace(",", " ").split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            time = float(words[0])
+        except ValueError:
+            time = float("nan")
+        if not np.isfinite(time) or len(words) < 1 + values:
+            raise InputError(f"{path}, line {number}: a time and {counted(values, 'value')} are expected; correct or remove this line")
+        entries.append((time, words[1:]))
+    if not entries:
+        raise InputError(f"{path} lists nothing; check how it was written")
+    entries.sort(key=lambda entry: entry[0])
+    return _Listing(np.array([time for time, _ in entries]), [words for _, words in entries])
+
+
+def _pose(words: list[str], where: str) -> Array:
+    try:
+        x, y, z, qx, qy, qz, qw = (float(word) for word in words[:7])
+    except ValueError as error:
+        raise InputError(f"{where}: the pose holds a word that is not a number; correct or remove this line") from error
+    return checked_pose(rigid(np.array([qw, qx, qy, qz]), np.array([x, y, z]), where), where)
