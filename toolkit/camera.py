@@ -73,6 +73,9 @@ class Intrinsics:
             raise InputError(f"{where}: the image size {self.width}×{self.height} is not usable")
         if self.lens not in LENSES:
             raise InputError(f"{where}: the lens model {self.lens!r} is not known; known are {', '.join(LENSES)}")
+        most = {PINHOLE: 0, FISHEYE: 4}.get(self.lens, 14)
+        if len(self.distortion) > most and any(self.distortion[most:]):
+            raise InputError(f"{where}: the lens model {self.lens!r} takes at most {most} coefficients, here are {len(self.distortion)}; correct them")
         return self
 
     def to_dict(self) -> dict[str, Any]:
@@ -92,12 +95,63 @@ def distort(intrinsics: Intrinsics, points: Array) -> Array:
     if not intrinsics.distorted or len(points) == 0:
         return points.copy()
     rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
-    coefficients = np.array(intrinsics.distortion, dtype=np.float64)
+    coefficients = _coefficients(intrinsics)
     if intrinsics.lens == FISHEYE:
-        out, _ = cv2.fisheye.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), np.eye(3), coefficients[:4])
+        out, _ = cv2.fisheye.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), np.eye(3), coefficients)
     else:
         out, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), coefficients)
     return out.reshape(-1, 2)
+
+
+def _coefficients(intrinsics: Intrinsics) -> Array:
+    """The lens coefficients, padded with zeros to a number that OpenCV takes (4; or 4, 5, 8, 12 or 14)."""
+    values = [float(value) for value in intrinsics.distortion]
+    length = 4 if intrinsics.lens == FISHEYE else next((n for n in (4, 5, 8, 12, 14) if len(values) <= n), 14)
+    return np.array((values + [0.0] * length)[:length], dtype=np.float64)
+
+
+def lens_limit(intrinsics: Intrinsics, radius: float) -> float:
+    """How far from the axis (x/z, up to `radius`) the lens model is one-to-one.
+
+    A polynomial with negative terms turns back at some radius; beyond it, different rays would claim the same pixel.
+    """
+    if not intrinsics.distorted:
+        return radius
+    radial = _coefficients(intrinsics)
+    if intrinsics.lens == OPENCV:
+        radial[2:4] = 0  # tangential terms shift, they do not fold
+    steps = np.linspace(0, radius, 2049)
+    bent = distort(replace(intrinsics, distortion=tuple(radial)), np.stack([steps, np.zeros_like(steps)], axis=1))[:, 0]
+    folded = np.flatnonzero(~(np.diff(bent) > 0))
+    return float(steps[folded[0]]) if len(folded) else radius
+
+
+def resample_maps(source: Intrinsics, target: Intrinsics) -> tuple[Array, Array, Array]:
+    """Where each pixel of the pinhole camera `target` lies in the image of `source`, a camera at the same place looking the same way.
+
+    Two such cameras see each point along the same ray, so the map does not depend on depth.
+
+    Returns:
+        map x and map y (height, width) float32 in OpenCV's whole-number pixel coordinates, and a (height, width) bool mask of
+        pixels that have a source.
+    """
+    shape = target.height, target.width
+    map_x, map_y, valid = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, bool)
+    x = (np.arange(target.width) + 0.5 - target.cx) / target.fx
+    y = (np.arange(target.height) + 0.5 - target.cy) / target.fy
+    limit = lens_limit(source, float(np.hypot(np.abs(x).max(), np.abs(y).max())))
+    rows = max(1, 500_000 // target.width)  # in strips: the float64 steps in between take much more memory than the maps
+    for start in range(0, target.height, rows):
+        part = slice(start, min(start + rows, target.height))
+        ideal = np.stack(np.meshgrid(x, y[part]), axis=-1).reshape(-1, 2)
+        bent = distort(source, ideal)
+        u = bent[:, 0] * source.fx + source.cx - 0.5
+        v = bent[:, 1] * source.fy + source.cy - 0.5
+        # A rounding error's worth of tolerance: without a lens, the outermost samples lie on the border itself.
+        seen = (u >= -0.5 - 1e-6) & (u <= source.width - 0.5 + 1e-6) & (v >= -0.5 - 1e-6) & (v <= source.height - 0.5 + 1e-6)
+        seen &= np.hypot(ideal[:, 0], ideal[:, 1]) <= limit
+        map_x[part], map_y[part], valid[part] = u.reshape(-1, shape[1]), v.reshape(-1, shape[1]), seen.reshape(-1, shape[1])
+    return map_x, map_y, valid
 
 
 def undistort_maps(intrinsics: Intrinsics, width: int, height: int) -> tuple[Intrinsics, Array, Array, Array]:
@@ -108,13 +162,7 @@ def undistort_maps(intrinsics: Intrinsics, width: int, height: int) -> tuple[Int
         OpenCV's whole-number pixel coordinates, and a (height, width) bool mask of pixels that have a source.
     """
     target = intrinsics.pinhole().scaled(width, height)
-    v, u = np.mgrid[0:height, 0:width].astype(np.float64)
-    ideal = np.stack([(u + 0.5 - target.cx) / target.fx, (v + 0.5 - target.cy) / target.fy], axis=-1).reshape(-1, 2)
-    bent = distort(intrinsics, ideal)
-    map_x = (bent[:, 0] * intrinsics.fx + intrinsics.cx - 0.5).reshape(height, width)
-    map_y = (bent[:, 1] * intrinsics.fy + intrinsics.cy - 0.5).reshape(height, width)
-    valid = (map_x >= -0.5) & (map_x <= intrinsics.width - 0.5) & (map_y >= -0.5) & (map_y <= intrinsics.height - 0.5)
-    return target, map_x.astype(np.float32), map_y.astype(np.float32), valid
+    return target, *resample_maps(intrinsics, target)
 
 
 # --------------------------------------------------------------------------------------------------- poses
@@ -154,7 +202,10 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     Raises:
         InputError: wrong shape, not finite, singular, mirrored or not rigid (beyond `tolerance`).
     """
-    pose = np.asarray(pose, dtype=np.float64)
+    try:
+        pose = np.asarray(pose, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where}: the pose is not a matrix of numbers; correct it") from error
     if pose.shape == (3, 4):
         pose = np.concatenate([pose, [[0, 0, 0, 1]]])
     if pose.shape != (4, 4):

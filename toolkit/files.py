@@ -7,9 +7,11 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from toolkit.errors import InputError, OutputError
 
@@ -34,7 +36,8 @@ def atomic_path(target: Path | str) -> Iterator[Path]:
     except OSError as error:
         raise OutputError(f"cannot write {target}: {error.strerror or error}; free space or choose another --out folder") from error
     finally:
-        remove(temporary)
+        with suppress(OSError):  # what went wrong is already on its way up
+            remove(temporary)
 
 
 def remove(path: Path) -> None:
@@ -66,7 +69,7 @@ def read_json(path: Path | str, max_bytes: int = MAX_JSON_BYTES) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except RecursionError as error:
         raise InputError(f"{path} is nested too deeply to be read as JSON; check how it was written") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:  # not JSON, not UTF-8, or a number of thousands of digits
         raise InputError(f"{path} is not valid JSON ({error}); check how it was written") from error
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
@@ -95,6 +98,13 @@ def fingerprint(*parts: Any) -> str:
         if isinstance(part, Path):
             stat = part.stat()
             part = [str(part.resolve()), stat.st_size, stat.st_mtime_ns]
-        digest.update(json.dumps(part, sort_keys=True, default=str).encode())
+        digest.update(json.dumps(part, sort_keys=True, default=_plain).encode())
         digest.update(b"\0")
     return digest.hexdigest()[:16]
+
+
+def _plain(value: Any) -> Any:
+    """Arrays by their content (their text form leaves out most of it), other things by their text form."""
+    if isinstance(value, np.ndarray | np.generic):
+        return [str(value.dtype), list(value.shape), hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()]
+    return str(value)

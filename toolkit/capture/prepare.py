@@ -1,0 +1,161 @@
+"""Pictures made ready for fitting and measuring: undistorted and resized once, depth and masks aligned, poses in the working frame."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from toolkit.camera import Array, Intrinsics, Similarity, resample_maps, undistort_maps
+from toolkit.capture.images import load_depth, load_image, load_mask, turns_by_exif
+from toolkit.capture.listing import fitted, natural_key
+from toolkit.capture.types import Capture, Frame, Views
+from toolkit.config import CaptureSettings
+from toolkit.errors import InputError
+from toolkit.progress import SILENT, Progress
+
+DEFAULT_LONG_SIDE = 640
+WHITE = (1.0, 1.0, 1.0)
+_MAX_SAMPLES = 4  # samples a pixel and side taken through the lens; what shrinks more is averaged down to this first
+
+
+def held_out(capture: Capture, holdout: int) -> Array:
+    """(N,) bool, True for test views: the source's own split when it has one, else every `holdout`-th frame by name (0, n, 2n, …).
+
+    A `holdout` of 0 gives no test views, unless the source has a split.
+    """
+    frames = capture.frames
+    if any(frame.split is not None for frame in frames):
+        return np.array([frame.split == "test" for frame in frames], dtype=bool)
+    test = np.zeros(len(frames), dtype=bool)
+    if holdout > 0:
+        order = sorted(range(len(frames)), key=lambda index: natural_key(frames[index].name))
+        test[order[::holdout]] = True
+    return test
+
+
+def prepare_views(capture: Capture, working_from_input: Similarity, settings: CaptureSettings, progress: Progress = SILENT) -> Views:
+    """Every picture of a posed capture as a pinhole picture in the working frame, its long side `settings.image_size`.
+
+    Pictures are never enlarged. Captures with alpha are composited on white before resampling. `valid` leaves out pixels that a
+    mask excludes or that lie outside the lens's picture; `depths` are in working units, taken from the nearest stored value.
+    One frame is decoded at a time.
+
+    Raises:
+        InputError: a frame without pose or intrinsics, a file that cannot be read, a picture of another shape than its camera.
+    """
+    count = len(capture.frames)
+    poses: list[Array] = []
+    views = Views([], [], [], np.zeros((0, 4, 4)), held_out(capture, settings.holdout), background=WHITE if capture.alpha else None)
+    shrink = _Shrinker(settings.image_size or DEFAULT_LONG_SIDE)
+    exif = turns_by_exif(capture)
+    for index, frame in enumerate(capture.frames):
+        progress.check()
+        progress.update(index, count, frame.name)
+        if frame.world_from_camera is None or frame.intrinsics is None:
+            raise InputError(f"the frame {frame.name} of {capture.root} has no pose or no intrinsics; find poses first")
+        picture = load_image(frame, exif=exif)
+        source = fitted(frame.intrinsics, (picture.shape[1], picture.shape[0]), str(frame.image))
+        colour, alpha = on_white(picture) if capture.alpha else (np.ascontiguousarray(picture[:, :, :3]), None)
+        target, image, seen = shrink(source, colour)
+        usable = seen & _usable(frame, source, target)
+        views.names.append(frame.name)
+        views.images.append(image)
+        views.intrinsics.append(target)
+        views.alpha.append(None if alpha is None else np.where(seen, shrink(source, alpha)[1], 0).astype(np.uint8))
+        views.valid.append(None if usable.all() else usable)
+        views.depths.append(None if frame.depth is None else aligned_depth(frame, capture, source, target) * np.float32(working_from_input.scale))
+        poses.append(working_from_input.poses(frame.world_from_camera))
+    views.world_from_camera = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
+    progress.update(count, count)
+    return views
+
+
+def target_size(width: int, height: int, long_side: int) -> tuple[int, int]:
+    """Size of a width × height picture whose long side is brought to `long_side`, never enlarged."""
+    factor = min(1.0, long_side / max(width, height))
+    return max(1, math.floor(width * factor + 0.5)), max(1, math.floor(height * factor + 0.5))
+
+
+def on_white(picture: Array) -> tuple[Array, Array | None]:
+    """(H, W, 4) RGBA → (H, W, 3) composited on white and (H, W) alpha; (H, W, 3) stays as it is, its alpha None."""
+    if picture.shape[2] == 3:
+        return picture, None
+    alpha = picture[:, :, 3:].astype(np.float32) / 255
+    colour = picture[:, :, :3].astype(np.float32) * alpha + 255 * (1 - alpha)
+    return np.round(colour).astype(np.uint8), np.ascontiguousarray(picture[:, :, 3])
+
+
+def aligned_depth(frame: Frame, capture: Capture, source: Intrinsics, target: Intrinsics) -> Array:
+    """The frame's depth seen by the pinhole camera `target`, (H, W) float32 along z in the input's units, 0 = missing.
+
+    A depth camera with its own intrinsics is taken to stand where the colour camera does. Then a ray is the same ray in both and
+    depth along z stays as it is, so each pixel looks its value up (the nearest one, nothing is mixed across edges): no surface
+    can hide another, and no holes open where the colour picture is finer.
+
+    Raises:
+        InputError: the file cannot be read, or its shape is not its camera's.
+    """
+    depth = load_depth(frame, capture)
+    height, width = depth.shape
+    camera = fitted(frame.depth_intrinsics or source, (width, height), str(frame.depth))
+    return _nearest(depth, camera, target)
+
+
+def _nearest(values: Array, camera: Intrinsics, target: Intrinsics) -> Array:
+    """The (H, W) map `values` of `camera` at the pixels of `target`; zero (or False) outside."""
+    if not camera.distorted and camera == target:
+        return values
+    map_x, map_y, seen = resample_maps(camera, target)
+    column = np.clip(np.floor(map_x + 0.5), 0, camera.width - 1).astype(np.intp)
+    row = np.clip(np.floor(map_y + 0.5), 0, camera.height - 1).astype(np.intp)
+    return np.where(seen, values[row, column], values.dtype.type(0))
+
+
+def _usable(frame: Frame, source: Intrinsics, target: Intrinsics) -> Array:
+    """(H, W) bool: pixels of `target` whose whole footprint the frame's mask allows."""
+    mask = load_mask(frame)
+    if mask is None:
+        return np.ones((target.height, target.width), dtype=bool)
+    camera = fitted(source, (mask.shape[1], mask.shape[0]), str(frame.mask))
+    # Grown by half a target pixel, then looked up: a pixel is used only where nothing forbidden goes into it.
+    reach = 2 * math.ceil(max(camera.width / target.width, camera.height / target.height) / 2) + 1
+    allowed = cv2.erode(mask.astype(np.uint8), np.ones((reach, reach), np.uint8), borderValue=1)
+    return _nearest(allowed.astype(bool), camera, target)
+
+
+class _Shrinker:
+    """Undistorts and resizes with the anti-aliasing that shrinking needs.
+
+    Without a lens: the exact average over each target pixel's area. With one: k × k samples inside each target pixel, each
+    through the lens (bicubic), averaged; k is the number of source pixels a target pixel spans. Maps are kept for the next
+    frame, which mostly has the same camera.
+    """
+
+    def __init__(self, long_side: int) -> None:
+        self.long_side = long_side
+        self.key: tuple[Intrinsics, int, int] | None = None
+        self.maps: tuple[Array, Array, Array] | None = None
+
+    def __call__(self, source: Intrinsics, picture: Array) -> tuple[Intrinsics, Array, Array]:
+        """(h, w[, 3]) uint8 of `source` → the pinhole camera, the picture in its size, and (H, W) bool where it shows the scene."""
+        width, height = target_size(source.width, source.height, self.long_side)
+        target = source.pinhole().scaled(width, height)
+        if not source.distorted:
+            if (width, height) != (source.width, source.height):
+                picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+            return target, picture, np.ones((height, width), dtype=bool)
+        samples = min(_MAX_SAMPLES, math.ceil(source.width / width - 1e-9))
+        if source.width > samples * width:
+            picture = cv2.resize(picture, (samples * width, samples * height), interpolation=cv2.INTER_AREA)
+            source = source.scaled(samples * width, samples * height)
+        if self.key != (source, width, height):
+            fine, map_x, map_y, seen = undistort_maps(source, samples * width, samples * height)
+            whole = seen.reshape(height, samples, width, samples).all(axis=(1, 3))
+            self.key, self.maps = (source, width, height), (map_x, map_y, whole)
+        assert self.maps is not None
+        fine_picture = cv2.remap(picture, self.maps[0], self.maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        if samples > 1:
+            fine_picture = cv2.resize(fine_picture, (width, height), interpolation=cv2.INTER_AREA)
+        return target, fine_picture, self.maps[2]

@@ -1,0 +1,102 @@
+"""`Views` as one safetensors file: pixels as tensors, names and cameras as JSON in its metadata."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from toolkit.camera import PINHOLE, Array, Intrinsics
+from toolkit.capture.types import Views
+from toolkit.errors import InputError, OutputError
+from toolkit.files import atomic_path
+
+VERSION = 1
+_OPTIONAL: dict[str, type] = {"valid": np.bool_, "alpha": np.uint8, "depth": np.float32}
+
+
+def save_views(path: Path, views: Views) -> None:
+    """Write `views` atomically.
+
+    Raises:
+        OutputError: the folder is not writable or the disk is full.
+    """
+    tensors: dict[str, Array] = {
+        "world_from_camera": np.ascontiguousarray(views.world_from_camera, dtype=np.float64),
+        "test": np.ascontiguousarray(views.test, dtype=np.bool_),
+    }
+    for index in range(len(views)):
+        tensors[f"image.{index}"] = np.ascontiguousarray(views.images[index], dtype=np.uint8)
+        for name, values in (("valid", views.valid), ("alpha", views.alpha), ("depth", views.depths)):
+            value = values[index] if values else None
+            if value is not None:
+                tensors[f"{name}.{index}"] = np.ascontiguousarray(value, dtype=_OPTIONAL[name])
+    facts = {
+        "names": views.names,
+        "intrinsics": [intrinsics.to_dict() for intrinsics in views.intrinsics],
+        "background": views.background,
+    }
+    with atomic_path(path) as temporary:
+        try:
+            save_file(tensors, temporary, metadata={"format": "fieldfuse-views", "version": str(VERSION), "views": json.dumps(facts, allow_nan=False)})
+        except SafetensorError as error:  # a full disk arrives as this, not as an OSError
+            raise OutputError(f"cannot write {path}: {error}; free space or choose another --out folder") from error
+
+
+def load_views(path: Path) -> Views:
+    """Read views back, checking that every part has the size that the others promise.
+
+    Raises:
+        InputError: missing, of another kind or version, damaged or tampered with.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"there are no prepared views {path}; run the job again to make them")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != "fieldfuse-views" or metadata.get("version") != str(VERSION):
+                raise InputError(f"{path} does not hold prepared views of version {VERSION}; remove it and run the job again")
+            keys = set(file.keys())
+            return _assemble(json.loads(metadata["views"]), keys, file)
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        detail = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"the prepared views {path} are damaged ({detail}); remove the file and run the job again") from error
+
+
+def _assemble(facts: dict[str, Any], keys: set[str], file: Any) -> Views:
+    names = [str(name) for name in facts["names"]]
+    cameras = [Intrinsics.from_dict(entry).checked(f"camera {index}") for index, entry in enumerate(facts["intrinsics"])]
+    count = len(names)
+    _require(len(cameras) == count, f"{count} names and {len(cameras)} cameras")
+    _require(len(set(names)) == count, "a name stands for two views")
+    poses = _tensor(file, "world_from_camera", np.float64, (count, 4, 4))
+    _require(bool(np.isfinite(poses).all()), "a pose is not finite")
+    views = Views(names, [], cameras, poses, _tensor(file, "test", np.bool_, (count,)))
+    for index, camera in enumerate(cameras):
+        _require(camera.lens == PINHOLE and not camera.distorted, f"camera {index} has a lens")
+        views.images.append(_tensor(file, f"image.{index}", np.uint8, (camera.height, camera.width, 3)))
+        for name, values in (("valid", views.valid), ("alpha", views.alpha), ("depth", views.depths)):
+            key = f"{name}.{index}"
+            values.append(_tensor(file, key, _OPTIONAL[name], (camera.height, camera.width)) if key in keys else None)
+    if facts["background"] is not None:
+        red, green, blue = (float(value) for value in facts["background"])
+        _require(all(math.isfinite(value) and 0 <= value <= 1 for value in (red, green, blue)), "the background is no colour")
+        views.background = (red, green, blue)
+    return views
+
+
+def _tensor(file: Any, key: str, kind: type, shape: tuple[int, ...]) -> Array:
+    value = np.asarray(file.get_tensor(key))
+    _require(value.dtype == kind and value.shape == shape, f"{key} is {value.dtype} {value.shape}, expected {np.dtype(kind)} {shape}")
+    return value
+
+
+def _require(fine: bool, reason: str) -> None:
+    if not fine:
+        raise ValueError(reason)
