@@ -1,0 +1,286 @@
+"""`BlockGrid`: blocks of voxels hosted by Open3D's `VoxelBlockGrid`, shared with torch without copying.
+
+Open3D's hash map has habits that lose data silently. They end here: keys already present, growth that moves every row, erased slots
+that come back dirty, buffer order that differs from run to run, and memory still held by torch when Python exits.
+"""
+
+from __future__ import annotations
+
+import atexit
+import weakref
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import open3d as o3d
+import torch
+from torch import Tensor
+from torch.utils import dlpack
+
+from toolkit.errors import InputError
+from toolkit.volume.topology import BLOCK, VOXELS, Topology
+
+DEFAULT_ATTRIBUTES = {"feature": 16, "density": 1, "occupied": 1}
+GROWTH = 1.5  # a table that must grow gets at least this much more room
+
+
+@dataclass(frozen=True)
+class RowsView:
+    """A shared view together with the generation it belongs to."""
+
+    rows: Tensor  # (capacity · 512, C)
+    generation: int
+
+
+class BlockGrid:
+    """A growing set of 8×8×8 blocks with float32 attributes.
+
+    Buffer slot b of the grid owns rows b·512 … b·512 + 511 of every attribute, z-major inside the block as in `Topology`. Slots are in
+    no order; `ordered`, `topology`, `gather` and `scatter` work in the order of sorted keys, which is the same in every run.
+
+    Args:
+        voxel_size: edge of a voxel in working units.
+        attributes: name → channels, float32.
+        capacity: blocks to make room for at once; growth costs up to three times the memory for a moment.
+        device: "cpu" or "cuda".
+
+    Raises:
+        InputError: Open3D cannot use the device, or there is not enough memory.
+    """
+
+    def __init__(
+        self, voxel_size: float, attributes: Mapping[str, int] | None = None, capacity: int = 1024, device: torch.device | str = "cpu"
+    ) -> None:
+        self.voxel_size = float(voxel_size)
+        self.attributes = dict(DEFAULT_ATTRIBUTES if attributes is None else attributes)
+        self.device = torch.device(device)
+        if not self.voxel_size > 0 or not self.attributes or min(self.attributes.values()) < 1:
+            raise ValueError("a grid needs a positive voxel size and at least one attribute with at least one channel")
+        if self.device.type == "cuda" and not o3d.core.cuda.is_available():
+            raise InputError("this Open3D cannot use CUDA here; choose --device cpu or install its CUDA build")
+        place = f"CUDA:{self.device.index or 0}" if self.device.type == "cuda" else "CPU:0"
+        self._generation = 0
+        self._views: dict[str, Tensor] = {}
+        self._lent: list[weakref.ref[Tensor]] = []
+        try:
+            host: Any = o3d.t.geometry.VoxelBlockGrid  # its stubs know neither tuples nor plain integers
+            self._host = host(
+                attr_names=tuple(self.attributes),
+                attr_dtypes=(o3d.core.float32,) * len(self.attributes),
+                attr_channels=tuple(self.attributes.values()),
+                voxel_size=self.voxel_size,
+                block_resolution=BLOCK,
+                block_count=max(int(capacity), 1),
+                device=o3d.core.Device(place),
+            )
+        except RuntimeError as error:
+            raise self._no_memory(capacity) from error
+        self._map: Any = self._host.hashmap()
+        _OPEN.add(self)
+
+    # ------------------------------------------------------------------------------------------------ size
+
+    def __len__(self) -> int:
+        """Number of active blocks."""
+        return int(self._table().size())
+
+    @property
+    def capacity(self) -> int:
+        """Blocks there is room for; rows of every attribute = capacity · 512."""
+        return int(self._table().capacity())
+
+    @property
+    def generation(self) -> int:
+        """Rises whenever rows have moved (growth) or were let go (close): views taken before are void."""
+        return self._generation
+
+    def estimate_bytes(self, blocks: int, growing: bool = False) -> int:
+        """Bytes of the attributes of so many blocks; while a table grows to that size, up to three times as many are in use."""
+        return blocks * (VOXELS * 4 * sum(self.attributes.values()) + 64) * (3 if growing else 1)
+
+    def reserve(self, blocks: int) -> None:
+        """Make room for at least `blocks` blocks in all. When that moves rows, the generation rises and views are void.
+
+        Raises:
+            InputError: not enough memory.
+        """
+        if blocks <= self.capacity:
+            return
+        self._let_go()
+        try:
+            self._map.reserve(int(blocks))
+        except (RuntimeError, MemoryError) as error:
+            raise self._no_memory(blocks) from error
+
+    # ------------------------------------------------------------------------------------------------ keys
+
+    def activate(self, keys: Tensor) -> Tensor:
+        """Make sure that the blocks (N, 3) exist; new ones hold zeros. Keys may repeat.
+
+        Returns:
+            (N,) int64 buffer slots.
+
+        Raises:
+            InputError: not enough memory.
+        """
+        keys = self._keys(keys)
+        slots = self.find(keys)
+        if bool((slots >= 0).all()):
+            return slots
+        missing = torch.unique(keys[slots < 0], dim=0)
+        needed = len(self) + len(missing)
+        if needed > self.capacity:
+            self.reserve(max(needed, int(self.capacity * GROWTH)))
+        self._map.activate(self._to_open3d(missing))
+        fresh = self.find(missing)
+        for name, channels in self.attributes.items():
+            self.rows(name).detach().view(-1, VOXELS * channels).index_fill_(0, fresh, 0.0)
+        return self.find(keys)
+
+    def find(self, keys: Tensor) -> Tensor:
+        """(N, 3) integer keys → (N,) int64 buffer slots, −1 where there is no such block."""
+        keys = self._keys(keys)
+        if len(keys) == 0 or len(self) == 0:
+            return torch.full((len(keys),), -1, dtype=torch.int64, device=self.device)
+        slots, found = self._map.find(self._to_open3d(keys))
+        return torch.where(_to_torch(found).to(torch.bool), _to_torch(slots).to(torch.int64), -1)
+
+    def erase(self, keys: Tensor) -> int:
+        """Remove the blocks (N, 3) that are there; returns how many. Rows of other blocks stay where they are."""
+        keys = torch.unique(self._keys(keys), dim=0)
+        keys = keys[self.find(keys) >= 0]
+        if len(keys):
+            self._map.erase(self._to_open3d(keys))
+        return len(keys)
+
+    def slots(self) -> Tensor:
+        """(M,) int64 active buffer slots, in the order of sorted keys."""
+        return self.ordered()[1]
+
+    def keys(self) -> Tensor:
+        """(M, 3) int32 active keys, sorted by z, then y, then x."""
+        return self.ordered()[0]
+
+    def ordered(self) -> tuple[Tensor, Tensor]:
+        """(M, 3) int32 active keys sorted by z, then y, then x, and their (M,) int64 buffer slots: the same in every run."""
+        if len(self) == 0:
+            empty = torch.zeros((0, 3), dtype=torch.int32, device=self.device)
+            return empty, torch.zeros(0, dtype=torch.int64, device=self.device)
+        slots = _to_torch(self._map.active_buf_indices()).to(torch.int64)
+        keys = _to_torch(self._map.key_tensor())[slots]
+        order = torch.arange(len(keys), device=self.device)
+        for axis in range(3):  # least significant axis first; stable sorts keep what came before
+            order = order[torch.sort(keys[order, axis], stable=True).indices]
+        return keys[order].contiguous(), slots[order]
+
+    def topology(self) -> Topology:
+        """The active blocks; its slot s is the s-th of `ordered`, not a buffer slot."""
+        return Topology(self.keys())
+
+    # ------------------------------------------------------------------------------------------------ values
+
+    def rows(self, name: str) -> Tensor:
+        """(capacity · 512, C) float32 view that shares Open3D's buffer: writes are seen by both sides.
+
+        It is void after the next growth: it then has no rows, so that a write cannot be lost in silence, and `generation` differs.
+        To optimise values in place call `requires_grad_()` on this very tensor (a `Parameter` made of it, like any tensor derived
+        from it, is another handle on the old memory which the grid can neither void nor release at exit).
+        """
+        if name not in self.attributes:
+            raise KeyError(f"the grid has no attribute {name!r}; it has {', '.join(self.attributes)}")
+        if name not in self._views:
+            self._table()
+            view = dlpack.from_dlpack(self._host.attribute(name).reshape((-1, self.attributes[name])).to_dlpack())
+            self._views[name] = view
+            self._lent.append(weakref.ref(view))
+        return self._views[name]
+
+    def view(self, name: str) -> RowsView:
+        """`rows` with the generation it belongs to, for code that keeps it across calls."""
+        return RowsView(self.rows(name), self._generation)
+
+    def check(self, view: RowsView) -> Tensor:
+        """The view's rows, if they are still the grid's.
+
+        Raises:
+            RuntimeError: the grid grew or was closed since.
+        """
+        if view.generation != self._generation:
+            raise RuntimeError("this view of the grid is void, because its rows have moved since; take a new one with rows()")
+        return view.rows
+
+    def gather(self, name: str) -> Tensor:
+        """(M · 512 + 1, C) copy of an attribute in `topology` order, with the zero row at the end."""
+        channels = self.attributes[name]
+        slots = self.slots()
+        out = torch.zeros((len(slots) * VOXELS + 1, channels), device=self.device)
+        blocks = self.rows(name).detach().view(-1, VOXELS * channels)
+        torch.index_select(blocks, 0, slots, out=out[:-1].view(-1, VOXELS * channels))
+        return out
+
+    def scatter(self, name: str, rows: Tensor) -> None:
+        """Write (M · 512, C) or (M · 512 + 1, C) values in `topology` order back into the grid."""
+        channels = self.attributes[name]
+        slots = self.slots()
+        if rows.shape not in ((len(slots) * VOXELS, channels), (len(slots) * VOXELS + 1, channels)):
+            raise ValueError(f"{name} wants {len(slots) * VOXELS} rows of {channels}, not {tuple(rows.shape)}")
+        values = rows.detach()[: len(slots) * VOXELS].to(self.device, torch.float32).reshape(-1, VOXELS * channels)
+        self.rows(name).detach().view(-1, VOXELS * channels).index_copy_(0, slots, values)
+
+    # ------------------------------------------------------------------------------------------------ life
+
+    def close(self) -> None:
+        """Let go of all memory, views included. Called at exit for grids still open: Open3D complains about longer held buffers and fails the exit status."""
+        self._let_go()
+        self._map = self._host = None
+        _OPEN.discard(self)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _table(self) -> Any:
+        if self._map is None:
+            raise RuntimeError("this grid is closed")
+        return self._map
+
+    def _let_go(self) -> None:
+        """Void every view lent so far, so that its old memory is freed and its use fails."""
+        self._views.clear()
+        for reference in self._lent:
+            view = reference()
+            if view is not None:
+                view.grad = None
+                view.data = torch.empty((0, view.shape[1]), device=view.device)
+        self._lent.clear()
+        self._generation += 1
+
+    def _keys(self, keys: Tensor) -> Tensor:
+        if keys.ndim != 2 or keys.shape[1] != 3 or keys.is_floating_point():
+            raise ValueError(f"block keys must be an integer (N, 3) tensor, not {keys.dtype} {tuple(keys.shape)}")
+        return keys.to(self.device, torch.int32).contiguous()
+
+    def _to_open3d(self, keys: Tensor) -> o3d.core.Tensor:
+        return o3d.core.Tensor.from_dlpack(keys.__dlpack__())
+
+    def _no_memory(self, blocks: int) -> InputError:
+        size = self.estimate_bytes(int(blocks)) / 2**30
+        return InputError(f"there is not enough memory for a volume of {blocks} blocks ({size:.1f} GB); choose a lower resolution")
+
+
+def _to_torch(tensor: Any) -> Tensor:
+    """A copy that shares nothing with Open3D (bool tensors do not pass through DLPack in every version)."""
+    if tensor.dtype == o3d.core.bool:
+        tensor = tensor.to(o3d.core.uint8)
+    return dlpack.from_dlpack(tensor.to_dlpack()).clone()
+
+
+_OPEN: weakref.WeakSet[BlockGrid] = weakref.WeakSet()
+
+
+@atexit.register
+def _close_all() -> None:
+    for grid in list(_OPEN):
+        grid.close()
