@@ -151,8 +151,8 @@ class _Shrinker:
             picture = cv2.resize(picture, (samples * width, samples * height), interpolation=cv2.INTER_AREA)
             source = source.scaled(samples * width, samples * height)
         if self.key != (source, width, height):
-            fine, map_x, map_y, seen = undistort_maps(source, samples * width, samples * height)
-            whole = seen.reshape(height, samples, width, samples).all(axis=(1, 3))
+            _, map_x, map_y, seen = undistort_maps(source, samples * width, samples * height)
+            whole = np.asarray(seen.reshape(height, samples, width, samples).all(axis=(1, 3)))
             self.key, self.maps = (source, width, height), (map_x, map_y, whole)
         assert self.maps is not None
         fine_picture = cv2.remap(picture, self.maps[0], self.maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

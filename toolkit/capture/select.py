@@ -1,0 +1,213 @@
+"""Which frames of a video are worth keeping: sharp ones, spread evenly over the camera's motion rather than over time."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from toolkit.camera import Array
+from toolkit.capture.checks import check_capture
+from toolkit.capture.types import Capture, Frame
+from toolkit.capture.video import iterate_video
+from toolkit.config import CaptureSettings
+from toolkit.errors import InputError, OutputError
+from toolkit.files import atomic_path, fingerprint, read_json, write_json
+from toolkit.progress import SILENT, Progress
+
+log = logging.getLogger(__name__)
+
+VERSION = 1  # of the measurement kept beside the frames
+QUALITY = 97
+TRACK_SIDE = 320  # long side of the pictures that motion is measured on
+SHARP_SIDE = 640  # and sharpness
+MIN_STEP = 0.008  # motion between chosen frames, share of the long side: less adds no parallax
+MAX_STEP = 0.20  # more than this between neighbours leaves too little overlap to match
+ANCHOR = 0.012  # motion after which a new reference frame is taken
+BLURRED = 0.6  # of the sharpness around it: a frame that may be left out
+JUMP = 0.30  # motion booked where tracking fails (a cut, a blank wall, strong blur)
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One number per readable frame of the video."""
+
+    sharpness: list[float]  # variance of the Laplacian of the small grey picture
+    motion: list[float]  # way that the picture's corners have moved since the start, in long sides; never decreases
+
+
+def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progress: Progress = SILENT) -> Capture:
+    """At most `settings.max_frames` sharp, well-spread frames of a video, written as pictures under `out/frames`.
+
+    Two passes: the first measures every frame small, the second writes the chosen ones as JPEG. What was measured stays in
+    `out/selection.json` and pictures that are there are not written again, so a killed run goes on where it stopped and a
+    second run does nothing.
+
+    Returns:
+        a capture of kind "video" whose frames are pictures, in time order; `extra["selected_from"]` is the number of readable frames.
+
+    Raises:
+        InputError: not a video, or its frames are unusable (all alike, black, fewer than two).
+        OutputError: the frames cannot be written.
+    """
+    if capture.kind != "video" or not capture.frames or capture.frames[0].video_index is None:
+        raise InputError(f"{capture.root} is not a video, there are no frames to choose")
+    video, announced = capture.frames[0].image, len(capture.frames)
+    measure = _measured(video, announced, Path(out) / "selection.json", progress)
+    readable = len(measure.sharpness)
+    if readable < 2:
+        raise InputError(f"only {readable} of {announced} frames of the video {video} can be decoded; the file is damaged, copy or convert it again")
+    chosen = choose(measure, settings.max_frames)
+    folder = Path(out) / "frames"
+    names = [f"frame_{index:06d}" for index in chosen]
+    _write(video, chosen, folder, announced, progress)
+    frames = [Frame(name=name, image=(folder / f"{name}.jpg").resolve()) for name in names]
+    extra = {**capture.extra, "selected_from": readable, "video": str(video)}
+    picked = replace(capture, frames=tuple(frames), ordered=True, extra=extra, warnings=capture.warnings + tuple(_remarks(measure, chosen, announced)))
+    return check_capture(picked, progress)
+
+
+def choose(measure: Measure, max_frames: int) -> list[int]:
+    """Indices of the frames to keep, ascending.
+
+    The way that the picture moved is cut into equal parts; each gives its best frame, by sharpness relative to the frames
+    around it, minus a penalty for lying away from the part's middle. Still stretches have no way, so they give at most one.
+    """
+    count = len(measure.sharpness)
+    way = np.asarray(measure.motion)
+    total = float(way[-1]) if count else 0.0
+    parts = max(1, min(max_frames, count, math.floor(total / MIN_STEP) + 1))
+    clear = _relative_sharpness(np.asarray(measure.sharpness))
+    part = np.minimum((way / max(total, 1e-12) * parts).astype(int), parts - 1) if total > 0 else np.zeros(count, dtype=int)
+    middle = (part + 0.5) * total / parts
+    away = np.abs(way - middle) / max(0.5 * total / parts, 1e-12)  # 0 in the middle of its part, 1 at its border
+    score = np.log(clear) - 0.4 * away**2
+    best: dict[int, int] = {}
+    for index in range(count):
+        kept = best.get(int(part[index]))
+        if kept is None or score[index] > score[kept]:
+            best[int(part[index])] = index
+    return _without_blurred(sorted(best.values()), clear, way)
+
+
+def _without_blurred(chosen: list[int], clear: Array, way: Array) -> list[int]:
+    """Leave out blurred frames, the worst first, where the frames on both sides still overlap well without them."""
+    kept = list(chosen)
+    for index in sorted((index for index in chosen if clear[index] < BLURRED), key=lambda index: float(clear[index])):
+        place = kept.index(index)
+        before, after = kept[max(place - 1, 0)], kept[min(place + 1, len(kept) - 1)]
+        if len(kept) > 2 and way[after] - way[before] <= 0.5 * MAX_STEP:
+            kept.remove(index)
+    return kept
+
+
+def measure_frames(frames: Iterator[tuple[int, Array]], announced: int, progress: Progress = SILENT) -> Measure:
+    """Sharpness and motion of pictures (H, W, 3) uint8 RGB in time order."""
+    sharpness: list[float] = []
+    motion: list[float] = []
+    anchor: Array | None = None  # grey picture that motion is counted from; a new one only after real motion, so jitter adds nothing
+    way = 0.0
+    for index, picture in frames:
+        progress.check()
+        if index % 10 == 0:
+            progress.update(index, 2 * announced, f"frame {index} of {announced}")
+        grey = cv2.cvtColor(_shrunk(picture, SHARP_SIDE), cv2.COLOR_RGB2GRAY)
+        # A light blur first: otherwise sensor noise and blocks of the codec count as detail.
+        sharpness.append(float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 0.8), cv2.CV_32F).var()))
+        small = _shrunk(grey, TRACK_SIDE)
+        moved = 0.0 if anchor is None or anchor.shape != small.shape else displacement(anchor, small)
+        motion.append(max(way + moved, motion[-1] if motion else 0.0))
+        if anchor is None or anchor.shape != small.shape or moved > ANCHOR:
+            anchor, way = small, motion[-1]
+    return Measure(sharpness, motion)
+
+
+def displacement(before: Array, after: Array) -> float:
+    """How far the corners of one grey picture have moved in the next: the mean, in long sides. `JUMP` when they are lost."""
+    long_side = max(before.shape)
+    corners = cv2.goodFeaturesToTrack(before, maxCorners=120, qualityLevel=0.01, minDistance=8)
+    if corners is None or len(corners) < 8:
+        # Nothing to track. Blank pictures that stay alike have not moved; others have, unknown how far.
+        return 0.0 if float(np.abs(before.astype(np.float32) - after).mean()) < 2.0 else JUMP
+    moved, found, error = cv2.calcOpticalFlowPyrLK(before, after, corners, None, winSize=(21, 21), maxLevel=3)
+    tracked = (found.ravel() == 1) & (error.ravel() < 25)
+    if tracked.sum() < max(8, 0.25 * len(corners)):
+        return JUMP
+    length = np.linalg.norm((moved - corners).reshape(-1, 2)[tracked], axis=1)
+    return float(min(np.mean(np.clip(length, 0, np.quantile(length, 0.9))) / long_side, JUMP))
+
+
+def _measured(video: Path, announced: int, path: Path, progress: Progress) -> Measure:
+    """The measurement kept at `path` when it is of this very file, else a new one, kept there."""
+    key = fingerprint(VERSION, video)
+    if path.is_file():
+        try:
+            kept = read_json(path)
+            measure = Measure([float(value) for value in kept["sharpness"]], [float(value) for value in kept["motion"]])
+            if kept["key"] == key and len(measure.sharpness) == len(measure.motion) > 0 and np.isfinite([measure.sharpness, measure.motion]).all():
+                return measure
+        except (InputError, KeyError, TypeError, ValueError):
+            log.info("%s is not readable, frames are measured again", path)
+    measure = measure_frames(iterate_video(video), announced, progress)
+    write_json(path, {"key": key, **{name: [round(value, 6) for value in values] for name, values in asdict(measure).items()}})
+    return measure
+
+
+def _write(video: Path, chosen: list[int], folder: Path, announced: int, progress: Progress) -> None:
+    """Write the chosen frames that are not there yet, and remove frames of an earlier choice."""
+    wanted = {index: folder / f"frame_{index:06d}.jpg" for index in chosen}
+    marker = folder / "source.json"
+    origin: dict[str, Any] = {"video": fingerprint(VERSION, video), "quality": QUALITY}
+    try:
+        same = marker.is_file() and read_json(marker) == origin
+    except InputError:
+        same = False
+    for stale in folder.glob("frame_*.jpg"):
+        if not same or stale not in wanted.values():
+            stale.unlink(missing_ok=True)
+    if not same:
+        write_json(marker, origin)
+    missing = {index for index, path in wanted.items() if not path.is_file()}
+    for index, picture in iterate_video(video, missing):
+        progress.check()
+        progress.update(announced + index, 2 * announced, f"writing frame {index}")
+        with atomic_path(wanted[index]) as temporary:
+            coded, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+            if not coded:
+                raise OutputError(f"frame {index} of {video} cannot be encoded as JPEG")
+            temporary.write_bytes(data.tobytes())
+    for index, path in wanted.items():
+        if not path.is_file():
+            raise InputError(f"frame {index} of the video {video} could be decoded once and not again; the file or the disk is damaged")
+
+
+def _relative_sharpness(sharpness: Array) -> Array:
+    """Sharpness over its median in a window of 31 frames: what the scene shows changes slowly, blur comes and goes."""
+    padded = np.pad(sharpness, 15, mode="reflect" if len(sharpness) > 15 else "edge")
+    median = np.median(np.lib.stride_tricks.sliding_window_view(padded, 31), axis=1)
+    return np.clip(sharpness / np.maximum(median, 1e-6), 0.05, 20.0)
+
+
+def _remarks(measure: Measure, chosen: list[int], announced: int) -> list[str]:
+    remarks = []
+    if len(measure.sharpness) < 0.95 * announced:
+        remarks.append(f"the video announces {announced} frames, {len(measure.sharpness)} could be decoded")
+    steps = np.diff(np.asarray(measure.motion)[chosen])
+    wide = int((steps > MAX_STEP).sum())
+    if wide:
+        remarks.append(f"the camera moves so fast that {wide} of {len(steps)} neighbouring frames overlap little; film slower, or raise max_frames")
+    return remarks
+
+
+def _shrunk(picture: Array, long_side: int) -> Array:
+    height, width = picture.shape[:2]
+    factor = long_side / max(height, width)
+    if factor >= 1:
+        return picture
+    return np.asarray(cv2.resize(picture, (max(1, round(width * factor)), max(1, round(height * factor))), interpolation=cv2.INTER_AREA))
