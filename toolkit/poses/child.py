@@ -1,0 +1,129 @@
+"""A child process that may abort, hang or outlive us: started, listened to, and always cleaned up.
+
+The child speaks JSON lines on its standard output; everything else that it (or a C++ library in it) writes goes to a log
+file. Its standard input is a pipe that we hold open: when it closes, the child knows that we are gone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+from toolkit.errors import PoseError
+from toolkit.progress import SILENT, Progress
+
+TICK = 0.2  # seconds between looks at the user's wish to stop
+SILENCE = 1800.0  # seconds without a word from the child after which it counts as hung
+LOG_TAIL = 200  # lines of the log that are looked at for the reason of a crash
+
+
+def run_child(
+    module: str,
+    arguments: list[str],
+    log: Path,
+    on_message: Callable[[dict[str, Any]], None],
+    progress: Progress = SILENT,
+    environment: dict[str, str] | None = None,
+    silence: float = SILENCE,
+) -> None:
+    """Run `python -m module arguments` to its end, passing on each JSON line.
+
+    Raises:
+        PoseError: it died by a signal, left with an error, or stayed silent for `silence` seconds. Names the log.
+        Interrupted: the user asked to stop; the child is dead by then.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("ab") as log_file:
+        process = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log_file,
+            env={**os.environ, **_import_path(), **(environment or {})},
+            start_new_session=True,  # so that Ctrl-C reaches us first and we decide what the child does
+        )
+    try:
+        _listen(process, log, on_message, progress, silence)
+    finally:
+        end(process)
+    if process.returncode != 0:
+        raise PoseError(f"the process that finds poses {_ending(process.returncode)}; the last line of {log} is: {log_tail(log)}")
+
+
+def end(process: subprocess.Popen[bytes]) -> None:
+    """Make sure that `process` and what it started are gone."""
+    if process.poll() is None:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+    for stream in (process.stdin, process.stdout):
+        if stream is not None:
+            with contextlib.suppress(OSError):
+                stream.close()
+    process.wait()
+
+
+def log_tail(log: Path) -> str:
+    """The last line of the log that is not part of a stack trace, cut to a sentence's length."""
+    try:
+        lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines()[-LOG_TAIL:] if line.strip()]
+    except OSError:
+        lines = []
+    telling = [line for line in lines if not line.startswith(("@", "***", "PC:"))] or lines
+    return telling[-1][-300:] if telling else "(empty)"
+
+
+def _import_path() -> dict[str, str]:
+    """So that the child finds this package wherever it was started from."""
+    here = str(Path(__file__).resolve().parents[2])
+    known = os.environ.get("PYTHONPATH")
+    return {"PYTHONPATH": here if not known else os.pathsep.join([here, known])}
+
+
+def _ending(code: int) -> str:
+    if code >= 0:
+        return f"failed with exit code {code}"
+    try:
+        return f"was ended by the signal {signal.Signals(-code).name}"
+    except ValueError:
+        return f"was ended by signal {-code}"
+
+
+def _listen(process: subprocess.Popen[bytes], log: Path, on_message: Callable[[dict[str, Any]], None], progress: Progress, silence: float) -> None:
+    lines: queue.Queue[bytes | None] = queue.Queue()
+
+    def pump(stream: IO[bytes]) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            for line in stream:
+                lines.put(line)
+        lines.put(None)
+
+    assert process.stdout is not None
+    threading.Thread(target=pump, args=(process.stdout,), daemon=True).start()
+    heard = time.monotonic()
+    while True:
+        progress.check()
+        try:
+            line = lines.get(timeout=TICK)
+        except queue.Empty:
+            if time.monotonic() - heard > silence:
+                raise PoseError(f"the process that finds poses said nothing for {silence:.0f} seconds and was ended; see {log}") from None
+            continue
+        heard = time.monotonic()
+        if line is None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(timeout=30)
+            return
+        with contextlib.suppress(json.JSONDecodeError):
+            message = json.loads(line)
+            if isinstance(message, dict):
+                on_message(message)

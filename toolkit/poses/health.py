@@ -1,0 +1,189 @@
+"""Why poses were not found, or not all of them, in a sentence that a user can act on. Plain numbers in, words out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from toolkit.camera import Array
+from toolkit.poses.result import listed
+
+FEW_KEYPOINTS = 40  # below which a picture cannot be matched reliably
+SAME = 1.0  # grey levels between thumbnails of pictures that count as identical
+BLACK = 2.0  # grey deviation of a picture without content
+FLAT_SHARE = 0.8  # of verified pairs explained by a homography before the scene or the motion is called degenerate
+ROTATION_RESIDUAL = 0.06  # distance of K⁻¹HK from a rotation, relative
+STILL = 0.004  # features moved by less than this share of the long side: the camera stood still
+SMALL_ANGLE = 1.5  # degrees; the median triangulation angle below which depth is guesswork
+TOO_FEW = 3  # registered frames that make a model at all
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the verified pairs say about how the camera moved."""
+
+    flat_share: float  # of pairs that a homography explains
+    residual: float  # how far these homographies are from pure rotations at the best focal length
+    moved: float  # median displacement of features, as a share of the long side
+
+
+def hopeless(records: Sequence[dict[str, Any]]) -> str | None:
+    """The reason why matching is not worth starting, from the pictures alone; None when it is."""
+    count = len(records)
+    if count < 2:
+        return f"there is {count} picture, and poses need at least 3 from different places; add photos that overlap"
+    keypoints = np.array([record["keypoints"] for record in records])
+    rich = int(np.count_nonzero(keypoints >= FEW_KEYPOINTS))
+    if rich < 2:
+        dark = sum(record["deviation"] < BLACK for record in records)
+        cause = f"{dark} of {count} pictures are one flat colour" if dark else "they are blank, blurred or without texture"
+        return f"no features to match: the pictures hold {int(np.median(keypoints))} keypoints each on the median, and {cause}; use sharp, lit pictures of a textured scene"
+    thumbnails = np.array([record["thumbnail"] for record in records], dtype=np.float64)
+    sizes = {(record["width"], record["height"]) for record in records}
+    if len(sizes) == 1 and np.abs(thumbnails - thumbnails[0]).max() < SAME:
+        return f"all {count} pictures are identical, so there is nothing to triangulate from; move the camera between pictures"
+    return None
+
+
+def motion(facts: dict[str, Any]) -> Motion | None:
+    """What kind of motion the verified pairs show; None without pairs."""
+    pairs = facts["pairs"]
+    if not pairs:
+        return None
+    pictures = facts["pictures"]
+    long_side = float(np.median([max(p["width"], p["height"]) for p in pictures]))
+    flat = [pair for pair in pairs if pair["flat"]]
+    size = pictures[pairs[0]["first"]]
+    homographies = np.array([pair["homography"] for pair in flat], dtype=np.float64).reshape(-1, 3, 3)
+    return Motion(
+        flat_share=len(flat) / len(pairs),
+        residual=rotation_residual(homographies, size["width"], size["height"]),
+        moved=float(np.median([pair["moved"] for pair in pairs])) / long_side,
+    )
+
+
+def rotation_residual(homographies: Array, width: int, height: int) -> float:
+    """How far (N, 3, 3) pixel homographies are from K R K⁻¹ with one focal length for all: the least median over focal lengths.
+
+    A camera that only turns gives 0 whatever it looks at; one that moves before a plane does not.
+    """
+    if len(homographies) == 0:
+        return float("inf")
+    best = float("inf")
+    for factor in np.geomspace(0.4, 4.0, 47):
+        k = np.array([[factor * max(width, height), 0, width / 2], [0, factor * max(width, height), height / 2], [0, 0, 1.0]])
+        inner = np.linalg.inv(k) @ homographies @ k
+        determinant = np.linalg.det(inner)
+        usable = np.abs(determinant) > 1e-12
+        inner = inner[usable] / np.cbrt(determinant[usable])[:, None, None]
+        if len(inner):
+            off = np.linalg.norm(np.swapaxes(inner, 1, 2) @ inner - np.eye(3), axis=(1, 2))
+            best = min(best, float(np.median(off)))
+    return best
+
+
+def turned_only(facts: dict[str, Any]) -> bool:
+    """True when every verified pair says that the camera turned on the spot."""
+    seen = motion(facts)
+    return seen is not None and seen.flat_share >= FLAT_SHARE and seen.residual < ROTATION_RESIDUAL
+
+
+def failure(facts: dict[str, Any]) -> str | None:
+    """The reason why there are no usable poses; None when there are.
+
+    Args:
+        facts: what the child process wrote: `pictures`, `pairs`, `attempts`, `model`.
+    """
+    reason = hopeless(facts["pictures"])
+    if reason is not None:
+        return reason
+    count = len(facts["pictures"])
+    model = facts["model"]
+    found = 0 if model is None else len(model["pictures"])
+    seen = motion(facts)
+    if seen is None:
+        keypoints = int(np.median([record["keypoints"] for record in facts["pictures"]]))
+        return f"no two of the {count} pictures share enough features ({keypoints} keypoints each on the median); take pictures that overlap by two thirds"
+    narrow = model is None or model["angle"] < SMALL_ANGLE
+    if seen.moved < STILL and narrow:
+        return f"the camera hardly moved: features shift by {100 * seen.moved:.2g}% of the picture on the median; move sideways around the scene while recording"
+    # A turning camera can be fitted by a wrong lens and a tiny shift, so the verdict of the pairs stands whatever the mapper says.
+    if turned_only(facts) and (model is None or model["angle"] < 2 * SMALL_ANGLE or found < TOO_FEW):
+        return "the camera only turned on the spot (rotations explain all matches), so depth cannot be told; move sideways around the scene while recording"
+    if narrow and model is not None:
+        return f"there is too little parallax: rays meet at {model['angle']:.2g}° on the median; move sideways around the scene while recording"
+    if found >= TOO_FEW:
+        return None
+    if seen.flat_share >= FLAT_SHARE:
+        return "all matches lie on one plane or show too little parallax to start from; include things at different depths and move sideways while recording"
+    parts = components(count, facts["pairs"])
+    if len(parts[0]) < max(TOO_FEW, count // 2):
+        return f"the pictures overlap too little: the largest group that matches holds {len(parts[0])} of {count}; take more pictures in between"
+    return f"mapping found no consistent geometry from {len(facts['pairs'])} matched pairs of {count} pictures; take sharper pictures with more overlap, of a scene that stands still"
+
+
+def components(count: int, pairs: Sequence[dict[str, Any]], least: int = 15) -> list[list[int]]:
+    """Groups of pictures connected by verified pairs with `least` inliers or more, largest first."""
+    parent = list(range(count))
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = parent[i]
+        return i
+
+    for pair in pairs:
+        if pair["inliers"] >= least:
+            parent[root(pair["first"])] = root(pair["second"])
+    groups: dict[int, list[int]] = {}
+    for i in range(count):
+        groups.setdefault(root(i), []).append(i)
+    return sorted(groups.values(), key=lambda group: (-len(group), group[0]))
+
+
+def shortfalls(facts: dict[str, Any]) -> list[str]:
+    """Warnings for a model that does not hold every picture: which are missing and why, grouped by cause."""
+    pictures, model = facts["pictures"], facts["model"]
+    count = len(pictures)
+    inside = set(model["pictures"])
+    missing = [i for i in range(count) if i not in inside]
+    if not missing:
+        return []
+    links = np.zeros(count, dtype=int)
+    partners = np.zeros(count, dtype=int)
+    for pair in facts["pairs"]:
+        for here, there in ((pair["first"], pair["second"]), (pair["second"], pair["first"])):
+            partners[here] += 1
+            links[here] += pair["inliers"] if there in inside else 0
+    groups: dict[str, list[int]] = {}
+    for i in missing:
+        if pictures[i]["keypoints"] < FEW_KEYPOINTS:
+            cause = "too few features (dark, blurred or blank)"
+        elif partners[i] == 0:
+            cause = "no other frame matches them"
+        elif links[i] == 0:
+            cause = "they match each other but no frame of the model (a gap in the overlap)"
+        else:
+            cause = "they match frames of the model too weakly or ambiguously to be placed"
+        groups.setdefault(cause, []).append(i)
+    sizes: list[int] = next((attempt["models"] for attempt in facts["attempts"] if attempt["attempt"] == model["attempt"]), [])
+    apart = f"; the scene split into models of {', '.join(str(size) for size in sizes)} frames" if len(sizes) > 1 else ""
+    warnings = [f"{len(inside)} of {count} frames were registered{apart}"]
+    for cause, frames in groups.items():
+        warnings.append(f"{len(frames)} frames are missing because {cause}: {listed(runs([pictures[i]['name'] for i in frames], frames))}")
+    return warnings
+
+
+def runs(names: Sequence[str], positions: Sequence[int]) -> list[str]:
+    """Names of neighbouring positions gathered as `first to last`."""
+    out: list[str] = []
+    start = 0
+    for k in range(1, len(positions) + 1):
+        if k == len(positions) or positions[k] != positions[k - 1] + 1:
+            length = k - start
+            out += [f"{names[start]} to {names[k - 1]}"] if length > 2 else list(names[start:k])
+            start = k
+    return out

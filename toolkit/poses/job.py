@@ -1,0 +1,109 @@
+"""What the parent tells the pose-finding child, and where both keep files. No pycolmap here."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from toolkit.capture.images import turns_by_exif
+from toolkit.capture.types import Capture, Frame
+from toolkit.config import PosesSettings
+from toolkit.files import fingerprint, read_json, write_json
+
+MAX_EXHAUSTIVE = 120  # photos; beyond it pairs are chosen
+VERSION = 1  # of the files in out/sparse; a change discards what earlier versions left
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture that the child reads."""
+
+    name: str
+    image: str
+    mask: str | None = None
+    video_index: int | None = None
+    focal_prior: float | None = None
+
+    def frame(self) -> Frame:
+        """As the capture's readers want it."""
+        return Frame(
+            name=self.name, image=Path(self.image), mask=None if self.mask is None else Path(self.mask), video_index=self.video_index, focal_prior=self.focal_prior
+        )
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that decides the child's result."""
+
+    folder: str  # out/sparse
+    pictures: tuple[Picture, ...]
+    sequential: bool
+    one_camera: bool  # all pictures come from one camera at one zoom when their sizes agree
+    exif: bool  # pictures are turned upright by their EXIF orientation
+    image_size: int
+    max_features: int
+    seed: int
+    threads: int
+
+    @property
+    def database(self) -> Path:
+        return Path(self.folder) / "database.db"
+
+    @property
+    def log(self) -> Path:
+        return Path(self.folder) / "log.txt"
+
+    @property
+    def records(self) -> Path:
+        """Facts of each picture, gathered while its features are extracted."""
+        return Path(self.folder) / "pictures.json"
+
+    @property
+    def key_file(self) -> Path:
+        return Path(self.folder) / "inputs.json"
+
+    @property
+    def result(self) -> Path:
+        return Path(self.folder) / "result.json"
+
+    def key(self) -> str:
+        """Of what features and matches depend on: not on threads, not on what the mapper is told."""
+        pictures = [[asdict(picture), Path(picture.image)] for picture in self.pictures]
+        flat = [part for pair in pictures for part in pair]
+        return fingerprint(VERSION, self.sequential, self.one_camera, self.exif, self.image_size, self.max_features, self.seed, *flat)
+
+    def save(self, path: Path) -> None:
+        write_json(path, asdict(self))
+
+    @classmethod
+    def load(cls, path: Path) -> Job:
+        data: dict[str, Any] = read_json(path)
+        return cls(**{**data, "pictures": tuple(Picture(**picture) for picture in data["pictures"])})
+
+
+def plan(capture: Capture, folder: Path, settings: PosesSettings, seed: int, threads: int) -> Job:
+    """The job for `capture`. Intrinsics and poses that the capture brings are not used; focal lengths from EXIF are."""
+    pictures = tuple(
+        Picture(
+            name=frame.name,
+            image=str(frame.image),
+            mask=None if frame.mask is None else str(frame.mask),
+            video_index=frame.video_index,
+            focal_prior=frame.focal_prior,
+        )
+        for frame in capture.frames
+    )
+    priors = {None if picture.focal_prior is None else round(picture.focal_prior, 1) for picture in pictures}
+    sequential = capture.ordered if settings.matching == "auto" else settings.matching == "sequential"
+    return Job(
+        folder=str(folder),
+        pictures=pictures,
+        sequential=sequential,
+        one_camera=capture.kind == "video" or len(priors) == 1,
+        exif=turns_by_exif(capture),
+        image_size=settings.image_size,
+        max_features=settings.max_features,
+        seed=seed,
+        threads=threads,
+    )

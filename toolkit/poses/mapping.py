@@ -1,0 +1,193 @@
+"""COLMAP's mappers, tried from strict to loose until most pictures are registered. Runs in the child process only."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from toolkit.camera import OPENCV, Intrinsics
+from toolkit.errors import PoseError
+from toolkit.files import remove
+from toolkit.poses.job import Job
+
+Report = Callable[[float, float, str], None]
+ENOUGH = 0.6  # share of registered pictures below which a looser attempt is worth its time
+FEW_POINTS = 12  # a picture that sees fewer of the model's points hangs in the air: not registered
+MAX_ERROR = 3.0  # pixels; the mean reprojection error of a model that can be trusted
+ANGLE_SAMPLE = 2000  # points looked at for the triangulation angle
+
+
+@dataclass
+class Model:
+    """One reconstruction, and the attempt that made it."""
+
+    reconstruction: pycolmap.Reconstruction
+    attempt: str
+    registered: list[int]  # image ids that see enough points
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return len(self.registered), self.reconstruction.num_points3D()
+
+
+def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str, Any]]]:
+    """The largest trustworthy model, and what every attempt gave: `{"attempt", "models": [frames, …]}`, largest first."""
+    attempts: list[tuple[str, Callable[[], list[pycolmap.Reconstruction]]]] = [
+        ("incremental", lambda: _incremental(job, report, loose=False)),
+        ("incremental, small angles", lambda: _incremental(job, report, loose=True)),
+        ("global", lambda: _global(job, report)),
+    ]
+    best: Model | None = None
+    history = []
+    for name, attempt in attempts:
+        models = sorted((_model(found, name) for found in attempt()), key=lambda model: model.size, reverse=True)
+        models = [model for model in models if len(model.registered) >= 2]
+        history.append({"attempt": name, "models": [len(model.registered) for model in models]})
+        for model in models:
+            if model.reconstruction.compute_mean_reprojection_error() > MAX_ERROR:
+                continue
+            # A looser attempt has to find clearly more: a few frames on top come at the price of accuracy.
+            if best is None or model.size[0] > 1.1 * best.size[0]:
+                best = model
+        if best is not None and best.size[0] >= ENOUGH * len(job.pictures):
+            break
+    return best, history
+
+
+def _model(reconstruction: pycolmap.Reconstruction, attempt: str) -> Model:
+    registered = sorted(i for i in reconstruction.reg_image_ids() if reconstruction.image(i).num_points3D >= FEW_POINTS)
+    return Model(reconstruction, attempt, registered)
+
+
+def _incremental(job: Job, report: Report, loose: bool) -> list[pycolmap.Reconstruction]:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = job.threads
+    options.random_seed = job.seed
+    options.extract_colors = False  # pictures may be frames of a video or turned: the points are coloured later where needed
+    options.min_model_size = 3
+    options.max_num_models = 10
+    options.mapper.num_threads = job.threads
+    options.mapper.random_seed = job.seed
+    options.triangulation.random_seed = job.seed
+    if loose:
+        options.mapper.init_min_tri_angle = 4.0
+        options.mapper.init_min_num_inliers = 40
+        options.mapper.abs_pose_min_num_inliers = 18
+        options.mapper.abs_pose_min_inlier_ratio = 0.15
+        options.mapper.filter_min_tri_angle = 1.0
+        options.triangulation.min_angle = 1.0
+    total = len(job.pictures)
+    what = "mapping again with small angles" if loose else "mapping"
+    count = 0
+
+    def started() -> None:
+        nonlocal count
+        count = 2
+        report(count, total, f"{what}, 2 of {total} registered")
+
+    def registered() -> None:
+        nonlocal count
+        count += 1
+        report(min(count, total), total, f"{what}, {min(count, total)} of {total} registered")
+
+    report(0, total, what)
+    pycolmap.set_random_seed(job.seed)
+    folder = _empty(Path(job.folder) / "attempt")
+    found = pycolmap.incremental_mapping(
+        job.database, folder, folder, options, initial_image_pair_callback=started, next_image_callback=registered
+    )
+    return list(found.values())
+
+
+def _global(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
+    report(0, len(job.pictures), "mapping all at once")
+    # Calibrating the view graph rewrites cameras and pairs: on a copy, so that a re-run starts from the same matches.
+    copy = Path(job.folder) / "global.db"
+    remove(copy)
+    shutil.copyfile(job.database, copy)
+    try:
+        pycolmap.set_random_seed(job.seed)
+        calibration = pycolmap.ViewGraphCalibrationOptions()
+        calibration.random_seed = job.seed
+        pycolmap.calibrate_view_graph(copy, calibration)
+        options = pycolmap.GlobalPipelineOptions()
+        options.num_threads = job.threads
+        options.random_seed = job.seed
+        folder = _empty(Path(job.folder) / "attempt")
+        return list(pycolmap.global_mapping(copy, folder, folder, options).values())
+    finally:
+        remove(copy)
+
+
+def _empty(folder: Path) -> Path:
+    remove(folder)
+    folder.mkdir(parents=True)
+    return folder
+
+
+# --------------------------------------------------------------------------------------------------- results
+
+
+def save_model(model: Model, names: list[str], folder: Path) -> None:
+    """COLMAP's binary files of the model, with the pictures' own names."""
+    for image_id in model.reconstruction.reg_image_ids():
+        image = model.reconstruction.image(image_id)
+        image.name = names[int(image.name)]
+    model.reconstruction.write_binary(_empty(folder))
+
+
+def plain(model: Model) -> dict[str, Any]:
+    """The model as plain data: cameras by picture (indices into the job's pictures), poses in our convention, points."""
+    reconstruction = model.reconstruction
+    order = sorted(model.registered, key=lambda image_id: int(reconstruction.image(image_id).name))
+    images = [reconstruction.image(image_id) for image_id in order]
+    points = [point for _, point in sorted(reconstruction.points3D.items())]
+    return {
+        "attempt": model.attempt,
+        "pictures": [int(image.name) for image in images],
+        "intrinsics": [_intrinsics(reconstruction.camera(image.camera_id)).to_dict() for image in images],
+        "world_from_camera": [_homogeneous(image.cam_from_world().inverse().matrix()) for image in images],
+        "points": [[float(value) for value in point.xyz] for point in points],
+        "point_errors": [float(point.error) for point in points],
+        "error": float(reconstruction.compute_mean_reprojection_error()),
+        "angle": _median_angle(reconstruction),
+    }
+
+
+def _homogeneous(matrix: Any) -> list[list[float]]:
+    return [[float(value) for value in row] for row in np.asarray(matrix)] + [[0.0, 0.0, 0.0, 1.0]]
+
+
+def _intrinsics(camera: pycolmap.Camera) -> Intrinsics:
+    """COLMAP's camera in our terms; both put pixel centres at +0.5.
+
+    Raises:
+        PoseError: a lens model that the database is never given.
+    """
+    values = [float(value) for value in camera.params]
+    if camera.model_name == "OPENCV":
+        fx, fy, cx, cy, *lens = values
+    elif camera.model_name == "SIMPLE_RADIAL":
+        fx, cx, cy, k = values
+        fy, lens = fx, [k, 0.0, 0.0, 0.0]
+    else:
+        raise PoseError(f"the lens model {camera.model_name} came back from mapping, which was not asked for; remove the sparse folder and run again")
+    return Intrinsics(int(camera.width), int(camera.height), fx, fy, cx, cy, OPENCV, tuple(lens))
+
+
+def _median_angle(reconstruction: pycolmap.Reconstruction) -> float:
+    """Median over points of the largest angle, in degrees, between two of the rays that see one."""
+    centres = {image_id: np.asarray(reconstruction.image(image_id).projection_center()) for image_id in reconstruction.reg_image_ids()}
+    points = [point for _, point in sorted(reconstruction.points3D.items())]
+    angles = []
+    for point in points[:: max(1, len(points) // ANGLE_SAMPLE)]:
+        rays = np.array([centres[element.image_id] for element in point.track.elements]) - np.asarray(point.xyz)
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+        angles.append(float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0)))))
+    return float(np.median(angles)) if angles else 0.0

@@ -1,0 +1,116 @@
+"""Poses from the pictures alone. This side talks to the child process (`worker.py`) that runs pycolmap."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from toolkit import errors
+from toolkit.camera import Intrinsics
+from toolkit.capture.types import Capture
+from toolkit.config import PosesSettings
+from toolkit.errors import FieldfuseError, InputError, PoseError
+from toolkit.files import read_json, remove
+from toolkit.poses.child import run_child
+from toolkit.poses.health import failure, shortfalls
+from toolkit.poses.job import Job, plan
+from toolkit.poses.result import SFM, PoseResult
+from toolkit.poses.sensor import scale_to_depth
+from toolkit.progress import SILENT, Progress
+
+WORKER = "toolkit.poses.worker"
+MAX_RESULT_BYTES = 2 * 2**30
+
+
+def find_poses(
+    capture: Capture, out: Path, settings: PosesSettings | None = None, seed: int = 0, threads: int | None = None, progress: Progress = SILENT
+) -> PoseResult:
+    """Structure from motion over the capture's pictures; poses and intrinsics that it brings are not looked at.
+
+    COLMAP's database, log and model stay in `out/sparse`; features and matches there are used again when the pictures and
+    settings are the same. With the same seed the result repeats. A capture with depth maps gets the depth's scale.
+
+    Raises:
+        PoseError: no usable poses, and why; or the child process crashed.
+        InputError: a picture cannot be read.
+        Interrupted: the user asked to stop.
+    """
+    settings = settings or PosesSettings()
+    if len(capture.frames) < 2:
+        raise PoseError(f"{capture.root}: {len(capture.frames)} picture is not enough to find poses, at least 3 from different places are needed; add photos that overlap")
+    workers = max(1, threads or os.cpu_count() or 1)
+    job = plan(capture, Path(out).resolve() / "sparse", settings, seed, workers)
+    seconds: dict[str, float] = {}
+    began = time.monotonic()
+    facts = _run(job, seconds, progress)
+    reason = failure(facts)
+    if reason is not None:
+        raise PoseError(f"{capture.root}: {reason}")
+    result = _result(capture, job, facts)
+    if capture.has_depth:
+        result = scale_to_depth(result, capture)
+    result.seconds = {**seconds, "total": time.monotonic() - began}
+    return result
+
+
+def _run(job: Job, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:
+    """The facts that the child leaves, and the seconds of its steps."""
+    folder = Path(job.folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        remove(job.log)
+    except OSError as error:
+        raise errors.OutputError(f"cannot write {folder}: {error.strerror or error}; free space or choose another --out folder") from error
+    remove(job.result)
+    job.save(folder / "job.json")
+    refusals: list[FieldfuseError] = []
+
+    def hear(message: dict[str, Any]) -> None:
+        event = message.get("event")
+        if event == "progress":
+            progress.update(float(message["done"]), float(message["total"]), str(message["note"]))
+        elif event == "step":
+            seconds[str(message["name"])] = float(message["seconds"])
+        elif event == "error":
+            kind = getattr(errors, str(message["kind"]), PoseError)
+            refusals.append(kind(str(message["message"])))
+
+    # BLAS and OpenMP spin up a thread a core each unless told; COLMAP's own threads are set by the worker.
+    counts = {name: str(job.threads) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+    run_child(WORKER, [str(folder / "job.json")], job.log, hear, progress, counts)
+    if refusals:
+        raise refusals[0]
+    try:
+        facts: dict[str, Any] = read_json(job.result, max_bytes=MAX_RESULT_BYTES)
+    except InputError as error:
+        raise PoseError(f"the process that finds poses left no result; see {job.log}") from error
+    return facts
+
+
+def _result(capture: Capture, job: Job, facts: dict[str, Any]) -> PoseResult:
+    model = facts["model"]
+    names = [picture.name for picture in job.pictures]
+    placed = [names[i] for i in model["pictures"]]
+    known = set(placed)
+    sizes = next(attempt["models"] for attempt in facts["attempts"] if attempt["attempt"] == model["attempt"])
+    warnings = shortfalls(facts)
+    if model["attempt"] != facts["attempts"][0]["attempt"]:
+        warnings.append(f"poses come from a fallback ({model['attempt']} mapping), the strict attempt registered {max(facts['attempts'][0]['models'], default=0)} of {len(names)} frames")
+    return PoseResult(
+        source=SFM,
+        registered=len(placed),
+        total=len(capture.frames),
+        names=placed,
+        intrinsics=[replace(Intrinsics.from_dict(camera)) for camera in model["intrinsics"]],
+        world_from_camera=np.array(model["world_from_camera"], dtype=np.float64),
+        models=[int(size) for size in sizes],
+        missing=[name for name in names if name not in known],
+        points=np.array(model["points"], dtype=np.float64).reshape(-1, 3),
+        point_errors=np.array(model["point_errors"], dtype=np.float64),
+        warnings=warnings,
+    )
