@@ -127,8 +127,8 @@ def _coarse_distances(grid: MarchGrid, origins: Tensor, directions: Tensor, near
         norm = torch.addcmul(origins, directions, distance[:, None]).abs_().amax(1).clamp_min_(1.0)
         if bool((norm > far).all()):
             break
-        across = closest * (2 - 1 / norm)
-        stretch = torch.where(norm > 1, norm * norm / (space.shell * space.shell + across * across).sqrt().clamp_min(space.shell), norm).clamp_max_(MAX_STRETCH)
+        across = closest * (space.extent - space.shell / norm)
+        stretch = torch.where(norm > 1, norm * norm / (space.shell**2 + across * across).sqrt(), norm).clamp_max_(MAX_STRETCH)
         distance = distance + stretch * (step / speed)
         out.append(distance)
     return torch.stack(out, 1)

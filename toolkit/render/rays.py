@@ -1,0 +1,67 @@
+"""Colour, distance and opacity along a batch of rays through a field (forward only; training has its own step with gradients)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from toolkit.networks.decoder import Deferred
+from toolkit.render.composite import ray_sum, weights
+from toolkit.render.field import Field, density
+from toolkit.render.march import Samples, march
+from toolkit.volume.lookup import corners, gather
+
+Tensor = torch.Tensor
+OPACITY_FLOOR = 1e-6
+
+
+@dataclass(frozen=True)
+class RayValues:
+    """Per ray: `colour` (B, 3), `distance` (B,) along the unit direction where half of the light is stopped (0 if none is), `opacity` (B,)."""
+
+    colour: Tensor
+    distance: Tensor
+    opacity: Tensor
+
+
+@torch.no_grad()
+def render_rays(field: Field, origins: Tensor, directions: Tensor, threshold: float = 1e-3) -> RayValues:
+    """Render (B, 3) rays. Samples whose weight stays below `threshold` are not decoded."""
+    count = len(origins)
+    samples = march(field.grid, origins, directions, field.near, field.fine)
+    if isinstance(field.decoder, Deferred):
+        rows, corner_weights = corners(field.topology, samples.cell, samples.inside)
+        thickness = density(gather(field.density_rows, rows, corner_weights)) * samples.length
+        weight, transmittance = weights(thickness, samples.first)
+        seen = weight > threshold
+        kept = samples.keep(seen)
+        w = weight[seen]
+        features = gather(field.feature_rows, rows[seen], corner_weights[seen])
+        summed = ray_sum(torch.cat([w[:, None] * features, w[:, None]], 1), kept.ray, count)
+        opacity = summed[:, -1]
+        colour = field.decoder(summed[:, :-1] / opacity.clamp_min(OPACITY_FLOOR)[:, None], directions)
+        colour = colour * opacity[:, None]
+    else:
+        rows, corner_weights = corners(field.topology, samples.cell, samples.inside)
+        raw, sample_colour = field.decoder(gather(field.feature_rows, rows, corner_weights), directions[samples.ray])
+        thickness = density(raw + gather(field.density_rows, rows, corner_weights)) * samples.length
+        weight, transmittance = weights(thickness, samples.first)
+        opacity = ray_sum(weight, samples.ray, count)
+        colour = ray_sum(weight[:, None] * sample_colour, samples.ray, count)
+    colour = colour + (1 - opacity)[:, None] * field.background
+    distance = median_distance(samples, transmittance, thickness, count)
+    return RayValues(colour.clamp(0, 1), distance, opacity)
+
+
+def median_distance(samples: Samples, transmittance: Tensor, thickness: Tensor, count: int) -> Tensor:
+    """(B,) distance at which the transmittance falls through ½, interpolated within the sample's interval; 0 where it never does."""
+    after = transmittance * torch.exp(-thickness)
+    crossing = ((transmittance > 0.5) & (after <= 0.5)).nonzero().squeeze(1)
+    part = torch.log(2 * transmittance[crossing]) / thickness[crossing].clamp_min(1e-12)  # T e^{-p τ} = ½
+    following = (crossing + 1).clamp_max(max(len(samples) - 1, 0))
+    same = (samples.ray[following] == samples.ray[crossing]) & (following != crossing)
+    spacing = torch.where(same, samples.distance[following] - samples.distance[crossing], torch.zeros_like(part))
+    out = torch.zeros(count, device=transmittance.device)
+    out[samples.ray[crossing]] = samples.distance[crossing] + (part - 0.5) * spacing.clamp_max(0.1 * samples.distance[crossing])
+    return out

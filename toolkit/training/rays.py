@@ -1,0 +1,60 @@
+"""The pixels that a fit may look at, and random batches of rays through them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from toolkit.capture.types import Views
+
+Tensor = torch.Tensor
+
+
+@dataclass(frozen=True)
+class Batch:
+    origins: Tensor  # (B, 3) working frame
+    directions: Tensor  # (B, 3) unit
+    colour: Tensor  # (B, 3) in [0, 1]
+    view: Tensor  # (B,) int64, which of the pool's views
+
+
+class PixelPool:
+    """All valid pixels of some views, as uint8 on the device, with what is needed to make their rays."""
+
+    def __init__(self, views: Views, device: torch.device | str = "cpu") -> None:
+        colours, places, which = [], [], []
+        for index in range(len(views)):
+            image = views.images[index]
+            valid = views.valid[index] if views.valid else None
+            flat = np.arange(image.shape[0] * image.shape[1]) if valid is None else np.flatnonzero(valid)
+            colours.append(torch.from_numpy(np.ascontiguousarray(image.reshape(-1, 3)[flat])))
+            places.append(torch.from_numpy(flat.astype(np.int32)))
+            which.append(torch.full((len(flat),), index, dtype=torch.int32))
+        self.colour = torch.cat(colours).to(device)
+        self.place = torch.cat(places).to(device)
+        self.view = torch.cat(which).to(device)
+        k = [(c.fx, c.fy, c.cx, c.cy, c.width) for c in views.intrinsics]
+        self.camera = torch.tensor(k, dtype=torch.float32, device=device)
+        self.pose = torch.from_numpy(views.world_from_camera.astype(np.float32)).to(device)
+
+    def __len__(self) -> int:
+        return len(self.colour)
+
+    def batch(self, count: int, generator: torch.Generator) -> Batch:
+        """`count` rays, uniformly over all pixels, with replacement."""
+        pick = torch.randint(len(self), (count,), generator=generator).to(self.colour.device)
+        return self.take(pick)
+
+    def take(self, pick: Tensor) -> Batch:
+        """The rays of the pixels `pick` (B,)."""
+        view = self.view[pick].long()
+        fx, fy, cx, cy, width = self.camera[view].unbind(1)
+        place = self.place[pick]
+        row = place.div(width.int(), rounding_mode="floor")
+        u, v = (place - row * width.int()).float() + 0.5, row.float() + 0.5
+        camera = torch.stack([(u - cx) / fx, (v - cy) / fy, torch.ones_like(u)], 1)
+        pose = self.pose[view]
+        directions = torch.nn.functional.normalize((pose[:, :3, :3] @ camera[:, :, None]).squeeze(2), dim=1)
+        return Batch(pose[:, :3, 3], directions, self.colour[pick].float() / 255, view)

@@ -1,0 +1,147 @@
+"""One optimisation step on one batch of rays: render, loss, gradients by hand, lazy Adam."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from toolkit.networks.decoder import Deferred
+from toolkit.render.composite import distortion, ray_sum, thickness_gradient, weights
+from toolkit.render.field import RAW_MAX, Field, density
+from toolkit.render.march import Samples, march
+from toolkit.render.rays import OPACITY_FLOOR
+from toolkit.training.adam import LazyAdam
+from toolkit.training.rays import Batch
+from toolkit.volume.lookup import corners, gather, scatter
+
+Tensor = torch.Tensor
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Step sizes and loss weights of one step."""
+
+    density: float
+    feature: float
+    decoder: float
+    distortion: float
+    opacity: float = 0.0  # weight of the mean of (1 - opacity)², for captures in which every ray ends somewhere
+    random_background: bool = False  # what is behind everything is another colour for every ray, so that it cannot stand in for a surface
+    colour_threshold: float = 1e-3  # samples of smaller weight are neither decoded nor given a gradient
+
+
+class Optimiser:
+    """A field with the optimiser state of its rows, and the largest weight that each voxel was seen with."""
+
+    def __init__(self, field: Field) -> None:
+        self.field = field
+        self.density = LazyAdam(field.density_rows)
+        self.feature = LazyAdam(field.feature_rows)
+        self.decoder = torch.optim.Adam(field.decoder.parameters(), lr=1e-3, betas=(0.9, 0.99), eps=1e-10)
+        self.seen = torch.zeros(len(field.occupied), device=field.device)
+        self._touched = torch.zeros(len(field.density_rows), dtype=torch.bool, device=field.device)
+
+    def renew_rows(self, field: Field) -> None:
+        """Go on with another field of the same decoder: the rows' state starts afresh, the decoder's is kept."""
+        decoder = self.decoder
+        self.__init__(field)  # type: ignore[misc]
+        self.decoder = decoder
+
+    def _touched_rows(self, rows: Tensor) -> Tensor:
+        self._touched[rows.reshape(-1)] = True
+        self._touched[-1] = False  # the zero row stays zero
+        touched = self._touched.nonzero().squeeze(1)
+        self._touched[touched] = False
+        return touched
+
+    def step(self, batch: Batch, rates: Rates, generator: torch.Generator) -> tuple[float, int]:
+        """One step. Returns the mean squared colour error of the batch and the number of samples that were looked at."""
+        field = self.field
+        jitter = torch.rand(len(batch.origins), generator=generator).to(field.device)
+        samples = march(field.grid, batch.origins, batch.directions, field.near, field.fine, jitter)
+        for group in self.decoder.param_groups:
+            group["lr"] = rates.decoder
+        deferred = isinstance(field.decoder, Deferred)
+        behind = torch.rand(len(batch.origins), 3, generator=generator).to(field.device) if rates.random_background else field.background
+        error = (self._deferred if deferred else self._per_sample)(batch, samples, rates, behind)
+        self.decoder.step()
+        self.decoder.zero_grad(set_to_none=True)
+        return error, len(samples)
+
+    def _deferred(self, batch: Batch, samples: Samples, rates: Rates, behind: Tensor) -> float:
+        """Features are composited, then decoded once a ray; only the decoder goes through autograd."""
+        field, count = self.field, len(batch.origins)
+        assert isinstance(field.decoder, Deferred)
+        rows, corner_weights = corners(field.topology, samples.cell, samples.inside)
+        raw = gather(field.density_rows, rows, corner_weights)
+        thickness = density(raw) * samples.length
+        weight, transmittance = weights(thickness, samples.first)
+        self.seen.scatter_reduce_(0, samples.cell, weight, "amax")
+
+        chosen = weight > rates.colour_threshold
+        kept = samples.keep(chosen)
+        rows, corner_weights, raw, thickness = rows[chosen], corner_weights[chosen], raw[chosen], thickness[chosen]
+        weight, transmittance = weight[chosen], transmittance[chosen]
+        features = gather(field.feature_rows, rows, corner_weights)
+        opacity = ray_sum(weight, kept.ray, count)
+        mean = ray_sum(weight[:, None] * features, kept.ray, count) / opacity.clamp_min(OPACITY_FLOOR)[:, None]
+
+        mean.requires_grad_(True)
+        colour = field.decoder(mean, batch.directions)
+        mixed = opacity[:, None] * colour + (1 - opacity)[:, None] * behind
+        residual = (mixed - batch.colour).detach()
+        # L = mean over rays and channels of the squared error; ∂L/∂mixed in closed form, the rest from the decoder's graph.
+        g_mixed = residual * (2 / residual.numel())
+        colour.backward(g_mixed * opacity[:, None])
+        g_mean = mean.grad
+        assert g_mean is not None
+        colour = colour.detach()
+        g_opacity = (g_mixed * (colour - behind)).sum(1) - (1 - opacity) * (2 * rates.opacity / count)
+        # mean = Σ w f / A and A = Σ w: ∂mean/∂w_i = (f_i - mean) / A
+        g_sum = g_mean / opacity.clamp_min(OPACITY_FLOOR)[:, None]
+        per_ray = torch.cat([g_sum, (g_opacity - (g_sum * mean.detach()).sum(1))[:, None]], 1)[kept.ray]
+        g_weight = (features * per_ray[:, :-1]).sum(1) + per_ray[:, -1]
+        if rates.distortion > 0:
+            _, g_distortion = distortion(weight, kept.place, kept.length, kept.first, kept.ray, count)
+            g_weight = g_weight + g_distortion * (rates.distortion / count)
+        g_thickness = thickness_gradient(weight, transmittance, thickness, g_weight, kept.first, kept.ray, count)
+        g_raw = torch.where(raw < RAW_MAX, g_thickness * thickness, torch.zeros_like(raw))  # ∂τ/∂raw = τ
+        scatter(self.density.gradient, rows, corner_weights, g_raw)
+        scatter(self.feature.gradient, rows, corner_weights, per_ray[:, :-1] * weight[:, None])
+        touched = self._touched_rows(rows)
+        self.density.step(touched, rates.density)
+        self.feature.step(touched, rates.feature)
+        return float(residual.square().mean())
+
+    def _per_sample(self, batch: Batch, samples: Samples, rates: Rates, behind: Tensor) -> float:
+        """The paper's decoder at every sample: autograd from looked-up features to loss, then our scatter and lazy Adam."""
+        field, count = self.field, len(batch.origins)
+        rows, corner_weights = corners(field.topology, samples.cell, samples.inside)
+        features = gather(field.feature_rows, rows, corner_weights).requires_grad_(True)
+        base = gather(field.density_rows, rows, corner_weights).requires_grad_(True)
+        raw, colour = field.decoder(features, batch.directions[samples.ray])
+        thickness = density(raw + base) * samples.length
+        # Weights and their gradient as in the deferred step; colours and raw densities hang on the decoder's graph.
+        tau = thickness.detach()
+        weight, transmittance = weights(tau, samples.first)
+        self.seen.scatter_reduce_(0, samples.cell, weight, "amax")
+        opacity = ray_sum(weight, samples.ray, count)
+        mixed = ray_sum(weight[:, None] * colour.detach(), samples.ray, count) + (1 - opacity)[:, None] * behind
+        residual = mixed - batch.colour
+        g_rays = residual * (2 / residual.numel())
+        g_opacity = -(g_rays * behind).sum(1) - (1 - opacity) * (2 * rates.opacity / count)
+        g_mixed = g_rays[samples.ray]
+        g_weight = (g_mixed * colour.detach()).sum(1) + g_opacity[samples.ray]
+        if rates.distortion > 0:
+            _, g_distortion = distortion(weight, samples.place, samples.length, samples.first, samples.ray, count)
+            g_weight = g_weight + g_distortion * (rates.distortion / count)
+        g_thickness = thickness_gradient(weight, transmittance, tau, g_weight, samples.first, samples.ray, count)
+        torch.autograd.backward([thickness, colour], [g_thickness, weight[:, None] * g_mixed])
+        assert features.grad is not None and base.grad is not None
+        scatter(self.density.gradient, rows, corner_weights, base.grad)
+        scatter(self.feature.gradient, rows, corner_weights, features.grad)
+        touched = self._touched_rows(rows)
+        self.density.step(touched, rates.density)
+        self.feature.step(touched, rates.feature)
+        return float(residual.square().mean())
