@@ -1,0 +1,171 @@
+"""The HTML page of a report: one file, no script, nothing loaded from anywhere, all text from users escaped by the template."""
+
+from __future__ import annotations
+
+import base64
+from importlib import resources
+from typing import Any
+from urllib.parse import quote
+
+import cv2
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from toolkit.camera import Array
+from toolkit.errors import OutputError
+from toolkit.evaluate import words
+from toolkit.evaluate.pictures import DEPTH_COLOURS, ERROR_COLOURS, ERROR_TOP, Pictures, colour_bar
+from toolkit.evaluate.plots import psnr_over_time, stage_bars
+from toolkit.evaluate.report import SCORE
+
+LONGEST = 480  # pixels of an embedded tile's long side: sharp at the size it is shown, small in bytes
+QUALITY = 86
+TILE_HEIGHT = 380  # CSS pixels at most, so that upright pictures do not fill the screen
+OPEN_VIEWS = 3  # views shown at once; the others are one click away
+METHODS = (("field", "Field"), ("tsdf", "TSDF"))
+
+
+def data_uri(picture: Array, lossless: bool = False) -> str:
+    """(H, W, 3) uint8 RGB as a `data:` address, shrunk to `LONGEST` pixels: JPEG, or PNG when `lossless`."""
+    height, width = picture.shape[:2]
+    if max(height, width) > LONGEST:
+        shrink = LONGEST / max(height, width)
+        picture = cv2.resize(picture, (max(1, round(width * shrink)), max(1, round(height * shrink))), interpolation=cv2.INTER_AREA)
+    suffix, parameters = (".png", [cv2.IMWRITE_PNG_COMPRESSION, 9]) if lossless else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    done, data = cv2.imencode(suffix, np.ascontiguousarray(picture[..., ::-1]), parameters)
+    if not done:
+        raise OutputError(f"cannot encode a picture of shape {picture.shape} for the report")
+    return f"data:image/{'png' if lossless else 'jpeg'};base64," + base64.b64encode(data.tobytes()).decode("ascii")
+
+
+def scores_by_name(score: dict[str, Any] | None) -> dict[str, dict[str, Any]]:
+    """Name of the view → its scores."""
+    return {str(view.get("name")): {**dict.fromkeys(SCORE), **view} for view in (score or {}).get("per_view") or []}
+
+
+def view_rows(data: dict[str, Any], pictures: Pictures) -> list[dict[str, Any]]:
+    """What the template shows of each view: its name, and for each method a row of four captioned tiles."""
+    scores = {key: scores_by_name(data["evaluation"][key]) for key, _ in METHODS}
+    out = []
+    for view in pictures.views:
+        rows: list[dict[str, Any]] = []
+        for key, title in METHODS:
+            if key not in view.methods:
+                continue
+            tiles, score = view.methods[key], scores[key].get(view.name, {})
+            first = ("Photo", view.truth)
+            if rows:  # the photo stands above already
+                first = ("Measured depth", view.measured) if view.measured is not None else ("Photo", view.truth)
+            shown = [first, (title, tiles.render), ("Error", tiles.error), ("Depth", tiles.depth)]
+            rows.append({"title": title, "score": score, "tiles": [{"caption": text, "uri": data_uri(tile)} for text, tile in shown]})
+        out.append({"name": view.name, "rows": rows, "tall": view.truth.shape[0] / view.truth.shape[1]})
+    return out
+
+
+def comparison(data: dict[str, Any]) -> list[dict[str, Any]]:
+    """Rows of the table of headline numbers, and for each measure whether a row is the best (when there are two to compare)."""
+    rows = []
+    for key, title in METHODS:
+        score = data["evaluation"][key]
+        if score is None:
+            continue
+        rows.append({**score, "title": title, "note": "", "part": False})
+        if score.get("psnr_masked") is not None:
+            note = f"where it has surface: {words.share(score.get('coverage'))} of the pixels"
+            rows.append({"title": title, "note": note, "psnr": score["psnr_masked"], "part": True})
+    floor = data["evaluation"]["nearest_image"]
+    if floor is not None and floor["psnr"] is not None:
+        rows.append({"title": "Nearest training photo", "note": "shown unchanged: the floor", "psnr": floor["psnr"], "part": True})
+    rivals = [row for row in rows if not row.get("part")]
+    for measure, better in (("psnr", max), ("ssim", max), ("lpips", min), ("depth_abs_err", min), ("seconds_per_view", min)):
+        known = [row[measure] for row in rivals if row.get(measure) is not None]
+        for row in rivals:
+            row.setdefault("best", {})[measure] = len(known) > 1 and row.get(measure) == better(known)
+    return rows
+
+
+def flat(settings: Any, prefix: str = "") -> list[tuple[str, str]]:
+    """Nested settings as (dotted name, value) pairs."""
+    if not isinstance(settings, dict):
+        return [
+            (prefix, "automatic" if settings is None else ", ".join(map(str, settings)) if isinstance(settings, list) else str(settings))
+        ]
+    return [pair for key, value in settings.items() for pair in flat(value, f"{prefix}.{key}" if prefix else str(key))]
+
+
+def headline(data: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """The large numbers on top: (value, unit or remark beside it, what it is)."""
+    evaluation, poses, field = data["evaluation"], data["poses"], data["field"]
+    out = []
+    for key, title in METHODS:
+        score = evaluation[key]
+        if score is not None and score["psnr"] is not None:
+            views = f"{score['views']} test view{'' if score['views'] == 1 else 's'}" if score["views"] is not None else "test views"
+            out.append((words.decimal(score["psnr"], 1), "dB", f"{title}: PSNR on {views}"))
+    if data["seconds_total"] is not None:
+        out.append((words.duration(data["seconds_total"]), "", "from capture to report"))
+    if poses["registered"] is not None and poses["total"] is not None:
+        out.append((f"{poses['registered']} / {poses['total']}", "", "pictures with a pose"))
+    if field["bytes"] is not None:
+        note = f"field: {words.whole(field['voxels'])} voxels" if field["voxels"] is not None else "size of the field"
+        out.append((words.size(field["bytes"]), "", note))
+    return out
+
+
+def export_rows(data: dict[str, Any]) -> list[dict[str, Any]]:
+    """Exports with an address relative to the page, none for a path that leads elsewhere, and their facts as one line."""
+    out = []
+    for entry in data["exports"]:
+        path = str(entry["path"] or "")
+        elsewhere = path.startswith(("/", "\\")) or ".." in path.split("/") or not path
+        facts = {**entry, **(entry["facts"] if isinstance(entry.get("facts"), dict) else {})}
+        shown = {key: value for key, value in facts.items() if key not in ("path", "bytes", "name", "facts") and value is not None}
+        line = ", ".join(_fact(key.replace("_", " "), value) for key, value in shown.items())
+        out.append({"path": path, "href": "" if elsewhere else "./" + quote(path), "bytes": entry["bytes"], "facts": line})
+    return out
+
+
+def _fact(name: str, value: Any) -> str:
+    if isinstance(value, bool):
+        return name if value else f"not {name}"
+    if isinstance(value, int):
+        return f"{words.whole(value)} {name}"
+    return f"{name} {words.significant(value) if isinstance(value, float) else value}"
+
+
+def render_page(data: dict[str, Any], pictures: Pictures) -> str:
+    """The page as text. `data` as `report_data` answers it."""
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    for show in (words.decimal, words.significant, words.whole, words.size, words.memory, words.duration, words.share):
+        environment.filters[show.__name__] = show
+    template = environment.from_string(resources.files("toolkit.evaluate").joinpath("report.html.j2").read_text(encoding="utf-8"))
+    evaluation = data["evaluation"]
+    levels = {
+        "TSDF": (evaluation["tsdf"] or {}).get("psnr"),
+        "nearest photo": (evaluation["nearest_image"] or {}).get("psnr"),
+    }
+    # The plots are our own text but for stage names, which matplotlib escapes.
+    time_plot, stage_plot = psnr_over_time(data["timeline"], levels), stage_bars(data["stages"])
+    near, far = pictures.depth_range or (None, None)
+    return template.render(
+        data=data,
+        title=data["source"] or "Report",
+        unit=words.unit_of(data),
+        headline=headline(data),
+        rows=comparison(data),
+        views=view_rows(data, pictures),
+        open_views=OPEN_VIEWS,
+        tile_height=TILE_HEIGHT,
+        left_out=pictures.left_out,
+        error_top=ERROR_TOP,
+        error_bar=data_uri(colour_bar(128, 1, ERROR_COLOURS), lossless=True),
+        depth_bar=data_uri(colour_bar(128, 1, DEPTH_COLOURS), lossless=True),
+        near=near,
+        far=far,
+        depth_unit=pictures.unit,
+        time_plot=None if time_plot is None else Markup(time_plot),
+        stage_plot=None if stage_plot is None else Markup(stage_plot),
+        exports=export_rows(data),
+        settings=flat(data["settings"]),
+    )

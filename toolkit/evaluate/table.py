@@ -1,0 +1,67 @@
+"""The headline numbers of a run as one table for the terminal."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from toolkit.evaluate import words
+from toolkit.evaluate.report import report_data
+
+
+def headline_table(data: dict[str, Any]) -> Table:
+    """One row a method (field, TSDF, nearest training picture), facts of the run in the caption. `data` as for `write_report`."""
+    data = report_data(data)
+    unit = words.unit_of(data)
+    evaluation = data["evaluation"]
+    table = Table(box=box.SIMPLE_HEAD, title_justify="left", caption_justify="left", caption_style="")
+    for name in ("", "PSNR", "SSIM", "LPIPS", f"depth error ({unit})", "render a view"):
+        table.add_column(name, justify="left" if name == "" else "right", no_wrap=True)
+    for key, title in (("field", "field"), ("tsdf", "TSDF")):
+        score = evaluation[key]
+        if score is not None:
+            table.add_row(
+                title,
+                words.decimal(score["psnr"]),
+                words.decimal(score["ssim"], 3),
+                words.decimal(score["lpips"], 3),
+                words.significant(score["depth_abs_err"]),
+                words.duration(score["seconds_per_view"]),
+            )
+            if score.get("psnr_masked") is not None:
+                table.add_row(f"  on its surface, {words.share(score.get('coverage'))} of the pixels", words.decimal(score["psnr_masked"]))
+    floor = evaluation.get("nearest_image")
+    if floor is not None and floor.get("psnr") is not None:
+        table.add_row("nearest training picture", words.decimal(floor["psnr"]))
+    table.caption = Text("\n".join(facts(data)))
+    return table
+
+
+def facts(data: dict[str, Any]) -> list[str]:
+    """Short lines on capture, field and time. `data` as `report_data` answers it."""
+    capture, poses, field = data["capture"], data["poses"], data["field"]
+    lines = []
+    if capture["frames"] is not None:
+        line = f"{words.whole(capture['frames'])} frames"
+        if poses["registered"] is not None and poses["total"] is not None:
+            line += f", {poses['registered']} of {poses['total']} with a pose"
+        lines.append(line)
+    if field["voxels"] is not None:
+        lines.append(
+            f"field of {words.whole(field['voxels'])} voxels in {words.whole(field['blocks'])} blocks, {words.size(field['bytes'])}"
+        )
+    if data["seconds_total"] is not None:
+        lines.append(f"{words.duration(data['seconds_total'])} in all")
+    return lines
+
+
+def table(data: dict[str, Any], width: int = 100) -> str:
+    """`headline_table` as plain text lines of at most `width` characters."""
+    stream = io.StringIO()
+    Console(file=stream, width=width, color_system=None, force_terminal=False).print(headline_table(data))
+    return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()) + "\n"

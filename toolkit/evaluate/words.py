@@ -1,0 +1,71 @@
+"""Numbers as people read them, for the report and the terminal. None becomes a dash."""
+
+from __future__ import annotations
+
+from typing import Any
+
+NONE = "–"
+
+
+def decimal(value: float | None, digits: int = 2) -> str:
+    return NONE if value is None else f"{value:.{digits}f}"
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """`digits` significant digits, without an exponent where people would not write one."""
+    if value is None:
+        return NONE
+    return (
+        f"{value:.{digits}g}"
+        if value == 0 or 1e-4 <= abs(value) < 10**digits
+        else f"{value:.{digits}e}"
+        if abs(value) < 1e-4
+        else f"{value:,.0f}"
+    )
+
+
+def whole(value: float | None) -> str:
+    """1234567 → 1,234,567."""
+    return NONE if value is None else f"{value:,.0f}"
+
+
+def size(count: float | None) -> str:
+    """Bytes in decimal units."""
+    if count is None:
+        return NONE
+    for unit in ("bytes", "kB", "MB", "GB"):
+        if count < 999.5 or unit == "GB":
+            return f"{count:.0f} {unit}" if unit == "bytes" or count >= 99.5 else f"{count:.1f} {unit}"
+        count /= 1000
+    return NONE
+
+
+def memory(megabytes: float | None) -> str:
+    return NONE if megabytes is None else size(megabytes * 1e6)
+
+
+def duration(seconds: float | None) -> str:
+    """0.012 → 12 ms, 4.2 → 4.2 s, 372 → 6 min 12 s, 7322 → 2 h 2 min."""
+    if seconds is None:
+        return NONE
+    if seconds < 0.0995:
+        return f"{seconds * 1000:.0f} ms"
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    total = round(seconds)
+    if total < 60:
+        return f"{total} s"
+    if total < 3600:
+        return f"{total // 60} min {total % 60} s"
+    total = round(seconds / 60)
+    return f"{total // 60} h {total % 60} min"
+
+
+def share(value: float | None) -> str:
+    return NONE if value is None else f"{100 * value:.1f}%"
+
+
+def unit_of(data: dict[str, Any]) -> str:
+    """The unit of lengths in a report's data: metres for captures with scale, else working units."""
+    scene = data.get("scene")
+    return "m" if isinstance(scene, dict) and scene.get("metric") else "units"
