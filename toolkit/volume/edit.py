@@ -1,0 +1,230 @@
+"""Changing the set of voxels: prune, dilate, drop empty blocks, split in eight, resample. Torch only; nothing is changed in place.
+
+Everywhere below `occupied` is (M · 512,) bool (a voxel is the cell whose lowest lattice corner is its row) and `rows` holds value arrays
+(M · 512 + 1, C) or (M · 512 + 1,) of lattice corners with the zero row at the end. Only corners of occupied voxels hold values that mean
+something; the others are never mixed in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from toolkit.volume.lookup import corners, gather
+from toolkit.volume.topology import BLOCK, VOXELS, Topology
+
+CHUNK = 1024  # blocks at a time
+MODES = ("trilinear", "nearest")
+_ELEMENTS = 4 * 2**20  # values gathered at a time by `resample`
+
+
+def corner_nodes(topology: Topology, occupied: Tensor) -> Tensor:
+    """(M · 512,) bool: lattice corners that at least one occupied voxel touches."""
+    return _pooled(topology, occupied, 0)
+
+
+def _pooled(topology: Topology, occupied: Tensor, last: int) -> Tensor:
+    """(M · 512,) bool: rows with an occupied row among the offsets −1 … `last` along each axis."""
+    padded = torch.cat([occupied, occupied.new_zeros(1)])
+    out = torch.empty_like(occupied)
+    width = last + 2
+    side = BLOCK + width - 1
+    for start in range(0, topology.blocks, CHUNK):
+        stop = min(start + CHUNK, topology.blocks)
+        mask = padded[topology.halo_chunk(start, stop).view(-1)].view(-1, 10, 10, 10)[:, :side, :side, :side]
+        for axis in (1, 2, 3):
+            mask = torch.stack([mask.narrow(axis, shift, BLOCK) for shift in range(width)]).any(0)
+        out[start * VOXELS : stop * VOXELS] = mask.reshape(-1)
+    return out
+
+
+def _with_reached_blocks(topology: Topology, occupied: Tensor, lowest: int) -> Topology:
+    """These blocks, then the absent ones that hold a row one step (from `lowest` to +1 along each axis) beside an occupied row."""
+    cube = occupied.view(-1, BLOCK, BLOCK, BLOCK)
+    parts = {-1: slice(0, 1), 0: slice(None), 1: slice(BLOCK - 1, BLOCK)}
+    steps = range(lowest, 2)
+    found = []
+    for dz, dy, dx in ((z, y, x) for z in steps for y in steps for x in steps if (z, y, x) != (0, 0, 0)):
+        reaches = cube[:, parts[dz], parts[dy], parts[dx]].flatten(1).any(1)
+        reaches &= topology.around[:, (dz + 1) * 9 + (dy + 1) * 3 + dx + 1] < 0
+        found.append(topology.keys[reaches].long() + torch.tensor([dx, dy, dz], device=topology.device))
+    new = torch.unique(torch.cat(found), dim=0)
+    return topology if len(new) == 0 else Topology(torch.cat([topology.keys.long(), new]))
+
+
+def with_corner_blocks(topology: Topology, occupied: Tensor) -> tuple[Topology, Tensor]:
+    """These blocks, then those missing that hold corners of occupied voxels; and `occupied` for them all."""
+    return _extended(_with_reached_blocks(topology, occupied, 0), occupied)
+
+
+def dilate(topology: Topology, occupied: Tensor, steps: int = 1, grow: bool = True) -> tuple[Topology, Tensor]:
+    """Occupied voxels grown by `steps` voxels in the 26-neighbourhood, across block borders.
+
+    Returns:
+        the topology (these blocks in their order, then, when `grow`, the new ones that were needed) and the new occupancy.
+    """
+    for _ in range(steps):
+        if grow:
+            topology, occupied = _extended(_with_reached_blocks(topology, occupied, -1), occupied)
+        occupied = _pooled(topology, occupied, 1)
+    return topology, occupied
+
+
+def _extended(topology: Topology, occupied: Tensor) -> tuple[Topology, Tensor]:
+    return topology, torch.cat([occupied, occupied.new_zeros(topology.zero_row - len(occupied))])
+
+
+def erase_empty_blocks(topology: Topology, occupied: Tensor, rows: Sequence[Tensor]) -> tuple[Topology, Tensor, list[Tensor]]:
+    """Without the blocks that hold neither an occupied voxel nor a corner of one; the others keep their order."""
+    kept = corner_nodes(topology, occupied).view(-1, VOXELS).any(1).nonzero().view(-1)
+    chosen = torch.cat([(kept[:, None] * VOXELS + torch.arange(VOXELS, device=kept.device)).view(-1), kept.new_tensor([topology.zero_row])])
+    return Topology(topology.keys[kept]), occupied[chosen[:-1]], [values[chosen] for values in rows]
+
+
+def trilinear_density(topology: Topology, density: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
+    """The function that `prune` wants, for densities σ ≥ 0 (M · 512 + 1,) interpolated between lattice corners."""
+
+    def function(cell: Tensor, inside: Tensor) -> Tensor:
+        return gather(density, *corners(topology, cell, inside))
+
+    return function
+
+
+def prune(
+    occupied: Tensor, density: Callable[[Tensor, Tensor], Tensor], voxel_size: float, gamma: float = 0.6, samples: int = 4
+) -> Tensor:
+    """Occupied voxels that are not see-through, after NeRFusion's pruning rule (its section on fine-tuning) made free of scale.
+
+    The paper drops a voxel when the smallest exp(−σ) over k points in it exceeds γ. That depends on the unit of length, so here
+    the voxel's own optical thickness is looked at: dropped when the smallest exp(−σ · voxel_size) exceeds γ.
+
+    Args:
+        density: (N,) int64 voxel rows and (N, 3) places inside them (x, y, z in 0 … 1) → (N,) σ per working unit.
+        voxel_size: working units.
+        samples: points along each axis, k = samples³, evenly spread.
+
+    Returns:
+        (M · 512,) bool, a subset of `occupied`.
+    """
+    cells = occupied.nonzero().view(-1)
+    line = (torch.arange(samples, device=cells.device) + 0.5) / samples
+    z, y, x = torch.meshgrid(line, line, line, indexing="ij")
+    points = torch.stack([x, y, z], -1).view(-1, 3)
+    out = torch.zeros_like(occupied)
+    step = max(2**20 // len(points), 1)
+    for start in range(0, len(cells), step):
+        part = cells[start : start + step]
+        sigma = density(part.repeat_interleave(len(points)), points.repeat(len(part), 1)).view(len(part), -1)
+        out[part] = torch.exp(-sigma * voxel_size).amin(1) <= gamma
+    return out
+
+
+def split(
+    topology: Topology, occupied: Tensor, rows: Sequence[Tensor], mode: str = "trilinear"
+) -> tuple[Topology, Tensor, list[Tensor]]:
+    """Every voxel into 2×2×2: the same field on a lattice of half the voxel size and the same origin.
+
+    Args:
+        mode: "trilinear" leaves the field as a function unchanged inside occupied voxels; "nearest" is the paper's.
+
+    Returns:
+        topology (children in the order of their parents, then blocks that only hold corners), occupancy and values.
+    """
+    octants = torch.tensor([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], device=topology.device)
+    # (M, z half, z, y half, y, x half, x) → (M, 8 octants, 4, 4, 4)
+    cubes = occupied.view(-1, 2, 4, 2, 4, 2, 4).permute(0, 1, 3, 5, 2, 4, 6).reshape(-1, 8, 4, 4, 4)
+    parent, octant = cubes.flatten(2).any(2).nonzero().unbind(1)
+    child = cubes[parent, octant]
+    for axis in (1, 2, 3):
+        child = child.repeat_interleave(2, axis)
+    keys = topology.keys[parent].long() * 2 + octants[octant]
+    new_topology, new_occupied = with_corner_blocks(Topology(keys), child.reshape(-1))
+    return new_topology, new_occupied, resample(topology, occupied, rows, new_topology.keys, 0.5, mode)
+
+
+def resample(
+    topology: Topology, occupied: Tensor, rows: Sequence[Tensor], new_keys: Tensor, scale: float, mode: str = "trilinear"
+) -> list[Tensor]:
+    """Values at the lattice corners of other blocks, on a lattice with the same origin and another voxel size.
+
+    Only corners of occupied voxels count; their weights are scaled to sum to 1, so that borders do not fade into what was never
+    fitted. Where none is near, the value is zero.
+
+    Args:
+        new_keys: (N, 3) blocks of the new lattice.
+        scale: new voxel size ÷ old voxel size.
+
+    Returns:
+        per value array (N · 512 + 1, …) with the zero row.
+    """
+    if mode not in MODES or not 0 < scale < math.inf:
+        raise ValueError(f"mode must be one of {', '.join(MODES)} and scale positive, not {mode!r} and {scale}")
+    nodes = corner_nodes(topology, occupied)
+    row_of_valid = torch.where(nodes, torch.arange(len(nodes), device=nodes.device), topology.zero_row)
+    row_of_valid = torch.cat([row_of_valid, row_of_valid.new_tensor([topology.zero_row])])
+    out = [values.new_zeros((len(new_keys) * VOXELS + 1, *values.shape[1:])) for values in rows]
+    flat = [values.flatten(1) if values.ndim > 1 else values[:, None] for values in rows]
+    side = math.floor((BLOCK - 1) * scale) + 3
+    widest = max((values.shape[1] for values in flat), default=1)
+    step = max(_ELEMENTS // (side**3 * (widest + 1)), 1)
+    for start in range(0, len(new_keys), step):
+        corner = new_keys[start : start + step].long()[..., None] * BLOCK + torch.arange(BLOCK, device=new_keys.device)
+        place = corner.double() * scale  # (n, 3, 8) in the old lattice
+        low = place[..., 0].floor().long()
+        base = place.floor().long()
+        inside = (place - base).float()
+        source = row_of_valid[_box_rows(topology, low, side)]  # (n, side³), z-major
+        for target, values in zip(out, flat, strict=True):
+            part = _interpolate(values, source, topology.zero_row, base - low[..., None], inside, side, mode)
+            target[start * VOXELS : start * VOXELS + len(part)] = part.view(-1, *target.shape[1:])
+    return out
+
+
+def _box_rows(topology: Topology, low: Tensor, side: int) -> Tensor:
+    """(n, 3) lowest lattice corners → (n, side³) int64 rows of the cubes above them, z-major; the zero row where absent."""
+    line = low[..., None] + torch.arange(side, device=low.device)  # (n, 3, side)
+    block = line >> 3
+    local = line & (BLOCK - 1)
+    first = block[..., :1]
+    spans = int((block[..., -1:] - first).amax()) + 1 if len(low) else 1
+    reach = torch.arange(spans, device=low.device)
+    near = first + reach  # (n, 3, spans): the blocks that a cube can touch
+    z, y, x = (near[:, axis] for axis in (2, 1, 0))
+    shape = (len(low), spans, spans, spans)
+    keys = torch.stack([x[:, None, None, :].expand(shape), y[:, None, :, None].expand(shape), z[:, :, None, None].expand(shape)], -1)
+    slots = topology.find(keys).view(len(low), -1)
+    at = block - first  # (n, 3, side) which of those blocks
+    which = (at[:, 2, :, None, None] * spans + at[:, 1, None, :, None]) * spans + at[:, 0, None, None, :]
+    inner = (local[:, 2, :, None, None] * BLOCK + local[:, 1, None, :, None]) * BLOCK + local[:, 0, None, None, :]
+    slot = slots.gather(1, which.view(len(low), side**3))
+    return torch.where(slot < 0, topology.zero_row, slot * VOXELS + inner.view(len(low), -1))
+
+
+def _interpolate(values: Tensor, source: Tensor, zero: int, base: Tensor, inside: Tensor, side: int, mode: str) -> Tensor:
+    """(n · 512, C) values at places base + inside (n, 3, 8 along each axis) of cubes with rows `source` (n, side³)."""
+    count, channels = len(source), values.shape[1]
+    if mode == "nearest":
+        best_row, best_weight = source.new_full((count, VOXELS), zero), inside.new_zeros((count, VOXELS))
+        for dz, dy, dx in ((z, y, x) for z in (0, 1) for y in (0, 1) for x in (0, 1)):
+            cell = ((base[:, 2, :, None, None] + dz) * side + base[:, 1, None, :, None] + dy) * side + base[:, 0, None, None, :] + dx
+            wx, wy, wz = ((inside[:, axis] if d else 1 - inside[:, axis]) for axis, d in ((0, dx), (1, dy), (2, dz)))
+            weight = (wz[:, :, None, None] * wy[:, None, :, None] * wx[:, None, None, :]).reshape(count, -1)
+            row = source.gather(1, cell.view(count, -1))
+            better = (row != zero) & (weight > best_weight)  # the first of equals stays: the lower corner
+            best_row, best_weight = torch.where(better, row, best_row), torch.where(better, weight, best_weight)
+        return torch.where((best_row == zero)[..., None], 0.0, values[best_row]).view(-1, channels)
+    known = (source != zero)[..., None]
+    cube = torch.cat([torch.where(known, values[source], 0.0), known.to(values.dtype)], -1)
+    for axis in (2, 1, 0):  # z, y, x: one linear step along each axis, always on contiguous rows
+        cube = cube.reshape(count, -1, side, side ** axis * (channels + 1))
+        lines = cube.shape[1]
+        first = torch.arange(count * lines, device=source.device).view(count, lines, 1) * side + base[:, None, axis]
+        cube = cube.view(count * lines * side, -1)
+        weight = inside[:, None, axis].expand(count, lines, BLOCK).reshape(-1, 1).to(values.dtype)
+        cube = torch.lerp(cube[first.view(-1)], cube[first.view(-1) + 1], weight)
+    cube = cube.view(-1, channels + 1)
+    weight = cube[:, -1:]
+    return torch.where(weight > 1e-6, cube[:, :-1] / weight.clamp_min(1e-6), 0.0)
