@@ -1,0 +1,87 @@
+"""`fieldfuse`: gathers the commands, one thin file each, and turns errors into one sentence and an exit code.
+
+Exit codes: 0 done; 1 something unexpected, with a log file; 2 bad input, settings or flags; 130 stopped by the user.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from typing import Annotated
+
+import typer
+
+from pipelines import evaluate, export, finetune, info, poses, render, run, tsdf
+from pipelines.options import Json
+from toolkit import __version__
+from toolkit.errors import FieldfuseError, Interrupted
+
+app = typer.Typer(
+    name="fieldfuse",
+    help="From a video, photos or an RGB-D capture to a radiance field on sparse voxels, and a TSDF surface beside it.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"fieldfuse {__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _all(version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False) -> None:
+    pass
+
+
+@app.command()
+def doctor(json: Json = False) -> None:
+    """Look at this machine: libraries, versions, devices, and what to do about what is missing."""
+    from dataclasses import asdict
+
+    from pipelines import doctor as examination
+
+    checks = examination.collect()
+    if json:
+        import json as writer
+
+        typer.echo(writer.dumps([asdict(check) for check in checks], indent=1))
+    else:
+        examination.show(checks)
+
+
+def main() -> None:
+    """Entry point of the command line."""
+    try:
+        app()
+    except Interrupted as error:
+        _fail(f"{error}", 130)
+    except FieldfuseError as error:
+        _fail(f"{error}", 2, error)
+    except KeyboardInterrupt:
+        _fail("stopped", 130)
+    except MemoryError as error:
+        _fail("there is not enough memory for this; use a smaller --image-size", 1, error)
+    except Exception as error:  # whatever it is, a user gets a sentence and a log
+        log = getattr(error, "fieldfuse_log", None)
+        place = f"the details are in {log}" if log else "set FIELDFUSE_DEBUG=1 to see the details"
+        _fail(f"something unexpected went wrong ({type(error).__name__}); {place}", 1, error)
+
+
+def _fail(text: str, code: int, error: BaseException | None = None) -> None:
+    if error is not None and os.environ.get("FIELDFUSE_DEBUG") == "1":
+        traceback.print_exception(error)
+    sys.stderr.write("fieldfuse: " + " ".join(text.split()) + "\n")
+    sys.exit(code)
+
+
+for _command in (run.run, poses.poses, tsdf.tsdf, finetune.finetune, render.render, export.export, evaluate.evaluate, info.info):
+    app.command()(_command)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,195 @@
+"""Progress on the terminal, and the user's wish to stop: Ctrl-C once ends the stage cleanly, twice ends at once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import IO, Any
+
+from toolkit.progress import Progress
+
+PLAIN_EVERY = 10.0  # seconds between two lines where there is no terminal
+STOPPING = "stopping: the current stage is brought to an end (Ctrl-C again to quit at once)"
+
+
+def clock(seconds: float) -> str:
+    """`75` → `1:15`."""
+    whole = int(round(seconds))
+    if whole >= 3600:
+        return f"{whole // 3600}:{whole % 3600 // 60:02d}:{whole % 60:02d}"
+    return f"{whole // 60}:{whole % 60:02d}"
+
+
+class ConsoleProgress(Progress):
+    """Silent on the terminal, but it listens: the base of the two that show something."""
+
+    def __init__(self, stream: IO[str] | None = None) -> None:
+        self.stream = stream or sys.stderr
+        self._stop = threading.Event()
+        self._phase = (0.0, 0.0, 0.0, "")  # when it began, done at that time, total, stage
+        self.stage = ""
+
+    # ---- what a pipeline calls
+
+    def begin(self, stage: str) -> None:
+        """A stage starts."""
+        self.stage = stage
+        self._phase = (time.monotonic(), 0.0, 0.0, stage)
+
+    def finish(self, stage: str, seconds: float, cached: bool) -> None:
+        """A stage is finished, or was found finished."""
+
+    def say(self, text: str) -> None:
+        """A remark of its own line."""
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+
+    # ---- what long work calls
+
+    def stopping(self) -> bool:
+        return self._stop.is_set()
+
+    def request_stop(self) -> None:
+        """What a first Ctrl-C does."""
+        self._stop.set()
+
+    def resume(self) -> None:
+        """What was asked to stop has stopped and is kept; the short stages after it may run."""
+        self._stop.clear()
+
+    def seconds_left(self, done: float, total: float) -> float | None:
+        """Estimate from the pace since this count began; None while it is too early to say."""
+        began, first, known, stage = self._phase
+        now = time.monotonic()
+        if total != known or done < first or stage != self.stage:
+            self._phase = (now, done, total, self.stage)
+            return None
+        if done <= first or now - began < 0.5:
+            return None
+        return max(0.0, (total - done) * (now - began) / (done - first))
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Turn the first SIGINT or SIGTERM into `stopping()`, the second into KeyboardInterrupt."""
+        asked = 0
+
+        def handler(number: int, frame: FrameType | None) -> None:
+            nonlocal asked
+            asked += 1
+            if asked > 1:
+                raise KeyboardInterrupt
+            self.request_stop()
+            self.say(STOPPING)
+
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, old in before.items():
+                signal.signal(number, old)
+            self.close()
+
+
+class PlainProgress(ConsoleProgress):
+    """Now and then a line, for log files and pipes."""
+
+    def __init__(self, stream: IO[str] | None = None, every: float = PLAIN_EVERY) -> None:
+        super().__init__(stream)
+        self.every = every
+        self._last = 0.0
+
+    def begin(self, stage: str) -> None:
+        super().begin(stage)
+        self._last = time.monotonic()
+
+    def update(self, done: float, total: float, note: str = "") -> None:
+        left = self.seconds_left(done, total)
+        now = time.monotonic()
+        if now - self._last < self.every:
+            return
+        self._last = now
+        share = f" {100 * done / total:.0f}%" if total > 0 else ""
+        rest = f", {clock(left)} left" if left is not None else ""
+        self.say(f"{self.stage}{share}{rest}{f', {note}' if note else ''}")
+
+    def finish(self, stage: str, seconds: float, cached: bool) -> None:
+        self.say(f"{stage}: {'reused' if cached else f'{seconds:.1f} s'}")
+
+    def say(self, text: str) -> None:
+        self.stream.write(text + "\n")
+        self.stream.flush()
+
+
+class RichProgress(ConsoleProgress):
+    """One line a stage with a bar and the time left."""
+
+    def __init__(self, stream: IO[str] | None = None) -> None:
+        super().__init__(stream)
+        from rich.console import Console
+        from rich.progress import BarColumn, TaskID, TextColumn
+        from rich.progress import Progress as Bars
+
+        self._bars = Bars(
+            TextColumn("{task.description:<10}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:>3.0f}%"),
+            TextColumn("{task.fields[left]:<14}"),
+            TextColumn("{task.fields[note]}", markup=False),
+            console=Console(file=self.stream, highlight=False),
+            refresh_per_second=5,
+        )
+        self._task: TaskID | None = None
+        self._shown = 0.0
+
+    def begin(self, stage: str) -> None:
+        super().begin(stage)
+        self._bars.start()
+        self._task = self._bars.add_task(stage, total=None, left="", note="")
+
+    def update(self, done: float, total: float, note: str = "") -> None:
+        left = self.seconds_left(done, total)
+        now = time.monotonic()
+        if self._task is None or (now - self._shown < 0.1 and done < total):
+            return
+        self._shown = now
+        self._bars.update(self._task, completed=done, total=total or None, left="" if left is None else f"{clock(left)} left", note=note)
+
+    def finish(self, stage: str, seconds: float, cached: bool) -> None:
+        if self._task is None:
+            self._bars.start()
+            self._task = self._bars.add_task(stage, total=1, left="", note="")
+        self._bars.update(self._task, total=1, completed=1, left="reused" if cached else clock(seconds), note="")
+        self._task = None
+
+    def say(self, text: str) -> None:
+        self._bars.console.print(text, markup=False)
+
+    def close(self) -> None:
+        self._bars.stop()
+
+
+def make_progress(quiet: bool = False, stream: IO[str] | None = None) -> ConsoleProgress:
+    """Bars on a terminal, lines elsewhere, nothing with `quiet`."""
+    stream = stream or sys.stderr
+    if quiet:
+        return ConsoleProgress(stream)
+    if stream.isatty() and os.environ.get("TERM") != "dumb":
+        return RichProgress(stream)
+    return PlainProgress(stream)
+
+
+def show_table(data: dict[str, Any], stream: IO[str] | None = None) -> None:
+    """The report's numbers as one table."""
+    from toolkit.evaluate.table import table  # rich and the metrics are needed only here
+
+    (stream or sys.stdout).write(str(table(data)).rstrip() + "\n")

@@ -1,0 +1,28 @@
+"""`fieldfuse export`: points, meshes, cameras and an orbit video from a run's field."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
+
+
+def export(
+    target: Target,
+    out: OptionalOut = None,
+    formats: Annotated[str | None, typer.Option(help="Comma-separated part of points,ply,obj,glb,cameras,video.", show_default=False)] = None,
+    threads: Threads = None,
+    config: Config = None,
+    pairs: Pairs = None,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Write the field as files for other programs, in the input's own frame and scale, into DIR/exports."""
+    from pipelines.reconstruct import BEFORE
+    from pipelines.work import work
+
+    wanted = None if formats is None else [name.strip() for name in formats.split(",") if name.strip()]
+    options = gather(None, config, pairs, threads=threads, **{"export.formats": wanted})
+    work(target, out, options, ("export",), quiet=quiet, as_json=json, trusted=(*BEFORE, "field"))

@@ -1,0 +1,153 @@
+"""A run's folder: one command at a time, nothing of anybody else touched, leftovers of a killed run removed."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import re
+import shlex
+import sys
+import traceback
+from datetime import datetime, timezone
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+from toolkit import __version__
+from toolkit.config import Settings, settings_dict
+from toolkit.errors import FieldfuseError, InputError, Interrupted, OutputError
+from toolkit.files import read_json, remove, write_json
+
+LOCK = ".lock"
+RUN = "run.json"
+STAGES = "stages"
+ERROR_LOG = "error.log"
+SUBFOLDERS = (STAGES, "frames", "sparse", "renders", "tsdf", "exports")
+FILES = ("capture.json", "poses.json", "scene.json", "keyframes.json", "views.safetensors", "field.safetensors", "timeline.json", "mesh.ply",
+         "evaluation.json", "report.json", "report.html")
+TEMPORARY = re.compile(r"\.tmp-\d+-")  # as toolkit.files.atomic_path names them
+WRITE_ERRORS = {errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EIO}
+WRITE_PHRASES = ("no space left", "file too large", "disk quota", "read-only file system", "disk i/o error", "database or disk is full")
+
+
+def is_run_folder(path: Path) -> bool:
+    """True when `path` is a folder that a run has written to."""
+    return (path / RUN).is_file()
+
+
+class RunFolder:
+    """The folder of one run, locked for as long as the context is open.
+
+    Raises:
+        OutputError: it cannot be made or written to, belongs to something else, or another command is working in it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(os.path.abspath(path))
+        self._lock: IO[str] | None = None
+
+    def __truediv__(self, name: str) -> Path:
+        return self.path / name
+
+    def __enter__(self) -> RunFolder:
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = open(self.path / LOCK, "a", encoding="utf-8")
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._check_ours()
+            self._remove_leftovers()
+        except BlockingIOError as error:
+            self._unlock()
+            raise OutputError(f"another fieldfuse command is working in {self.path}; wait for it to end or choose another --out folder") from error
+        except OSError as error:
+            self._unlock()
+            raise OutputError(f"cannot write to {self.path}: {error.strerror or error}; choose another --out folder") from error
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        try:
+            if isinstance(error, Exception) and not isinstance(error, FieldfuseError):
+                if failed_write(error):
+                    raise OutputError(f"cannot write to {self.path}: {first_line(error)}; free space or choose another --out folder") from error
+                self._log(error)
+        finally:
+            self._unlock()
+
+    def _check_ours(self) -> None:
+        """A folder with files of the same names as a run's, but without a run in it, is somebody's data."""
+        if is_run_folder(self.path):
+            return
+        foreign = [name for name in (*SUBFOLDERS, *FILES) if (self.path / name).exists()]
+        if foreign:
+            self._unlock()
+            remove(self.path / LOCK)
+            raise OutputError(f"{self.path} holds {foreign[0]!r} but no fieldfuse run; choose a new or empty --out folder so that nothing of yours is replaced")
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def _remove_leftovers(self) -> None:
+        """Half-written files of a run that was killed; only below our own folders."""
+        places = [self.path, *(place for name in SUBFOLDERS for place in [self.path / name, *(self.path / name).glob("**/")])]
+        for place in places:
+            for leftover in place.glob(".tmp-*"):
+                if TEMPORARY.match(leftover.name):
+                    remove(leftover)
+
+    def _log(self, error: Exception) -> None:
+        """Keep the traceback of something unexpected in the folder; the terminal gets a sentence."""
+        try:
+            text = "".join(traceback.format_exception(error))
+            (self.path / ERROR_LOG).write_text(f"fieldfuse {__version__}\n{command_line()}\n\n{text}", encoding="utf-8")
+        except OSError:
+            return
+        error.__dict__["fieldfuse_log"] = str(self.path / ERROR_LOG)
+
+    def start(self, source: Path, settings: Settings) -> None:
+        """Write run.json: what is run with what. Written before anything else, so that the folder is known as ours."""
+        write_json(
+            self.path / RUN,
+            {
+                "version": __version__,
+                "command": command_line(),
+                "source": str(source),
+                "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+                "settings": settings_dict(settings),
+            },
+        )
+
+    def about(self) -> dict[str, Any]:
+        """What run.json says.
+
+        Raises:
+            InputError: the folder holds no run, or its run.json is damaged.
+        """
+        if not is_run_folder(self.path):
+            raise InputError(f"{self.path} is not the folder of a run (it has no {RUN}); make one with `fieldfuse run SOURCE --out {self.path}`")
+        data = read_json(self.path / RUN)
+        if not isinstance(data, dict) or not isinstance(data.get("source"), str) or not isinstance(data.get("settings"), dict):
+            raise InputError(f"{self.path / RUN} is damaged; run `fieldfuse run SOURCE --out {self.path}` again")
+        return data
+
+
+def command_line() -> str:
+    """The command as it was typed, to be repeated by copying it."""
+    return shlex.join(["fieldfuse", *sys.argv[1:]])
+
+
+def first_line(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def failed_write(error: Exception) -> bool:
+    """True for a full disk or a folder that may not be written, however a library says it."""
+    if isinstance(error, Interrupted):
+        return False
+    if isinstance(error, OSError) and error.errno in WRITE_ERRORS:
+        return True
+    return any(phrase in str(error).lower() for phrase in WRITE_PHRASES)

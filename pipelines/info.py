@@ -1,0 +1,102 @@
+"""`fieldfuse info SOURCE`: what a source is, before anything long is started; or what an earlier run has made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipelines.options import Json, Quiet
+
+if TYPE_CHECKING:
+    from toolkit.capture.types import Capture
+
+
+def info(
+    target: Annotated[Path, typer.Argument(metavar="SOURCE", help="A source, or the folder of an earlier run.", show_default=False)],
+    fast: Annotated[bool, typer.Option("--fast", help="Read headers only; pictures are not looked at for damage.")] = False,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Tell what was detected: kind, counts, sizes, lenses, depth, warnings."""
+    from pipelines.folder import is_run_folder
+
+    data = run_facts(target) if is_run_folder(target) else source_facts(target, fast, quiet or json)
+    if json:
+        import json as writer
+
+        typer.echo(writer.dumps(data, indent=1))
+    else:
+        for key, value in data.items():
+            for line in lines(key, value):
+                typer.echo(line)
+
+
+def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
+    """Facts of a capture; with `fast` no pixel is decoded."""
+    from pipelines.console import make_progress
+    from pipelines.summary import describe_capture
+    from toolkit.capture import open_capture
+    from toolkit.capture.checks import check_capture
+
+    capture = open_capture(source)
+    if not fast:
+        progress = make_progress(quiet)
+        with progress.listening():
+            progress.begin("checking")
+            capture = check_capture(capture, progress)
+    return {
+        "source": str(source),
+        **describe_capture(capture),
+        "intrinsics": lenses(capture),
+        "focal_prior": len([frame for frame in capture.frames if frame.focal_prior is not None]),
+        "test": sum(frame.split == "test" for frame in capture.frames),
+        "points": 0 if capture.points is None else len(capture.points),
+        "ordered": capture.ordered,
+        "depth_scale": capture.depth_scale if capture.has_depth else None,
+        "warnings": list(capture.warnings),
+    }
+
+
+def lenses(capture: Capture) -> list[dict[str, Any]]:
+    """The different cameras that the source names, each with how many frames have it."""
+    found: dict[Any, int] = {}
+    for frame in capture.frames:
+        if frame.intrinsics is not None:
+            found[frame.intrinsics] = found.get(frame.intrinsics, 0) + 1
+    return [{"frames": count, **camera.to_dict()} for camera, count in found.items()]
+
+
+def run_facts(folder: Path) -> dict[str, Any]:
+    """What a run's folder holds."""
+    from pipelines.folder import RunFolder
+    from pipelines.stages import finished_stages
+
+    run = RunFolder(folder)
+    about = run.about()
+    return {
+        "run": str(folder),
+        "source": about["source"],
+        "command": about.get("command"),
+        "version": about.get("version"),
+        "stages": [
+            {"name": record.name, "seconds": record.seconds, "peak_memory_mb": record.peak_memory_mb, "stopped": record.stopped}
+            for record in finished_stages(run)
+        ],
+    }
+
+
+def lines(key: str, value: Any) -> list[str]:
+    """One fact as lines for people; what is empty or unknown is left out."""
+    name = key.replace("_", " ")
+    if value is None or value == [] or value == {} or value is False:
+        return []
+    if isinstance(value, dict):
+        return [line for inner, entry in value.items() for line in lines(inner, entry)]
+    if isinstance(value, list) and isinstance(value[0], dict):
+        shown = value[:4] + ([{"and": f"{len(value) - 4} more"}] if len(value) > 4 else [])
+        return [f"{name:<14} " + ", ".join(f"{inner} {entry:.6g}" if isinstance(entry, float) else f"{inner} {entry}" for inner, entry in part.items()) for part in shown]
+    if isinstance(value, list):
+        return [f"{name:<14} {entry}" for entry in value]
+    return [f"{name:<14} {'yes' if value is True else value}"]

@@ -1,0 +1,147 @@
+"""What every stage of a run is given, and the surroundings that are set once: threads, device, seeds."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pipelines.console import ConsoleProgress
+from pipelines.folder import RunFolder, is_run_folder
+from pipelines.stages import Stages
+from toolkit.config import Settings, load_settings
+from toolkit.errors import InputError
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+@dataclass
+class Job:
+    """One command at work on one folder."""
+
+    folder: RunFolder
+    source: Path
+    settings: Settings
+    progress: ConsoleProgress
+    stages: Stages
+
+
+@contextmanager
+def open_job(
+    target: Path,
+    out: Path | None,
+    options: dict[str, Any],
+    progress: ConsoleProgress,
+    trusted: Iterable[str] = (),
+) -> Iterator[Job]:
+    """The job for `target`: a source (with `out`), or the folder of an earlier run whose settings are taken over.
+
+    Args:
+        options: `preset`, `config`, `pairs` and `flags` as the command line gives them.
+        trusted: stages that are used as they are when `target` is a run's folder.
+
+    Raises:
+        InputError: neither a source with `out` nor a run's folder; settings that do not fit.
+        OutputError: the folder cannot be used.
+    """
+    again = out is None and is_run_folder(target)
+    if out is None and not again:
+        raise InputError(_no_out(target))
+    path = target if out is None else out
+    if not again:
+        check_places(target, path)
+        settings = read_settings(options)
+        set_threads(settings.threads)
+        settings.device = choose_device(settings.device)
+    with RunFolder(path) as folder, progress.listening():
+        source = Path(os.path.abspath(target))
+        if again:
+            about = folder.about()
+            source = Path(about["source"])
+            settings = read_settings(options, about["settings"])
+            set_threads(settings.threads)
+            settings.device = choose_device(settings.device)
+        folder.start(source, settings)
+        yield Job(folder, source, settings, progress, Stages(folder, progress, trusted if again else ()))
+
+
+def _no_out(target: Path) -> str:
+    if not target.exists():
+        return f"{target} does not exist; give a video, a folder of pictures, or the folder of an earlier run"
+    return f"{target} is not the folder of an earlier run; to work on it as a source add --out DIR"
+
+
+def check_places(source: Path, out: Path) -> None:
+    """A run must not write among its own input.
+
+    Raises:
+        InputError: the source does not exist, or it is the out folder.
+    """
+    if not source.exists():
+        raise InputError(f"{source} does not exist; give a video, a folder of pictures, or a capture folder")
+    if source.resolve() == out.resolve():
+        raise InputError(f"--out {out} is the source itself; choose another folder, so that nothing of the capture is changed")
+
+
+def read_settings(options: dict[str, Any], stored: dict[str, Any] | None = None) -> Settings:
+    """Settings of the command line over those of an earlier run (`stored`) or over a preset's."""
+    pairs = options.get("pairs") or []
+    if options.get("preset") is not None or any(pair.startswith("preset=") for pair in pairs):
+        stored = None  # a preset is a new start: the stored settings would hide what it sets
+    preset = options.get("preset") or (stored or {}).get("preset") or "balanced"
+    return load_settings(preset, options.get("config"), pairs, options.get("flags"), stored)
+
+
+def bound_threads(options: dict[str, Any]) -> None:
+    """Tell numeric libraries the thread count that the command line gives; they read it once, when they are loaded."""
+    wanted = options.get("flags", {}).get("threads") or next((pair[8:] for pair in options.get("pairs") or [] if pair.startswith("threads=")), None)
+    if wanted is not None and str(wanted).isdigit() and int(wanted) > 0:
+        os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(wanted)))
+
+
+def set_threads(threads: int | None) -> None:
+    """Bound the threads of every library, also of those that are loaded already."""
+    if threads is not None:
+        os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
+    import cv2
+    import torch
+
+    if threads is not None:
+        torch.set_num_threads(threads)
+        cv2.setNumThreads(threads)
+
+
+def choose_device(wanted: str) -> str:
+    """`auto` → `cuda` when there is one, else `cpu`.
+
+    Raises:
+        InputError: `cuda` is asked for and there is none.
+    """
+    import torch
+
+    if wanted == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise InputError("device is 'cuda' but torch finds no CUDA device here; use --device cpu or install torch with CUDA")
+    return wanted
+
+
+def set_seeds(seed: int) -> None:
+    """Seed every generator in use; called at the start of each stage that draws, so reused stages before it change nothing."""
+    import cv2
+    import numpy as np
+    import torch
+
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
+    torch.manual_seed(seed)
+    cv2.setRNGSeed(seed % 2**31)
+
+
+def with_budget(settings: Settings, seconds: float) -> Settings:
+    """The same settings with another fitting budget."""
+    return replace(settings, fit=replace(settings.fit, budget=seconds))

@@ -1,0 +1,69 @@
+"""The main job: capture → poses → key frames → views → TSDF surface and radiance field → pictures → exports → report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipelines.job import Job, open_job
+from pipelines.steps_capture import choose_frames, choose_keyframes, find_camera_poses, find_capture, make_views, measure_scene
+from pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views, score_pictures, wants_tsdf
+from pipelines.summary import put_report, summarise_poses
+
+if TYPE_CHECKING:
+    from toolkit.capture.types import Capture, Views
+    from toolkit.poses.result import PoseResult
+    from toolkit.poses.scene import Scene
+
+BEFORE = ("capture", "frames", "poses", "scene", "keyframes", "views")  # what every result stands on
+RESULTS = ("tsdf", "field", "render", "export")
+ALL = frozenset(RESULTS)
+
+
+def run_job(target: Path, out: Path | None, options: dict[str, Any], goals: Iterable[str], progress: Any, trusted: Iterable[str] = BEFORE) -> dict[str, Any]:
+    """Open the run's folder and make `goals` in it, with all that they need; see `open_job` for the arguments."""
+    with open_job(target, out, options, progress, trusted) as job:
+        wanted = frozenset(goals)
+        return reconstruct(job, wanted) if wanted else reconstruct_poses(job)
+
+
+def stand(job: Job) -> tuple[Capture, PoseResult, Capture, Scene, Views]:
+    """What every result stands on: capture, poses, the posed capture, the scene, and the views made ready."""
+    capture = choose_frames(job, find_capture(job))
+    poses = find_camera_poses(job, capture)
+    posed = poses.apply(capture)
+    scene = measure_scene(job, posed)
+    choose_keyframes(job, posed, scene)
+    return capture, poses, posed, scene, make_views(job, posed, scene)
+
+
+def reconstruct_poses(job: Job) -> dict[str, Any]:
+    """Camera poses alone; answers a summary of them."""
+    capture = choose_frames(job, find_capture(job))
+    return summarise_poses(job, capture, find_camera_poses(job, capture))
+
+
+def reconstruct(job: Job, goals: frozenset[str] = ALL) -> dict[str, Any]:
+    """Make the results named in `goals` (a part of `RESULTS`) and the report of all that is there; answers `report.json`.
+
+    Results that are not asked for are left as they are, and stay in the report as long as they still fit.
+    """
+    start = time.monotonic()
+    stages = job.stages
+    stages.trust(set(RESULTS) - goals)
+    capture, poses, posed, scene, views = stand(job)
+
+    field, timeline, exported = None, [], None
+    pictures = {}
+    if ("tsdf" in goals and wants_tsdf(job, posed)) or stages.usable("tsdf"):
+        pictures["tsdf"] = fuse_tsdf(job, posed, scene, views)
+    if goals & {"field", "render", "export"} or stages.usable("field"):
+        field, timeline = fit_radiance_field(job, views, scene)
+        if "render" in goals or stages.usable("render"):
+            pictures["field"] = render_test_views(job, field, views)
+        if "export" in goals or stages.usable("export"):
+            exported = export_results(job, field, posed, scene)
+    scores = score_pictures(job, views, pictures)
+    return put_report(job, capture, poses, scene, views, field, timeline, pictures, scores, exported, time.monotonic() - start)

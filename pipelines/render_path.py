@@ -1,0 +1,156 @@
+"""Rendering a field along a path of cameras, into a video or a folder of pictures."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.console import make_progress
+from pipelines.job import Job, open_job
+from pipelines.rendered import file_name, to_picture, write_png
+from pipelines.reconstruct import BEFORE, stand
+from pipelines.steps_results import fit_radiance_field
+from toolkit.camera import Array, Intrinsics
+from toolkit.capture import nerf_json
+from toolkit.errors import InputError
+from toolkit.files import read_json
+from toolkit.progress import Progress
+
+if TYPE_CHECKING:
+    from toolkit.capture.types import Views
+    from toolkit.poses.scene import Scene
+    from toolkit.render.field import Field
+
+VIDEO = (".mp4",)
+MAX_CAMERAS = 100_000
+
+
+def render_run(
+    target: Path,
+    out: Path | None,
+    options: dict[str, Any],
+    *,
+    views: str,
+    cameras: Path | None,
+    to: Path | None,
+    frames: int,
+    fps: float,
+    image_size: int | None,
+    quiet: bool,
+) -> dict[str, Any]:
+    """Render what is asked for; the field of a run's folder is taken as it is.
+
+    Returns:
+        how many `pictures` of which `width` and `height`, the `seconds` it took, and the path `to`.
+
+    Raises:
+        InputError: an unknown path of cameras, cameras that cannot be used, a folder without a field and without its source.
+        OutputError: the result cannot be written.
+    """
+    if views not in ("orbit", "test"):
+        raise InputError(f"--views is {views!r}; it must be orbit or test")
+    if to is not None and to.suffix and to.suffix.lower() not in VIDEO:
+        raise InputError(f"--to {to} must be an .mp4 file or a folder")
+    given = read_cameras(cameras) if cameras is not None else None
+    with open_job(target, out, options, make_progress(quiet), (*BEFORE, "field")) as job:
+        _, _, _, scene, ready = stand(job)
+        field, _ = fit_radiance_field(job, ready, scene)
+        if given is not None:
+            names, lenses, poses = given[0], given[1], scene.working_from_input.poses(given[2])
+        elif views == "test":
+            names, lenses, poses = test_cameras(ready)
+        else:
+            names, lenses, poses = orbit_cameras(ready, scene, frames)
+        lenses = [sized(lens, image_size) for lens in lenses]
+        place = to or job.folder / "renders" / ("orbit.mp4" if given is None and views == "orbit" else "cameras" if given is not None else "test")
+        start = time.monotonic()
+        job.progress.begin("render")
+        write(job, field, names, lenses, poses, place, fps)
+        seconds = time.monotonic() - start
+        job.progress.finish("render", seconds, False)
+    return {"pictures": len(names), "width": lenses[0].width, "height": lenses[0].height, "seconds": round(seconds, 3), "to": str(place)}
+
+
+def write(job: Job, field: Field, names: list[str], lenses: list[Intrinsics], poses: Array, to: Path, fps: float) -> None:
+    """Render every camera and write it as it comes."""
+    frames = pictures(field, lenses, poses, job.progress)
+    if to.suffix.lower() in VIDEO:
+        from toolkit.export.video import write_video
+
+        if len({(lens.width, lens.height) for lens in lenses}) > 1:
+            raise InputError("a video needs pictures of one size and these cameras differ; give a folder with --to, or --image-size")
+        write_video(to, frames, fps)
+        return
+    for index, (name, frame) in enumerate(zip(names, frames, strict=True)):
+        write_png(to / f"{index:04d}_{file_name(Path(name).stem)}.png", frame)
+
+
+def pictures(field: Field, lenses: list[Intrinsics], poses: Array, progress: Progress) -> Iterator[Array]:
+    """(H, W, 3) uint8 for each camera (working frame), one at a time."""
+    from toolkit.render.image import render_view
+
+    for index, (lens, pose) in enumerate(zip(lenses, poses, strict=True)):
+        progress.check()
+        progress.update(index, len(lenses))
+        yield to_picture(render_view(field, lens, pose)).rgb
+
+
+def sized(lens: Intrinsics, long_side: int | None) -> Intrinsics:
+    """The camera for pictures with this long side, pinhole."""
+    lens = lens.pinhole()
+    if long_side is None:
+        return lens
+    factor = long_side / max(lens.width, lens.height)
+    return lens.scaled(max(1, round(lens.width * factor)), max(1, round(lens.height * factor)))
+
+
+def even(lens: Intrinsics) -> Intrinsics:
+    """The camera without its last odd row and column: video formats store colour at half the size."""
+    return replace(lens, width=max(2, lens.width // 2 * 2), height=max(2, lens.height // 2 * 2))
+
+
+def test_cameras(views: Views) -> tuple[list[str], list[Intrinsics], Array]:
+    """The held-out views.
+
+    Raises:
+        InputError: there is none.
+    """
+    indices = np.flatnonzero(views.test)
+    if len(indices) == 0:
+        raise InputError("this run has no held-out views to render; use --views orbit, or run again with --holdout 8")
+    return [views.names[i] for i in indices], [views.intrinsics[i] for i in indices], views.world_from_camera[indices]
+
+
+def orbit_cameras(views: Views, scene: Scene, frames: int) -> tuple[list[str], list[Intrinsics], Array]:
+    """A closed path around what the training cameras look at."""
+    from toolkit.render.paths import orbit
+
+    poses = orbit(views.world_from_camera, scene, frames)
+    lens = even(views.intrinsics[0])
+    return [f"orbit_{index:03d}" for index in range(len(poses))], [lens] * len(poses), poses
+
+
+def read_cameras(path: Path) -> tuple[list[str], list[Intrinsics], Array]:
+    """Cameras of a `transforms.json` (OpenGL axes, as nerfstudio and instant-ngp write it); its pictures need not exist.
+
+    Raises:
+        InputError: not such a file, no camera, or an unusable one.
+    """
+    data = read_json(path)
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise InputError(f"{path} lists no cameras; it must have `frames`, each with a `transform_matrix`, as a transforms.json has")
+    if len(frames) > MAX_CAMERAS:
+        raise InputError(f"{path} lists {len(frames)} cameras, more than the {MAX_CAMERAS} that are rendered; split it")
+    names, lenses, poses = [], [], []
+    for index, frame in enumerate(frames):
+        where = f"{path}, camera {index}"
+        names.append(str(frame.get("file_path", f"camera_{index:04d}")))
+        poses.append(nerf_json.pose(frame, where))
+        lenses.append(nerf_json.camera(data, frame, (0, 0), where).pinhole())
+    return names, lenses, np.array(poses)

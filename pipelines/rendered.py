@@ -1,0 +1,119 @@
+"""Rendered pictures of one run: kept exactly for scoring (`renders/<what>.safetensors`), and as PNG for people."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from toolkit.errors import InputError, OutputError
+from toolkit.files import atomic_path
+
+Array = NDArray[Any]
+
+
+@dataclass
+class Picture:
+    """One rendered view."""
+
+    rgb: Array  # (H, W, 3) uint8
+    depth: Array  # (H, W) float32 along z, working units, 0 = missing
+    mask: Array | None = None  # (H, W) bool, where a surface was hit; None for a field, which fills every pixel
+
+
+@dataclass
+class Pictures:
+    """Rendered views by name, with the seconds that each took."""
+
+    names: list[str] = field(default_factory=list)
+    pictures: list[Picture] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    facts: dict[str, Any] = field(default_factory=dict)  # plain data that belongs to them
+
+    def add(self, name: str, picture: Picture, seconds: float) -> None:
+        self.names.append(name)
+        self.pictures.append(picture)
+        self.seconds.append(seconds)
+
+
+def to_picture(rendered: Any) -> Picture:
+    """What a renderer answers (`rgb` float or uint8, `depth`, optional `mask`) → a picture with 8-bit colour."""
+    rgb = np.asarray(rendered.rgb)
+    if rgb.dtype != np.uint8:
+        rgb = (np.clip(rgb, 0, 1) * 255 + 0.5).astype(np.uint8)
+    mask = getattr(rendered, "mask", None)
+    return Picture(rgb, np.ascontiguousarray(rendered.depth, dtype=np.float32), None if mask is None else np.asarray(mask).astype(bool))
+
+
+def save_pictures(path: Path, pictures: Pictures) -> None:
+    """Write all of them into one safetensors file, atomically."""
+    tensors: dict[str, Array] = {}
+    for index, picture in enumerate(pictures.pictures):
+        tensors[f"rgb.{index}"] = np.ascontiguousarray(picture.rgb)
+        tensors[f"depth.{index}"] = picture.depth
+        if picture.mask is not None:
+            tensors[f"mask.{index}"] = np.ascontiguousarray(picture.mask.astype(np.uint8))
+    about = {"names": pictures.names, "seconds": pictures.seconds, "facts": pictures.facts}
+    with atomic_path(path) as temporary:
+        try:
+            save_file(tensors, str(temporary), metadata={"pictures": json.dumps(about)})
+        except SafetensorError as error:
+            raise OutputError(f"cannot write {path}: {error}; free space or choose another --out folder") from error
+
+
+def load_pictures(path: Path) -> Pictures:
+    """What `save_pictures` wrote.
+
+    Raises:
+        InputError: missing or damaged.
+    """
+    try:
+        with safe_open(str(path), framework="numpy") as file:
+            about = json.loads(file.metadata()["pictures"])
+            keys = set(file.keys())
+            pictures = [
+                Picture(
+                    file.get_tensor(f"rgb.{index}"),
+                    file.get_tensor(f"depth.{index}"),
+                    file.get_tensor(f"mask.{index}").astype(bool) if f"mask.{index}" in keys else None,
+                )
+                for index in range(len(about["names"]))
+            ]
+            return Pictures(about["names"], pictures, about["seconds"], about["facts"])
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} cannot be read ({str(error).splitlines()[0]}); remove it and run the command again") from error
+
+
+def file_name(name: str) -> str:
+    """A frame's name as one part of a path."""
+    return re.sub(r"[^\w.-]+", "_", name).strip("._") or "view"
+
+
+def write_pngs(folder: Path, prefix: str, pictures: Pictures) -> list[Path]:
+    """`<prefix>_<name>.png` and `<prefix>_<name>_depth.png` (16 bit, thousandths of a working unit) for every view."""
+    written: list[Path] = []
+    for index, (name, picture) in enumerate(zip(pictures.names, pictures.pictures, strict=True)):
+        stem = f"{prefix}_{index:03d}_{file_name(Path(name).stem)}"
+        depth = np.clip(np.nan_to_num(picture.depth) * 1000, 0, 65535).astype(np.uint16)
+        written += [write_png(folder / f"{stem}.png", picture.rgb), write_png(folder / f"{stem}_depth.png", depth)]
+    return written
+
+
+def write_png(path: Path, pixels: Array) -> Path:
+    """(H, W, 3) uint8 RGB or (H, W) uint16, atomically."""
+    if pixels.ndim == 3:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    done, data = cv2.imencode(".png", pixels)
+    if not done:
+        raise OutputError(f"the picture {path} of shape {pixels.shape} cannot be encoded as PNG")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data.tobytes())
+    return path

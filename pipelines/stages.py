@@ -1,0 +1,181 @@
+"""Stages of a run: each is made once, recorded last, and made again when anything that went into it has changed.
+
+A stage's record `DIR/stages/<name>.json` is written atomically after its outputs, so a run that is killed at any moment
+leaves either a finished stage or none. Its key is a hash of all that went in; a stage before it goes in by the identity
+of that very result (`made`), so that whatever is made again makes all that follows from it again.
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pipelines.console import ConsoleProgress
+from pipelines.folder import STAGES, RunFolder
+from pipelines.memory import PeakMemory
+from toolkit import __version__
+from toolkit.errors import FieldfuseError, InputError
+from toolkit.files import fingerprint, read_json, remove, write_json
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Record:
+    """What is kept of a finished stage."""
+
+    name: str
+    key: str
+    made: str  # identity of this very result
+    seconds: float
+    peak_memory_mb: float
+    outputs: dict[str, int]  # path relative to the run's folder → bytes
+    after: dict[str, str]  # stages before it → which of their results went in
+    stopped: bool = False  # ended early on request, usable but not what was asked for
+
+
+def read_record(path: Path) -> Record | None:
+    """The record at `path`, None when it is not there or not readable."""
+    if not path.is_file():
+        return None
+    try:
+        return Record(**read_json(path))
+    except (FieldfuseError, TypeError):
+        return None
+
+
+def finished_stages(folder: RunFolder) -> list[Record]:
+    """Records of a run's folder, the oldest first."""
+    paths = [path for path in (folder / STAGES).glob("*.json") if not path.name.startswith(".")]
+    found = [read_record(path) for path in sorted(paths, key=lambda path: path.stat().st_mtime_ns)]
+    return [record for record in found if record is not None]
+
+
+class Stages:
+    """The stages of one run folder, in the order in which they are asked for."""
+
+    def __init__(self, folder: RunFolder, progress: ConsoleProgress, trusted: Iterable[str] = ()) -> None:
+        """Stages named in `trusted` are taken as they are in the folder, whatever settings and source say now, if the stages before them are the same."""
+        self.folder = folder
+        self.progress = progress
+        self.trusted = set(trusted)
+        self.records: dict[str, Record] = {}
+        self.cached: dict[str, bool] = {}
+
+    def run(
+        self,
+        name: str,
+        make: Callable[[], T],
+        save: Callable[[T], Iterable[Path]],
+        load: Callable[[], T],
+        *,
+        uses: Any = None,
+        after: Sequence[str] = (),
+        version: int = 1,
+        in_place: bool = False,
+        keeps: bool = False,
+    ) -> T:
+        """The stage's result: loaded when it is finished and nothing that went in has changed, else made and recorded.
+
+        Args:
+            make: does the work.
+            save: writes the result, returns the files that the stage consists of.
+            load: reads back what `save` wrote; an InputError from it means that the files are damaged.
+            uses: plain data of all that the stage depends on besides the stages `after`.
+            version: raised when the stage's code changes what it writes.
+            in_place: `make` itself writes into the folder, so an older result is gone once it starts.
+            keeps: `make` may return early when the user asks to stop; what it has is kept.
+
+        Raises:
+            Interrupted: the user asked to stop.
+            FieldfuseError: from the stage itself.
+        """
+        before = {other: self.records[other].made for other in after}
+        key = fingerprint(name, version, __version__, uses, before)
+        record = self.finished(name)
+        trusted = record is not None and name in self.trusted and record.after == before
+        if record is not None and (trusted or (record.key == key and not record.stopped)):
+            try:
+                value = load()
+            except InputError:
+                if trusted:
+                    raise
+            else:
+                self._note(record, cached=True)
+                return value
+        self.progress.check()
+        return self._make(name, key, before, make, save, in_place, keeps)
+
+    def _make(
+        self, name: str, key: str, before: dict[str, str], make: Callable[[], T], save: Callable[[T], Iterable[Path]], in_place: bool, keeps: bool
+    ) -> T:
+        old = self.record(name)
+        if in_place:
+            remove(self._path(name))
+        self.progress.begin(name)
+        start = time.monotonic()
+        with PeakMemory() as memory:
+            value = make()
+            stopped = keeps and self.progress.stopping()
+            remove(self._path(name))
+            paths = [Path(path) for path in save(value)]
+        outputs = {path.relative_to(self.folder.path).as_posix(): path.stat().st_size for path in paths}
+        record = Record(name, key, uuid.uuid4().hex[:16], round(time.monotonic() - start, 3), round(memory.megabytes, 1), outputs, before, stopped)
+        write_json(self._path(name), asdict(record))
+        for gone in set(old.outputs if old else ()) - set(outputs):
+            remove(self.folder / gone)
+        if stopped:
+            self.progress.resume()
+        self._note(record, cached=False)
+        return value
+
+    def _note(self, record: Record, cached: bool) -> None:
+        self.records[record.name] = record
+        self.cached[record.name] = cached
+        self.progress.finish(record.name, record.seconds, cached)
+
+    def _path(self, name: str) -> Path:
+        return self.folder / STAGES / f"{name}.json"
+
+    def record(self, name: str) -> Record | None:
+        """The stage's record, if there is a readable one."""
+        return read_record(self._path(name))
+
+    def trust(self, names: Iterable[str]) -> None:
+        """Take these stages, too, as they are."""
+        self.trusted.update(names)
+
+    def usable(self, name: str) -> bool:
+        """True when the stage is finished and stands on the results that this run has."""
+        record = self.finished(name)
+        return record is not None and all(other in self.records and self.records[other].made == made for other, made in record.after.items())
+
+    def finished(self, name: str) -> Record | None:
+        """The stage's record, if all files that it lists are there in the size that was written."""
+        record = self.record(name)
+        if record is None:
+            return None
+        for relative, size in record.outputs.items():
+            path = self.folder / relative
+            if not path.is_file() or path.stat().st_size != size:
+                return None
+        return record
+
+    def summary(self) -> list[dict[str, Any]]:
+        """Entries of the report: name, seconds that making it took, peak memory, and whether it was reused."""
+        return [
+            {"name": name, "seconds": record.seconds, "peak_memory_mb": record.peak_memory_mb, "cached": self.cached[name]}
+            for name, record in self.records.items()
+        ]
+
+    def fresh_seconds(self) -> float:
+        """Seconds of stages that were made earlier and reused now."""
+        return sum(record.seconds for name, record in self.records.items() if self.cached[name])
+
+    def stopped(self) -> list[str]:
+        """Stages that hold less than what was asked for, because the user stopped them."""
+        return [name for name, record in self.records.items() if record.stopped]

@@ -1,0 +1,208 @@
+"""The first half of a run: capture → frames → poses → scene → key frames → views."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipelines.job import Job, set_seeds
+from toolkit.files import fingerprint, read_json, write_json
+
+if TYPE_CHECKING:
+    from toolkit.capture.types import Capture, Views
+    from toolkit.poses.result import PoseResult
+    from toolkit.poses.scene import Scene
+
+MAX_LISTED = 200_000  # files of a source that are looked at for changes
+
+
+def find_capture(job: Job) -> Capture:
+    """Detect what the source is, read what it says, look at every picture once."""
+    from toolkit.capture import open_capture
+    from toolkit.capture.checks import check_capture
+    from toolkit.capture.storage import capture_from_dict, capture_to_dict
+
+    path = job.folder / "capture.json"
+
+    def save(capture: Capture) -> list[Path]:
+        write_json(path, capture_to_dict(capture))
+        return [path]
+
+    return job.stages.run(
+        "capture",
+        make=lambda: check_capture(open_capture(job.source), job.progress),
+        save=save,
+        load=lambda: capture_from_dict(read_json(path)),
+        uses=source_state(job.source, job.folder.path),
+    )
+
+
+def choose_frames(job: Job, capture: Capture) -> Capture:
+    """Pictures of a video; other captures pass as they are."""
+    from toolkit.capture.select import select_frames
+    from toolkit.capture.storage import capture_from_dict, capture_to_dict
+
+    if capture.kind != "video":
+        return capture
+    path = job.folder / "frames" / "capture.json"
+
+    def make() -> Capture:
+        set_seeds(job.settings.seed)
+        return select_frames(capture, job.folder.path, job.settings.capture, job.progress)
+
+    def save(chosen: Capture) -> list[Path]:
+        write_json(path, capture_to_dict(chosen))
+        return [*(frame.image for frame in chosen.frames), path]
+
+    return job.stages.run(
+        "frames",
+        make=make,
+        save=save,
+        load=lambda: capture_from_dict(read_json(path)),
+        uses=job.settings.capture.max_frames,
+        after=["capture"],
+        in_place=True,
+    )
+
+
+def last_of(job: Job, *names: str) -> list[str]:
+    """Those of the stages that this run has; `frames`, for one, exists only for videos."""
+    return [name for name in names if name in job.stages.records]
+
+
+def find_camera_poses(job: Job, capture: Capture) -> PoseResult:
+    """Poses that the capture brings, or structure from motion."""
+    from toolkit.poses.given import given_poses
+    from toolkit.poses.result import PoseResult
+    from toolkit.poses.sfm import find_poses
+
+    settings = job.settings
+    given = settings.poses.source == "given" or (settings.poses.source == "auto" and capture.posed)
+    path = job.folder / "poses.json"
+
+    def make() -> PoseResult:
+        if given:
+            return given_poses(capture)
+        set_seeds(settings.seed)
+        return find_poses(capture, job.folder.path, settings.poses, settings.seed, settings.threads, job.progress)
+
+    def save(result: PoseResult) -> list[Path]:
+        write_json(path, result.to_dict())
+        return [path]
+
+    uses: list[Any] = [given]
+    if not given:
+        uses += [asdict(settings.poses), settings.seed, pixel_state(capture)]
+    return job.stages.run(
+        "poses",
+        make=make,
+        save=save,
+        load=lambda: PoseResult.from_dict(read_json(path)),
+        uses=uses,
+        after=last_of(job, "capture", "frames"),
+        in_place=True,
+    )
+
+
+def measure_scene(job: Job, posed: Capture) -> Scene:
+    """Working frame, region of interest, depth range."""
+    from toolkit.poses.scene import Scene, describe_scene
+
+    path = job.folder / "scene.json"
+
+    def save(scene: Scene) -> list[Path]:
+        write_json(path, scene.to_dict())
+        return [path]
+
+    def make() -> Scene:
+        set_seeds(job.settings.seed)
+        return describe_scene(posed, job.progress)
+
+    return job.stages.run("scene", make=make, save=save, load=lambda: Scene.from_dict(read_json(path)), after=["poses"])
+
+
+def choose_keyframes(job: Job, posed: Capture, scene: Scene) -> dict[str, Any]:
+    """Key frames among the training pictures, with their neighbours, by name."""
+    import numpy as np
+
+    from toolkit.capture.prepare import held_out
+    from toolkit.keyframes import select_keyframes
+
+    path = job.folder / "keyframes.json"
+    holdout = job.settings.capture.holdout
+
+    def make() -> dict[str, Any]:
+        frames = [frame for frame, test in zip(posed.frames, held_out(posed, holdout), strict=True) if not test]
+        poses = scene.working_from_input.poses(np.array([frame.world_from_camera for frame in frames]))
+        chosen = select_keyframes(poses, [frame.intrinsics for frame in frames if frame.intrinsics is not None], scene.median_depth)
+        names = [frame.name for frame in frames]
+        return {
+            "keyframes": [names[int(index)] for index in chosen.indices],
+            "neighbours": [[names[int(index)] for index in row] for row in chosen.neighbours],
+        }
+
+    def save(value: dict[str, Any]) -> list[Path]:
+        write_json(path, value)
+        return [path]
+
+    return job.stages.run("keyframes", make=make, save=save, load=lambda: read_json(path), uses=holdout, after=["poses", "scene"])
+
+
+def make_views(job: Job, posed: Capture, scene: Scene) -> Views:
+    """Pictures undistorted and resized once, in the working frame, test views marked."""
+    from toolkit.capture.prepare import prepare_views
+    from toolkit.capture.views_file import load_views, save_views
+
+    path = job.folder / "views.safetensors"
+
+    def save(views: Views) -> list[Path]:
+        save_views(path, views)
+        return [path]
+
+    settings = job.settings.capture
+    return job.stages.run(
+        "views",
+        make=lambda: prepare_views(posed, scene.working_from_input, settings, job.progress),
+        save=save,
+        load=lambda: load_views(path),
+        uses=[settings.image_size, settings.holdout, pixel_state(posed)],
+        after=["poses", "scene"],
+    )
+
+
+# ------------------------------------------------------------------------------------------------- what files say
+
+
+def source_state(source: Path, without: Path) -> str:
+    """Hash of names, sizes and times of all files of the source; `without` (the run's own folder) does not count."""
+    if source.is_file() and source.suffix.lower() != ".json":
+        return fingerprint(source)
+    root = source.parent if source.is_file() else source
+    return fingerprint(str(source), [_state(path) for path in _files(root, without)])
+
+
+def _files(root: Path, without: Path) -> Iterable[Path]:
+    found: list[Path] = []
+    for folder, folders, files in os.walk(root):
+        folders[:] = sorted(name for name in folders if Path(folder, name) != without and not name.startswith("."))
+        found += [Path(folder, name) for name in sorted(files) if not name.startswith(".")]
+        if len(found) > MAX_LISTED:
+            break
+    return found[:MAX_LISTED]
+
+
+def pixel_state(capture: Capture) -> str:
+    """Hash of the files that hold the capture's pictures, wherever they are."""
+    paths = {path for frame in capture.frames for path in (frame.image, frame.depth, frame.mask) if path is not None}
+    return fingerprint([_state(path) for path in sorted(paths)])
+
+
+def _state(path: Path) -> list[Any]:
+    try:
+        stat = path.stat()
+    except OSError:
+        return [str(path), None]
+    return [str(path), stat.st_size, stat.st_mtime_ns]

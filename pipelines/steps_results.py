@@ -1,0 +1,156 @@
+"""The second half of a run: TSDF surface, radiance field, pictures of the held-out views, exports, scores."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.job import Job, set_seeds
+from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture, write_pngs
+from pipelines.steps_capture import last_of, pixel_state
+from toolkit.errors import InputError
+from toolkit.files import read_json, write_json
+
+if TYPE_CHECKING:
+    from toolkit.capture.types import Capture, Views
+    from toolkit.poses.scene import Scene
+    from toolkit.render.field import Field
+
+
+def wants_tsdf(job: Job, capture: Capture) -> bool:
+    """Whether this run makes the TSDF surface.
+
+    Raises:
+        InputError: it is asked for and the capture has no depth.
+    """
+    wanted = job.settings.tsdf.enabled
+    if wanted == "on" and not capture.has_depth:
+        raise InputError(f"{job.source} holds no depth pictures, which a TSDF surface is made of; leave out tsdf.enabled=on or give an RGB-D capture")
+    return wanted != "off" and capture.has_depth
+
+
+def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views) -> Pictures:
+    """Fuse the training frames' depth into a surface; its pictures at the held-out views are the result."""
+    folder = job.folder / "tsdf"
+    kept = job.folder / "renders" / "tsdf.safetensors"
+    made: list[Path] = []
+
+    def make() -> Pictures:
+        from pipelines.surface import fuse_training_frames
+
+        pictures, paths = fuse_training_frames(job, folder, posed, scene, views)
+        made.extend(paths)
+        return pictures
+
+    def save(pictures: Pictures) -> list[Path]:
+        save_pictures(kept, pictures)
+        return [kept, *made, *write_pngs(kept.parent, "tsdf", pictures)]
+
+    return job.stages.run(
+        "tsdf", make=make, save=save, load=lambda: load_pictures(kept), uses=[asdict(job.settings.tsdf), pixel_state(posed)], after=["scene", "views"]
+    )
+
+
+def fit_radiance_field(job: Job, views: Views, scene: Scene) -> tuple[Field, list[dict[str, Any]]]:
+    """Optimise the field on the training views; held-out views only measure the timeline."""
+    from toolkit.render.field import Field
+    from toolkit.training.fit import fit_field
+
+    settings = job.settings
+    path, times = job.folder / "field.safetensors", job.folder / "timeline.json"
+
+    def make() -> tuple[Field, list[dict[str, Any]]]:
+        set_seeds(settings.seed)
+        result = fit_field(views, scene, settings, job.progress)
+        return result.field, result.timeline
+
+    def save(value: tuple[Field, list[dict[str, Any]]]) -> list[Path]:
+        field, timeline = value
+        field.save(path, scene.working_from_input, {"budget": settings.fit.budget, "seed": settings.seed})
+        write_json(times, timeline)
+        return [path, times]
+
+    uses = [asdict(settings.field), asdict(settings.fit), settings.preset, settings.engine, settings.device, settings.seed]
+    return job.stages.run(
+        "field",
+        make=make,
+        save=save,
+        load=lambda: (Field.load(path).to(settings.device), read_json(times)),
+        uses=uses,
+        after=["scene", "views"],
+        keeps=True,
+    )
+
+
+def render_test_views(job: Job, field: Field, views: Views) -> Pictures:
+    """The field's pictures at the held-out views."""
+    from toolkit.render.image import render_view
+
+    kept = job.folder / "renders" / "field.safetensors"
+
+    def make() -> Pictures:
+        pictures = Pictures()
+        indices = np.flatnonzero(views.test)
+        for count, index in enumerate(indices):
+            job.progress.update(count, len(indices), views.names[index])
+            job.progress.check()
+            start = time.monotonic()
+            picture = to_picture(render_view(field, views.intrinsics[index], views.world_from_camera[index]))
+            pictures.add(views.names[index], picture, time.monotonic() - start)
+        return pictures
+
+    def save(pictures: Pictures) -> list[Path]:
+        save_pictures(kept, pictures)
+        return [kept, *write_pngs(kept.parent, "field", pictures)]
+
+    return job.stages.run("render", make=make, save=save, load=lambda: load_pictures(kept), after=["field", "views"])
+
+
+def export_results(job: Job, field: Field, posed: Capture, scene: Scene) -> dict[str, Any]:
+    """Points, meshes, cameras and video in the input's own frame; answers the mesh's facts."""
+    facts_path = job.folder / "exports" / "facts.json"
+    made: list[Path] = []
+
+    def make() -> dict[str, Any]:
+        from pipelines.surface import export_field
+
+        facts, paths = export_field(job, job.folder / "exports", field, posed, scene)
+        made.extend(paths)
+        return facts
+
+    def save(facts: dict[str, Any]) -> list[Path]:
+        write_json(facts_path, facts)
+        return [facts_path, *made]
+
+    return job.stages.run(
+        "export", make=make, save=save, load=lambda: read_json(facts_path), uses=asdict(job.settings.export), after=["field", "poses", "scene"]
+    )
+
+
+def score_pictures(job: Job, views: Views, pictures: dict[str, Pictures]) -> dict[str, Any]:
+    """The same metrics for field and TSDF, beside those of the nearest training picture."""
+    from toolkit.evaluate.baseline import nearest_image_scores
+    from toolkit.evaluate.score import score_views
+
+    path = job.folder / "evaluation.json"
+
+    def make() -> dict[str, Any]:
+        indices = np.flatnonzero(views.test)
+        out: dict[str, Any] = {}
+        for count, (what, shown) in enumerate(pictures.items()):
+            job.progress.update(count, len(pictures), what)
+            out[what] = {**score_views(shown.pictures, views, indices, shown.seconds), **shown.facts}
+        out["nearest_image"] = nearest_image_scores(views, indices)
+        return out
+
+    def save(scores: dict[str, Any]) -> list[Path]:
+        write_json(path, scores)
+        return [path]
+
+    return job.stages.run(
+        "evaluate", make=make, save=save, load=lambda: read_json(path), uses=sorted(pictures), after=["views", *last_of(job, "tsdf", "render")]
+    )

@@ -1,0 +1,163 @@
+"""What a run found, gathered for `report.json`, `report.html` and the terminal."""
+
+from __future__ import annotations
+
+import platform
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.folder import command_line
+from pipelines.job import Job
+from pipelines.rendered import Pictures
+from toolkit import __version__
+from toolkit.config import settings_dict
+
+if TYPE_CHECKING:
+    from toolkit.capture.types import Capture, Views
+    from toolkit.poses.result import PoseResult
+    from toolkit.poses.scene import Scene
+    from toolkit.render.field import Field
+
+SEEN_BY_SFM = "poses were computed from all pictures, the held-out ones included, so scores are a little kinder than with poses known beforehand"
+NO_TEST_VIEWS = "no picture was held out, so there are no scores; give --holdout 8 to keep every 8th picture for testing"
+
+
+def picture_size(capture: Capture) -> tuple[int | None, int | None]:
+    """Width and height of the capture's first picture, as its header says."""
+    first = capture.frames[0]
+    if first.intrinsics is not None:
+        return first.intrinsics.width, first.intrinsics.height
+    if capture.kind == "video":
+        return capture.extra.get("width"), capture.extra.get("height")
+    from toolkit.capture.headers import read_bytes, read_header
+
+    header = read_header(read_bytes(first.image), first.image)
+    turned = header.orientation >= 5  # EXIF: the stored picture lies on its side
+    return (header.height, header.width) if turned else (header.width, header.height)
+
+
+def describe_capture(capture: Capture) -> dict[str, Any]:
+    """The report's part `capture`."""
+    width, height = picture_size(capture)
+    return {
+        "kind": capture.kind,
+        "frames": len(capture.frames),
+        "width": width,
+        "height": height,
+        "posed": capture.posed,
+        "depth": sum(frame.depth is not None for frame in capture.frames),
+        "masks": sum(frame.mask is not None for frame in capture.frames),
+        "metric": capture.metric,
+        "extra": capture.extra,
+    }
+
+
+def describe_poses(poses: PoseResult) -> dict[str, Any]:
+    """The report's part `poses`."""
+    return {
+        "source": poses.source,
+        "registered": poses.registered,
+        "total": poses.total,
+        "models": poses.models,
+        "missing": poses.missing,
+        "seconds": poses.seconds,
+    }
+
+
+def base_data(job: Job, capture: Capture, poses: PoseResult) -> dict[str, Any]:
+    return {
+        "version": __version__,
+        "command": command_line(),
+        "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "source": str(job.source),
+        "capture": describe_capture(capture),
+        "poses": describe_poses(poses),
+        "stages": job.stages.summary(),
+        "settings": settings_dict(job.settings),
+        "machine": {"python": platform.python_version(), "system": platform.platform(), "device": job.settings.device},
+    }
+
+
+def summarise_poses(job: Job, capture: Capture, poses: PoseResult) -> dict[str, Any]:
+    """Cameras written for other programs, and what was found."""
+    from toolkit.export.cameras import write_cameras
+
+    folder = job.folder / "exports" / "cameras"
+    write_cameras(folder, poses.names, poses.intrinsics, poses.world_from_camera, poses.points)
+    data = base_data(job, capture, poses)
+    return {**data, "warnings": unique([*capture.warnings, *poses.warnings]), "exports": str(folder)}
+
+
+def unique(texts: list[str]) -> list[str]:
+    return list(dict.fromkeys(texts))
+
+
+def warnings_of(job: Job, capture: Capture, poses: PoseResult, views: Views) -> list[str]:
+    """Everything that a reader of the numbers has to know."""
+    texts = [*capture.warnings, *poses.warnings]
+    if not np.any(views.test):
+        texts.append(NO_TEST_VIEWS)
+    elif poses.source == "sfm":
+        texts.append(SEEN_BY_SFM)
+    texts += [f"the stage {name!r} was stopped early on request; run the same command again to do it in full" for name in job.stages.stopped()]
+    return unique(texts)
+
+
+def describe_field(field: Field | None) -> dict[str, Any] | None:
+    """The report's part `field`; the voxel size is in working units."""
+    if field is None:
+        return None
+    return {"voxel_size": field.voxel_size, "blocks": field.blocks, "voxels": field.voxels, "bytes": field.bytes, "resolution": field.resolution}
+
+
+def exported_files(job: Job) -> list[dict[str, Any]]:
+    """Files that other programs can open, as they stand in the records of the stages."""
+    out = []
+    for name in ("tsdf", "export"):
+        record = job.stages.records.get(name)
+        out += [{"path": path, "bytes": size} for path, size in (record.outputs if record else {}).items() if is_export(path)]
+    return out
+
+
+def is_export(path: str) -> bool:
+    return path.startswith(("exports/", "tsdf/", "mesh")) and Path(path).suffix in {".ply", ".obj", ".glb", ".mp4", ".txt", ".json"} and not path.endswith("facts.json")
+
+
+def put_report(
+    job: Job,
+    capture: Capture,
+    poses: PoseResult,
+    scene: Scene,
+    views: Views,
+    field: Field | None,
+    timeline: list[dict[str, Any]],
+    pictures: dict[str, Pictures],
+    scores: dict[str, Any],
+    export_facts: dict[str, Any] | None,
+    seconds: float,
+) -> dict[str, Any]:
+    """Write report.json and report.html; `seconds` is what this command took so far, reused stages count as they took."""
+    from toolkit.evaluate.pictures import make_pictures
+    from toolkit.evaluate.report import report_data, write_report
+
+    data = {
+        **base_data(job, capture, poses),
+        "warnings": warnings_of(job, capture, poses, views),
+        "scene": scene.to_dict(),
+        "views": {"total": len(views), "test": int(np.sum(views.test)), "width": views.intrinsics[0].width, "height": views.intrinsics[0].height},
+        "field": describe_field(field),
+        "evaluation": {"field": scores.get("field"), "tsdf": scores.get("tsdf")},
+        "baseline": scores.get("nearest_image"),
+        "timeline": timeline,
+        "exports": exported_files(job),
+        "export_facts": export_facts,
+        "seconds_total": round(seconds + job.stages.fresh_seconds(), 3),
+    }
+    shown = {name: [*found.pictures] for name, found in pictures.items()}
+    unit = "m" if scene.metric else "units"
+    tiles = make_pictures(views, np.flatnonzero(views.test), shown.get("field"), shown.get("tsdf"), unit)
+    write_report(job.folder.path, data, tiles)
+    return report_data(data, job.folder.path)

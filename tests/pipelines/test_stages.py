@@ -1,0 +1,256 @@
+"""The stage runner: what is reused, what is made again, and what a kill at any moment leaves."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines.console import ConsoleProgress
+from pipelines.folder import RunFolder
+from pipelines.stages import Stages, finished_stages
+from toolkit.config import Settings
+from toolkit.errors import InputError, Interrupted, OutputError
+from toolkit.files import read_json, write_json
+
+
+class Chain:
+    """Three stages that add one to a number each; counts how often each is made."""
+
+    def __init__(self, path: Path, trusted: tuple[str, ...] = ()) -> None:
+        self.path = path
+        self.made: list[str] = []
+        self.trusted = trusted
+        self.progress = ConsoleProgress()
+
+    def run(self, start: int = 0, shift: int = 0, keeps: bool = False, stop: bool = False) -> int:
+        self.made = []
+        with RunFolder(self.path) as folder:
+            folder.start(Path("source"), Settings())
+            stages = Stages(folder, self.progress, self.trusted)
+            value, before = start, []
+            for name in ("first", "second", "third"):
+                uses = {"first": start, "second": shift, "third": None}[name]
+                value = self._stage(stages, folder, name, value + (shift if name == "second" else 1), uses, before, keeps and name == "second", stop)
+                before = [name]
+            self.stages = stages
+            return value
+
+    def _stage(self, stages: Stages, folder: RunFolder, name: str, result: int, uses: Any, after: list[str], keeps: bool, stop: bool) -> int:
+        path = folder / f"{name}.value"
+
+        def make() -> int:
+            self.made.append(name)
+            if stop and keeps:
+                self.progress.request_stop()
+            return result
+
+        def save(value: int) -> list[Path]:
+            path.write_text(str(value))
+            return [path]
+
+        def load() -> int:
+            text = path.read_text()
+            if not text.isdigit():
+                raise InputError(f"{path} is damaged")
+            return int(text)
+
+        return stages.run(name, make, save, load, uses=uses, after=after, keeps=keeps)
+
+
+def test_finished_stages_are_reused(tmp_path: Path) -> None:
+    chain = Chain(tmp_path / "run")
+    assert chain.run(shift=5) == 7
+    assert chain.made == ["first", "second", "third"]
+    assert chain.run(shift=5) == 7
+    assert chain.made == []
+    assert [entry["cached"] for entry in chain.stages.summary()] == [True, True, True]
+    assert [record.name for record in finished_stages(RunFolder(tmp_path / "run"))] == ["first", "second", "third"]
+
+
+def test_a_changed_setting_makes_its_stage_and_what_follows(tmp_path: Path) -> None:
+    chain = Chain(tmp_path / "run")
+    chain.run(shift=5)
+    assert chain.run(shift=6) == 8
+    assert chain.made == ["second", "third"]
+
+
+@pytest.mark.parametrize("spoil", ["remove", "grow", "record"])
+def test_damaged_outputs_are_made_again_with_what_follows(tmp_path: Path, spoil: str) -> None:
+    chain = Chain(tmp_path / "run")
+    chain.run(shift=5)
+    path = tmp_path / "run" / "second.value"
+    if spoil == "remove":
+        path.unlink()
+    elif spoil == "grow":
+        path.write_text("123456")
+    else:
+        (tmp_path / "run" / "stages" / "second.json").write_text("{")
+    assert chain.run(shift=5) == 7
+    assert chain.made == ["second", "third"]
+
+
+def test_same_size_but_unreadable_is_made_again_unless_it_was_to_be_taken_as_it_is(tmp_path: Path) -> None:
+    chain = Chain(tmp_path / "run")
+    chain.run(shift=5)
+    (tmp_path / "run" / "second.value").write_text("x")
+    assert chain.run(shift=5) == 7
+    assert chain.made == ["second", "third"]
+    (tmp_path / "run" / "second.value").write_text("x")
+    with pytest.raises(InputError, match="damaged"):
+        Chain(tmp_path / "run", trusted=("first", "second")).run(shift=5)
+
+
+def test_trusted_stages_ignore_settings_but_not_what_they_stand_on(tmp_path: Path) -> None:
+    Chain(tmp_path / "run").run(shift=5)
+    chain = Chain(tmp_path / "run", trusted=("first", "second", "third"))
+    assert chain.run(start=100, shift=50) == 7
+    assert chain.made == []
+    Chain(tmp_path / "run").run(start=10, shift=5)
+    record = tmp_path / "run" / "stages" / "first.json"
+    write_json(record, {**read_json(record), "made": "another"})
+    chain.run(start=10, shift=5)
+    assert chain.made == ["second", "third"]
+
+
+def test_a_stopped_stage_keeps_what_it_has_and_is_made_in_full_next_time(tmp_path: Path) -> None:
+    chain = Chain(tmp_path / "run")
+    assert chain.run(shift=5, keeps=True, stop=True) == 7  # the short stages after it still run
+    assert chain.stages.stopped() == ["second"]
+    assert not chain.progress.stopping()
+    assert chain.run(shift=5, keeps=True) == 7
+    assert chain.made == ["second", "third"]
+    assert chain.stages.stopped() == []
+
+
+def test_a_stop_between_stages_ends_before_the_next(tmp_path: Path) -> None:
+    chain = Chain(tmp_path / "run")
+    chain.progress.request_stop()
+    with pytest.raises(Interrupted, match="again"):
+        chain.run(shift=5)
+    assert chain.made == []
+
+
+def test_outputs_that_are_no_longer_made_are_removed(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "run") as folder:
+        for count in (3, 1):
+            stages = Stages(folder, ConsoleProgress())
+
+            def save(value: int) -> list[Path]:
+                paths = [folder / f"{index}.txt" for index in range(value)]
+                for path in paths:
+                    path.write_text("here")
+                return paths
+
+            stages.run("only", lambda: count, save, lambda: 0, uses=count)  # noqa: B023
+        assert sorted(path.name for path in folder.path.glob("*.txt")) == ["0.txt"]
+
+
+def test_memory_of_children_counts(tmp_path: Path) -> None:
+    program = "import time; block = bytearray(300 * 2**20); time.sleep(1.0)"
+    with RunFolder(tmp_path / "run") as folder:
+        stages = Stages(folder, ConsoleProgress())
+        stages.run("idle", lambda: 0, lambda value: [], lambda: 0)
+        stages.run("child", lambda: subprocess.run([sys.executable, "-c", program], check=True).returncode, lambda value: [], lambda: 0)
+        idle, child = (stages.records[name].peak_memory_mb for name in ("idle", "child"))
+    assert child > idle + 250
+    assert stages.records["child"].seconds >= 1.0
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from pipelines.console import ConsoleProgress
+from pipelines.folder import RunFolder
+from pipelines.stages import Stages
+from toolkit.config import Settings
+from toolkit.files import atomic_path
+
+when = sys.argv[2]
+with RunFolder(Path(sys.argv[1])) as folder:
+    folder.start(Path("source"), Settings())
+    stages = Stages(folder, ConsoleProgress())
+    path = folder / "value.txt"
+
+    def die(moment):
+        if when == moment:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def make():
+        print("made")
+        die("make")
+        return "result"
+
+    def save(value):
+        with atomic_path(path) as temporary:
+            temporary.write_text(value)
+            die("write")
+        die("saved")
+        return [path]
+
+    print(stages.run("only", make, save, path.read_text))
+    die("after")
+"""
+
+
+@pytest.mark.parametrize(("moment", "again"), [("make", True), ("write", True), ("saved", True), ("after", False)])
+def test_kill_leaves_a_finished_stage_or_none(tmp_path: Path, moment: str, again: bool) -> None:
+    def run(when: str) -> subprocess.CompletedProcess[str]:
+        environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+        command = [sys.executable, "-c", textwrap.dedent(KILLED), str(tmp_path / "run"), when]
+        return subprocess.run(command, capture_output=True, text=True, env=environment)
+
+    assert run(moment).returncode == -signal.SIGKILL
+    assert (tmp_path / "run" / "stages" / "only.json").is_file() != again
+    second = run("never")
+    assert second.returncode == 0, second.stderr
+    assert ("made" in second.stdout) == again
+    assert "result" in second.stdout
+    assert list((tmp_path / "run").glob(".tmp-*")) == []
+
+
+def test_two_commands_in_one_folder(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "run"):
+        with pytest.raises(OutputError, match="another fieldfuse command is working"):
+            RunFolder(tmp_path / "run").__enter__()
+    with RunFolder(tmp_path / "run"):
+        pass
+
+
+def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "frames").mkdir()
+    (tmp_path / ".tmp-mine").write_text("keep")
+    with pytest.raises(OutputError, match="holds 'frames' but no fieldfuse run"):
+        RunFolder(tmp_path).__enter__()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".tmp-mine", "frames"]
+    (tmp_path / "frames").rmdir()
+    with RunFolder(tmp_path):
+        assert (tmp_path / ".tmp-mine").read_text() == "keep"
+
+
+def test_leftovers_of_a_killed_run_are_removed(tmp_path: Path) -> None:
+    with RunFolder(tmp_path) as folder:
+        folder.start(Path("source"), Settings())
+    (tmp_path / "exports" / "cameras").mkdir(parents=True)
+    for place in (tmp_path, tmp_path / "stages", tmp_path / "exports" / "cameras"):
+        (place / ".tmp-123-mesh.ply").write_text("half")
+    with RunFolder(tmp_path):
+        assert list(tmp_path.rglob(".tmp-*")) == []
+
+
+def test_unexpected_errors_are_kept_in_the_folder(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError) as caught, RunFolder(tmp_path):
+        _ = 1 / 0
+    assert "ZeroDivisionError" in Path(caught.value.fieldfuse_log).read_text()  # type: ignore[attr-defined]
+
+
+def test_a_full_disk_is_said_in_a_sentence(tmp_path: Path) -> None:
+    for error in (OSError(28, "No space left on device"), RuntimeError("write failed: No space left on device (os error 28)")):
+        with pytest.raises(OutputError, match="No space left"), RunFolder(tmp_path):
+            raise error
