@@ -1,0 +1,85 @@
+"""Which way is up, and how to turn the working frame about it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from toolkit.camera import Array
+
+LEVEL = 0.25  # eigenvalue ratio below which the cameras' x axes lie in a plane (held level while turning)
+ORBIT = 0.05  # the same for camera centres: they lie in a plane
+AGREE = 15.0  # degrees between two estimates that count as one
+NEAR = 40.0  # degrees that an estimate may lie off the mean up vector of the cameras
+GAIN = 0.9  # the turned footprint must shrink to this share to be worth turning
+
+
+def up_direction(world_from_camera: Array, given: tuple[float, float, float] | None = None) -> tuple[Array, str]:
+    """A unit up vector (3,) in the frame of the poses, and the reason for it.
+
+    Without a given one: people hold cameras level, so the direction across all x axes is up, when the camera turned enough to
+    tell; else the median up vector of the cameras (−y). Where the camera centres lie in a plane whose normal agrees within
+    15°, as on an orbit, the two are averaged.
+    """
+    if given is not None:
+        vector = np.asarray(given, dtype=np.float64)
+        return vector / np.linalg.norm(vector), "given by the source"
+    mean = _unit(np.median(-world_from_camera[:, :3, 1], axis=0))
+    if not np.isfinite(mean).all():
+        return np.array([0.0, 0.0, 1.0]), "cameras point their up vectors everywhere: kept as it is"
+    up, reason = mean, "median up vector of the cameras"
+    x = world_from_camera[:, :3, 0]
+    values, vectors = np.linalg.eigh(x.T @ x / len(x))
+    level = _towards(vectors[:, 0], mean)
+    if values[0] < LEVEL * values[1] and _degrees(level, mean) < NEAR:
+        up, reason = level, "direction across the cameras' x axes (held level)"
+    centres = world_from_camera[:, :3, 3] - world_from_camera[:, :3, 3].mean(axis=0)
+    values, vectors = np.linalg.eigh(centres.T @ centres / len(centres))
+    normal = _towards(vectors[:, 0], up)
+    if values[0] < ORBIT * values[1] and _degrees(normal, up) < AGREE:
+        up, reason = _unit(up + normal), reason + ", averaged with the normal of the cameras' plane"
+    return up, reason
+
+
+def rotation_to_z(up: Array) -> Array:
+    """The least (3, 3) rotation that takes the unit vector `up` to +z."""
+    z = np.array([0.0, 0.0, 1.0])
+    cosine = float(up @ z)
+    if cosine < -1 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    v = np.cross(up, z)
+    skew = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    rotation: Array = np.eye(3) + skew + skew @ skew / (1 + cosine)
+    return rotation
+
+
+def turn_about_z(degrees: float) -> Array:
+    """(3, 3)."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def tight_turn(points: Array) -> float:
+    """Degrees to turn (P, 3) points about z for the smallest axis-aligned footprint, within ±45°; 0 when it gains less than a tenth."""
+    flat = np.ascontiguousarray(points[:, :2] - points[:, :2].mean(axis=0), dtype=np.float32)
+    (_, (width, height), _) = cv2.minAreaRect(flat)
+    extent = np.ptp(flat, axis=0)
+    if width * height > GAIN * extent[0] * extent[1]:
+        return 0.0
+    corners = cv2.boxPoints(cv2.minAreaRect(flat))
+    edge = corners[1] - corners[0]
+    angle = float(np.degrees(np.arctan2(edge[1], edge[0])))
+    return -((angle + 45.0) % 90.0 - 45.0)
+
+
+def _unit(vector: Array) -> Array:
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > 1e-6 else np.full(3, np.nan)
+
+
+def _towards(vector: Array, other: Array) -> Array:
+    return vector if vector @ other >= 0 else -vector
+
+
+def _degrees(first: Array, second: Array) -> float:
+    return float(np.degrees(np.arccos(np.clip(first @ second, -1.0, 1.0))))

@@ -1,0 +1,216 @@
+"""Points for posed pictures that come without any: SIFT, matches that respect the known epipolar geometry, triangulation."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from toolkit.camera import FISHEYE, Array, Intrinsics, distort, invert
+from toolkit.capture.images import load_image, turns_by_exif
+from toolkit.capture.types import Capture
+from toolkit.poses.cloud import Cloud, every
+from toolkit.poses.overlap import best_neighbours, guessed_depth, overlap, parallax
+from toolkit.progress import SILENT, Progress
+
+LONG_SIDE = 640  # pixels that SIFT works on
+FEATURES = 1500  # a frame
+MOST_FRAMES = 100
+NEIGHBOURS = 4
+RATIO = 0.8  # best against second-best descriptor distance
+EPIPOLAR = 2.0  # working pixels off the epipolar line
+REPROJECTION = 2.0  # working pixels
+MIN_ANGLE = 1.0  # degrees between rays
+
+
+def triangulate(capture: Capture, progress: Progress = SILENT) -> Cloud:
+    """Sparse points of a posed capture from up to 100 of its pictures, each matched with up to 4 that overlap.
+
+    A point is kept when all of its observations reproject within 2 pixels (of the picture at a long side of 640), and two
+    of its rays meet at more than 1°. The result may be empty.
+    """
+    chosen = every(len(capture.frames), MOST_FRAMES)
+    frames = [capture.frames[i] for i in chosen]
+    exif = turns_by_exif(capture)
+    poses = np.array([frame.world_from_camera for frame in frames], dtype=np.float64)
+    cameras = [frame.intrinsics for frame in frames if frame.intrinsics is not None]
+    flat, descriptors, focal = [], [], np.zeros(len(frames))
+    for i, (frame, camera) in enumerate(zip(frames, cameras, strict=True)):
+        progress.check()
+        progress.update(i, 2 * len(frames), f"points, picture {i + 1} of {len(frames)}")
+        ideal, described, scale = _features(load_image(frame, exif=exif), camera)
+        flat.append(ideal)
+        descriptors.append(described)
+        focal[i] = 0.5 * (camera.fx + camera.fy) * scale
+    depth = guessed_depth(poses)
+    shares, angles = overlap(poses, cameras, depth), parallax(poses, depth)
+    partners = best_neighbours(poses, shares, angles, NEIGHBOURS)
+    pairs = sorted({(min(i, int(j)), max(i, int(j))) for i in range(len(frames)) for j in partners[i]})
+    starts = np.concatenate([[0], np.cumsum([len(f) for f in flat])])
+    links = []
+    for n, (i, j) in enumerate(pairs):
+        progress.check()
+        progress.update(len(frames) + n * len(frames) / len(pairs), 2 * len(frames), f"points, pair {n + 1} of {len(pairs)}")
+        found = _mutual(descriptors[i], descriptors[j])
+        if len(found):
+            off = epipolar_distance(poses[i], poses[j], flat[i][found[:, 0]], flat[j][found[:, 1]]) * 0.5 * (focal[i] + focal[j])
+            found = found[off < EPIPOLAR]
+            links.append(np.stack([found[:, 0] + starts[i], found[:, 1] + starts[j]], axis=1))
+    owner = np.repeat(np.arange(len(frames)), [len(f) for f in flat])
+    track, keypoint = tracks(np.concatenate(links) if links else np.zeros((0, 2), np.int64), owner)
+    image_plane = np.concatenate(flat) if flat else np.zeros((0, 2))
+    points, point, kept, z = intersect(poses, owner[keypoint], image_plane[keypoint], track, REPROJECTION / focal[owner[keypoint]])
+    return Cloud(points, point, chosen[owner[keypoint[kept]]], z, "triangulated")
+
+
+def _features(picture: Array, camera: Intrinsics) -> tuple[Array, Array, float]:
+    """(N, 2) keypoints on the ideal image plane (x/z, y/z), (N, 128) float32 descriptors, and the working scale."""
+    height, width = picture.shape[:2]
+    scale = min(1.0, LONG_SIDE / max(width, height))
+    grey = cv2.cvtColor(np.ascontiguousarray(picture[..., :3]), cv2.COLOR_RGB2GRAY)
+    small = grey if scale == 1.0 else cv2.resize(grey, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
+    keypoints, descriptors = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.02).detectAndCompute(small, None)
+    if descriptors is None or len(keypoints) == 0:
+        return np.zeros((0, 2)), np.zeros((0, 128), np.float32), scale * width / camera.width
+    pixels = (np.array([k.pt for k in keypoints]) + 0.5) * [camera.width / small.shape[1], camera.height / small.shape[0]]
+    if picture.shape[2] == 4:
+        alpha = picture[..., 3]
+        column = np.clip((pixels[:, 0] * width / camera.width).astype(int), 0, width - 1)
+        row = np.clip((pixels[:, 1] * height / camera.height).astype(int), 0, height - 1)
+        pixels, descriptors = pixels[alpha[row, column] >= 128], descriptors[alpha[row, column] >= 128]
+    # Root-SIFT: Euclidean distances of these compare histograms better than those of plain descriptors.
+    rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)).astype(np.float32)
+    return undistorted(camera, pixels), rooted, scale * width / camera.width
+
+
+def undistorted(camera: Intrinsics, pixels: Array) -> Array:
+    """(N, 2) pixels → (N, 2) ideal image-plane points. Where the lens cannot be inverted there, NaN."""
+    bent = (np.asarray(pixels, dtype=np.float64) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    if not camera.distorted or len(bent) == 0:
+        return bent
+    coefficients = np.array(camera.distortion, dtype=np.float64)
+    if camera.lens == FISHEYE:
+        ideal = cv2.fisheye.undistortPoints(bent[:, None], np.eye(3), coefficients[:4])
+    else:
+        stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-10)
+        ideal = cv2.undistortPoints(bent[:, None], np.eye(3), coefficients, criteria=stop)
+    ideal = np.asarray(ideal, dtype=np.float64).reshape(-1, 2)
+    wrong = ~(np.abs(distort(camera, ideal) - bent).max(axis=1) < 1e-4)
+    ideal[wrong] = np.nan
+    return ideal
+
+
+def _mutual(first: Array, second: Array) -> Array:
+    """(K, 2) indices of mutual best matches that pass the ratio test, of unit descriptors."""
+    if len(first) < 2 or len(second) < 2:
+        return np.zeros((0, 2), np.int64)
+    similarity = first @ second.T
+    forward = similarity.argmax(axis=1)
+    rows = np.flatnonzero(similarity.argmax(axis=0)[forward] == np.arange(len(first)))
+    top = np.partition(similarity[rows], -2, axis=1)[:, -2:]
+    distance = np.sqrt(np.maximum(2 - 2 * top, 0))
+    rows = rows[distance[:, 1] < RATIO * distance[:, 0]]
+    return np.stack([rows, forward[rows]], axis=1)
+
+
+def epipolar_distance(first: Array, second: Array, points1: Array, points2: Array) -> Array:
+    """Sampson distance of (K, 2) ideal image-plane points of two posed cameras, in image-plane units (times focal: pixels)."""
+    relative = invert(second) @ first  # second camera from first
+    t = relative[:3, 3] / max(float(np.linalg.norm(relative[:3, 3])), 1e-15)
+    essential = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ relative[:3, :3]
+    x1 = np.concatenate([points1, np.ones((len(points1), 1))], axis=1)
+    x2 = np.concatenate([points2, np.ones((len(points2), 1))], axis=1)
+    line2, line1 = x1 @ essential.T, x2 @ essential
+    slope = np.sqrt(np.maximum((line2[:, :2] ** 2).sum(axis=1) + (line1[:, :2] ** 2).sum(axis=1), 1e-30))
+    distance = np.abs((x2 * line2).sum(axis=1)) / slope
+    return np.where(np.isfinite(distance), distance, np.inf)
+
+
+def tracks(links: Array, owner: Array) -> tuple[Array, Array]:
+    """Connected keypoints that are one point in the world.
+
+    Args:
+        links: (K, 2) matched keypoints, numbered across frames. owner: frame of each keypoint.
+
+    Returns:
+        (M,) track number from 0, ascending, and (M,) keypoint. Tracks that hold one frame twice are dropped.
+    """
+    root = np.arange(len(owner))
+    while len(links):  # the least number reachable spreads along links; halving paths makes this a few rounds
+        low = np.minimum(root[links[:, 0]], root[links[:, 1]])
+        before = root.copy()
+        for side in (0, 1):
+            np.minimum.at(root, root[links[:, side]], low)
+            np.minimum.at(root, links[:, side], low)
+        root = root[root]
+        if np.array_equal(root, before):
+            break
+    nodes = np.unique(links)
+    number = np.unique(root[nodes], return_inverse=True)[1]
+    order = np.lexsort((owner[nodes], number))
+    number, nodes = number[order], nodes[order]
+    twice = (np.diff(number) == 0) & (np.diff(owner[nodes]) == 0)
+    keep = ~np.isin(number, number[1:][twice])
+    return np.unique(number[keep], return_inverse=True)[1], nodes[keep]
+
+
+def intersect(poses: Array, frame: Array, image_plane: Array, track: Array, tolerance: Array) -> tuple[Array, Array, Array, Array]:
+    """Where the rays of each track meet.
+
+    Args:
+        poses: (N, 4, 4). frame, track, tolerance: (M,) of each observation, tolerance in image-plane units. image_plane: (M, 2).
+
+    Returns:
+        points (P, 3); and of the observations kept: point index (K,), index into the M given (K,), depth along z (K,).
+    """
+    empty = np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
+    if len(track) == 0:
+        return empty
+    count = int(track.max()) + 1
+    centres = poses[frame, :3, 3]
+    rays = np.einsum("mij,mj->mi", poses[frame, :3, :3], np.concatenate([image_plane, np.ones((len(frame), 1))], axis=1))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    usable = np.ones(len(track), dtype=bool)
+    weights = np.ones(len(track))
+    points = np.zeros((count, 3))
+    error = np.zeros(len(track))
+    z = np.zeros(len(track))
+    for _ in range(4):
+        points = _closest(centres, rays, track, weights * usable, count)
+        local = np.einsum("mij,mi->mj", poses[frame, :3, :3], points[track] - centres)  # (M, 3) camera axes
+        z = local[:, 2]
+        front = np.where(z > 1e-12, z, 1.0)
+        error = np.where(z > 1e-12, np.linalg.norm(local[:, :2] / front[:, None] - image_plane, axis=1), np.inf)
+        # Distances from rays, divided by depth, are reprojection errors.
+        weights = 1.0 / np.maximum(np.einsum("mi,mi->m", local, local), 1e-24)
+        usable &= error < 4 * tolerance
+    bad = np.zeros(count, dtype=bool)
+    np.logical_or.at(bad, track[usable], (error > tolerance)[usable])
+    enough = np.bincount(track[usable], minlength=count) >= 2
+    good = enough & ~bad & (_spread(centres, points, track, usable, count) > MIN_ANGLE)
+    kept = np.flatnonzero(usable & good[track])
+    renumber = np.cumsum(good) - 1
+    return points[good], renumber[track[kept]], kept, z[kept]
+
+
+def _closest(centres: Array, rays: Array, track: Array, weights: Array, count: int) -> Array:
+    """(count, 3) least-squares points closest to the weighted rays of each track."""
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    normal, side = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    np.add.at(normal, track, weights[:, None, None] * across)
+    np.add.at(side, track, weights[:, None] * np.einsum("mij,mj->mi", across, centres))
+    size = np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-300)[:, None, None]
+    solved: Array = np.linalg.solve(normal / size + 1e-12 * np.eye(3), (side / size[:, 0])[..., None])[..., 0]
+    return solved
+
+
+def _spread(centres: Array, points: Array, track: Array, usable: Array, count: int) -> Array:
+    """(count,) degrees between a track's first ray and the one farthest from it: exact for two views, a lower bound of the widest for more."""
+    towards = centres - points[track]
+    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-15)
+    first = np.zeros((count, 3))
+    kept = np.flatnonzero(usable)[::-1]
+    first[track[kept]] = towards[kept]  # written last to first: the first stays
+    angle = np.degrees(np.arccos(np.clip(np.einsum("mi,mi->m", towards, first[track]), -1, 1)))
+    widest = np.zeros(count)
+    np.maximum.at(widest, track[usable], angle[usable])
+    return widest

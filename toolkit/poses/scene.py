@@ -1,0 +1,180 @@
+"""The working frame and what is worth modelling in it. Everything after this stage lives in the working frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from toolkit.camera import Array, Similarity
+from toolkit.capture.types import Capture
+from toolkit.errors import InputError, PoseError
+from toolkit.poses.cloud import Cloud, cloud_of_depth, cloud_of_points
+from toolkit.poses.gravity import rotation_to_z, tight_turn, turn_about_z, up_direction
+from toolkit.poses.hull import silhouette_cloud
+from toolkit.poses.points import triangulate
+from toolkit.poses.region import ALL, FORWARD, Layout, box, layout, points_of_interest
+from toolkit.progress import SILENT, Progress
+
+MEDIAN_DEPTH = 1.5  # working units, for captures without scale
+BEYOND = 0.05  # share of observations outside the region that makes a background
+FEW_POINTS = 30  # fewer cannot describe a scene
+
+
+@dataclass
+class Scene:
+    """The working frame (z up, recentred on the region, metres or median depth 1.5) and the region of interest in it."""
+
+    working_from_input: Similarity
+    centre: Array  # (3,) of the region of interest
+    half_size: Array  # (3,) along the working axes
+    median_depth: float  # median over frames of the median depth
+    near: float  # closest depth that matters to a camera
+    far: float  # farthest depth seen, background included
+    background_share: float  # share of observations that lie beyond the region
+    has_background: bool
+    metric: bool
+    layout: str = "object"  # object (cameras look inwards) | room (around) | forward (one way)
+    up_reason: str = ""
+    points_source: str = ""  # source | depth | triangulated | silhouettes
+    points: int = 0  # how many told the above
+    warnings: list[str] = field(default_factory=list)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON."""
+        return {
+            "working_from_input": self.working_from_input.to_dict(),
+            "centre": self.centre.tolist(),
+            "half_size": self.half_size.tolist(),
+            "median_depth": self.median_depth,
+            "near": self.near,
+            "far": self.far,
+            "background_share": self.background_share,
+            "has_background": self.has_background,
+            "metric": self.metric,
+            "layout": self.layout,
+            "up_reason": self.up_reason,
+            "points_source": self.points_source,
+            "points": self.points,
+            "warnings": list(self.warnings),
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Scene:
+        """The reverse of `to_dict`.
+
+        Raises:
+            InputError: the data does not hold what `to_dict` writes.
+        """
+        try:
+            return cls(
+                working_from_input=Similarity.from_dict(data["working_from_input"]),
+                centre=np.array(data["centre"], dtype=np.float64).reshape(3),
+                half_size=np.array(data["half_size"], dtype=np.float64).reshape(3),
+                median_depth=float(data["median_depth"]),
+                near=float(data["near"]),
+                far=float(data["far"]),
+                background_share=float(data["background_share"]),
+                has_background=bool(data["has_background"]),
+                metric=bool(data["metric"]),
+                layout=str(data["layout"]),
+                up_reason=str(data["up_reason"]),
+                points_source=str(data["points_source"]),
+                points=int(data["points"]),
+                warnings=[str(text) for text in data["warnings"]],
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"scene.json is not what the poses stage writes ({error}); remove it and run again") from error
+
+
+def describe_scene(capture: Capture, progress: Progress = SILENT) -> Scene:
+    """Working frame, region of interest and depth range of a posed capture.
+
+    Raises:
+        PoseError: the capture is not posed, or too few points can be found to tell where the scene is.
+    """
+    if not capture.posed:
+        raise PoseError(f"{capture.root}: not every frame has a pose and intrinsics; run the poses stage first")
+    poses = np.array([frame.world_from_camera for frame in capture.frames], dtype=np.float64)
+    # Inputs may lie far from their origin (6000 km in earth-centred frames): all that follows is about offsets from here.
+    origin = np.median(poses[:, :3, 3], axis=0)
+    cloud = find_cloud(capture, progress)
+    if len(cloud.points) < FEW_POINTS or len(cloud.point) == 0:
+        raise PoseError(
+            f"{capture.root}: only {len(cloud.points)} points could be triangulated with the given poses, so they or their axis convention do not fit the pictures; check them or use --set poses.source=sfm"
+        )
+    depth = cloud.median_depth()
+    scale = 1.0 if capture.metric else MEDIAN_DEPTH / depth
+    up, reason = up_direction(poses, capture.up)
+    rotation = rotation_to_z(up)
+    upright = Similarity(scale, rotation, -scale * (rotation @ origin))
+    found = layout(upright.poses(poses))
+    points = upright.points(cloud.points)
+    bounded = cloud.source in ("silhouettes", "depth")
+    turn = turn_about_z(_turn(found, upright.poses(poses), points, cloud, bounded, capture))
+    centre, half, inside = _region(Layout(found.kind, turn @ found.focus, found.distance, found.nearest), points @ turn.T, cloud, bounded)
+    working = Similarity(scale, turn @ rotation, turn @ upright.translation - centre)
+    views = cloud.views
+    beyond = float((views * ~inside).sum() / max(views.sum(), 1))
+    depths = cloud.depth * scale
+    corners = working.poses(poses)[:, :3, 3]
+    reach = float((np.linalg.norm(corners, axis=1) + np.linalg.norm(half)).max())
+    return Scene(
+        working_from_input=working,
+        centre=np.zeros(3),
+        half_size=half,
+        median_depth=depth * scale,
+        near=0.7 * float(np.percentile(depths, 0.5)),
+        far=float(max(1.2 * np.percentile(depths, 99.5), min(reach, 1e3 * depth * scale))),
+        background_share=beyond,
+        has_background=beyond > BEYOND and cloud.source != "silhouettes",
+        metric=capture.metric,
+        layout=found.kind,
+        up_reason=reason,
+        points_source=cloud.source,
+        points=len(cloud.points),
+    )
+
+
+def find_cloud(capture: Capture, progress: Progress = SILENT) -> Cloud:
+    """Points of a posed capture in the input's frame, from the best there is: silhouettes, depth, the source's own points, or triangulated."""
+    if capture.alpha:
+        cloud = silhouette_cloud(capture, progress)
+        if len(cloud.points) >= FEW_POINTS:
+            return cloud
+    if capture.has_depth:
+        cloud = cloud_of_depth(capture, progress)
+        if len(cloud.points) >= FEW_POINTS:
+            return cloud
+    if capture.points is not None and len(capture.points) >= FEW_POINTS:
+        cloud = cloud_of_points(capture, np.asarray(capture.points, dtype=np.float64), "source")
+        if len(cloud.point) >= FEW_POINTS:
+            return cloud
+    return triangulate(capture, progress)
+
+
+def _turn(found: Layout, poses: Array, points: Array, cloud: Cloud, bounded: bool, capture: Capture) -> float:
+    """Degrees about z that make the region's box fit: along the view when cameras look one way, else tight around the points."""
+    if found.kind == FORWARD:
+        ahead = poses[:, :2, 2].mean(axis=0)
+        if np.linalg.norm(ahead) > 0.3:
+            return float(90 - np.degrees(np.arctan2(ahead[1], ahead[0])))  # looking along +y
+        return 0.0
+    if capture.up is not None and not bounded:
+        return 0.0
+    chosen, weights, _ = points_of_interest(found, points, cloud.views, bounded)
+    centre, half = box(points[chosen], weights[chosen], ALL, 0.0)
+    core = np.all(np.abs(points - centre) <= half, axis=1) & chosen
+    return tight_turn(points[core]) if np.count_nonzero(core) >= FEW_POINTS else 0.0
+
+
+def _region(found: Layout, points: Array, cloud: Cloud, bounded: bool) -> tuple[Array, Array, Array]:
+    """Centre, half size, and which points lie inside. Silhouettes span it whole: they have no outliers."""
+    if cloud.source == "silhouettes":
+        low, high = points.min(axis=0), points.max(axis=0)
+        centre, half = 0.5 * (low + high), 0.5 * (high - low) * 1.04
+    else:
+        chosen, weights, percents = points_of_interest(found, points, cloud.views, bounded)
+        centre, half = box(points[chosen], weights[chosen], percents)
+    return centre, half, np.all(np.abs(points - centre) <= half, axis=1)
