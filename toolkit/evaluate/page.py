@@ -113,6 +113,18 @@ def headline(data: dict[str, Any]) -> list[tuple[str, str, str]]:
     return out
 
 
+def subtitle(data: dict[str, Any]) -> list[str]:
+    """The line under the title, in parts: what the capture is and when it was made."""
+    capture = data["capture"]
+    out = [str(capture["kind"])] if capture["kind"] is not None else []
+    if capture["frames"] is not None:
+        out.append(f"{words.whole(capture['frames'])} frames")
+    if capture["width"] is not None and capture["height"] is not None:
+        out.append(f"{capture['width']}×{capture['height']}")
+    out += {"sfm": ["poses computed"], "given": ["poses given"]}.get(str(data["poses"]["source"]), [])
+    return out + ([str(data["created"])] if data["created"] else [])
+
+
 def export_rows(data: dict[str, Any]) -> list[dict[str, Any]]:
     """Exports with an address relative to the page, none for a path that leads elsewhere, and their facts as one line."""
     out = []
@@ -151,6 +163,7 @@ def render_page(data: dict[str, Any], pictures: Pictures) -> str:
     return template.render(
         data=data,
         title=data["source"] or "Report",
+        subtitle=subtitle(data),
         unit=words.unit_of(data),
         headline=headline(data),
         rows=comparison(data),

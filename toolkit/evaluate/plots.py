@@ -38,7 +38,7 @@ def _figure(width: float, height: float) -> tuple[Figure, Axes]:
     for name, spine in axes.spines.items():
         spine.set_visible(name in ("left", "bottom"))
         spine.set_color(LINE)
-    axes.tick_params(colors=QUIET, labelsize=9, length=0, pad=5)
+    axes.tick_params(colors=QUIET, labelsize=9.5, length=0, pad=5)
     axes.set_axisbelow(True)
     return figure, axes
 
@@ -76,7 +76,7 @@ def psnr_over_time(timeline: list[dict[str, Any]], levels: dict[str, float | Non
     if len(points) < 2:
         return None
     seconds, values = zip(*sorted(points), strict=True)
-    figure, axes = _figure(6.4, 3.1)
+    figure, axes = _figure(5, 2.9)
     axes.grid(axis="y", color=LINE, linewidth=0.8)
     axes.plot(seconds, values, color=ACCENT, linewidth=2, marker="o", markersize=3.5, solid_capstyle="round")
     axes.annotate(
@@ -93,11 +93,11 @@ def psnr_over_time(timeline: list[dict[str, Any]], levels: dict[str, float | Non
         if level is not None:
             axes.axhline(level, color=SECOND, linewidth=1.2, dashes=(4, 3))
             end: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "xytext": (0, 4)}
-            axes.annotate(f"{name} {level:.1f}", (1, level), ha="right", color=SECOND, fontsize=9, **end)
+            axes.annotate(f"{name} {level:.1f}", (1, level), ha="right", color=SECOND, fontsize=9.5, **end)
     axes.margins(x=0.02, y=0.14)
     axes.set_xlim(left=0)
-    axes.set_xlabel("seconds of fitting", color=QUIET, fontsize=9)
-    axes.set_ylabel("PSNR on test views (dB)", color=QUIET, fontsize=9)
+    axes.set_xlabel("seconds of fitting", color=QUIET, fontsize=9.5)
+    axes.set_ylabel("PSNR on test views (dB)", color=QUIET, fontsize=9.5)
     return _svg(figure, "PSNR on test views over seconds of fitting", "time")
 
 
@@ -116,15 +116,15 @@ def stage_bars(stages: list[dict[str, Any]]) -> str | None:
     known = [stage for stage in stages if stage.get("seconds") is not None]
     if not known:
         return None
-    figure, axes = _figure(6.4, 0.5 + 0.3 * len(known))
+    figure, axes = _figure(5, 0.4 + 0.3 * len(known))
     seconds = [max(0.0, float(stage["seconds"])) for stage in known]
     places = list(range(len(known)))
     bars = axes.barh(places, seconds, color=[PALE if stage.get("cached") else ACCENT for stage in known], height=0.62)
     labels = [bar_label(stage) for stage in known]
-    axes.bar_label(bars, labels=labels, padding=5, color=INK, fontsize=9)
+    axes.bar_label(bars, labels=labels, padding=5, color=INK, fontsize=9.5)
     axes.set_yticks(places, labels=[str(stage.get("name", "")).replace("$", r"\$") for stage in known], color=INK)
     axes.invert_yaxis()
     axes.spines["bottom"].set_visible(False)
     axes.set_xticks([])
-    axes.set_xlim(0, max(max(seconds), 1e-3) * 1.42)  # room for the labels
+    axes.set_xlim(0, max(max(seconds), 1e-3) * 1.6)  # room for the labels
     return _svg(figure, "Seconds and peak memory by stage", "stages")
