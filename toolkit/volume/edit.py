@@ -18,7 +18,7 @@ from toolkit.volume.topology import BLOCK, VOXELS, Topology
 
 CHUNK = 1024  # blocks at a time
 MODES = ("trilinear", "nearest")
-_ELEMENTS = 4 * 2**20  # values gathered at a time by `resample`
+_ELEMENTS = 2**19  # values gathered at a time by `resample`: about what fits into a core's cache
 
 
 def corner_nodes(topology: Topology, occupied: Tensor) -> Tensor:
@@ -94,7 +94,7 @@ def trilinear_density(topology: Topology, density: Tensor) -> Callable[[Tensor, 
 
 
 def prune(
-    occupied: Tensor, density: Callable[[Tensor, Tensor], Tensor], voxel_size: float, gamma: float = 0.6, samples: int = 4
+    occupied: Tensor, density: Callable[[Tensor, Tensor], Tensor], voxel_size: float, gamma: float = 0.6, samples: int = 3
 ) -> Tensor:
     """Occupied voxels that are not see-through, after NeRFusion's pruning rule (its section on fine-tuning) made free of scale.
 
@@ -131,7 +131,8 @@ def split(
         mode: "trilinear" leaves the field as a function unchanged inside occupied voxels; "nearest" is the paper's.
 
     Returns:
-        topology (children in the order of their parents, then blocks that only hold corners), occupancy and values.
+        topology (children in the order of their parents, then blocks that only hold corners), occupancy, and values, which are zero
+        at corners that no occupied voxel touches.
     """
     octants = torch.tensor([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], device=topology.device)
     # (M, z half, z, y half, y, x half, x) → (M, 8 octants, 4, 4, 4)
@@ -142,7 +143,9 @@ def split(
         child = child.repeat_interleave(2, axis)
     keys = topology.keys[parent].long() * 2 + octants[octant]
     new_topology, new_occupied = with_corner_blocks(Topology(keys), child.reshape(-1))
-    return new_topology, new_occupied, resample(topology, occupied, rows, new_topology.keys, 0.5, mode)
+    out = resample(topology, occupied, rows, new_topology.keys, 0.5, mode)
+    unused = (~corner_nodes(new_topology, new_occupied)).nonzero().view(-1)
+    return new_topology, new_occupied, [values.index_fill_(0, unused, 0.0) for values in out]
 
 
 def resample(
@@ -165,11 +168,13 @@ def resample(
     nodes = corner_nodes(topology, occupied)
     row_of_valid = torch.where(nodes, torch.arange(len(nodes), device=nodes.device), topology.zero_row)
     row_of_valid = torch.cat([row_of_valid, row_of_valid.new_tensor([topology.zero_row])])
+    if not rows:
+        return []
     out = [values.new_zeros((len(new_keys) * VOXELS + 1, *values.shape[1:])) for values in rows]
     flat = [values.flatten(1) if values.ndim > 1 else values[:, None] for values in rows]
     side = math.floor((BLOCK - 1) * scale) + 3
-    widest = max((values.shape[1] for values in flat), default=1)
-    step = max(_ELEMENTS // (side**3 * (widest + 1)), 1)
+    widths = [values.shape[1] for values in flat]
+    step = max(_ELEMENTS // (side**3 * (sum(widths) + 1)), 1)
     for start in range(0, len(new_keys), step):
         corner = new_keys[start : start + step].long()[..., None] * BLOCK + torch.arange(BLOCK, device=new_keys.device)
         place = corner.double() * scale  # (n, 3, 8) in the old lattice
@@ -177,9 +182,10 @@ def resample(
         base = place.floor().long()
         inside = (place - base).float()
         source = row_of_valid[_box_rows(topology, low, side)]  # (n, side³), z-major
-        for target, values in zip(out, flat, strict=True):
-            part = _interpolate(values, source, topology.zero_row, base - low[..., None], inside, side, mode)
-            target[start * VOXELS : start * VOXELS + len(part)] = part.view(-1, *target.shape[1:])
+        cube = torch.cat([values[source] for values in flat], -1).masked_fill_((source == topology.zero_row)[..., None], 0.0)
+        mixed = _interpolate(cube, source != topology.zero_row, base - low[..., None], inside, side, mode)
+        for target, part in zip(out, mixed.split(widths, -1), strict=True):
+            target[start * VOXELS : start * VOXELS + len(part)] = part.reshape(-1, *target.shape[1:])
     return out
 
 
@@ -203,27 +209,27 @@ def _box_rows(topology: Topology, low: Tensor, side: int) -> Tensor:
     return torch.where(slot < 0, topology.zero_row, slot * VOXELS + inner.view(len(low), -1))
 
 
-def _interpolate(values: Tensor, source: Tensor, zero: int, base: Tensor, inside: Tensor, side: int, mode: str) -> Tensor:
-    """(n · 512, C) values at places base + inside (n, 3, 8 along each axis) of cubes with rows `source` (n, side³)."""
-    count, channels = len(source), values.shape[1]
+def _interpolate(cube: Tensor, known: Tensor, base: Tensor, inside: Tensor, side: int, mode: str) -> Tensor:
+    """(n, side³, C) values with (n, side³) bool, at the places base + inside (n, 3, 8 along each axis) → (n · 512, C)."""
+    count, _, channels = cube.shape
     if mode == "nearest":
-        best_row, best_weight = source.new_full((count, VOXELS), zero), inside.new_zeros((count, VOXELS))
+        best, best_weight = base.new_zeros((count, VOXELS)), inside.new_zeros((count, VOXELS))
         for dz, dy, dx in ((z, y, x) for z in (0, 1) for y in (0, 1) for x in (0, 1)):
             cell = ((base[:, 2, :, None, None] + dz) * side + base[:, 1, None, :, None] + dy) * side + base[:, 0, None, None, :] + dx
+            cell = cell.view(count, -1)
             wx, wy, wz = ((inside[:, axis] if d else 1 - inside[:, axis]) for axis, d in ((0, dx), (1, dy), (2, dz)))
             weight = (wz[:, :, None, None] * wy[:, None, :, None] * wx[:, None, None, :]).reshape(count, -1)
-            row = source.gather(1, cell.view(count, -1))
-            better = (row != zero) & (weight > best_weight)  # the first of equals stays: the lower corner
-            best_row, best_weight = torch.where(better, row, best_row), torch.where(better, weight, best_weight)
-        return torch.where((best_row == zero)[..., None], 0.0, values[best_row]).view(-1, channels)
-    known = (source != zero)[..., None]
-    cube = torch.cat([torch.where(known, values[source], 0.0), known.to(values.dtype)], -1)
+            better = known.gather(1, cell) & (weight > best_weight)  # the first of equals stays: the lower corner
+            best, best_weight = torch.where(better, cell, best), torch.where(better, weight, best_weight)
+        best += torch.arange(count, device=best.device)[:, None] * side**3
+        return cube.view(-1, channels)[best.view(-1)].masked_fill_(best_weight.view(-1, 1) == 0, 0.0)
+    cube = torch.cat([cube, known[..., None].to(cube.dtype)], -1)
     for axis in (2, 1, 0):  # z, y, x: one linear step along each axis, always on contiguous rows
-        cube = cube.reshape(count, -1, side, side ** axis * (channels + 1))
+        cube = cube.view(count, -1, side, side**axis * (channels + 1))
         lines = cube.shape[1]
-        first = torch.arange(count * lines, device=source.device).view(count, lines, 1) * side + base[:, None, axis]
+        first = torch.arange(count * lines, device=cube.device).view(count, lines, 1) * side + base[:, None, axis]
         cube = cube.view(count * lines * side, -1)
-        weight = inside[:, None, axis].expand(count, lines, BLOCK).reshape(-1, 1).to(values.dtype)
+        weight = inside[:, None, axis].expand(count, lines, BLOCK).reshape(-1, 1).to(cube.dtype)
         cube = torch.lerp(cube[first.view(-1)], cube[first.view(-1) + 1], weight)
     cube = cube.view(-1, channels + 1)
     weight = cube[:, -1:]
