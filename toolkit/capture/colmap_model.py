@@ -114,7 +114,9 @@ def intrinsics_of(model: str, width: int, height: int, values: list[float], wher
     if model not in LENS_OF:
         raise InputError(f"{where}: the camera model {model} is not supported; run `colmap image_undistorter` and give its output")
     if len(values) != COUNT_OF[model]:
-        raise InputError(f"{where}: the camera model {model} has {COUNT_OF[model]} parameters, not {len(values)}; check how the file was written")
+        raise InputError(
+            f"{where}: the camera model {model} has {COUNT_OF[model]} parameters, not {len(values)}; check how the file was written"
+        )
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         raise InputError(f"{where}: the image size {width}×{height} is not usable; check how the file was written")
     head = [values[0], *values] if model in ONE_FOCAL else values

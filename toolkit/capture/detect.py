@@ -80,4 +80,7 @@ def read_source(path: Path) -> Capture:
     if videos:
         raise InputError(f"{folder} holds {len(videos)} videos; give one of them, for instance {videos[0]}")
     held = ", ".join(sorted(child.name for child in folder.iterdir())[:4])
-    raise InputError(f"{folder} holds no capture of a known kind (it holds {held}); give a video, a folder of photos, or a posed capture as the README lists")
+    raise InputError(
+        f"{folder} holds no capture of a known kind (it holds {held}); "
+        "give a video, a folder of photos, or a posed capture as the README lists"
+    )

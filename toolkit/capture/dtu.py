@@ -40,7 +40,9 @@ def read_dtu(path: Path | str) -> Capture:
         InputError: the cameras are not readable, pictures and cameras differ in number, or a camera fits no known crop.
     """
     root = require_folder(path)
-    source = next((root / name for name in PREFERRED if (root / name).is_file()), None) or min(root.glob("cameras*.npz"), default=root / PREFERRED[1])
+    source = next((root / name for name in PREFERRED if (root / name).is_file()), None) or min(
+        root.glob("cameras*.npz"), default=root / PREFERRED[1]
+    )
     matrices = _read_matrices(source)
     indices = sorted(int(key.removeprefix("world_mat_")) for key in matrices if re.fullmatch(r"world_mat_[0-9]{1,6}", key))
     pictures = next((found for folder in FOLDERS if (found := pictures_in(root / folder))), [])
@@ -55,7 +57,9 @@ def read_dtu(path: Path | str) -> Capture:
         intrinsics, warning = camera_for(matrix, picture_header(picture).size, where)
         if warning:
             warnings[warning] = None
-        frames.append(Frame(name=name, image=picture, intrinsics=intrinsics, world_from_camera=pose, mask=masks[position] if masks else None))
+        frames.append(
+            Frame(name=name, image=picture, intrinsics=intrinsics, world_from_camera=pose, mask=masks[position] if masks else None)
+        )
     return assemble("dtu", root, frames, list(warnings), extra=_region(matrices, indices))
 
 
@@ -101,9 +105,11 @@ def camera_for(matrix: Array, size: tuple[int, int], where: str) -> tuple[Intrin
     if _near(full, ORIGINAL) and (square or abs(width * ORIGINAL[1] - height * ORIGINAL[0]) <= 2 * ORIGINAL[0]):
         cropped = replace(full, width=ORIGINAL[1] if square else ORIGINAL[0], cx=full.cx - crop)
         what = f"the middle {ORIGINAL[1]}×{ORIGINAL[1]} of it" if square else "it"
-        return cropped.scaled(width, height), f"the cameras are for {ORIGINAL[0]}×{ORIGINAL[1]} pictures; {width}×{height} was taken as {what}, resized"
+        warning = f"the cameras are for {ORIGINAL[0]}×{ORIGINAL[1]} pictures; {width}×{height} was taken as {what}, resized"
+        return cropped.scaled(width, height), warning
     raise InputError(
-        f"{where} is for a picture of about {2 * camera.cx:.0f}×{2 * camera.cy:.0f} but the picture is {width}×{height}; give pictures of that size"
+        f"{where} is for a picture of about {2 * camera.cx:.0f}×{2 * camera.cy:.0f} but the picture is {width}×{height}; "
+        "give pictures of that size"
     )
 
 
@@ -117,7 +123,9 @@ def _read_matrices(path: Path) -> dict[str, Array]:
             if any(member.file_size > MAX_MEMBER for member in archive.infolist()):
                 raise ValueError("an entry is far too large")
         with np.load(path, allow_pickle=False) as archive:
-            out = {key: np.array(archive[key]) for key in archive.files if key.startswith(("world_mat_", "scale_mat_")) and "inv" not in key}
+            out = {
+                key: np.array(archive[key]) for key in archive.files if key.startswith(("world_mat_", "scale_mat_")) and "inv" not in key
+            }
         if any(value.dtype.kind not in "fiu" for value in out.values()):
             raise ValueError("an entry does not hold numbers")
     except Exception as error:  # NumPy's and zipfile's parsers raise many families on broken files
@@ -138,7 +146,9 @@ def _in_order(pictures: list[Path], indices: list[int]) -> list[Path]:
 def _masks(root: Path, pictures: list[Path], indices: list[int]) -> list[Path]:
     masks = pictures_in(root / "mask")
     if masks and len(masks) != len(pictures):
-        raise InputError(f"{root} holds {counted(len(pictures), 'picture')} but {counted(len(masks), 'mask')}; add what is missing or remove mask/")
+        raise InputError(
+            f"{root} holds {counted(len(pictures), 'picture')} but {counted(len(masks), 'mask')}; add what is missing or remove mask/"
+        )
     return _in_order(masks, indices)
 
 

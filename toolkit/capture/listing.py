@@ -129,7 +129,8 @@ def fitted(intrinsics: Intrinsics, size: tuple[int, int], where: str) -> Intrins
     expected = intrinsics.height * width / intrinsics.width
     if abs(expected - height) > max(2.0, 0.005 * height):
         raise InputError(
-            f"{where}: the picture is {width}×{height} but its intrinsics are for {intrinsics.width}×{intrinsics.height}, which is another shape; "
+            f"{where}: the picture is {width}×{height} but its intrinsics are for "
+            f"{intrinsics.width}×{intrinsics.height}, which is another shape; "
             "give pictures that are neither cropped nor turned, or correct the intrinsics"
         )
     return intrinsics.scaled(width, height)
@@ -202,7 +203,8 @@ def same_count(pictures: int, poses: int, where: Path) -> None:
     """Raises: InputError: the numbers of pictures and poses differ."""
     if pictures != poses:
         raise InputError(
-            f"{where} holds {counted(pictures, 'picture')} but {counted(poses, 'pose')}; each picture needs exactly one pose, add or remove what does not belong"
+            f"{where} holds {counted(pictures, 'picture')} but {counted(poses, 'pose')}; "
+            "each picture needs exactly one pose, add or remove what does not belong"
         )
 
 

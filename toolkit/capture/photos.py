@@ -38,7 +38,10 @@ def read_photos(path: Path | str) -> Capture:
     pictures = max((pictures_in(root / folder) for folder in FOLDERS), key=len)
     if not pictures:
         raise InputError(f"no photo (jpg, png, webp, bmp, tif) was found in {root}; give the folder that holds them")
-    frames = [Frame(name=name, image=picture, focal_prior=focal_from_exif(picture)) for name, picture in zip(unique_names(pictures), pictures, strict=True)]
+    frames = [
+        Frame(name=name, image=picture, focal_prior=focal_from_exif(picture))
+        for name, picture in zip(unique_names(pictures), pictures, strict=True)
+    ]
     return assemble("photos", root, frames)
 
 

@@ -49,7 +49,10 @@ def read_redwood(path: Path | str) -> Capture:
     same_count(len(pictures), len(poses), root)
     depths = pictures_in(root / "depth")
     if depths and len(depths) != len(pictures):
-        raise InputError(f"{root} holds {counted(len(pictures), 'picture')} but {counted(len(depths), 'depth picture')}; add or remove what does not belong")
+        raise InputError(
+            f"{root} holds {counted(len(pictures), 'picture')} but {counted(len(depths), 'depth picture')}; "
+            "add or remove what does not belong"
+        )
     described = find_json(root)
     camera = described[0] if described else PRIMESENSE
     warnings = [] if described else ["no camera JSON was found; the PrimeSense default of 525 pixels is used"]

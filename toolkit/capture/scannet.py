@@ -64,7 +64,15 @@ def read_scannet(path: Path | str) -> Capture:
     if lost:
         warnings.append(f"{counted(lost, 'frame')} left out because tracking was lost there (pose -inf)")
     return assemble(
-        "scannet", root, frames, warnings, ordered=True, metric=True, depth_scale=1000.0, up=(0.0, 0.0, 1.0), extra={"listed": len(found), "lost": lost}
+        "scannet",
+        root,
+        frames,
+        warnings,
+        ordered=True,
+        metric=True,
+        depth_scale=1000.0,
+        up=(0.0, 0.0, 1.0),
+        extra={"listed": len(found), "lost": lost},
     )
 
 

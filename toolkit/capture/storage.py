@@ -40,7 +40,9 @@ def capture_from_dict(data: dict[str, Any]) -> Capture:
     """
     try:
         if data["version"] != VERSION:
-            raise InputError(f"the stored capture has version {data['version']}, this program reads version {VERSION}; run the job again in a new folder")
+            raise InputError(
+                f"the stored capture has version {data['version']}, this program reads version {VERSION}; run the job again in a new folder"
+            )
         return Capture(
             kind=str(data["kind"]),
             root=Path(data["root"]),
@@ -55,7 +57,9 @@ def capture_from_dict(data: dict[str, Any]) -> Capture:
             extra=dict(data["extra"]),
         )
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise InputError(f"the stored capture is not usable ({type(error).__name__}: {error}); run the job again in a new folder") from error
+        raise InputError(
+            f"the stored capture is not usable ({type(error).__name__}: {error}); run the job again in a new folder"
+        ) from error
 
 
 def _frame_to_dict(frame: Frame) -> dict[str, Any]:

@@ -63,7 +63,9 @@ def read_transforms(path: Path | str) -> Capture:
     tally = _Tally()
     frames = [frame for index, entry in enumerate(entries) if (frame := _frame(root, data, entry, index, splits, tally)) is not None]
     if not frames and tally.missing:
-        raise InputError(f"none of the {counted(len(entries), 'picture')} listed in {json_path} exists; put them beside it or correct the paths")
+        raise InputError(
+            f"none of the {counted(len(entries), 'picture')} listed in {json_path} exists; put them beside it or correct the paths"
+        )
     named = [replace(frame, name=name) for frame, name in zip(frames, unique_names(tally.files), strict=True)]
     extra: dict[str, Any] = {"listed": len(entries), "missing": tally.missing}
     if data.get("applied_transform") is not None:

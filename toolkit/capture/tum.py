@@ -89,7 +89,8 @@ def read_tum(path: Path | str) -> Capture:
     total = len(colours.values)
     if not frames:
         raise InputError(
-            f"none of the {counted(total, 'picture')} in {root / 'rgb.txt'} has both a file and a pose within {MAX_GAP * 1000:.0f} ms; check the three lists"
+            f"none of the {counted(total, 'picture')} in {root / 'rgb.txt'} has both a file and "
+            f"a pose within {MAX_GAP * 1000:.0f} ms; check the three lists"
         )
     if missing:
         warnings.append(f"{missing} of the {total} listed pictures do not exist; the others are used")

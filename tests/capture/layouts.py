@@ -1,0 +1,217 @@
+"""Writers of the made-up scene, one a layout. Each states the layout's convention in its own words, from the cameras' axes."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from tests.capture.made import Eye, Pinhole, eyes, render, save_depth, save_picture
+from toolkit.camera import Array
+
+OFF_CENTRE = Pinhole(80, 60, 71.0, 73.0, 42.25, 27.5)
+CENTRED = Pinhole(80, 60, 72.0, 72.0, 40.0, 30.0)
+EIGHTH_525 = Pinhole(80, 60, 525 / 8, 525 / 8, 40.0, 30.0)
+EIGHTH_585 = Pinhole(80, 60, 585 / 8, 585 / 8, 40.0, 30.0)
+SCANNET_COLOUR = Pinhole(96, 72, 86.0, 87.0, 47.25, 37.5)
+
+
+def rows(matrix: Array) -> str:
+    return "\n".join(" ".join(f"{value:.12g}" for value in row) for row in np.asarray(matrix)) + "\n"
+
+
+def transforms_entry(eye: Eye, name: str) -> dict:
+    return {"file_path": name, "transform_matrix": eye.opengl().tolist()}
+
+
+def shared_camera(camera: Pinhole) -> dict:
+    return {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": camera.width, "h": camera.height}
+
+
+def write_transforms(root: Path, depth_scale: float = 1000.0) -> Pinhole:
+    frames = []
+    for index, eye in enumerate(eyes()):
+        picture, depth = render(eye, OFF_CENTRE)
+        save_picture(root / f"images/{index:04d}.png", picture)
+        save_depth(root / f"depth/{index:04d}.png", depth, depth_scale)
+        frames.append({**transforms_entry(eye, f"images/{index:04d}.png"), "depth_file_path": f"depth/{index:04d}.png"})
+    (root / "transforms.json").write_text(json.dumps({**shared_camera(OFF_CENTRE), "frames": frames}))
+    return OFF_CENTRE
+
+
+def write_blender(root: Path) -> Pinhole:
+    angle = 2 * np.arctan(0.5 * CENTRED.width / CENTRED.fx)
+    entries: dict[str, list] = {"train": [], "test": []}
+    for index, eye in enumerate(eyes()):
+        split = "train" if index < 3 else "test"
+        picture, depth = render(eye, CENTRED)
+        name = f"r_{index % 3}"  # numbers start again in each split
+        save_picture(root / split / f"{name}.png", np.dstack([picture, np.where(depth > 0, 255, 0).astype(np.uint8)]))
+        entries[split].append(transforms_entry(eye, f"./{split}/{name}"))
+    for split, frames in entries.items():
+        (root / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    return CENTRED
+
+
+def quaternion(rotation: Array) -> Array:
+    """(w, x, y, z) of a rotation matrix: the eigenvector of Bar-Itzhack's symmetric 4×4 matrix with the largest eigenvalue."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    table = np.array(
+        [
+            [a - e - i, d + b, g + c, h - f],
+            [d + b, e - a - i, h + f, c - g],
+            [g + c, h + f, i - a - e, d - b],
+            [h - f, c - g, d - b, a + e + i],
+        ]
+    )
+    x, y, z, w = np.linalg.eigh(table)[1][:, -1]
+    return np.array([w, x, y, z])
+
+
+POINTS = np.array([[0.1, -0.2, 1.2], [0.5, 0.5, 0.0], [-0.4, 0.2, 0.0]])
+
+
+def colmap_images(root: Path) -> list[tuple[str, Array, Array]]:
+    out = []
+    for index, eye in enumerate(eyes()):
+        save_picture(root / f"images/view {index}.png", render(eye, OFF_CENTRE)[0])
+        out.append((f"view {index}.png", quaternion(eye.rotation()), -eye.rotation() @ eye.centre))
+    return out
+
+
+def write_colmap_bin(root: Path) -> Pinhole:
+    folder = root / "sparse/0"
+    folder.mkdir(parents=True)
+    c = OFF_CENTRE
+    (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ4d", 1, 7, 1, c.width, c.height, c.fx, c.fy, c.cx, c.cy))
+    body = b""
+    images = colmap_images(root)
+    for number, (name, q, t) in enumerate(images):
+        body += struct.pack("<I7dI", number + 1, *q, *t, 7) + name.encode() + b"\0" + struct.pack("<QddQ", 1, 3.0, 4.0, 2**64 - 1)
+    (folder / "images.bin").write_bytes(struct.pack("<Q", len(images)) + body)
+    points = b"".join(struct.pack("<QdddBBBdQII", n, *point, 9, 9, 9, 0.5, 1, 1, 0) for n, point in enumerate(POINTS))
+    (folder / "points3D.bin").write_bytes(struct.pack("<Q", len(POINTS)) + points)
+    return c
+
+
+def write_colmap_txt(root: Path) -> Pinhole:
+    folder = root / "sparse/0"
+    folder.mkdir(parents=True)
+    c = OFF_CENTRE
+    (folder / "cameras.txt").write_text(f"# list\n7 PINHOLE {c.width} {c.height} {c.fx} {c.fy} {c.cx} {c.cy}\n")
+    lines = ["# list"]
+    for number, (name, q, t) in enumerate(colmap_images(root)):
+        lines += [f"{number + 1} {' '.join(map(repr, map(float, [*q, *t])))} 7 {name}", "1.5 2.5 -1" if number % 2 else ""]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    (folder / "points3D.txt").write_text("".join(f"{n} {p[0]} {p[1]} {p[2]} 9 9 9 0.5 1 0\n" for n, p in enumerate(POINTS)))
+    return c
+
+
+def write_seven_scenes(root: Path, folder: str = "") -> Pinhole:
+    for index, eye in enumerate(eyes()):
+        save_picture(root / folder / f"frame-{index:06d}.color.png", render(eye, EIGHTH_525)[0])
+        save_depth(root / folder / f"frame-{index:06d}.depth.png", render(eye, EIGHTH_585)[1])
+        (root / folder / f"frame-{index:06d}.pose.txt").write_text(rows(eye.pose()))
+    return EIGHTH_525
+
+
+def write_tum(root: Path) -> Pinhole:
+    colour, depths, truth = ["# colour"], ["# depth"], ["# time tx ty tz qx qy qz qw"]
+    for index, eye in enumerate(eyes()):
+        time = 1000 + 0.1 * index
+        picture, depth = render(eye, EIGHTH_525)
+        save_picture(root / f"rgb/{time:.6f}.png", picture)
+        save_depth(root / f"depth/{time + 0.012:.6f}.png", depth, 5000.0)
+        colour.append(f"{time:.6f} rgb/{time:.6f}.png")
+        depths.append(f"{time + 0.012:.6f} depth/{time + 0.012:.6f}.png")
+        w, x, y, z = quaternion(eye.rotation().T)
+        truth.append(f"{time - 0.004:.6f} {' '.join(map(repr, map(float, [*eye.centre, x, y, z, w])))}")
+        truth.append(f"{time + 0.05:.6f} 9 9 9 0 0 0 1")
+    for name, lines in (("rgb", colour), ("depth", depths), ("groundtruth", truth)):
+        (root / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    return EIGHTH_525
+
+
+def whole_centres(camera: Pinhole) -> Array:
+    """K as calibration tools write it: the middle of the first pixel is 0."""
+    return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
+
+
+def write_scannet(root: Path) -> Pinhole:
+    for index, eye in enumerate(eyes()):
+        save_picture(root / f"color/{index * 5}.jpg", render(eye, SCANNET_COLOUR)[0])
+        save_depth(root / f"depth/{index * 5}.png", render(eye, OFF_CENTRE)[1])
+        (root / "pose").mkdir(exist_ok=True)
+        (root / f"pose/{index * 5}.txt").write_text(rows(eye.pose()))
+    (root / "intrinsic").mkdir()
+    for name, camera in (("color", SCANNET_COLOUR), ("depth", OFF_CENTRE)):
+        k = np.eye(4)
+        k[:3, :3] = whole_centres(camera)
+        (root / f"intrinsic/intrinsic_{name}.txt").write_text(rows(k))
+    return SCANNET_COLOUR
+
+
+def write_llff(root: Path) -> Pinhole:
+    table = []
+    for index, eye in enumerate(eyes()):
+        save_picture(root / f"images_4/IMG_{index:02d}.png", render(eye, CENTRED)[0])
+        axes = np.stack([eye.down, eye.right, -eye.forward, eye.centre], axis=1)
+        size = np.array([[4 * CENTRED.height], [4 * CENTRED.width], [4 * CENTRED.fx]])
+        table.append(np.concatenate([np.hstack([axes, size]).ravel(), [1.0 + index, 9.0 - index]]))
+    np.save(root / "poses_bounds.npy", np.array(table))
+    return CENTRED
+
+
+def write_dtu(root: Path) -> Pinhole:
+    arrays = {}
+    for index, eye in enumerate(eyes()):
+        save_picture(root / f"image/{index:06d}.png", render(eye, OFF_CENTRE)[0])
+        projection = whole_centres(OFF_CENTRE) @ np.hstack([eye.rotation(), -eye.rotation() @ eye.centre[:, None]])
+        arrays[f"world_mat_{index}"] = np.vstack([projection * (-3.5 if index % 2 else 0.25), [0, 0, 0, 1]])
+        arrays[f"scale_mat_{index}"] = np.array([[2.0, 0, 0, 0.1], [0, 2.0, 0, -0.2], [0, 0, 2.0, 0.6], [0, 0, 0, 1]])
+    np.savez(root / "cameras.npz", **arrays)
+    return OFF_CENTRE
+
+
+def write_redwood(root: Path) -> Pinhole:
+    log = ""
+    for index, eye in enumerate(eyes()):
+        picture, depth = render(eye, OFF_CENTRE)
+        save_picture(root / f"color/{index:05d}.jpg", picture)
+        save_depth(root / f"depth/{index:05d}.png", depth)
+        log += f"{index} {index} {index + 1}\n{rows(eye.pose())}"
+    (root / "trajectory.log").write_text(log)
+    c = OFF_CENTRE
+    by_column = [c.fx, 0, 0, 0, c.fy, 0, c.cx - 0.5, c.cy - 0.5, 1]
+    (root / "camera_intrinsics.json").write_text(json.dumps({"width": c.width, "height": c.height, "intrinsic_matrix": by_column}))
+    return c
+
+
+LAYOUTS: dict[str, tuple[str, Callable[[Path], Pinhole]]] = {
+    "transforms": ("transforms", write_transforms),
+    "blender": ("blender", write_blender),
+    "colmap bin": ("colmap", write_colmap_bin),
+    "colmap txt": ("colmap", write_colmap_txt),
+    "7scenes": ("7scenes", write_seven_scenes),
+    "tum": ("tum", write_tum),
+    "scannet": ("scannet", write_scannet),
+    "llff": ("llff", write_llff),
+    "dtu": ("dtu", write_dtu),
+    "redwood": ("redwood", write_redwood),
+}
+
+
+def true_eyes(layout: str) -> list[Eye]:
+    """The cameras in the order in which the capture's frames stand: by name, and a split's name comes first (test before train)."""
+    made = eyes()
+    return made[3:] + made[:3] if layout == "blender" else made
+
+
+def half_size(camera: Pinhole) -> Pinhole:
+    return replace(
+        camera, width=camera.width // 2, height=camera.height // 2, fx=camera.fx / 2, fy=camera.fy / 2, cx=camera.cx / 2, cy=camera.cy / 2
+    )

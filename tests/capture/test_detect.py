@@ -1,0 +1,148 @@
+"""Every layout is told apart, and its cameras are the true ones: by exact projection, and by reprojecting what the pictures show."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.capture.layouts import LAYOUTS, true_eyes, write_colmap_bin, write_llff, write_seven_scenes, write_transforms
+from tests.capture.made import colour_difference, eyes, pixel_error, render, reprojection, save_picture
+from toolkit.camera import Intrinsics
+from toolkit.capture import open_capture
+from toolkit.capture.detect import READERS, detect_kind
+from toolkit.capture.listing import fitted, natural_key, unique_names
+from toolkit.errors import InputError
+
+# What a reader would do wrong: turn about each axis (OpenGL for OpenCV, …), take the inverse, or take the axes in LLFF's order.
+MISTAKES = {
+    "OpenGL axes": np.diag([1.0, -1, -1, 1]),
+    "half turn": np.diag([-1.0, -1, 1, 1]),
+    "down for right": np.array([[0, 1.0, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_layout_is_found_and_its_cameras_are_the_true_ones(tmp_path: Path, layout: str) -> None:
+    kind, write = LAYOUTS[layout]
+    camera = write(tmp_path)
+    capture = open_capture(tmp_path)
+    assert capture.kind == kind == detect_kind(tmp_path)
+    assert capture.posed
+    assert len({frame.name for frame in capture.frames}) == len(eyes())
+    assert pixel_error(capture, true_eyes(layout), camera) < 1e-3
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_pictures_agree_when_reprojected_and_not_with_another_convention(tmp_path: Path, layout: str) -> None:
+    camera = LAYOUTS[layout][1](tmp_path)
+    frames = open_capture(tmp_path).frames[:2]
+    depths = [render(eye, camera)[1] for eye in true_eyes(layout)[:2]]
+    pictures = [cv2.imread(str(frame.image))[..., ::-1] for frame in frames]
+
+    def difference(poses: list[np.ndarray]) -> tuple[float, float]:
+        views = [(frame.intrinsics, pose, depth) for frame, pose, depth in zip(frames, poses, depths, strict=True)]
+        points, relative = reprojection(*views)
+        if len(points) < 100:
+            return np.inf, np.inf
+        visible = points[np.abs(relative) < 0.02]
+        if len(visible) < 100:
+            return np.inf, float(np.median(np.abs(relative)))
+        return colour_difference(visible, [(v[0], v[1], p) for v, p in zip(views, pictures, strict=True)]), float(
+            np.median(np.abs(relative))
+        )
+
+    poses = [frame.world_from_camera for frame in frames]
+    colour, depth = difference(poses)
+    assert colour < 4
+    assert depth < 0.01
+    for name, mistake in MISTAKES.items():
+        assert difference([pose @ mistake for pose in poses])[1] > 0.05, name
+    assert difference([np.linalg.inv(pose) for pose in poses])[1] > 0.05
+
+
+def test_what_is_written_on_purpose_goes_before_what_is_left_behind(tmp_path: Path) -> None:
+    write_colmap_bin(tmp_path)
+    assert detect_kind(tmp_path) == "colmap"
+    write_llff(tmp_path)
+    assert detect_kind(tmp_path) == "colmap", "the model has lens and points, and its pictures are there"
+    for picture in (tmp_path / "images").iterdir():
+        picture.unlink()
+    assert detect_kind(tmp_path) == "llff"
+    write_transforms(tmp_path)
+    assert detect_kind(tmp_path) == "transforms"
+
+
+def test_each_kind_has_one_reader() -> None:
+    kinds = [kind for kind, _, _ in READERS]
+    assert len(set(kinds)) == len(kinds) == 10
+
+
+def test_a_json_file_names_its_capture(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    (tmp_path / "transforms.json").rename(tmp_path / "other.json")
+    assert open_capture(tmp_path / "other.json").kind == "transforms"
+
+
+def test_a_folder_with_one_video_is_that_video(tmp_path: Path) -> None:
+    writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    for level in range(5):
+        writer.write(np.full((48, 64, 3), 40 * level, np.uint8))
+    writer.release()
+    assert open_capture(tmp_path).kind == "video"
+    (tmp_path / "second.avi").write_bytes((tmp_path / "clip.avi").read_bytes())
+    with pytest.raises(InputError, match="2 videos"):
+        open_capture(tmp_path)
+
+
+def test_nothing_there_is_said_in_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        open_capture(tmp_path / "absent")
+    with pytest.raises(InputError, match="is empty"):
+        open_capture(tmp_path)
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(InputError, match=r"no capture of a known kind .*notes\.txt"):
+        open_capture(tmp_path)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_file_that_is_no_picture_is_named(tmp_path: Path, layout: str) -> None:
+    LAYOUTS[layout][1](tmp_path)
+    victim = open_capture(tmp_path).frames[-1].image
+    victim.write_bytes(b"not a picture")
+    with pytest.raises(InputError, match=victim.name):
+        open_capture(tmp_path)
+
+
+@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name != "blender"])  # Blender's JSON tells no picture size
+def test_a_cropped_picture_does_not_pass_as_a_resized_one(tmp_path: Path, layout: str) -> None:
+    LAYOUTS[layout][1](tmp_path)
+    victim = open_capture(tmp_path).frames[0].image
+    save_picture(victim, np.zeros((60, 50, 3), np.uint8))
+    with pytest.raises(InputError):
+        open_capture(tmp_path)
+
+
+def test_sequences_in_folders_are_read_together(tmp_path: Path) -> None:
+    write_seven_scenes(tmp_path, "seq-01")
+    write_seven_scenes(tmp_path, "seq-02")
+    capture = open_capture(tmp_path)
+    assert capture.kind == "7scenes"
+    assert [frame.name for frame in capture.frames][4:6] == ["seq-01_frame-000004", "seq-02_frame-000000"]
+
+
+def test_names_are_short_and_unique() -> None:
+    assert unique_names([Path("/a/b/1.jpg"), Path("/a/c/2.jpg")]) == ["1", "2"]
+    assert unique_names([Path("/a/b/1.jpg"), Path("/a/c/1.jpg")]) == ["b_1", "c_1"]
+    assert unique_names([Path("/a/b/1.jpg"), Path("/a/b/1.png")]) == ["1.jpg", "1.png"]
+    assert sorted(["10", "9", "a2", "a10", "A1"], key=natural_key) == ["9", "10", "A1", "a2", "a10"]
+
+
+def test_a_camera_is_scaled_with_its_picture() -> None:
+    camera = Intrinsics(4032, 3024, 3000, 3000, 2016, 1512)
+    assert fitted(camera, (504, 378), "here").fx == pytest.approx(375)
+    assert fitted(camera, (4032, 3024), "here") is camera
+    with pytest.raises(InputError, match="another shape"):
+        fitted(camera, (3024, 4032), "here")
