@@ -1,6 +1,195 @@
+"""A first look at every picture of a capture: refuse what cannot work, and say what will work badly, before time is spent."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from toolkit.camera import Array
+from toolkit.capture.depth_checks import check_depth
+from toolkit.capture.headers import Header, read_bytes, read_header
+from toolkit.capture.images import turns_by_exif
+from toolkit.capture.listing import counted, fitted
 from toolkit.capture.types import Capture
+from toolkit.errors import InputError
 from toolkit.progress import SILENT, Progress
+
+THUMB_SIDE = 320  # at least this many pixels on the long side of what is looked at
+PIXEL_BUDGET = 600e6  # stored pixels decoded at most; of a larger capture every n-th picture is decoded, all are checked for wholeness
+SAME = 0.6  # grey levels by which pictures of one and the same view differ on average, at 48 × 48
+FLAT = 2.0  # grey levels of standard deviation below which a picture shows nothing
+DARK = 40  # grey level that 95% of a dark picture's pixels stay under
+BLOWN = 253  # grey level from which a pixel counts as saturated
+BLURRED = 0.25  # of the usual sharpness of the capture
+NOTICE = 0.1  # share of pictures from which a warning is worth reading
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is measured on the thumbnail of one picture."""
+
+    name: str
+    tiny: Array  # (48, 48) float32 grey
+    deviation: float
+    sharpness: float
+    bright: float  # grey level of the 95th percentile
+    blown: float  # share of saturated pixels
 
 
 def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
-    return capture
+    """Look at all pictures and some depth maps; return the capture with warnings and `extra["sizes"]` added.
+
+    A video that has not been split into pictures passes as it is: `select_frames` checks what it writes.
+
+    Raises:
+        InputError: fewer than two pictures, a file that is missing, cut short, no picture or of another shape than its camera,
+            all pictures alike or blank, depth that is empty or in another unit than the poses.
+    """
+    frames = capture.frames
+    if not frames:
+        raise InputError(f"{capture.root} holds no pictures; give a video, a folder of photos or a capture")
+    if frames[0].video_index is not None:
+        if len(frames) < 2:
+            raise InputError(f"the video {frames[0].image} has only one frame; film for some seconds while moving around the scene")
+        return capture
+    if len(frames) == 1:
+        raise InputError(f"{capture.root} holds only one picture; take at least 20 from different places")
+    headers, looks, copies = _look_at_all(capture, progress)
+    _refuse_blank(capture, looks)
+    _refuse_same(capture, looks)
+    sizes = Counter(_upright_size(header, turns_by_exif(capture)) for header in headers)
+    warnings = [*_size_warnings(capture, sizes), *_picture_warnings(capture, looks, copies), *check_depth(capture, progress)]
+    extra = {**capture.extra, "sizes": {f"{width}x{height}": number for (width, height), number in sizes.most_common()}}
+    return replace(capture, extra=extra, warnings=capture.warnings + tuple(warning for warning in warnings if warning not in capture.warnings))
+
+
+def _look_at_all(capture: Capture, progress: Progress) -> tuple[list[Header], list[Look], int]:
+    """Headers of all pictures, thumbnail measures of as many as `PIXEL_BUDGET` allows, and the number of exact copies."""
+    headers: list[Header] = []
+    looks: list[Look] = []
+    hashes: Counter[bytes] = Counter()
+    every = 1
+    exif = turns_by_exif(capture)
+    for index, frame in enumerate(capture.frames):
+        progress.check()
+        progress.update(index, len(capture.frames), frame.name)
+        data = read_bytes(frame.image)
+        header = read_header(data, frame.image)
+        headers.append(header)
+        hashes[hashlib.blake2b(data, digest_size=16).digest()] += 1
+        if index == 0:
+            # Entropy decoding of a JPEG costs about a third of a PNG's, whatever size it is reduced to.
+            cost = header.width * header.height * len(capture.frames) * (0.35 if header.format in ("JPEG", "MPO") else 1.0)
+            every = max(1, min(int(np.ceil(cost / PIXEL_BUDGET)), len(capture.frames) // 20))
+        if frame.intrinsics is not None:
+            fitted(frame.intrinsics, _upright_size(header, exif), str(frame.image))
+        if index % every == 0:
+            looks.append(_look(frame.name, frame.image, data, header))
+    return headers, looks, len(capture.frames) - len(hashes)
+
+
+def _look(name: str, path: Path, data: bytes, header: Header) -> Look:
+    thumb = thumbnail(data, header, path)
+    grey = thumb.astype(np.float32)
+    deviation = float(grey.std())
+    # Divided by the contrast, so that a dim picture does not pass for a blurred one.
+    sharpness = float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 0.8), cv2.CV_32F).var()) / max(deviation**2, 1.0)
+    tiny = np.asarray(cv2.resize(grey, (48, 48), interpolation=cv2.INTER_AREA), dtype=np.float32)
+    return Look(name, tiny, deviation, sharpness, float(np.quantile(grey, 0.95)), float((thumb >= BLOWN).mean()))
+
+
+def thumbnail(data: bytes, header: Header, path: Path) -> Array:
+    """A small grey picture (h, w) uint8, long side about `THUMB_SIDE`; JPEG is decoded at an eighth, a quarter or half its size.
+
+    Raises:
+        InputError: the picture cannot be decoded.
+    """
+    ratio = max(header.width, header.height) / THUMB_SIDE
+    flags = cv2.IMREAD_GRAYSCALE
+    for factor, reduced in ((8, cv2.IMREAD_REDUCED_GRAYSCALE_8), (4, cv2.IMREAD_REDUCED_GRAYSCALE_4), (2, cv2.IMREAD_REDUCED_GRAYSCALE_2)):
+        if ratio >= factor and header.format in ("JPEG", "MPO"):
+            flags = reduced
+            break
+    try:
+        grey = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        grey = None
+    if grey is None:
+        raise InputError(f"the picture {path} ({header.format}) is damaged or of a kind that cannot be decoded; copy it again or remove it")
+    factor = THUMB_SIDE / max(grey.shape[:2])
+    if factor < 0.75:
+        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    return np.asarray(grey)
+
+
+# ------------------------------------------------------------------------------------------------ what is refused
+
+
+def _refuse_blank(capture: Capture, looks: list[Look]) -> None:
+    blank = [look for look in looks if look.deviation < FLAT]
+    if len(blank) > 0.5 * len(looks):
+        kind = "black" if np.mean([look.tiny.mean() for look in blank]) < 20 else "of one colour"
+        raise InputError(f"{len(blank)} of {len(looks)} pictures in {capture.root} are {kind}, there is nothing to see in them; check the camera and the files")
+
+
+def _refuse_same(capture: Capture, looks: list[Look]) -> None:
+    difference = max(float(np.abs(look.tiny - looks[0].tiny).mean()) for look in looks)
+    if difference < SAME:
+        raise InputError(
+            f"all {len(capture.frames)} pictures in {capture.root} show the same view; depth needs a camera that moves, take each picture from another place"
+        )
+
+
+# ------------------------------------------------------------------------------------------------ what is remarked
+
+
+def _upright_size(header: Header, exif: bool) -> tuple[int, int]:
+    turned = exif and header.orientation >= 5
+    return (header.height, header.width) if turned else (header.width, header.height)
+
+
+def _size_warnings(capture: Capture, sizes: Counter[tuple[int, int]]) -> list[str]:
+    if len(sizes) == 1:
+        return []
+    listed = ", ".join(f"{width}×{height} ({number})" for (width, height), number in sizes.most_common(4)) + (", …" if len(sizes) > 4 else "")
+    if all(frame.intrinsics is not None for frame in capture.frames):
+        return [f"the pictures have {len(sizes)} sizes: {listed}; each comes with its own camera, so this is fine"]
+    return [f"the pictures have {len(sizes)} sizes: {listed}; each size gets its own camera, which is less certain than one camera for all"]
+
+
+def _picture_warnings(capture: Capture, looks: list[Look], copies: int) -> list[str]:
+    warnings = []
+    total = len(looks)
+    if copies:
+        warnings.append(f"{counted(copies, 'picture is an exact copy', 'pictures are exact copies')} of others; copies add nothing")
+    blank = [look for look in looks if look.deviation < FLAT]
+    if blank:
+        names = ", ".join(look.name for look in blank[:3]) + (", …" if len(blank) > 3 else "")
+        warnings.append(f"{len(blank)} of {total} pictures show nothing but one colour ({names}); remove them")
+    looks = [look for look in looks if look.deviation >= FLAT]
+    usual = _usual_sharpness(np.array([look.sharpness for look in looks]), capture.ordered)
+    blurred = sum(look.sharpness < BLURRED * sharp for look, sharp in zip(looks, usual, strict=True))
+    # Object captures are dark or white around the object on purpose.
+    dark = 0 if capture.alpha else sum(look.bright < DARK for look in looks)
+    blown = 0 if capture.alpha else sum(look.blown > 0.3 for look in looks)
+    for number, text in (
+        (blurred, "are much less sharp than the others; hold the camera still or use more light"),
+        (dark, "are very dark; use more light or a longer exposure"),
+        (blown, "are white in large parts (overexposed, or a white backdrop); if it is light, lower the exposure"),
+    ):
+        if number > NOTICE * total:
+            warnings.append(f"{number} of {total} pictures {text}")
+    return warnings
+
+
+def _usual_sharpness(sharpness: Array, ordered: bool) -> Array:
+    """The median around each picture (neighbours in time show much the same), or of all when their order means nothing."""
+    if not len(sharpness) or not ordered or len(sharpness) < 11:
+        return np.full(len(sharpness), np.median(sharpness) if len(sharpness) else 0.0)
+    padded = np.pad(sharpness, 5, mode="reflect")
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 11), axis=1))

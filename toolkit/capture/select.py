@@ -30,6 +30,8 @@ SHARP_SIDE = 640  # and sharpness
 MIN_STEP = 0.008  # motion between chosen frames, share of the long side: less adds no parallax
 MAX_STEP = 0.20  # more than this between neighbours leaves too little overlap to match
 ANCHOR = 0.012  # motion after which a new reference frame is taken
+STILL = 0.03  # motion in a whole video below which nothing can be learnt from it
+BLANK = 0.05  # sharpness of frames that show one colour
 BLURRED = 0.6  # of the sharpness around it: a frame that may be left out
 JUMP = 0.30  # motion booked where tracking fails (a cut, a blank wall, strong blur)
 
@@ -63,6 +65,10 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
     readable = len(measure.sharpness)
     if readable < 2:
         raise InputError(f"only {readable} of {announced} frames of the video {video} can be decoded; the file is damaged, copy or convert it again")
+    if np.median(measure.sharpness) < BLANK:
+        raise InputError(f"the video {video} shows nothing (its frames are black or of one colour); check the camera and the file")
+    if measure.motion[-1] < STILL:
+        raise InputError(f"the camera does not move in the video {video}; depth needs views from different places, film while walking around the scene")
     chosen = choose(measure, settings.max_frames)
     folder = Path(out) / "frames"
     names = [f"frame_{index:06d}" for index in chosen]
