@@ -29,9 +29,11 @@ def run_job(target: Path, out: Path | None, options: dict[str, Any], goals: Iter
         return reconstruct(job, wanted) if wanted else reconstruct_poses(job)
 
 
-def stand(job: Job) -> tuple[Capture, PoseResult, Capture, Scene, Views]:
+def stand(job: Job, goals: frozenset[str] = frozenset()) -> tuple[Capture, PoseResult, Capture, Scene, Views]:
     """What every result stands on: capture, poses, the posed capture, the scene, and the views made ready."""
     capture = choose_frames(job, find_capture(job))
+    if "tsdf" in goals:
+        wants_tsdf(job, capture)  # a surface that cannot be made is refused before the long work
     poses = find_camera_poses(job, capture)
     posed = poses.apply(capture)
     scene = measure_scene(job, posed)
@@ -53,7 +55,7 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL) -> dict[str, Any]:
     start = time.monotonic()
     stages = job.stages
     stages.trust(set(RESULTS) - goals)
-    capture, poses, posed, scene, views = stand(job)
+    capture, poses, posed, scene, views = stand(job, goals)
 
     field, timeline, exported = None, [], None
     pictures = {}

@@ -95,9 +95,9 @@ def unique(texts: list[str]) -> list[str]:
     return list(dict.fromkeys(texts))
 
 
-def warnings_of(job: Job, capture: Capture, poses: PoseResult, views: Views) -> list[str]:
+def warnings_of(job: Job, capture: Capture, poses: PoseResult, scene: Scene, views: Views) -> list[str]:
     """Everything that a reader of the numbers has to know."""
-    texts = [*capture.warnings, *poses.warnings]
+    texts = [*capture.warnings, *poses.warnings, *scene.warnings]
     if not np.any(views.test):
         texts.append(NO_TEST_VIEWS)
     elif poses.source == "sfm":
@@ -145,7 +145,7 @@ def put_report(
 
     data = {
         **base_data(job, capture, poses),
-        "warnings": warnings_of(job, capture, poses, views),
+        "warnings": warnings_of(job, capture, poses, scene, views),
         "scene": scene.to_dict(),
         "views": {"total": len(views), "test": int(np.sum(views.test)), "width": views.intrinsics[0].width, "height": views.intrinsics[0].height},
         "field": describe_field(field),

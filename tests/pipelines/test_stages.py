@@ -237,6 +237,7 @@ def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:
 def test_leftovers_of_a_killed_run_are_removed(tmp_path: Path) -> None:
     with RunFolder(tmp_path) as folder:
         folder.start(Path("source"), Settings())
+    (tmp_path / "stages").mkdir()
     (tmp_path / "exports" / "cameras").mkdir(parents=True)
     for place in (tmp_path, tmp_path / "stages", tmp_path / "exports" / "cameras"):
         (place / ".tmp-123-mesh.ply").write_text("half")

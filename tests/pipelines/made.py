@@ -1,0 +1,134 @@
+"""A small made-up room with exact colours and depths, written as captures; and the command line called in this process."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from toolkit.camera import Array, Intrinsics, opengl_from_world
+
+ROOT = Path(__file__).resolve().parents[2]
+HALF = np.array([2.0, 1.5, 2.0])  # half size of the room, metres
+CAMERA = Intrinsics(64, 48, 55.0, 55.0, 32.0, 24.0)
+
+
+def look_at(eye: Array, target: Array) -> Array:
+    """world_from_camera (4, 4) of a camera at `eye`; the world's y points down."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = eye
+    return pose
+
+
+def circle(count: int) -> list[Array]:
+    """Cameras on a circle in the room, each looking across its middle."""
+    poses = []
+    for angle in np.arange(count) / count * 2 * np.pi:
+        eye = np.array([np.cos(angle), 0.25 * np.sin(3 * angle), np.sin(angle)])
+        poses.append(look_at(eye, np.array([0.1, 0.0, -0.1])))
+    return poses
+
+
+def colour_at(points: Array) -> Array:
+    """(N, 3) points → (N, 3) RGB in [0, 1]: waves of several lengths, different on every wall."""
+    x, y, z = points.T
+    waves = [np.sin(3.1 * x + 1.7 * y - 2.3 * z), np.sin(7.3 * y - 5.1 * x + 1.0), np.sin(6.1 * z + 4.3 * y + 2.0)]
+    mixed = np.stack([waves[0] + 0.6 * waves[1], waves[1] + 0.6 * waves[2], waves[2] + 0.6 * waves[0]], axis=1)
+    return 0.5 + 0.3 * mixed / 1.1
+
+
+def shoot(pose: Array, camera: Intrinsics = CAMERA) -> tuple[Array, Array]:
+    """(H, W, 3) uint8 RGB and (H, W) float64 depth along z of the room."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    rays = np.stack([(u + 0.5 - camera.cx) / camera.fx, (v + 0.5 - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1).reshape(-1, 3)
+    directions, eye = rays @ pose[:3, :3].T, pose[:3, 3]
+    with np.errstate(divide="ignore"):
+        distance = np.max(np.stack([(HALF - eye) / directions, (-HALF - eye) / directions]), axis=0).min(axis=1)
+    rgb = np.clip(colour_at(eye + directions * distance[:, None]), 0, 1)
+    return (rgb.reshape(*u.shape, 3) * 255 + 0.5).astype(np.uint8), distance.reshape(u.shape)
+
+
+def save_picture(path: Path, rgb: Array) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    return path
+
+
+def make_room(folder: Path, count: int = 12, depth: bool = False, camera: Intrinsics = CAMERA) -> dict[str, Any]:
+    """Write the room as transforms.json with pictures (and depth in millimetres); answers the JSON."""
+    frames = []
+    for index, pose in enumerate(circle(count)):
+        rgb, metres = shoot(pose, camera)
+        frame: dict[str, Any] = {"file_path": f"images/{index:03d}.png", "transform_matrix": opengl_from_world(pose).tolist()}
+        save_picture(folder / frame["file_path"], rgb)
+        if depth:
+            frame["depth_file_path"] = f"depth/{index:03d}.png"
+            (folder / "depth").mkdir(exist_ok=True)
+            cv2.imwrite(str(folder / frame["depth_file_path"]), (metres * 1000 + 0.5).astype(np.uint16))
+        frames.append(frame)
+    data = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "frames": frames}
+    write_transforms(folder, data)
+    return data
+
+
+def write_transforms(folder: Path, data: dict[str, Any]) -> None:
+    (folder / "transforms.json").write_text(json.dumps(data))
+
+
+@dataclass
+class Answer:
+    """What a command did."""
+
+    code: int
+    out: str
+    err: str
+
+    def sentence(self) -> str:
+        """The one line of an error, checked to be one and to hold no traceback."""
+        lines = [line for line in self.err.splitlines() if line.startswith("fieldfuse: ")]
+        assert "Traceback" not in self.err + self.out, self.err
+        assert len(lines) == 1 and self.err.rstrip().endswith(lines[0]), self.err
+        return lines[0]
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> Answer:
+    """`fieldfuse …` in this process."""
+    from pipelines import cli
+
+    before = sys.argv
+    sys.argv = ["fieldfuse", *map(str, arguments)]
+    try:
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+    finally:
+        sys.argv = before
+    shown = capsys.readouterr()
+    return Answer(int(end.value.code or 0), shown.out, shown.err)
+
+
+def command(*arguments: object) -> list[str]:
+    """`fieldfuse …` as a process of its own."""
+    return [sys.executable, "-m", "pipelines.cli", *map(str, arguments)]
+
+
+def environment(**more: str) -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **more}
+
+
+def spawn(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run `fieldfuse …` as a process of its own until it ends."""
+    return subprocess.run(command(*arguments), capture_output=True, text=True, env=environment(), **options)
+
+

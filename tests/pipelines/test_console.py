@@ -1,0 +1,78 @@
+"""Progress lines, time left, and what Ctrl-C does."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import time
+
+import pytest
+
+from pipelines.console import ConsoleProgress, PlainProgress, RichProgress, clock, make_progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_clock() -> None:
+    assert [clock(seconds) for seconds in (0, 59.6, 75, 3725)] == ["0:00", "1:00", "1:15", "1:02:05"]
+
+
+def test_choice_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    assert type(make_progress(quiet=True, stream=Terminal())) is ConsoleProgress
+    assert type(make_progress(stream=io.StringIO())) is PlainProgress
+    assert type(make_progress(stream=Terminal())) is RichProgress
+
+
+def test_time_left_follows_the_pace_of_this_count() -> None:
+    progress = ConsoleProgress()
+    progress.begin("fit")
+    assert progress.seconds_left(0, 10) is None
+    time.sleep(0.6)
+    left = progress.seconds_left(5, 10)
+    assert left is not None and 0.4 < left < 1.5
+    assert progress.seconds_left(1, 400) is None  # another count began
+
+
+def test_plain_lines_now_and_then() -> None:
+    stream = io.StringIO()
+    progress = PlainProgress(stream, every=0.05)
+    progress.begin("poses")
+    for done in range(20):
+        progress.update(done, 20, "matching")
+        time.sleep(0.01)
+    progress.finish("poses", 12.34, cached=False)
+    progress.finish("views", 3.0, cached=True)
+    lines = stream.getvalue().splitlines()
+    assert lines[-2:] == ["poses: 12.3 s", "views: reused"]
+    assert 1 <= len(lines) - 2 <= 6
+    assert lines[0].startswith("poses ") and "%" in lines[0] and lines[0].endswith("matching")
+
+
+def test_bars_show_stage_share_and_note() -> None:
+    stream = Terminal()
+    progress = RichProgress(stream)
+    with progress.listening():
+        progress.finish("capture", 1.0, cached=True)
+        progress.begin("field")
+        progress.update(5, 10, "level 2")
+        progress.finish("field", 65.0, cached=False)
+    text = stream.getvalue()
+    assert "capture" in text and "reused" in text and "field" in text and "1:05" in text
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_first_signal_asks_second_ends(number: int) -> None:
+    before = signal.getsignal(number)
+    progress = PlainProgress(io.StringIO())
+    with pytest.raises(KeyboardInterrupt), progress.listening():
+        os.kill(os.getpid(), number)
+        assert progress.stopping()
+        os.kill(os.getpid(), number)
+        time.sleep(0.1)
+    assert signal.getsignal(number) is before
+    assert isinstance(progress.stream, io.StringIO) and "stopping" in progress.stream.getvalue()
