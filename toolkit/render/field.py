@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import torch
 
-from toolkit.networks.decoder import Deferred, PerSample
+from toolkit.camera import Similarity
+from toolkit.errors import InputError
+from toolkit.networks.decoder import Deferred, PerSample, make_decoder
 from toolkit.render.march import MarchGrid
+from toolkit.volume.edit import corner_nodes, erase_empty_blocks
 from toolkit.volume.space import Space
-from toolkit.volume.topology import VOXELS, Topology
+from toolkit.volume.store import FieldFile, compact, expand, read_field, write_field
+from toolkit.volume.topology import BLOCK, VOXELS, Topology
 
 Tensor = torch.Tensor
 
@@ -77,15 +83,91 @@ class Field:
 
     def to(self, device: torch.device | str) -> Field:
         """The same field on another device."""
-        return Field(
-            self.space,
-            self.resolution,
-            self.topology.to(device),
-            self.occupied.to(device),
-            self.density_rows.to(device),
-            self.feature_rows.to(device),
-            self.decoder.to(device),
-            self.background.to(device),
-            self.near,
-            self.fine,
+        return replace(
+            self,
+            topology=self.topology.to(device),
+            occupied=self.occupied.to(device),
+            density_rows=self.density_rows.to(device),
+            feature_rows=self.feature_rows.to(device),
+            decoder=self.decoder.to(device),
+            background=self.background.to(device),
+        )
+
+    def settled(self) -> Field:
+        """A copy in memory of its own, without the blocks that hold nothing."""
+        topology, occupied, (density_rows, feature_rows) = erase_empty_blocks(self.topology, self.occupied, [self.density_rows, self.feature_rows])
+        return replace(self, topology=topology, occupied=occupied, density_rows=density_rows.clone(), feature_rows=feature_rows.clone())
+
+    def save(self, path: Path | str, working_from_input: Similarity | None = None, meta: dict[str, Any] | None = None) -> None:
+        """Write `field.safetensors`, atomically; corners that no occupied voxel uses are left out.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        nodes = corner_nodes(self.topology, self.occupied)[: self.topology.zero_row].nonzero().squeeze(1)
+        decoder = "deferred" if isinstance(self.decoder, Deferred) else "per_sample"
+        config = {
+            "space": self.space.to_dict(),
+            "resolution": self.resolution,
+            "decoder": decoder,
+            "hidden": self.decoder.hidden,
+            "background": self.background.tolist(),
+            "near": self.near,
+            "fine": self.fine,
+        }
+        x, y, z = (c - self.space.extent * self.space.half for c in self.space.centre)
+        data = FieldFile(
+            keys=self.topology.keys,
+            occupied=self.occupied.view(-1, VOXELS),
+            node_index=nodes.int(),
+            features=compact(self.feature_rows, nodes),
+            density=compact(self.density_rows, nodes),
+            decoder=dict(self.decoder.state_dict()),
+            config=config,
+            voxel_size=self.voxel_size,
+            origin=(x, y, z),
+            working_from_input=working_from_input or Similarity.identity(),
+            meta=meta or {},
+        )
+        write_field(path, data, precision="float16")
+
+    @classmethod
+    def load(cls, path: Path | str) -> Field:
+        """Read `field.safetensors`.
+
+        Raises:
+            InputError: the file is not a field, or was tampered with.
+        """
+        return cls.from_file(read_field(path), str(path))
+
+    @classmethod
+    def from_file(cls, data: FieldFile, where: str) -> Field:
+        """A field from the contents of a file that came from `where`."""
+        try:
+            config = data.config
+            space, resolution = Space.from_dict(config["space"]), int(config["resolution"])
+            kind, hidden, fine, near = str(config["decoder"]), int(config["hidden"]), int(config["fine"]), float(config["near"])
+            background = torch.tensor([float(v) for v in config["background"]])
+            sane = kind in ("deferred", "per_sample") and 8 <= resolution <= 8192 and 1 <= hidden <= 4096 and 1 <= fine <= 64 and near >= 0
+            if not sane or len(background) != 3 or not space.half > 0 or not 0 <= space.shell <= 16:
+                raise ValueError("a setting is out of range")
+            if len(data.keys) and (int(data.keys.min()) < 0 or int(data.keys.max()) > resolution // BLOCK):
+                raise ValueError("a block lies outside the lattice")
+            decoder = make_decoder(kind, data.features.shape[1], hidden)
+            decoder.load_state_dict(data.decoder)
+        except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(f"{where} does not hold a field that can be used ({reason}); fit it again") from error
+        blocks = len(data.keys)
+        return cls(
+            space,
+            resolution,
+            Topology(data.keys),
+            data.occupied.reshape(-1),
+            expand(data.density, data.node_index, blocks),
+            expand(data.features, data.node_index, blocks),
+            decoder,
+            background,
+            near,
+            fine,
         )

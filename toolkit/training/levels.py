@@ -2,57 +2,60 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from toolkit.networks.decoder import Deferred, PerSample
 from toolkit.render.field import Field
-from toolkit.volume.lookup import corners
+from toolkit.volume.edit import dilate, erase_empty_blocks, resample, split, with_corner_blocks
+from toolkit.volume.host import Host
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
 
 Tensor = torch.Tensor
+FEATURE_NOISE = 0.05
 
 
-def cell_places(topology: Topology, rows: Tensor) -> Tensor:
-    """(N,) voxel rows → (N, 3) int64 lattice coordinates (x, y, z)."""
-    slot, local = rows.div(VOXELS, rounding_mode="floor"), rows % VOXELS
-    inner = torch.stack([local & 7, (local >> 3) & 7, local >> 6], 1)
-    return topology.keys[slot].long() * BLOCK + inner
-
-
-def rows_of(topology: Topology, places: Tensor) -> Tensor:
-    """(N, 3) lattice coordinates → (N,) rows, -1 where there is no block."""
-    slot = topology.find(places >> 3)
-    local = places & 7
-    return torch.where(slot >= 0, slot * VOXELS + (local[:, 2] * BLOCK + local[:, 1]) * BLOCK + local[:, 0], -1)
-
-
-def blocks_for(places: Tensor) -> Tensor:
-    """Sorted block keys that hold the corners of voxels at (N, 3) lattice coordinates."""
-    corner = torch.tensor([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], device=places.device)
-    shift = 2**20
-    keys = torch.cat([torch.unique(_pack((places + offset) >> 3, shift)) for offset in corner])
-    packed = torch.unique(keys)
-    return torch.stack([(packed % (2 * shift)) - shift, (packed // (2 * shift)) % (2 * shift) - shift, packed // (4 * shift * shift) - shift], 1)
-
-
-def _pack(keys: Tensor, shift: int) -> Tensor:
-    return ((keys[:, 2] + shift) * 2 * shift + keys[:, 1] + shift) * 2 * shift + keys[:, 0] + shift
-
-
-def dense_cells(space: Space, resolution: int) -> Tensor:
-    """(N, 3) every voxel of the lattice that touches the space's box."""
+def all_places(space: Space, resolution: int) -> Tensor:
+    """(N, 3) lattice coordinates of every voxel that touches the space."""
     line = torch.arange(resolution)
     z, y, x = torch.meshgrid(line, line, line, indexing="ij")
     places = torch.stack([x.reshape(-1), y.reshape(-1), z.reshape(-1)], 1)
     if space.shell == 0:
         voxel = 2 * space.extent / resolution
         centre = (places + 0.5) * voxel - space.extent
-        places = places[(centre.abs() <= torch.tensor(space.box) + voxel).all(1)]
+        places = places[(centre.abs() <= torch.tensor(space.box) + 0.5 * voxel).all(1)]
     return places
 
 
-def new_field(
+def occupancy(places: Tensor) -> tuple[Topology, Tensor]:
+    """(N, 3) lattice coordinates of voxels → blocks that hold them and their corners, and (M · 512,) bool."""
+    block = places >> 3
+    low = block.amin(0) if len(block) else torch.zeros(3, dtype=torch.int64)
+    size = (block.amax(0) - low + 1) if len(block) else torch.ones(3, dtype=torch.int64)
+    code = ((block[:, 2] - low[2]) * size[1] + (block[:, 1] - low[1])) * size[0] + (block[:, 0] - low[0])
+    unique = torch.unique(code)
+    keys = torch.stack([unique % size[0], (unique // size[0]) % size[1], unique // (size[0] * size[1])], 1) + low
+    topology = Topology(keys.int())
+    local = places & 7
+    occupied = torch.zeros(topology.zero_row, dtype=torch.bool, device=places.device)
+    occupied[topology.find(block) * VOXELS + (local[:, 2] * BLOCK + local[:, 1]) * BLOCK + local[:, 0]] = True
+    return with_corner_blocks(topology, occupied)
+
+
+def _housed(field: Field, topology: Topology, occupied: Tensor, density: Tensor, feature: Tensor, resolution: int, host: Host) -> Field:
+    """The values in rows of the host, whose order of blocks may differ."""
+    voxel_size = 2 * field.space.extent / resolution * field.space.half
+    hosted = host.allocate(topology.keys, feature.shape[1], voxel_size)
+    slot = topology.find(hosted.topology.keys)
+    hosted.density[:-1].view(-1, VOXELS).copy_(density[:-1].view(-1, VOXELS)[slot])
+    hosted.feature[:-1].view(len(slot), -1).copy_(feature[:-1].view(len(slot), -1)[slot])
+    ordered = occupied.view(-1, VOXELS)[slot].reshape(-1)
+    return replace(field, resolution=resolution, topology=hosted.topology, occupied=ordered, density_rows=hosted.density, feature_rows=hosted.feature)
+
+
+def first_field(
     space: Space,
     resolution: int,
     places: Tensor,
@@ -62,81 +65,59 @@ def new_field(
     background: Tensor,
     near: float,
     fine: int,
+    host: Host,
     generator: torch.Generator,
 ) -> Field:
-    """A field with the voxels at `places` (N, 3), all of one density and grey but for a little noise that breaks the symmetry."""
-    topology = Topology(blocks_for(places))
+    """A field with the voxels at `places` (N, 3): one density everywhere, grey but for a little noise that breaks the symmetry."""
+    topology, occupied = occupancy(places.to(background.device))
     size = topology.zero_row + 1
-    occupied = torch.zeros(size - 1, dtype=torch.bool)
-    occupied[rows_of(topology, places)] = True
-    rows = torch.full((size,), raw_density)
-    features = torch.randn(size, channels, generator=generator) * 0.05
-    rows[-1] = 0
-    features[-1] = 0
-    return Field(space, resolution, topology, occupied, rows, features, decoder, background, near, fine)
-
-
-def regrid(field: Field, places: Tensor, resolution: int) -> Field:
-    """The same function on the voxels at `places` (N, 3) of a lattice with `resolution` voxels a side.
-
-    Trilinear, normalised by the weight of the corners that belong to occupied voxels, so that borders do not fade into what was never fitted.
-    """
-    ratio = field.resolution / resolution
-    topology = Topology(blocks_for(places))
-    size = topology.zero_row + 1
-    occupied = torch.zeros(size - 1, dtype=torch.bool, device=places.device)
-    occupied[rows_of(topology, places)] = True
-    old_rows, _ = corners(field.topology, field.occupied.nonzero().squeeze(1), torch.zeros(int(field.occupied.sum()), 3))
-    trained = torch.zeros(len(field.density_rows))
-    trained[old_rows.reshape(-1)] = 1
-    trained[-1] = 0
-    values = torch.cat([field.density_rows[:, None], field.feature_rows, torch.ones(len(trained), 1)], 1) * trained[:, None]
-    out = torch.zeros(size, values.shape[1])
-    step = 512
-    for start in range(0, topology.blocks, step):  # in pieces, so that memory stays bounded
-        rows = torch.arange(start * VOXELS, min(start + step, topology.blocks) * VOXELS)
-        place = cell_places(topology, rows).float() * ratio
-        whole = place.floor().clamp(0, field.resolution - 1)
-        base = rows_of(field.topology, whole.long())
-        known = (base >= 0).nonzero().squeeze(1)
-        corner_rows, corner_weights = corners(field.topology, base[known], (place - whole)[known])
-        out[rows[known]] = torch.nn.functional.embedding_bag(corner_rows, values, mode="sum", per_sample_weights=corner_weights)
-    weight = out[:, -1:]
-    out = torch.where(weight > 1e-6, out / weight.clamp_min(1e-6), out)
-    return Field(field.space, resolution, topology, occupied, out[:, 0].contiguous(), out[:, 1:-1].contiguous(), field.decoder, field.background, field.near, field.fine)
-
-
-def dilate(topology: Topology, mask: Tensor) -> Tensor:
-    """(M · 512,) voxels grown by one in the 26-neighbourhood, within the blocks that there are."""
-    padded = torch.cat([mask, mask.new_zeros(1)])
-    out = torch.empty_like(mask)
-    step = 2048
-    for start in range(0, topology.blocks, step):
-        halo = padded[topology.halo_chunk(start, start + step).long()].view(-1, 1, 10, 10, 10).to(torch.uint8).float()
-        grown = torch.nn.functional.max_pool3d(halo, 3, 1) > 0
-        out[start * VOXELS : start * VOXELS + grown.numel()] = grown.view(-1)
-    return out
+    density = torch.full((size,), raw_density, device=background.device)
+    feature = (torch.randn(size, channels, generator=generator) * FEATURE_NOISE).to(background.device)
+    start = Field(space, resolution, topology, occupied, density, feature, decoder, background, near, fine)
+    return _housed(start, topology, occupied, density, feature, resolution, host)
 
 
 def visible(field: Field, seen: Tensor, threshold: float) -> Tensor:
-    """(M · 512,) bool: occupied voxels within one voxel of one that a training ray saw with weight T·α above `threshold`."""
-    return dilate(field.topology, seen > threshold) & field.occupied
+    """(M · 512,) bool: occupied voxels within one voxel of one that a training ray saw with a weight T·α above `threshold`.
+
+    When nothing was seen that strongly (a very thin start), everything occupied stays.
+    """
+    strong = seen > threshold
+    if not bool(strong.any()):
+        return field.occupied
+    return dilate(field.topology, strong, 1, grow=False)[1] & field.occupied
 
 
-def finer_places(field: Field, keep: Tensor, resolution: int) -> Tensor:
-    """(N, 3) voxels of the finer lattice whose centres lie in the voxels `keep` (M · 512,) of the field's lattice."""
-    ratio = resolution / field.resolution
-    places = cell_places(field.topology, keep.nonzero().squeeze(1))
-    if ratio == 2:
-        child = torch.tensor([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)])
-        return (places[:, None] * 2 + child).view(-1, 3)
-    # centre of new voxel j lies in old voxel floor((j + ½) / ratio)
-    low = torch.ceil(places * ratio - 0.5).long()
-    high = torch.ceil((places + 1) * ratio - 0.5).long()
+def pruned(field: Field, keep: Tensor) -> Field:
+    """The field with only the voxels `keep` (M · 512,) occupied; rows stay where they are, so optimiser state stays good."""
+    return replace(field, occupied=field.occupied & keep)
+
+
+def finer(field: Field, keep: Tensor, resolution: int, host: Host) -> Field:
+    """The same function, where `keep` says, on a lattice of `resolution` voxels a side; rows are new."""
+    values = [field.density_rows, field.feature_rows]
+    topology, occupied, rows = erase_empty_blocks(field.topology, field.occupied & keep, values)
+    if resolution == 2 * field.resolution:
+        topology, occupied, rows = split(topology, occupied, rows)
+    else:
+        new_topology, new_occupied = occupancy(_finer_places(topology, occupied, resolution / field.resolution))
+        rows = resample(topology, occupied, rows, new_topology.keys, field.resolution / resolution)
+        topology, occupied = new_topology, new_occupied
+    return _housed(field, topology, occupied, rows[0], rows[1], resolution, host)
+
+
+def _finer_places(topology: Topology, occupied: Tensor, ratio: float) -> Tensor:
+    """(N, 3) voxels of the finer lattice whose centres lie in occupied voxels: j with floor((j + ½) / ratio) = i."""
+    row = occupied.nonzero().squeeze(1)
+    slot, local = row.div(VOXELS, rounding_mode="floor"), row % VOXELS
+    place = topology.keys[slot].long() * BLOCK + torch.stack([local & 7, (local >> 3) & 7, local >> 6], 1)
+    low = torch.ceil(place.double() * ratio - 0.5).long()
+    high = torch.ceil((place + 1).double() * ratio - 0.5).long()
     parts = []
-    for z in range(int(ratio) + 1):
-        for y in range(int(ratio) + 1):
-            for x in range(int(ratio) + 1):
-                place = low + torch.tensor([x, y, z])
-                parts.append(place[(place < high).all(1)])
+    reach = range(int(ratio) + 1)
+    for z in reach:
+        for y in reach:
+            for x in reach:
+                moved = low + torch.tensor([x, y, z], device=low.device)
+                parts.append(moved[(moved < high).all(1)])
     return torch.cat(parts)
