@@ -33,7 +33,7 @@ def test_identical() -> None:
     assert found["delta_1"] == found["within_5_percent"] == found["coverage"] == 1
 
 
-@pytest.mark.parametrize("missing", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("missing", [0.0, -1.0, 1e-300, np.nan, np.inf])
 def test_missing_depth_is_not_compared(missing: float) -> None:
     truth = np.full((4, 5), 2.0)
     rendered = truth.copy()
@@ -60,7 +60,7 @@ def test_sizes_must_agree() -> None:
         depth_metrics(np.ones((3, 3)), np.ones((3, 3)), np.ones((4, 3), dtype=bool))
 
 
-@given(seed=st.integers(0, 10**6), scale=st.floats(1e-3, 1e3), noise=st.floats(0, 2), holes=st.floats(0, 1))
+@given(seed=st.integers(0, 10**6), scale=st.floats(1e-3, 1e3), noise=st.just(0.0) | st.floats(1e-3, 2), holes=st.floats(0, 1))
 @settings(max_examples=80, deadline=None)
 def test_ranges_symmetry_scale(seed: int, scale: float, noise: float, holes: float) -> None:
     rng = np.random.default_rng(seed)

@@ -82,7 +82,9 @@ def test_make_pictures_of_both_methods() -> None:
     assert (view.methods["tsdf"].depth[:, 0] == MISSING).all()
     assert found.depth_range is not None and 1 <= found.depth_range[0] < found.depth_range[1] <= 3.3
     shape = view.truth.shape
-    assert all(tile.shape == shape and tile.dtype == np.uint8 for one in view.methods.values() for tile in (one.render, one.error, one.depth))
+    assert all(
+        tile.shape == shape and tile.dtype == np.uint8 for one in view.methods.values() for tile in (one.render, one.error, one.depth)
+    )
 
 
 def test_only_some_of_many_views() -> None:

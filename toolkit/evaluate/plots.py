@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from typing import Any
 
 import matplotlib
@@ -27,6 +28,7 @@ CSS = {
     PALE: "var(--pale, #a9c3e6)",
 }
 SANS = "system-ui, -apple-system, 'Segoe UI', 'Helvetica Neue', Arial, sans-serif"
+LONGEST_NAME = 24  # letters
 METADATA: dict[str, Any] = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
 
@@ -46,7 +48,8 @@ def _figure(width: float, height: float) -> tuple[Figure, Axes]:
 def _svg(figure: Figure, title: str, salt: str) -> str:
     """The figure as an SVG element that fills the width it is given."""
     buffer = io.StringIO()
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": salt, "font.family": "sans-serif"}):
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": salt, "font.family": "sans-serif"}), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # letters that matplotlib's own font lacks are drawn by the browser
         figure.savefig(buffer, format="svg", metadata=METADATA)
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
@@ -101,6 +104,13 @@ def psnr_over_time(timeline: list[dict[str, Any]], levels: dict[str, float | Non
     return _svg(figure, "PSNR on test views over seconds of fitting", "time")
 
 
+def shown_name(stage: dict[str, Any]) -> str:
+    """A stage's name, shortened so that the bars keep their room, and with no formula for matplotlib to find in it."""
+    name = str(stage.get("name") or "")
+    name = name if len(name) <= LONGEST_NAME else name[: LONGEST_NAME - 1] + "…"
+    return name.replace("$", r"\$")
+
+
 def bar_label(stage: dict[str, Any]) -> str:
     """Time and memory of a stage in a few words."""
     parts = [duration(stage["seconds"])]
@@ -122,7 +132,7 @@ def stage_bars(stages: list[dict[str, Any]]) -> str | None:
     bars = axes.barh(places, seconds, color=[PALE if stage.get("cached") else ACCENT for stage in known], height=0.62)
     labels = [bar_label(stage) for stage in known]
     axes.bar_label(bars, labels=labels, padding=5, color=INK, fontsize=9.5)
-    axes.set_yticks(places, labels=[str(stage.get("name", "")).replace("$", r"\$") for stage in known], color=INK)
+    axes.set_yticks(places, labels=[shown_name(stage) for stage in known], color=INK)
     axes.invert_yaxis()
     axes.spines["bottom"].set_visible(False)
     axes.set_xticks([])

@@ -15,13 +15,9 @@ def significant(value: float | None, digits: int = 3) -> str:
     """`digits` significant digits, without an exponent where people would not write one."""
     if value is None:
         return NONE
-    return (
-        f"{value:.{digits}g}"
-        if value == 0 or 1e-4 <= abs(value) < 10**digits
-        else f"{value:.{digits}e}"
-        if abs(value) < 1e-4
-        else f"{value:,.0f}"
-    )
+    if abs(value) >= 10**digits:
+        return f"{value:,.0f}"
+    return f"{value:.{digits}g}" if value == 0 or abs(value) >= 1e-4 else f"{value:.{digits - 1}e}"
 
 
 def whole(value: float | None) -> str:
