@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from toolkit.camera import Array
@@ -59,17 +58,17 @@ def turn_about_z(degrees: float) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def tight_turn(points: Array) -> float:
-    """Degrees to turn (P, 3) points about z for the smallest axis-aligned footprint, within ±45°; 0 when it gains less than a tenth."""
-    flat = np.ascontiguousarray(points[:, :2] - points[:, :2].mean(axis=0), dtype=np.float32)
-    (_, (width, height), _) = cv2.minAreaRect(flat)
-    extent = np.ptp(flat, axis=0)
-    if width * height > GAIN * extent[0] * extent[1]:
-        return 0.0
-    corners = cv2.boxPoints(cv2.minAreaRect(flat))
-    edge = corners[1] - corners[0]
-    angle = float(np.degrees(np.arctan2(edge[1], edge[0])))
-    return -((angle + 45.0) % 90.0 - 45.0)
+def tight_turn(points: Array, percents: tuple[float, float] = (0.5, 99.5)) -> float:
+    """Degrees to turn (P, 3) points about z for the smallest axis-aligned footprint, within ±45°; 0 when it gains less than a tenth.
+
+    The footprint spans percentiles, so that stray points do not decide.
+    """
+    angles = np.arange(-45.0, 45.0, 1.5)
+    turned = np.einsum("aij,pj->api", np.stack([turn_about_z(float(a))[:2, :2] for a in angles]), points[:, :2])  # (angles, P, 2)
+    low, high = np.percentile(turned, percents, axis=1)
+    areas = np.prod(high - low, axis=1)
+    best = int(np.argmin(areas))
+    return float(angles[best]) if areas[best] < GAIN * areas[np.flatnonzero(angles == 0)[0]] else 0.0
 
 
 def _unit(vector: Array) -> Array:

@@ -68,7 +68,7 @@ def _features(picture: Array, camera: Intrinsics) -> tuple[Array, Array, float]:
     scale = min(1.0, LONG_SIDE / max(width, height))
     grey = cv2.cvtColor(np.ascontiguousarray(picture[..., :3]), cv2.COLOR_RGB2GRAY)
     small = grey if scale == 1.0 else cv2.resize(grey, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
-    keypoints, descriptors = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.02).detectAndCompute(small, None)
+    keypoints, descriptors = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.02).detectAndCompute(small, None)
     if descriptors is None or len(keypoints) == 0:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32), scale * width / camera.width
     pixels = (np.array([k.pt for k in keypoints]) + 0.5) * [camera.width / small.shape[1], camera.height / small.shape[0]]

@@ -16,6 +16,7 @@ FORWARD = "forward"  # cameras look one way
 INWARD = 0.85  # share of cameras that must have the common point before them
 MISS = 0.35  # median distance of an axis from the common point, relative to the camera's distance
 TURNED = 0.02  # mean squared sine of axes about their mean direction that makes them converge (about 8°)
+SURROUND = 0.25  # the same (30°) where depth shows the whole extent: a depth camera that sways in a room looks at the room
 REACH = 0.8  # radius of an object's ball, relative to the median camera distance
 CLEAR = 0.95  # and to the distance of the nearest tenth of the cameras
 MARGIN = 0.05  # of the box on each side
@@ -34,8 +35,8 @@ class Layout:
     nearest: float  # distance of the closest tenth
 
 
-def layout(world_from_camera: Array) -> Layout:
-    """Inward, outward or forward, from the poses alone."""
+def layout(world_from_camera: Array, with_depth: bool = False) -> Layout:
+    """Inward, outward or forward, from the poses alone; with depth maps more is asked of inward."""
     focus, depth, miss = convergence(world_from_camera)
     centres, axes = world_from_camera[:, :3, 3], world_from_camera[:, :3, 2]
     away = np.linalg.norm(centres - focus, axis=1)
@@ -43,7 +44,7 @@ def layout(world_from_camera: Array) -> Layout:
     mean = axes.mean(axis=0)
     length = float(np.linalg.norm(mean))
     turned = 1.0 if length < 1e-9 else float(1 - np.mean((axes @ (mean / length)) ** 2))
-    if turned > TURNED and np.mean(depth > 0) >= INWARD and np.median(miss / np.maximum(away, 1e-12)) < MISS:
+    if turned > (SURROUND if with_depth else TURNED) and np.mean(depth > 0) >= INWARD and np.median(miss / np.maximum(away, 1e-12)) < MISS:
         kind = OBJECT
     elif length > 0.85:
         kind = FORWARD

@@ -14,7 +14,7 @@ from toolkit.poses.cloud import Cloud, cloud_of_depth, cloud_of_points
 from toolkit.poses.gravity import rotation_to_z, tight_turn, turn_about_z, up_direction
 from toolkit.poses.hull import silhouette_cloud
 from toolkit.poses.points import triangulate
-from toolkit.poses.region import ALL, FORWARD, Layout, box, layout, points_of_interest
+from toolkit.poses.region import FORWARD, Layout, box, layout, points_of_interest
 from toolkit.progress import SILENT, Progress
 
 MEDIAN_DEPTH = 1.5  # working units, for captures without scale
@@ -33,7 +33,7 @@ class Scene:
     near: float  # closest depth that matters to a camera
     far: float  # farthest depth seen, background included
     background_share: float  # share of observations that lie beyond the region
-    has_background: bool
+    has_background: bool  # whether space beyond the region has to be modelled
     metric: bool
     layout: str = "object"  # object (cameras look inwards) | room (around) | forward (one way)
     up_reason: str = ""
@@ -109,10 +109,10 @@ def describe_scene(capture: Capture, progress: Progress = SILENT) -> Scene:
     up, reason = up_direction(poses, capture.up)
     rotation = rotation_to_z(up)
     upright = Similarity(scale, rotation, -scale * (rotation @ origin))
-    found = layout(upright.poses(poses))
+    found = layout(upright.poses(poses), with_depth=cloud.source == "depth")
     points = upright.points(cloud.points)
     bounded = cloud.source in ("silhouettes", "depth")
-    turn = turn_about_z(_turn(found, upright.poses(poses), points, cloud, bounded, capture))
+    turn = turn_about_z(_turn(found, upright.poses(poses), points, cloud, bounded))
     centre, half, inside = _region(Layout(found.kind, turn @ found.focus, found.distance, found.nearest), points @ turn.T, cloud, bounded)
     working = Similarity(scale, turn @ rotation, turn @ upright.translation - centre)
     views = cloud.views
@@ -128,7 +128,8 @@ def describe_scene(capture: Capture, progress: Progress = SILENT) -> Scene:
         near=0.7 * float(np.percentile(depths, 0.5)),
         far=float(max(1.2 * np.percentile(depths, 99.5), min(reach, 1e3 * depth * scale))),
         background_share=beyond,
-        has_background=beyond > BEYOND and cloud.source != "silhouettes",
+        # Without alpha or depth, pictures are full to the rim, and what has no texture left no points to count.
+        has_background=not bounded or beyond > BEYOND,
         metric=capture.metric,
         layout=found.kind,
         up_reason=reason,
@@ -154,19 +155,15 @@ def find_cloud(capture: Capture, progress: Progress = SILENT) -> Cloud:
     return triangulate(capture, progress)
 
 
-def _turn(found: Layout, poses: Array, points: Array, cloud: Cloud, bounded: bool, capture: Capture) -> float:
+def _turn(found: Layout, poses: Array, points: Array, cloud: Cloud, bounded: bool) -> float:
     """Degrees about z that make the region's box fit: along the view when cameras look one way, else tight around the points."""
-    if found.kind == FORWARD:
+    if found.kind == FORWARD and not bounded:
         ahead = poses[:, :2, 2].mean(axis=0)
         if np.linalg.norm(ahead) > 0.3:
             return float(90 - np.degrees(np.arctan2(ahead[1], ahead[0])))  # looking along +y
         return 0.0
-    if capture.up is not None and not bounded:
-        return 0.0
-    chosen, weights, _ = points_of_interest(found, points, cloud.views, bounded)
-    centre, half = box(points[chosen], weights[chosen], ALL, 0.0)
-    core = np.all(np.abs(points - centre) <= half, axis=1) & chosen
-    return tight_turn(points[core]) if np.count_nonzero(core) >= FEW_POINTS else 0.0
+    chosen, _, _ = points_of_interest(found, points, cloud.views, bounded)
+    return tight_turn(points[chosen]) if np.count_nonzero(chosen) >= FEW_POINTS else 0.0
 
 
 def _region(found: Layout, points: Array, cloud: Cloud, bounded: bool) -> tuple[Array, Array, Array]:
