@@ -180,6 +180,13 @@ def test_page_shows_what_counts(tmp_path: Path) -> None:
     assert sum(tag == "svg" for tag, _ in page.tags) == 2
 
 
+@pytest.mark.parametrize(("source", "title"), [("/data/my fox/", "my fox"), ("room.mp4", "room.mp4"), ("/", "Report"), (None, "Report")])
+def test_title_is_the_captures_name(source: str | None, title: str) -> None:
+    page = check_page(render_page(report_data({"source": source, "created": "2026-03-02T14:05:33+00:00"}), Pictures()))
+    assert f" Fieldfuse {title} " in page.text and "2026-03-02 14:05 UTC" in page.text
+    assert source is None or source in page.text
+
+
 def test_embedded_pictures_decode() -> None:
     data, pictures = sample()
     page = check_page(render_page(report_data(data), pictures))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from datetime import datetime
 from importlib import resources
 from typing import Any
 from urllib.parse import quote
@@ -113,6 +114,21 @@ def headline(data: dict[str, Any]) -> list[tuple[str, str, str]]:
     return out
 
 
+def short_name(source: Any) -> str:
+    """The last part of a path: what people call their capture."""
+    text = str(source or "").rstrip("/")
+    return text.rsplit("/", 1)[-1] or text
+
+
+def moment(created: Any) -> str:
+    """An ISO time as date and minute; any other text as it is."""
+    try:
+        time = datetime.fromisoformat(str(created))
+    except ValueError:
+        return str(created)
+    return f"{time:%Y-%m-%d %H:%M} {time.tzname() or ''}".rstrip()
+
+
 def subtitle(data: dict[str, Any]) -> list[str]:
     """The line under the title, in parts: what the capture is and when it was made."""
     capture = data["capture"]
@@ -122,7 +138,7 @@ def subtitle(data: dict[str, Any]) -> list[str]:
     if capture["width"] is not None and capture["height"] is not None:
         out.append(f"{capture['width']}×{capture['height']}")
     out += {"sfm": ["poses computed"], "given": ["poses given"]}.get(str(data["poses"]["source"]), [])
-    return out + ([str(data["created"])] if data["created"] else [])
+    return out + ([moment(data["created"])] if data["created"] else [])
 
 
 def export_rows(data: dict[str, Any]) -> list[dict[str, Any]]:
@@ -162,7 +178,7 @@ def render_page(data: dict[str, Any], pictures: Pictures) -> str:
     near, far = pictures.depth_range or (None, None)
     return template.render(
         data=data,
-        title=data["source"] or "Report",
+        title=short_name(data["source"]) or "Report",
         subtitle=subtitle(data),
         unit=words.unit_of(data),
         headline=headline(data),
