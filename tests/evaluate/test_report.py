@@ -180,6 +180,14 @@ def test_page_shows_what_counts(tmp_path: Path) -> None:
     assert sum(tag == "svg" for tag, _ in page.tags) == 2
 
 
+def test_exports_may_be_paths_alone(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(b"12345")
+    assert report_data({"exports": [tmp_path / "a.ply", "b.ply"]}, tmp_path)["exports"] == [
+        {"path": "a.ply", "bytes": 5},
+        {"path": "b.ply", "bytes": None},
+    ]
+
+
 @pytest.mark.parametrize(("source", "title"), [("/data/my fox/", "my fox"), ("room.mp4", "room.mp4"), ("/", "Report"), (None, "Report")])
 def test_title_is_the_captures_name(source: str | None, title: str) -> None:
     page = check_page(render_page(report_data({"source": source, "created": "2026-03-02T14:05:33+00:00"}), Pictures()))
@@ -292,4 +300,9 @@ def test_table_for_the_terminal() -> None:
     assert "13 frames, 12 of 13 with a pose" in text and "6 min 12 s in all" in text
     assert max(map(len, text.splitlines())) <= 100
     assert table(report_data(data)) == text
-    assert "PSNR" in table({})
+
+
+def test_table_without_scores_is_the_facts() -> None:
+    assert table({}) == ""
+    data = {"capture": {"frames": 50}, "poses": {"registered": 48, "total": 50}, "exports": "run/exports/cameras"}
+    assert table(data) == "50 frames, 48 of 50 with a pose\n"

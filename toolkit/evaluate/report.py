@@ -102,6 +102,11 @@ def report_data(data: dict[str, Any], folder: Path | None = None) -> dict[str, A
     notes = [str(note) for note in data.get("notes") or []]
     if poses["source"] == "sfm" and (evaluation["field"] or evaluation["tsdf"]) and SFM_NOTE not in notes:
         notes.append(SFM_NOTE)
+    exports = data.get("exports")
+    if isinstance(exports, str):
+        exports = [exports]
+    if isinstance(exports, list):
+        exports = [{"path": entry} if isinstance(entry, str) else entry for entry in exports]
     known = {
         "version": data.get("version") or __version__,
         "command": data.get("command"),
@@ -117,7 +122,7 @@ def report_data(data: dict[str, Any], folder: Path | None = None) -> dict[str, A
         "evaluation": evaluation,
         "timeline": _parts(data.get("timeline"), POINT, "timeline"),
         "stages": _parts(data.get("stages"), STAGE, "stages"),
-        "exports": _exports(_parts(data.get("exports"), ("path", "bytes"), "exports"), folder),
+        "exports": _exports(_parts(exports, ("path", "bytes"), "exports"), folder),
         "settings": data.get("settings") or {},
     }
     return {**known, **{key: value for key, value in data.items() if key not in known and key != "baseline"}}
@@ -132,7 +137,7 @@ def write_report(folder: Path | str, data: dict[str, Any], pictures: Pictures | 
             `warnings`, `notes` (lists of sentences); `capture` {kind, frames, width, height}; `poses` {source, registered, total, models,
             missing}; `scene` {metric, …}; `field` {voxel_size, blocks, voxels, bytes}; `evaluation` {field, tsdf} as `score_views` answers;
             `baseline` as `nearest_image_scores` answers (in the JSON it is `evaluation.nearest_image`); `timeline` [{seconds, psnr}];
-            `stages` [{name, seconds, peak_memory_mb, cached}]; `exports` [{path, bytes, facts to show}]; `settings` (nested plain data).
+            `stages` [{name, seconds, peak_memory_mb, cached}]; `exports` [{path, bytes, facts to show}] or paths; `settings` (nested plain data).
         pictures: as `make_pictures` answers; None: none.
 
     Returns:

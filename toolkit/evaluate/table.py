@@ -61,7 +61,10 @@ def facts(data: dict[str, Any]) -> list[str]:
 
 
 def table(data: dict[str, Any], width: int = 100) -> str:
-    """`headline_table` as plain text lines of at most `width` characters."""
+    """`headline_table` as plain text lines of at most `width` characters; the facts alone when nothing was scored."""
+    whole = headline_table(data)
+    if whole.row_count == 0:
+        return "".join(f"{line}\n" for line in facts(report_data(data)))
     stream = io.StringIO()
-    Console(file=stream, width=width, color_system=None, force_terminal=False).print(headline_table(data))
+    Console(file=stream, width=width, color_system=None, force_terminal=False).print(whole)
     return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()) + "\n"
