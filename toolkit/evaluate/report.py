@@ -137,7 +137,7 @@ def write_report(folder: Path | str, data: dict[str, Any], pictures: Pictures | 
             `warnings`, `notes` (lists of sentences); `capture` {kind, frames, width, height}; `poses` {source, registered, total, models,
             missing}; `scene` {metric, …}; `field` {voxel_size, blocks, voxels, bytes}; `evaluation` {field, tsdf} as `score_views` answers;
             `baseline` as `nearest_image_scores` answers (in the JSON it is `evaluation.nearest_image`); `timeline` [{seconds, psnr}];
-            `stages` [{name, seconds, peak_memory_mb, cached}]; `exports` [{path, bytes, facts to show}] or paths; `settings` (nested plain data).
+            `stages` [{name, seconds, peak_memory_mb, cached}]; `exports` [{path, bytes, facts}] or paths; `settings` (nested plain data).
         pictures: as `make_pictures` answers; None: none.
 
     Returns:
