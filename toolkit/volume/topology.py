@@ -86,7 +86,8 @@ class Topology:
 
     def to(self, device: torch.device | str) -> Topology:
         """The same blocks in the same order on another device (self when already there)."""
-        return self if torch.device(device) == self.device else Topology(self.keys.to(device), self._max_table_cells)
+        keys = self.keys.to(device)
+        return self if keys.device == self.device else Topology(keys, self._max_table_cells)
 
     def _cells(self, wide: Tensor) -> Tensor:
         """(..., 3) int64 keys inside the table's box → (...) flat cell."""
