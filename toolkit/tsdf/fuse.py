@@ -1,0 +1,298 @@
+"""Classic TSDF fusion (Curless and Levoy 1996) of depth frames on Open3D's `VoxelBlockGrid` with blocks of 8³ voxels.
+
+What Open3D 0.20 does and this file takes care of:
+- `integrate` reads the depth pixel by cutting the decimals off, so it needs the matrix with pixel centres at +0.5, while
+  `compute_unique_block_coordinates` unprojects whole pixel numbers and needs centres at whole numbers; with one matrix for
+  both the surface moves by half a pixel.
+- 16-bit depth with 8-bit colour is its fastest pair of types (others convert each picture); depth is stored in 1/60000 of the range.
+- A frame without valid depth raises; the weight threshold is exclusive, so 3 needs four observations.
+- `VoxelBlockGrid.ray_cast` can hang on the CPU, leaves tiles empty, and its depth is off by up to a voxel: views are rendered by ray
+  casting the extracted mesh.
+- The table grows when the keys passed would not fit, present or not, and growth copies everything: room is made beforehand.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import open3d as o3d
+import open3d.core as o3c
+
+from toolkit.camera import Array, Intrinsics, Similarity, invert
+from toolkit.capture.types import Capture
+from toolkit.config import TsdfSettings
+from toolkit.errors import InputError
+from toolkit.progress import SILENT, Progress
+from toolkit.tsdf.frames import DepthFrame, automatic_depth_max, automatic_voxel_size, capture_depth_frames
+from toolkit.tsdf.mesh import Mesh, as_bytes
+from toolkit.tsdf.view import MeshView, SurfaceCaster
+
+__all__ = ["DepthFrame", "MeshView", "Points", "TsdfVolume", "capture_depth_frames", "estimate_blocks", "fuse_capture", "fuse_frames"]
+
+log = logging.getLogger(__name__)
+
+BLOCK = 8
+DEPTH_STEPS = 60000  # 16-bit depth: this value is depth_max, what saturates above it is out of range
+BYTES_PER_BLOCK = BLOCK**3 * (1 + 1 + 3) * 4
+MAX_BYTES = 4 * 2**30
+SAMPLE_FRAMES = 12  # frames looked at before fusion, for voxel size, range and memory
+DEVICE = o3c.Device("CPU:0")
+
+
+@dataclass(frozen=True)
+class Points:
+    """Coloured surface points with normals."""
+
+    points: Array  # (P, 3) float64
+    colours: Array  # (P, 3) uint8
+    normals: Array  # (P, 3) float64 unit length, out of the surface
+
+
+def default_weight_threshold(frames: int) -> float:
+    """How often a voxel must have been seen, exclusive: once up to 10 frames, twice up to 40, then three times.
+
+    Open3D's own 3 (four times) removes surface that a short or fast capture saw only once or twice; with many frames single sightings
+    are mostly noise at depth edges.
+    """
+    return 0.5 if frames <= 10 else 1.5 if frames <= 40 else 2.5
+
+
+class TsdfVolume:
+    """A truncated signed distance volume with colour.
+
+    Args:
+        voxel_size, depth_max: working units; depth beyond depth_max is not fused.
+        truncation: half width of the band around the surface, in voxels.
+        expected_blocks: room made beforehand (see `estimate_blocks`); it grows when that was too little.
+        max_bytes: bound of the voxels' memory.
+    """
+
+    def __init__(
+        self, voxel_size: float, depth_max: float, truncation: float = 4.0, expected_blocks: int = 4000, max_bytes: int = MAX_BYTES
+    ) -> None:
+        for name, value in (("voxel size", voxel_size), ("largest depth", depth_max), ("truncation", truncation)):
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"the {name} of the TSDF is {value:g}; it must be a positive number")
+        self.voxel_size, self.depth_max, self.truncation = float(voxel_size), float(depth_max), float(truncation)
+        self.max_blocks = max(1, max_bytes // BYTES_PER_BLOCK)
+        self.frames = 0
+        self.empty_frames = 0
+        self.grid = o3d.t.geometry.VoxelBlockGrid(
+            ("tsdf", "weight", "color"),
+            (o3c.float32, o3c.float32, o3c.float32),
+            ((1,), (1,), (3,)),
+            self.voxel_size,
+            BLOCK,
+            int(np.clip(expected_blocks, 64, self.max_blocks)),
+            DEVICE,
+        )
+        self._scale = DEPTH_STEPS / self.depth_max
+        self._caster: tuple[int, SurfaceCaster] | None = None
+
+    @property
+    def blocks(self) -> int:
+        return int(self.grid.hashmap().size())
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the voxels that are in use."""
+        return self.blocks * BYTES_PER_BLOCK
+
+    def integrate(self, frame: DepthFrame) -> bool:
+        """Fuse one frame; False when it holds no depth within range.
+
+        Raises:
+            InputError: the volume would outgrow its memory.
+        """
+        depth = self._quantised(frame.depth)
+        extrinsic = o3c.Tensor(invert(frame.world_from_camera))
+        keys = self._touched(depth, frame.depth_intrinsics, extrinsic)
+        if keys is None:
+            self.empty_frames += 1
+            return False
+        self._make_room(keys)
+        self.grid.integrate(
+            keys,
+            depth,
+            o3d.t.geometry.Image(np.ascontiguousarray(frame.colour)),
+            o3c.Tensor(frame.depth_intrinsics.matrix()),
+            o3c.Tensor(_colour_matrix(frame.colour_intrinsics, frame.depth_intrinsics)),
+            extrinsic,
+            self._scale,
+            self.depth_max,
+            self.truncation,
+        )
+        self.frames += 1
+        return True
+
+    def touched(self, frame: DepthFrame) -> Array:
+        """(B, 3) int32 keys of the blocks that a frame would write to; nothing is allocated."""
+        keys = self._touched(self._quantised(frame.depth), frame.depth_intrinsics, o3c.Tensor(invert(frame.world_from_camera)))
+        return np.zeros((0, 3), np.int32) if keys is None else keys.numpy()
+
+    def mesh(self, weight_threshold: float | None = None) -> Mesh:
+        """The surface, uncleaned, in the working frame.
+
+        Raises:
+            InputError: no frame with valid depth was fused.
+        """
+        self._require_frames()
+        threshold = default_weight_threshold(self.frames) if weight_threshold is None else weight_threshold
+        mesh = self.grid.extract_triangle_mesh(threshold)
+        if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
+            return Mesh.empty()
+        vertex = mesh.vertex
+        return Mesh.create(
+            vertex.positions.numpy(), mesh.triangle.indices.numpy(), as_bytes(vertex.colors.numpy() / 255), _unit(vertex.normals.numpy())
+        )
+
+    def points(self, weight_threshold: float | None = None) -> Points:
+        """Surface points where the distance changes sign along a lattice edge, in the working frame.
+
+        Raises:
+            InputError: no frame with valid depth was fused.
+        """
+        self._require_frames()
+        threshold = default_weight_threshold(self.frames) if weight_threshold is None else weight_threshold
+        cloud = self.grid.extract_point_cloud(threshold)
+        if "positions" not in cloud.point or len(cloud.point.positions) == 0:
+            return Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)))
+        point = cloud.point
+        return Points(point.positions.numpy().astype(np.float64), as_bytes(point.colors.numpy() / 255), _unit(point.normals.numpy()))
+
+    def render(self, intrinsics: Intrinsics, world_from_camera: Array) -> MeshView:
+        """Colour, depth and mask as a camera sees the surface. The surface is extracted once and again after new frames.
+
+        Raises:
+            InputError: no frame with valid depth was fused.
+        """
+        if self._caster is None or self._caster[0] != self.frames:
+            self._caster = (self.frames, SurfaceCaster(self.mesh()))
+        return self._caster[1].render(intrinsics, world_from_camera)
+
+    def _quantised(self, depth: Array) -> o3d.t.geometry.Image:
+        # One pass: scaled, rounded and saturated; NaN, infinite and negative become 0. Then what is out of range becomes 0 too.
+        steps = cv2.multiply(np.ascontiguousarray(depth, dtype=np.float32), self._scale, dtype=cv2.CV_16U)
+        _, steps = cv2.threshold(steps, DEPTH_STEPS, 0, cv2.THRESH_TOZERO_INV)
+        return o3d.t.geometry.Image(steps)
+
+    def _touched(self, depth: o3d.t.geometry.Image, intrinsics: Intrinsics, extrinsic: o3c.Tensor) -> o3c.Tensor | None:
+        matrix = o3c.Tensor(intrinsics.matrix_integer_centres())
+        try:
+            return self.grid.compute_unique_block_coordinates(depth, matrix, extrinsic, self._scale, self.depth_max, self.truncation)
+        except RuntimeError as error:  # Open3D's way to say that no pixel it looked at has depth
+            if "No block is touched" not in str(error):
+                raise
+            return None
+
+    def _make_room(self, keys: o3c.Tensor) -> None:
+        table = self.grid.hashmap()
+        needed = table.size() + len(keys)
+        if needed <= table.capacity():
+            return
+        if needed > self.max_blocks:
+            _, present = table.find(keys)
+            fresh = int((~present.numpy()).sum())
+            if table.size() + fresh > self.max_blocks:
+                raise too_fine(self.voxel_size, table.size() + fresh, self.max_blocks)
+        # Open3D counts present keys again when it decides whether to grow, so the room must hold them twice.
+        table.reserve(max(needed, min(2 * table.capacity(), self.max_blocks)))
+
+    def _require_frames(self) -> None:
+        if self.frames == 0:
+            raise InputError(
+                f"no frame has valid depth between 0 and {self.depth_max:g}, so there is nothing to fuse; check the depth maps and tsdf.depth_max"
+            )
+
+
+def too_fine(voxel_size: float, blocks: int, max_blocks: int) -> InputError:
+    """The refusal of a voxel size whose surface does not fit into memory; blocks on a surface fall with the square of the voxel size."""
+    fits = float(f"{voxel_size * (1.2 * blocks / max_blocks) ** 0.5:.1e}")
+    return InputError(
+        f"a voxel size of {voxel_size:g} needs more than {blocks * BYTES_PER_BLOCK / 2**30:.1f} GB for the TSDF, and"
+        f" {max_blocks * BYTES_PER_BLOCK / 2**30:.1f} GB are allowed; use tsdf.voxel_size={max(fits, 1.1 * voxel_size):.2g} or larger"
+    )
+
+
+def estimate_blocks(sample: Sequence[DepthFrame], volume: TsdfVolume, total: int) -> int:
+    """Blocks that `total` frames will need, from an evenly spread sample of them: the blocks it touches, and as much again for what
+    lies between when the sample's frames overlap little.
+
+    Raises:
+        InputError: the sample alone needs more than the volume may hold.
+    """
+    union = np.zeros((0, 3), np.int32)
+    passed = largest = 0
+    for frame in sample:
+        keys = volume.touched(frame)
+        passed, largest = passed + len(keys), max(largest, len(keys))
+        union = np.unique(np.concatenate([union, keys]), axis=0)
+        if len(union) > volume.max_blocks:
+            raise too_fine(volume.voxel_size, len(union), volume.max_blocks)
+    unseen = len(union) * (len(union) / max(passed, 1)) if total > len(sample) else 0.0
+    return int(1.2 * (len(union) + unseen)) + largest
+
+
+def fuse_frames(
+    frames: Iterable[DepthFrame], voxel_size: float, depth_max: float, total: int = 0, expected_blocks: int = 4000, progress: Progress = SILENT
+) -> TsdfVolume:
+    """Fuse all `frames` (`total` of them, for the progress).
+
+    Raises:
+        InputError: none holds depth within range, or the voxel size is too fine for the memory.
+        Interrupted: the user asked to stop.
+    """
+    volume = TsdfVolume(voxel_size, depth_max, expected_blocks=expected_blocks)
+    for number, frame in enumerate(frames, 1):
+        progress.check()
+        volume.integrate(frame)
+        progress.update(number, max(total, number), f"{volume.blocks} blocks")
+    volume._require_frames()
+    if volume.empty_frames:
+        log.warning("%d of %d frames hold no depth within %g and were left out of the TSDF", volume.empty_frames, volume.frames + volume.empty_frames, depth_max)
+    return volume
+
+
+def fuse_capture(
+    capture: Capture,
+    working_from_input: Similarity,
+    indices: Iterable[int] | None = None,
+    settings: TsdfSettings | None = None,
+    progress: Progress = SILENT,
+) -> TsdfVolume:
+    """Fuse the frames `indices` (None: all) of a capture; voxel size and range from its depth unless `settings` name them.
+
+    Raises:
+        InputError: no frame has depth, poses are missing, or the voxel size is too fine for the memory.
+        Interrupted: the user asked to stop.
+    """
+    settings = settings or TsdfSettings()
+    wanted = [i for i in (range(len(capture.frames)) if indices is None else [int(i) for i in indices]) if capture.frames[i].depth is not None]
+    if not wanted:
+        raise InputError(f"{capture.root} holds no depth maps, which the TSDF needs; set tsdf.enabled=off")
+    spread = np.unique(np.linspace(0, len(wanted) - 1, SAMPLE_FRAMES).round().astype(int))
+    sample = list(capture_depth_frames(capture, working_from_input, [wanted[i] for i in spread]))
+    depths = [frame.depth for frame in sample]
+    focal = min(frame.depth_intrinsics.fx for frame in sample)
+    depth_max = settings.depth_max or automatic_depth_max(depths)
+    voxel_size = settings.voxel_size or automatic_voxel_size(depths, focal)
+    expected = estimate_blocks(sample, TsdfVolume(voxel_size, depth_max, expected_blocks=64), len(wanted))
+    del sample, depths
+    return fuse_frames(capture_depth_frames(capture, working_from_input, wanted), voxel_size, depth_max, len(wanted), expected, progress)
+
+
+def _colour_matrix(colour: Intrinsics, depth: Intrinsics) -> Array:
+    """(3, 3) K for `integrate`, which projects the corner of the depth pixel and rounds: half a depth pixel is added, half a colour pixel taken off."""
+    matrix = colour.matrix_integer_centres()
+    matrix[0, 2] += 0.5 * colour.fx / depth.fx
+    matrix[1, 2] += 0.5 * colour.fy / depth.fy
+    return matrix
+
+
+def _unit(vectors: Array) -> Array:
+    vectors = vectors.astype(np.float64)
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))

@@ -1,0 +1,135 @@
+"""A triangle mesh in plain NumPy: move it between frames, remove what is not surface, thin it out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import open3d as o3d
+
+from toolkit.camera import Array, Similarity
+from toolkit.errors import InputError
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle soup with shared vertices. The frame and the unit of length are the caller's."""
+
+    vertices: Array  # (V, 3) float64
+    triangles: Array  # (T, 3) int32 indices into vertices, counter-clockwise seen from outside
+    colours: Array  # (V, 3) uint8
+    normals: Array | None = None  # (V, 3) float64 unit length, out of the surface
+
+    @classmethod
+    def create(cls, vertices: Array, triangles: Array, colours: Array | None = None, normals: Array | None = None) -> Mesh:
+        """From arrays of any number type; a missing colour is mid grey, floating-point colours are taken as 0 to 1.
+
+        Raises:
+            InputError: shapes that do not fit each other, an index without a vertex, or a position that is not finite.
+        """
+        vertices = np.asarray(vertices, dtype=np.float64).reshape(-1, 3)
+        triangles = np.asarray(triangles, dtype=np.int32).reshape(-1, 3)
+        if colours is None:
+            colours = np.full((len(vertices), 3), 128, np.uint8)
+        mesh = cls(vertices, triangles, as_bytes(colours), None if normals is None else np.asarray(normals, dtype=np.float64))
+        for name, array in (("colours", mesh.colours), ("normals", mesh.normals)):
+            if array is not None and array.shape != vertices.shape:
+                raise InputError(f"a mesh of {len(vertices)} vertices has {name} of shape {array.shape}; one row a vertex is needed")
+        if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
+            raise InputError(f"a mesh of {len(vertices)} vertices has triangles that point to vertex {triangles.max()}; the mesh is damaged")
+        if not np.isfinite(vertices).all():
+            raise InputError("a mesh has vertices that are not finite; the mesh is damaged")
+        return mesh
+
+    @classmethod
+    def empty(cls) -> Mesh:
+        return cls(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8), np.zeros((0, 3)))
+
+    def transformed(self, similarity: Similarity) -> Mesh:
+        """The same mesh in the frame that `similarity` leads to (its inverse undoes it)."""
+        normals = None if self.normals is None else similarity.directions(self.normals)
+        return replace(self, vertices=similarity.points(self.vertices), normals=normals)
+
+    def bounds(self) -> Array:
+        """(2, 3) smallest and largest corner; zeros for an empty mesh."""
+        if len(self.vertices) == 0:
+            return np.zeros((2, 3))
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    def areas(self) -> Array:
+        """(T,) area of each triangle."""
+        a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
+        return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+
+    def components(self) -> Array:
+        """(T,) int32: the connected component of each triangle (triangles that share an edge are connected), largest number unknown."""
+        if len(self.triangles) == 0:
+            return np.zeros(0, np.int32)
+        labels, _, _ = self.to_open3d().cluster_connected_triangles()
+        return np.asarray(labels, dtype=np.int32)
+
+    def cleaned(self, min_share: float = 0.0, min_area_share: float = 0.0) -> Mesh:
+        """Without degenerate and repeated triangles, small components, and vertices that nothing uses.
+
+        Args:
+            min_share: components with fewer than this share of all triangles go.
+            min_area_share: components with less than this share of the whole area go.
+
+        The largest component always stays.
+        """
+        degenerate = (self.triangles[:, [0, 1, 2]] == self.triangles[:, [1, 2, 0]]).any(axis=1) | (self.areas() <= 0)
+        mesh = replace(self, triangles=self.triangles[~degenerate])
+        _, first = np.unique(np.sort(mesh.triangles, axis=1), axis=0, return_index=True)
+        mesh = replace(mesh, triangles=mesh.triangles[np.sort(first)])
+        if (min_share > 0 or min_area_share > 0) and len(mesh.triangles):
+            label = mesh.components()
+            count = np.bincount(label)
+            area = np.bincount(label, weights=mesh.areas())
+            keep = (count >= min_share * count.sum()) & (area >= min_area_share * area.sum())
+            keep[np.argmax(area)] = True
+            mesh = replace(mesh, triangles=mesh.triangles[keep[label]])
+        return mesh.compacted()
+
+    def compacted(self) -> Mesh:
+        """Without vertices that no triangle uses; the order of the others is kept."""
+        used = np.zeros(len(self.vertices), bool)
+        used[self.triangles.reshape(-1)] = True
+        number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+        normals = None if self.normals is None else self.normals[used]
+        return Mesh(self.vertices[used], number[self.triangles].astype(np.int32), self.colours[used], normals)
+
+    def decimated(self, max_triangles: int) -> Mesh:
+        """At most about `max_triangles` triangles, by quadric edge collapse (Garland and Heckbert 1997); as it is when it has no more."""
+        if len(self.triangles) <= max_triangles:
+            return self
+        legacy = self.to_open3d().simplify_quadric_decimation(target_number_of_triangles=max_triangles)
+        legacy.remove_degenerate_triangles()
+        if self.normals is not None:
+            legacy.compute_vertex_normals()
+        return Mesh.from_open3d(legacy).cleaned()
+
+    def to_open3d(self) -> o3d.geometry.TriangleMesh:
+        """As Open3D's (legacy, float64) triangle mesh."""
+        out = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(self.vertices), o3d.utility.Vector3iVector(self.triangles))
+        out.vertex_colors = o3d.utility.Vector3dVector(self.colours / 255.0)
+        if self.normals is not None:
+            out.vertex_normals = o3d.utility.Vector3dVector(self.normals)
+        return out
+
+    @classmethod
+    def from_open3d(cls, mesh: o3d.geometry.TriangleMesh) -> Mesh:
+        """From Open3D's (legacy) triangle mesh."""
+        return cls.create(
+            np.asarray(mesh.vertices),
+            np.asarray(mesh.triangles),
+            np.asarray(mesh.vertex_colors) if mesh.has_vertex_colors() else None,
+            np.asarray(mesh.vertex_normals) if mesh.has_vertex_normals() else None,
+        )
+
+
+def as_bytes(colours: Array) -> Array:
+    """Colours as uint8: whole numbers are kept, floating-point ones are taken as 0 to 1 and rounded."""
+    colours = np.asarray(colours)
+    if colours.dtype.kind == "f":
+        return np.round(np.clip(np.nan_to_num(colours), 0, 1) * 255).astype(np.uint8)
+    return np.clip(colours, 0, 255).astype(np.uint8)
