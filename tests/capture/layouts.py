@@ -91,9 +91,13 @@ def write_colmap_bin(root: Path) -> Pinhole:
     body = b""
     images = colmap_images(root)
     for number, (name, q, t) in enumerate(images):
-        body += struct.pack("<I7dI", number + 1, *q, *t, 7) + name.encode() + b"\0" + struct.pack("<QddQ", 1, 3.0, 4.0, 2**64 - 1)
+        seen = b"".join(struct.pack("<ddQ", 3.0, 4.0, point + 1) for point in range(len(POINTS)))
+        body += struct.pack("<I7dI", number + 1, *q, *t, 7) + name.encode() + b"\0" + struct.pack("<Q", len(POINTS)) + seen
     (folder / "images.bin").write_bytes(struct.pack("<Q", len(images)) + body)
-    points = b"".join(struct.pack("<QdddBBBdQII", n, *point, 9, 9, 9, 0.5, 1, 1, 0) for n, point in enumerate(POINTS))
+    points = b""
+    for number, point in enumerate(POINTS):
+        track = b"".join(struct.pack("<II", image + 1, number) for image in range(len(images)))
+        points += struct.pack("<QdddBBBdQ", number + 1, *point, 9, 9, 9, 0.5, len(images)) + track
     (folder / "points3D.bin").write_bytes(struct.pack("<Q", len(POINTS)) + points)
     return c
 

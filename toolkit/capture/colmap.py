@@ -46,12 +46,10 @@ def looks_like_colmap(path: Path) -> bool:
 
 def image_folders(root: Path) -> list[Path]:
     """Where the images of a model may lie; also above, when `root` is `…/sparse/0` itself."""
-    near = [root, *([root.parent] if root.name in ("sparse", "colmap") or root.name.isdecimal() else [])]
-    if root.parent.name == "sparse":
-        near += [root.parent.parent]
-        if root.parent.parent.name == "colmap":
-            near += [root.parent.parent.parent]
-    return [folder for base in near for folder in (base / "images", base) if folder.is_dir()]
+    bases = [root]
+    while len(bases) < 4 and (bases[-1].name in ("sparse", "colmap") or bases[-1].name.isdecimal()):
+        bases.append(bases[-1].parent)
+    return [folder for base in bases for folder in (base / "images", base) if folder.is_dir()]
 
 
 def read_colmap(path: Path | str) -> Capture:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -110,7 +111,10 @@ def picture_header(path: Path) -> Header:
         if path.suffix.lower() == ".npy":
             height, width = np.load(path, mmap_mode="r", allow_pickle=False).shape[:2]
             return Header(int(width), int(height), False)
-        with Image.open(path) as picture:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # only the header is read; large photos are welcome
+            picture = Image.open(path)
+        with picture:
             width, height = picture.size
             return Header(width, height, picture.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in picture.info)
     except Exception as error:  # Pillow's and NumPy's parsers raise many families on broken files
@@ -208,7 +212,7 @@ def same_count(pictures: int, poses: int, where: Path) -> None:
         )
 
 
-def assemble(kind: str, root: Path, frames: list[Frame], warnings: Sequence[str] = (), **facts: Any) -> Capture:
+def assemble(kind: str, root: Path, frames: list[Frame], remarks: Sequence[str] = (), **facts: Any) -> Capture:
     """The capture, frames in natural order of their names.
 
     Raises:
@@ -221,4 +225,4 @@ def assemble(kind: str, root: Path, frames: list[Frame], warnings: Sequence[str]
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"{root}: the picture {twice!r} is listed twice; list each picture once")
     ordered = sorted(frames, key=lambda frame: natural_key(frame.name))
-    return replace(Capture(kind=kind, root=root, frames=tuple(ordered)), warnings=tuple(warnings), **facts)
+    return replace(Capture(kind=kind, root=root, frames=tuple(ordered)), warnings=tuple(remarks), **facts)

@@ -7,12 +7,13 @@ intrinsics are for the stored pixels). The focal length in pixels is the same ei
 from __future__ import annotations
 
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
-from toolkit.capture.listing import assemble, pictures_in, require_folder, unique_names
+from toolkit.capture.listing import assemble, picture_header, pictures_in, require_folder, unique_names
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 
@@ -53,15 +54,14 @@ def focal_from_exif(path: Path) -> float | None:
     Raises:
         InputError: the file is not a picture.
     """
+    width, height = picture_header(path).size
     try:
-        with Image.open(path) as picture:
-            width, height = picture.size
-            try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow remarks on size and on every oddity of EXIF
+            with Image.open(path) as picture:
                 exif = dict(picture.getexif().get_ifd(EXIF_FOLDER))
-            except Exception:  # broken metadata in a good picture; Pillow raises many families
-                return None
-    except Exception as error:
-        raise InputError(f"{path} cannot be read as a picture; remove it or replace it") from error
+    except Exception:  # broken metadata in a good picture; Pillow raises many families
+        return None
     equivalent = _positive(exif.get(FOCAL_LENGTH_35))
     focal: float | None = None
     if equivalent:

@@ -1,0 +1,124 @@
+"""Redwood/Open3D: both forms of the camera file, the log's index, and numbers that do not match."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.capture.layouts import OFF_CENTRE, rows, write_redwood
+from tests.capture.made import Pinhole, eyes, pixel_error, render, save_depth, save_picture
+from tests.conftest import shared_data
+from toolkit.capture import open_capture
+from toolkit.errors import InputError
+
+
+def test_flags(tmp_path: Path) -> None:
+    write_redwood(tmp_path)
+    capture = open_capture(tmp_path)
+    assert capture.metric
+    assert capture.ordered
+    assert capture.depth_scale == 1000
+    assert all(frame.depth is not None and frame.depth_intrinsics is None for frame in capture.frames)
+
+
+def test_the_plain_form_and_its_depth_scale(tmp_path: Path) -> None:
+    write_redwood(tmp_path)
+    c = OFF_CENTRE
+    plain = {"width": 80, "height": 60, "fx": c.fx, "fy": c.fy, "cx": c.cx - 0.5, "cy": c.cy - 0.5, "depth_scale": 5000.0}
+    (tmp_path / "camera_intrinsics.json").rename(tmp_path / "camera.json")
+    (tmp_path / "camera.json").write_text(json.dumps(plain))
+    capture = open_capture(tmp_path)
+    assert capture.depth_scale == 5000
+    assert pixel_error(capture, eyes(), c) < 1e-3
+
+
+def test_without_a_camera_file_the_sensor_default_is_named(tmp_path: Path) -> None:
+    write_redwood(tmp_path)
+    (tmp_path / "camera_intrinsics.json").unlink()
+    capture = open_capture(tmp_path)
+    camera = capture.frames[0].intrinsics
+    assert (camera.fx, camera.cx, camera.cy) == pytest.approx((525 / 8, 40, 30))
+    assert "PrimeSense" in capture.warnings[0]
+
+
+def test_the_index_of_the_log_counts_not_its_order(tmp_path: Path) -> None:
+    write_redwood(tmp_path)
+    entries = [f"{i} {i} {i + 1}\n{rows(eye.pose())}" for i, eye in enumerate(eyes())]
+    (tmp_path / "trajectory.log").write_text("".join(reversed(entries)))
+    assert pixel_error(open_capture(tmp_path), eyes(), OFF_CENTRE) < 1e-3
+    from_one = [f"{i + 1} {i + 1} {i + 2}\n{rows(eye.pose())}" for i, eye in enumerate(eyes())]
+    (tmp_path / "trajectory.log").write_text("".join(from_one))
+    assert pixel_error(open_capture(tmp_path), eyes(), OFF_CENTRE) < 1e-3
+
+
+@pytest.mark.parametrize("folder", ["image", "rgb", "images"])
+def test_folders_of_pictures(tmp_path: Path, folder: str) -> None:
+    write_redwood(tmp_path)
+    (tmp_path / "color").rename(tmp_path / folder)
+    assert len(open_capture(tmp_path).frames) == 5
+    (tmp_path / folder).rename(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match="no pictures in image/"):
+        open_capture(tmp_path)
+
+
+def test_depth_at_another_size_has_a_scaled_camera(tmp_path: Path) -> None:
+    write_redwood(tmp_path)
+    for index, eye in enumerate(eyes()):
+        save_depth(tmp_path / f"depth/{index:05d}.png", render(eye, Pinhole(40, 30, 35.5, 36.5, 21.125, 13.75))[1])
+    camera = open_capture(tmp_path).frames[0].depth_intrinsics
+    assert (camera.width, camera.fx, camera.cx) == (40, 35.5, 21.125)
+
+
+def test_numbers_that_do_not_match(tmp_path: Path) -> None:
+    write_redwood(tmp_path)
+    (tmp_path / "depth/00004.png").unlink()
+    with pytest.raises(InputError, match="5 pictures but 4 depth pictures"):
+        open_capture(tmp_path)
+    save_picture(tmp_path / "color/00009.jpg", render(eyes()[0], OFF_CENTRE)[0])
+    with pytest.raises(InputError, match="6 pictures but 5 poses"):
+        open_capture(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "whole entries"),
+        ("0 0 1\n1 0 0", "whole entries"),
+        ("0 0 1\nx", "numbers only"),
+        ("".join(f"{i} {i} {i}\n{rows(np.diag([1.0, 1, 0, 1]))}" for i in range(5)), r"trajectory\.log, entry 0.*singular"),
+    ],
+)
+def test_broken_logs(tmp_path: Path, text: str, message: str) -> None:
+    write_redwood(tmp_path)
+    (tmp_path / "trajectory.log").write_text(text)
+    with pytest.raises(InputError, match=message):
+        open_capture(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"intrinsic_matrix": [1, 2, 3]}, "nine numbers"),
+        ({"intrinsic_matrix": [-70.0, 0, 0, 0, 70, 0, 40, 30, 1]}, "must be positive"),
+        ({"intrinsic_matrix": None}, "must hold 'fx'"),
+        ({"intrinsic_matrix": None, "fx": "a"}, "'fx' must be a finite number"),
+        ({"width": None}, "no usable 'width'"),
+        ({"width": 10**400}, "'width' must be a finite number"),
+        ({"depth_scale": -1}, "'depth_scale'"),
+    ],
+)
+def test_broken_cameras(tmp_path: Path, change: dict, message: str) -> None:
+    write_redwood(tmp_path)
+    path = tmp_path / "camera_intrinsics.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with pytest.raises(InputError, match=message):
+        open_capture(tmp_path)
+
+
+def test_living_room() -> None:
+    capture = open_capture(shared_data("redwood_livingroom1"))
+    assert (capture.kind, len(capture.frames), capture.depth_scale) == ("redwood", 105, 1000)
+    assert (capture.frames[0].intrinsics.cx, capture.frames[0].intrinsics.cy) == (320, 240)
