@@ -101,11 +101,12 @@ def hand_held(frames: int, seed: int = 0) -> Array:
 
     azimuth = np.deg2rad(-13 + 116 * s)
     radius = 1.95 + 0.16 * np.sin(2 * np.pi * 1.3 * s)
-    centres = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), 1.05 + 0.38 * np.sin(2 * np.pi * 1.5 * s + 0.4)], axis=1) + sway(0.03)
+    height = 1.05 + 0.38 * np.sin(2 * np.pi * 1.5 * s + 0.4)
+    centres = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1) + sway(0.03)
     targets = np.array([-0.05, -0.05, 0.30]) + sway(0.05)
     forward = targets - centres
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    right = np.cross(forward, [0.0, 0.0, 1.0] + sway(0.03))
+    right = np.cross(forward, np.array([0.0, 0.0, 1.0]) + sway(0.03))
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, :3, :] = np.stack([right, np.cross(forward, right), forward, centres], axis=-1)
@@ -127,7 +128,7 @@ def write_demo_video(
     with atomic_path(path) as temporary:
         writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_A_SECOND, (width, height))
         if not writer.isOpened():
-            raise OutputError(f"cannot write {path}: the folder is not writable or OpenCV has no mp4 encoder; `fieldfuse doctor` tells which")
+            raise OutputError(f"cannot write {path}: OpenCV has no mp4 encoder or the folder is not writable; see `fieldfuse doctor`")
         try:
             for number, pose in enumerate(poses):
                 progress.check()

@@ -71,11 +71,10 @@ class Scene:
         right, below = (x - column)[:, None], (y - row)[:, None]
         round_about = shape >= self.shapes.rectangles  # longitudes wrap
         last = width - 1
-        columns = []
-        for value in (column.long(), column.long() + 1):
-            columns.append(torch.where(round_about, value % width, value.clamp(min=0).minimum(last)))
-        rows = [value.clamp(min=0).minimum(height - 1) for value in (row.long(), row.long() + 1)]
-        top, bottom = (torch.lerp(*(self._texels[first + r * width + c] for c in columns), right) for r in rows)
+        left, past = (torch.where(round_about, c % width, c.clamp(min=0).minimum(last)) for c in (column.long(), column.long() + 1))
+        upper, lower = (first + r.clamp(min=0).minimum(height - 1) * width for r in (row.long(), row.long() + 1))
+        top = torch.lerp(self._texels[upper + left], self._texels[upper + past], right)
+        bottom = torch.lerp(self._texels[lower + left], self._texels[lower + past], right)
         colour = torch.lerp(top, bottom, below)
         balls = round_about.nonzero()[:, 0]
         if len(balls):

@@ -7,9 +7,18 @@ import numpy as np
 
 from toolkit.camera import Array
 
-WORDS = ("FIELD", "VOXEL", "FUSE", "LATTICE", "PRISM", "HALO", "RADIANT", "ORBIT", "DEPTH", "KEYFRAME", "SPARSE", "BLOCK", "SURFACE", "VOLUME")
+WORDS = ("FIELD", "VOXEL", "FUSE", "LATTICE", "PRISM", "HALO", "RADIANT", "ORBIT", "DEPTH", "KEYFRAME", "SPARSE", "BLOCK", "SURFACE")
 FONTS = (cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_SIMPLEX)
-INKS = ((0.16, 0.20, 0.30), (0.70, 0.22, 0.16), (0.14, 0.42, 0.38), (0.84, 0.60, 0.18), (0.42, 0.24, 0.44), (0.22, 0.36, 0.62), (0.92, 0.88, 0.80))
+INKS = (
+    (0.16, 0.20, 0.30),
+    (0.70, 0.22, 0.16),
+    (0.14, 0.42, 0.38),
+    (0.84, 0.60, 0.18),
+    (0.42, 0.24, 0.44),
+    (0.22, 0.36, 0.62),
+    (0.92, 0.88, 0.80),
+)
+CHIPS = ((0.30, 0.29, 0.30), (0.60, 0.37, 0.27), (0.90, 0.88, 0.84), (0.44, 0.50, 0.47), (0.66, 0.55, 0.38), (0.22, 0.26, 0.33))
 
 Generator = np.random.Generator
 
@@ -55,11 +64,10 @@ def _polygon(rng: Generator, centre: Array, radius: float) -> Array:
 def terrazzo(rng: Generator, height: int, width: int) -> Array:
     """(height, width, 3) polished floor: chips of stone of many sizes and colours in a pale ground."""
     image = _canvas(height, width, (0.76, 0.73, 0.68))
-    palette = np.array([(0.30, 0.29, 0.30), (0.60, 0.37, 0.27), (0.90, 0.88, 0.84), (0.44, 0.50, 0.47), (0.66, 0.55, 0.38), (0.22, 0.26, 0.33)])
     area = height * width
     for radius, share in ((44, 0.10), (22, 0.18), (10, 0.20), (5, 0.12)):
         for _ in range(int(share * area / (np.pi * radius**2))):
-            colour = _ink(palette[rng.integers(len(palette))] * rng.uniform(0.75, 1.2) + rng.normal(0, 0.02, 3))
+            colour = _ink(np.array(CHIPS[rng.integers(len(CHIPS))]) * rng.uniform(0.75, 1.2) + rng.normal(0, 0.02, 3))
             centre = rng.uniform((0, 0), (width, height))
             cv2.fillPoly(image, [_polygon(rng, centre, radius * rng.uniform(0.5, 1.3))], colour, lineType=cv2.LINE_AA, shift=4)
     return _grained(image, noise(rng, height, width, 160, 7), 0.05)
@@ -127,7 +135,7 @@ def carton(rng: Generator, height: int, width: int) -> Array:
 
 
 def marble(rng: Generator, height: int, width: int) -> Array:
-    """(height, width, 3) veined stone on a longitude × latitude map; speckles are widened towards the poles, so that they look round on the ball."""
+    """(height, width, 3) veined stone on a longitude × latitude map; speckles widen towards the poles, to look round on the ball."""
     dark, light = np.array(INKS[rng.integers(len(INKS) - 1)]), np.array((0.93, 0.90, 0.85))
     bend = noise(rng, height, width, height // 3, 6)
     x = np.linspace(0, 2 * np.pi, width, endpoint=False)[None, :]

