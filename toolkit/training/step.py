@@ -48,6 +48,11 @@ class Optimiser:
         self.__init__(field)  # type: ignore[misc]
         self.decoder = decoder
 
+    def go_on_with(self, field: Field) -> None:
+        """Go on with the same rows after pruning; what was seen is counted afresh."""
+        self.field = field
+        self.seen.zero_()
+
     def _touched_rows(self, rows: Tensor) -> Tensor:
         self._touched[rows.reshape(-1)] = True
         self._touched[-1] = False  # the zero row stays zero

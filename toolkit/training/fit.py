@@ -1,0 +1,191 @@
+"""Per-scene optimisation of a sparse voxel field, coarse to fine, within a budget of seconds.
+
+Levels double the lattice; before each step to a finer one, and now and then between, voxels that no training ray saw are removed.
+Held-out views are looked at for one purpose: the timeline of their PSNR, whose seconds are not counted and which steers nothing.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from toolkit.capture.types import Views
+from toolkit.config import Settings
+from toolkit.errors import InputError
+from toolkit.networks.decoder import make_decoder
+from toolkit.poses.scene import Scene
+from toolkit.progress import SILENT, Progress
+from toolkit.render.field import Field
+from toolkit.render.rays import render_rays
+from toolkit.training.levels import all_places, finer, first_field, pruned, visible
+from toolkit.training.rays import PixelPool
+from toolkit.training.start import finest_resolution, levels, make_space, possible
+from toolkit.training.step import Optimiser, Rates
+from toolkit.volume.host import Host, TorchHost
+
+DEFAULT_BUDGET = 120.0
+START_RAW = -4.5  # of the first density: thin enough that every voxel along a ray is tried, thick enough that none is ignored
+TIMELINE_POINTS = 12
+TIMELINE_PIXELS = 8192
+PRUNE_EVERY = 150  # steps
+LAST_PRUNE = 0.8  # of the budget
+FIRST_BATCH = 1024
+
+
+@dataclass
+class FitResult:
+    """The fitted field in memory of its own, and how it came to be."""
+
+    field: Field
+    timeline: list[dict[str, float]] = field(default_factory=list)  # fitting seconds, held-out PSNR over a fixed sample of pixels
+    seconds: float = 0.0
+    steps: int = 0
+    rays: int = 0
+    interrupted: bool = False
+
+
+class _Clock:
+    """Fitting seconds; stands still while something else is measured."""
+
+    def __init__(self) -> None:
+        self._spent, self._since = 0.0, time.perf_counter()
+
+    def seconds(self) -> float:
+        return self._spent + time.perf_counter() - self._since
+
+    def pause(self) -> None:
+        self._spent = self.seconds()
+
+    def go_on(self) -> None:
+        self._since = time.perf_counter()
+
+
+class _HeldOut:
+    """PSNR over a fixed random sample of the held-out views' pixels."""
+
+    def __init__(self, views: Views, device: torch.device) -> None:
+        self.batch = None
+        indices = np.flatnonzero(views.test)
+        if len(indices):
+            pool = PixelPool(views.subset(indices), device)
+            pick = torch.randperm(len(pool), generator=torch.Generator().manual_seed(0))[:TIMELINE_PIXELS]
+            self.batch = pool.take(pick.to(device))
+
+    def psnr(self, current: Field) -> float | None:
+        if self.batch is None:
+            return None
+        colour = render_rays(current, self.batch.origins, self.batch.directions).colour
+        return float(-10 * torch.log10((colour - self.batch.colour).square().mean().clamp_min(1e-10)))
+
+
+def fit_field(views: Views, scene: Scene, settings: Settings, progress: Progress = SILENT, host: Host | None = None, start: Field | None = None) -> FitResult:
+    """Fit a field to the training views.
+
+    Args:
+        views: all views; those marked `test` are only measured.
+        scene: region of interest, near and far, and whether there is a background, in the same working frame.
+        settings: `field`, `fit`, `seed`; `fit.budget` bounds the seconds.
+        progress: `stopping()` ends the fit early and keeps what there is.
+        host: where rows live while they change (`GridHost` puts them into Open3D's hash map).
+        start: a field to go on from, at its finest level.
+
+    Raises:
+        InputError: there is no training view.
+    """
+    device = torch.device(settings.device if settings.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu")
+    train = views.subset(np.flatnonzero(~views.test))
+    if len(train) == 0:
+        raise InputError("no training view is left; lower --holdout or give more pictures")
+    clock = _Clock()
+    host = host or TorchHost(device)
+    generator = torch.Generator().manual_seed(settings.seed)
+    torch.manual_seed(settings.seed)
+    pool = PixelPool(train, device)
+    held_out = _HeldOut(views, device)
+    budget = settings.fit.budget or DEFAULT_BUDGET
+    if start is None:
+        current, ladder = _first(views, train, scene, settings, device, host, generator)
+    else:
+        keep = torch.ones_like(start.occupied)
+        current, ladder = finer(start, keep, start.resolution, host), [start.resolution]
+    optimiser = Optimiser(current)
+    result = FitResult(current)
+    rungs = _rungs(len(ladder))
+    level, steps_here = 0, 0
+    marks = [budget * 0.02 * 50 ** (i / (TIMELINE_POINTS - 1)) for i in range(TIMELINE_POINTS - 1)]
+    opaque = views.background is None
+
+    while (now := clock.seconds()) < budget and not progress.stopping():
+        done = now / budget
+        if level < len(ladder) - 1 and done > rungs[level]:
+            level += 1
+            current = finer(current, visible(current, optimiser.seen, settings.fit.prune_weight), ladder[level], host)
+            optimiser.renew_rows(current)
+            steps_here = 0
+        elif steps_here and steps_here % PRUNE_EVERY == 0 and done < LAST_PRUNE:
+            current = pruned(current, visible(current, optimiser.seen, settings.fit.prune_weight))
+            optimiser.go_on_with(current)
+        rays = min(FIRST_BATCH << level, settings.fit.max_rays)
+        optimiser.step(pool.batch(rays, generator), _rates(settings, done, opaque), generator)
+        steps_here += 1
+        result.steps += 1
+        result.rays += rays
+        if marks and now > marks[0]:
+            clock.pause()
+            marks = [mark for mark in marks if mark > now]
+            _measure(result, held_out, current, now)
+            clock.go_on()
+        if result.steps % 5 == 0:
+            note = f"{ladder[level]}³, {result.timeline[-1]['psnr']:.1f} dB" if result.timeline else f"{ladder[level]}³"
+            progress.update(now, budget, note)
+    clock.pause()
+    result.interrupted = progress.stopping()
+    result.seconds = clock._spent
+    _measure(result, held_out, current, result.seconds)
+    result.field = current.settled()
+    host.close()
+    return result
+
+
+def _first(
+    views: Views, train: Views, scene: Scene, settings: Settings, device: torch.device, host: Host, generator: torch.Generator
+) -> tuple[Field, list[int]]:
+    """The classical start at the coarsest level, and the resolutions to climb."""
+    wanted = settings.field.background
+    background = scene.has_background if wanted == "auto" else wanted == "on"
+    space = make_space(scene, background and views.background is None)
+    ladder = levels(settings.field.resolution or finest_resolution(space, train, scene))
+    places = possible(space, ladder[0], all_places(space, ladder[0]), views)
+    decoder = make_decoder(settings.field.decoder, settings.field.channels, settings.field.hidden).to(device)
+    if views.background is not None:
+        behind = torch.tensor(views.background)
+    else:
+        behind = torch.from_numpy(np.mean([image.reshape(-1, 3).mean(0) for image in train.images], axis=0) / 255).float()
+    near = 0.5 * scene.near
+    fine = 4
+    return first_field(
+        space, ladder[0], places, settings.field.channels, START_RAW, decoder, behind.float().to(device), near, fine, host, generator
+    ), ladder
+
+
+def _rungs(count: int) -> list[float]:
+    """Share of the budget at which each level ends: little for the coarse ones, about half for the finest."""
+    ends = [0.05, 0.15, 0.35, 0.6]
+    return ends[: count - 1] if count <= 4 else [ends[min(i, 2)] if i < 3 else 0.35 + 0.25 * (i - 2) / (count - 4) for i in range(count - 1)]
+
+
+def _rates(settings: Settings, done: float, opaque: bool) -> Rates:
+    """Step sizes that fall to a tenth over the budget."""
+    fall = 0.1**done
+    fit = settings.fit
+    return Rates(fit.rate_density * fall, fit.rate_feature * fall, fit.rate_decoder * fall, fit.distortion)
+
+
+def _measure(result: FitResult, held_out: _HeldOut, current: Field, seconds: float) -> None:
+    value = held_out.psnr(current)
+    if value is not None and math.isfinite(value):
+        result.timeline.append({"seconds": round(seconds, 3), "psnr": round(value, 4)})

@@ -1,0 +1,97 @@
+"""The classical start of a fit: the space, the lattice's levels, and which coarse voxels could hold something at all.
+
+No network and no learning: a voxel takes part when enough training views see it, and, for captures with alpha, when no view sees
+through it (the visual hull), or, with depth, when no view measured past it (space carving).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from toolkit.camera import Array, invert
+from toolkit.capture.types import Views
+from toolkit.poses.scene import Scene
+from toolkit.volume.space import Space
+
+Tensor = torch.Tensor
+SHELL = 1.0  # width of the contracted shell, in half sizes of the region
+MARGIN = 1.05  # the region grows by this much, so that its border is not cut
+COARSEST = 32
+SEEN_BY = 3  # training views that must see a voxel: fewer cannot tell its depth
+
+
+def make_space(scene: Scene, background: bool) -> Space:
+    """The region of interest as a cube with everything else around it, or as a bare box."""
+    half = float(np.max(scene.half_size)) * MARGIN
+    x, y, z = (float(v) for v in scene.centre)
+    if background:
+        return Space((x, y, z), half, SHELL)
+    bx, by, bz = (float(v) * MARGIN / half for v in scene.half_size)
+    return Space((x, y, z), half, 0.0, (bx, by, bz))
+
+
+def finest_resolution(space: Space, views: Views, scene: Scene) -> int:
+    """Voxels a side so that one voxel in the middle of the scene is about one pixel of the training views."""
+    focal = float(np.median([camera.fx for camera in views.intrinsics]))
+    pixel = scene.median_depth / focal
+    wanted = 2 * space.extent * space.half / pixel
+    return int(np.clip(round(wanted / 32) * 32, 64, 512))
+
+
+def levels(finest: int) -> list[int]:
+    """Resolutions from coarse to fine: doublings of the coarsest, then the finest itself."""
+    out = [COARSEST]
+    while out[-1] * 2 <= finest:
+        out.append(out[-1] * 2)
+    if out[-1] < finest:
+        if finest / out[-1] < 1.25:
+            out[-1] = finest
+        else:
+            out.append(finest)
+    return out
+
+
+def possible(space: Space, resolution: int, places: Tensor, views: Views) -> Tensor:
+    """(N, 3) voxels → the ones that can hold something, judged from the training views alone."""
+    voxel = 2 * space.extent / resolution
+    centre = (places.double() + 0.5) * voxel - space.extent
+    points = space.to_working(centre).numpy()
+    # Half the diagonal of a voxel in working units; contracted voxels are larger the farther out they are.
+    norm = np.maximum(centre.abs().amax(1).numpy(), 1.0)
+    stretch = 1.0 if space.shell == 0 else np.minimum((space.shell / np.maximum(space.extent - norm, voxel)) ** 2 / space.shell, 1e6)
+    radius = 0.87 * voxel * space.half * np.maximum(stretch, 1.0)
+    train = np.flatnonzero(~views.test)
+    seen, emptied = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    for index in train:
+        visible, empty = _look(views, int(index), points, np.broadcast_to(radius, len(points)))
+        seen += visible
+        emptied += empty
+    keep = (seen >= min(SEEN_BY, len(train))) & (emptied <= 0.02 * len(train))
+    return places[torch.from_numpy(keep)] if keep.any() else places
+
+
+def _look(views: Views, index: int, points: Array, radius: Array) -> tuple[Array, Array]:
+    """(N,) bool: the ball around each point touches the picture; and the picture says that the whole ball is empty."""
+    camera, pose = views.intrinsics[index], invert(views.world_from_camera[index])
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    depth = np.maximum(local[:, 2], 1e-6)
+    u, v = local[:, 0] / depth * camera.fx + camera.cx, local[:, 1] / depth * camera.fy + camera.cy
+    reach = radius / depth * max(camera.fx, camera.fy)
+    visible = (local[:, 2] > 0) & (u > -reach) & (u < camera.width + reach) & (v > -reach) & (v < camera.height + reach)
+    empty = np.zeros(len(points), bool)
+    alpha = views.alpha[index] if views.alpha else None
+    measured = views.depths[index] if views.depths else None
+    if alpha is None and measured is None:
+        return visible, empty
+    for row in np.flatnonzero(visible & (local[:, 2] > radius) & (reach < 0.25 * camera.width)):
+        x0, x1 = int(max(u[row] - reach[row], 0)), int(min(u[row] + reach[row] + 1, camera.width))
+        y0, y1 = int(max(v[row] - reach[row], 0)), int(min(v[row] + reach[row] + 1, camera.height))
+        if x1 <= x0 or y1 <= y0:
+            continue
+        if alpha is not None:
+            empty[row] = not alpha[y0:y1, x0:x1].any()
+        elif measured is not None:
+            window = measured[y0:y1, x0:x1]
+            empty[row] = bool(window.all()) and float(window.min()) > local[row, 2] + 2 * radius[row]
+    return visible, empty
