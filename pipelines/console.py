@@ -20,7 +20,7 @@ STOPPING = "stopping: the current stage is brought to an end (Ctrl-C again to qu
 
 def clock(seconds: float) -> str:
     """`75` → `1:15`."""
-    whole = int(round(seconds))
+    whole = round(seconds)
     if whole >= 3600:
         return f"{whole // 3600}:{whole % 3600 // 60:02d}:{whole % 60:02d}"
     return f"{whole // 60}:{whole % 60:02d}"

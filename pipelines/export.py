@@ -12,7 +12,9 @@ from pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, T
 def export(
     target: Target,
     out: OptionalOut = None,
-    formats: Annotated[str | None, typer.Option(help="Comma-separated part of points,ply,obj,glb,cameras,video.", show_default=False)] = None,
+    formats: Annotated[
+        str | None, typer.Option(help="Comma-separated part of points,ply,obj,glb,cameras,video.", show_default=False)
+    ] = None,
     threads: Threads = None,
     config: Config = None,
     pairs: Pairs = None,

@@ -1,4 +1,4 @@
-"""`fieldfuse finetune`: fit the field of a run again with another budget or other settings of the fit."""
+"""`fieldfuse finetune`: fit the field of a run further."""
 
 from __future__ import annotations
 
@@ -19,8 +19,11 @@ def finetune(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Fit the field anew on the pictures and poses that a run has made ready, then render, export and score it."""
+    """Fit the field of a run for another --budget seconds, then render, export and score it.
+
+    With other settings of the field itself (its decoder, say) it is fitted anew on the same pictures and poses.
+    """
     from pipelines.work import work
 
     flags = {"budget": budget, "device": device, "threads": threads, "seed": seed, "engine": engine, "decoder": decoder}
-    work(target, out, gather(None, config, pairs, **flags), ("field", "render", "export"), quiet=quiet, as_json=json)
+    work(target, out, gather(None, config, pairs, **flags), ("field", "render", "export"), quiet=quiet, as_json=json, go_on=True)

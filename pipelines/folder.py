@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import os
 import re
 import shlex
 import sys
 import traceback
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
@@ -24,8 +23,21 @@ RUN = "run.json"
 STAGES = "stages"
 ERROR_LOG = "error.log"
 SUBFOLDERS = (STAGES, "frames", "sparse", "renders", "tsdf", "exports")
-FILES = ("capture.json", "poses.json", "scene.json", "keyframes.json", "views.safetensors", "field.safetensors", "timeline.json", "mesh.ply",
-         "evaluation.json", "report.json", "report.html")
+FILES = (
+    "capture.json",
+    "poses.json",
+    "scene.json",
+    "keyframes.json",
+    "views.safetensors",
+    "field.safetensors",
+    "timeline.json",
+    "mesh.ply",
+    "evaluation.json",
+    "report.json",
+    "report.html",
+)
+BUSY = "another fieldfuse command is working in {}; wait for it to end or choose another --out folder"
+FOREIGN = "{} holds {!r} but no fieldfuse run; choose a new or empty --out folder so that nothing of yours is replaced"
 TEMPORARY = re.compile(r"\.tmp-\d+-")  # as toolkit.files.atomic_path names them
 WRITE_ERRORS = {errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EIO}
 WRITE_PHRASES = ("no space left", "file too large", "disk quota", "read-only file system", "disk i/o error", "database or disk is full")
@@ -44,7 +56,7 @@ class RunFolder:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = Path(os.path.abspath(path))
+        self.path = path.absolute()
         self._lock: IO[str] | None = None
 
     def __truediv__(self, name: str) -> Path:
@@ -53,13 +65,13 @@ class RunFolder:
     def __enter__(self) -> RunFolder:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            self._lock = open(self.path / LOCK, "a", encoding="utf-8")
+            self._lock = (self.path / LOCK).open("a", encoding="utf-8")
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._check_ours()
             self._remove_leftovers()
         except BlockingIOError as error:
             self._unlock()
-            raise OutputError(f"another fieldfuse command is working in {self.path}; wait for it to end or choose another --out folder") from error
+            raise OutputError(BUSY.format(self.path)) from error
         except OSError as error:
             self._unlock()
             raise OutputError(f"cannot write to {self.path}: {error.strerror or error}; choose another --out folder") from error
@@ -69,7 +81,9 @@ class RunFolder:
         try:
             if isinstance(error, Exception) and not isinstance(error, FieldfuseError):
                 if failed_write(error):
-                    raise OutputError(f"cannot write to {self.path}: {first_line(error)}; free space or choose another --out folder") from error
+                    raise OutputError(
+                        f"cannot write to {self.path}: {first_line(error)}; free space or choose another --out folder"
+                    ) from error
                 self._log(error)
         finally:
             self._unlock()
@@ -82,7 +96,7 @@ class RunFolder:
         if foreign:
             self._unlock()
             remove(self.path / LOCK)
-            raise OutputError(f"{self.path} holds {foreign[0]!r} but no fieldfuse run; choose a new or empty --out folder so that nothing of yours is replaced")
+            raise OutputError(FOREIGN.format(self.path, foreign[0]))
 
     def _unlock(self) -> None:
         if self._lock is not None:
@@ -114,7 +128,7 @@ class RunFolder:
                 "version": __version__,
                 "command": command_line(),
                 "source": str(source),
-                "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+                "started": datetime.now(UTC).isoformat(timespec="seconds"),
                 "settings": settings_dict(settings),
             },
         )
@@ -126,7 +140,9 @@ class RunFolder:
             InputError: the folder holds no run, or its run.json is damaged.
         """
         if not is_run_folder(self.path):
-            raise InputError(f"{self.path} is not the folder of a run (it has no {RUN}); make one with `fieldfuse run SOURCE --out {self.path}`")
+            raise InputError(
+                f"{self.path} is not the folder of a run (it has no {RUN}); make one with `fieldfuse run SOURCE --out {self.path}`"
+            )
         data = read_json(self.path / RUN)
         if not isinstance(data, dict) or not isinstance(data.get("source"), str) or not isinstance(data.get("settings"), dict):
             raise InputError(f"{self.path / RUN} is damaged; run `fieldfuse run SOURCE --out {self.path}` again")

@@ -96,7 +96,12 @@ def lines(key: str, value: Any) -> list[str]:
         return [line for inner, entry in value.items() for line in lines(inner, entry)]
     if isinstance(value, list) and isinstance(value[0], dict):
         shown = value[:4] + ([{"and": f"{len(value) - 4} more"}] if len(value) > 4 else [])
-        return [f"{name:<14} " + ", ".join(f"{inner} {entry:.6g}" if isinstance(entry, float) else f"{inner} {entry}" for inner, entry in part.items()) for part in shown]
+        return [f"{name:<14} " + ", ".join(f"{inner} {number(entry)}" for inner, entry in part.items()) for part in shown]
     if isinstance(value, list):
         return [f"{name:<14} {entry}" for entry in value]
     return [f"{name:<14} {'yes' if value is True else value}"]
+
+
+def number(value: Any) -> str:
+    """Fractions with six digits, all else as it is."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -6,7 +6,7 @@ import os
 import random
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ class Job:
     settings: Settings
     progress: ConsoleProgress
     stages: Stages
+    other_field: bool = False  # the settings of the field differ from those that the folder was made with
 
 
 @contextmanager
@@ -58,15 +59,17 @@ def open_job(
         set_threads(settings.threads)
         settings.device = choose_device(settings.device)
     with RunFolder(path) as folder, progress.listening():
-        source = Path(os.path.abspath(target))
+        source = target.absolute()
+        other = False
         if again:
             about = folder.about()
             source = Path(about["source"])
             settings = read_settings(options, about["settings"])
             set_threads(settings.threads)
             settings.device = choose_device(settings.device)
+            other = settings.field != read_settings({}, about["settings"]).field
         folder.start(source, settings)
-        yield Job(folder, source, settings, progress, Stages(folder, progress, trusted if again else ()))
+        yield Job(folder, source, settings, progress, Stages(folder, progress, trusted if again else ()), other)
 
 
 def _no_out(target: Path) -> str:
@@ -98,7 +101,8 @@ def read_settings(options: dict[str, Any], stored: dict[str, Any] | None = None)
 
 def bound_threads(options: dict[str, Any]) -> None:
     """Tell numeric libraries the thread count that the command line gives; they read it once, when they are loaded."""
-    wanted = options.get("flags", {}).get("threads") or next((pair[8:] for pair in options.get("pairs") or [] if pair.startswith("threads=")), None)
+    pairs = [pair.removeprefix("threads=") for pair in options.get("pairs") or [] if pair.startswith("threads=")]
+    wanted = options.get("flags", {}).get("threads") or next(iter(pairs), None)
     if wanted is not None and str(wanted).isdigit() and int(wanted) > 0:
         os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(wanted)))
 
@@ -140,8 +144,3 @@ def set_seeds(seed: int) -> None:
     np.random.seed(seed % 2**32)
     torch.manual_seed(seed)
     cv2.setRNGSeed(seed % 2**31)
-
-
-def with_budget(settings: Settings, seconds: float) -> Settings:
-    """The same settings with another fitting budget."""
-    return replace(settings, fit=replace(settings.fit, budget=seconds))

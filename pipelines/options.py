@@ -7,14 +7,20 @@ from typing import Annotated, Any
 
 import typer
 
-Source = Annotated[Path, typer.Argument(help="A video, a folder of photos, or a posed capture; what it is is found by looking.", show_default=False)]
+Source = Annotated[
+    Path, typer.Argument(help="A video, a folder of photos, or a posed capture; its kind is found by looking.", show_default=False)
+]
 Target = Annotated[Path, typer.Argument(help="The folder of an earlier run; or a source, then --out is needed.", show_default=False)]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for everything that the run makes.", show_default=False)]
-OptionalOut = Annotated[Path | None, typer.Option("--out", "-o", help="Folder of the run, when the first argument is a source.", show_default=False)]
+OptionalOut = Annotated[
+    Path | None, typer.Option("--out", "-o", help="Folder of the run, when the first argument is a source.", show_default=False)
+]
 Preset = Annotated[str | None, typer.Option(help="fast, balanced (default) or quality.", show_default=False)]
 Budget = Annotated[float | None, typer.Option(help="Seconds of optimisation.", show_default=False)]
 ImageSize = Annotated[int | None, typer.Option(help="Long side of the pictures in pixels.", show_default=False)]
-Holdout = Annotated[int | None, typer.Option(help="Every n-th picture by name is kept for testing; 0: none. Default 8.", show_default=False)]
+Holdout = Annotated[
+    int | None, typer.Option(help="Every n-th picture by name is kept for testing; 0: none. Default 8.", show_default=False)
+]
 Device = Annotated[str | None, typer.Option(help="auto (default), cpu or cuda.", show_default=False)]
 Threads = Annotated[int | None, typer.Option(help="Threads to use; default: all cores.", show_default=False)]
 Seed = Annotated[int | None, typer.Option(help="Seed of all random numbers; default 0.", show_default=False)]

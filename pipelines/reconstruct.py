@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipelines.console import ConsoleProgress
 from pipelines.job import Job, open_job
 from pipelines.steps_capture import choose_frames, choose_keyframes, find_camera_poses, find_capture, make_views, measure_scene
 from pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views, score_pictures, wants_tsdf
@@ -22,11 +23,19 @@ RESULTS = ("tsdf", "field", "render", "export")
 ALL = frozenset(RESULTS)
 
 
-def run_job(target: Path, out: Path | None, options: dict[str, Any], goals: Iterable[str], progress: Any, trusted: Iterable[str] = BEFORE) -> dict[str, Any]:
+def run_job(
+    target: Path,
+    out: Path | None,
+    options: dict[str, Any],
+    goals: Iterable[str],
+    progress: ConsoleProgress,
+    trusted: Iterable[str] = BEFORE,
+    go_on: bool = False,
+) -> dict[str, Any]:
     """Open the run's folder and make `goals` in it, with all that they need; see `open_job` for the arguments."""
     with open_job(target, out, options, progress, trusted) as job:
         wanted = frozenset(goals)
-        return reconstruct(job, wanted) if wanted else reconstruct_poses(job)
+        return reconstruct(job, wanted, go_on) if wanted else reconstruct_poses(job)
 
 
 def stand(job: Job, goals: frozenset[str] = frozenset()) -> tuple[Capture, PoseResult, Capture, Scene, Views]:
@@ -47,8 +56,10 @@ def reconstruct_poses(job: Job) -> dict[str, Any]:
     return summarise_poses(job, capture, find_camera_poses(job, capture))
 
 
-def reconstruct(job: Job, goals: frozenset[str] = ALL) -> dict[str, Any]:
+def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> dict[str, Any]:
     """Make the results named in `goals` (a part of `RESULTS`) and the report of all that is there; answers `report.json`.
+
+    With `go_on`, a field that the folder has is fitted further.
 
     Results that are not asked for are left as they are, and stay in the report as long as they still fit.
     """
@@ -57,15 +68,16 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL) -> dict[str, Any]:
     stages.trust(set(RESULTS) - goals)
     capture, poses, posed, scene, views = stand(job, goals)
 
-    field, timeline, exported = None, [], None
+    timeline: list[dict[str, Any]] = []
+    field, exported = None, None
     pictures = {}
     if ("tsdf" in goals and wants_tsdf(job, posed)) or stages.usable("tsdf"):
         pictures["tsdf"] = fuse_tsdf(job, posed, scene, views)
     if goals & {"field", "render", "export"} or stages.usable("field"):
-        field, timeline = fit_radiance_field(job, views, scene)
+        field, timeline = fit_radiance_field(job, views, scene, go_on)
         if "render" in goals or stages.usable("render"):
             pictures["field"] = render_test_views(job, field, views)
         if "export" in goals or stages.usable("export"):
-            exported = export_results(job, field, posed, scene)
+            exported = export_results(job, field, poses, scene, views)
     scores = score_pictures(job, views, pictures)
     return put_report(job, capture, poses, scene, views, field, timeline, pictures, scores, exported, time.monotonic() - start)

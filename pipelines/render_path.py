@@ -12,8 +12,8 @@ import numpy as np
 
 from pipelines.console import make_progress
 from pipelines.job import Job, open_job
-from pipelines.rendered import file_name, to_picture, write_png
 from pipelines.reconstruct import BEFORE, stand
+from pipelines.rendered import file_name, to_picture, write_png
 from pipelines.steps_results import fit_radiance_field
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture import nerf_json
@@ -67,7 +67,9 @@ def render_run(
         else:
             names, lenses, poses = orbit_cameras(ready, scene, frames)
         lenses = [sized(lens, image_size) for lens in lenses]
-        place = to or job.folder / "renders" / ("orbit.mp4" if given is None and views == "orbit" else "cameras" if given is not None else "test")
+        place = to or job.folder / "renders" / (
+            "orbit.mp4" if given is None and views == "orbit" else "cameras" if given is not None else "test"
+        )
         start = time.monotonic()
         job.progress.begin("render")
         write(job, field, names, lenses, poses, place, fps)

@@ -2,7 +2,25 @@
 
 from __future__ import annotations
 
-from pipelines.options import Budget, Config, Decoder, Device, Engine, Holdout, ImageSize, Json, Out, Pairs, PosesFrom, Preset, Quiet, Seed, Source, Threads, gather
+from pipelines.options import (
+    Budget,
+    Config,
+    Decoder,
+    Device,
+    Engine,
+    Holdout,
+    ImageSize,
+    Json,
+    Out,
+    Pairs,
+    PosesFrom,
+    Preset,
+    Quiet,
+    Seed,
+    Source,
+    Threads,
+    gather,
+)
 
 
 def run(

@@ -7,6 +7,7 @@ of that very result (`made`), so that whatever is made again makes all that foll
 
 from __future__ import annotations
 
+import os
 import time
 import uuid
 from collections.abc import Callable, Iterable, Sequence
@@ -38,6 +39,13 @@ class Record:
     stopped: bool = False  # ended early on request, usable but not what was asked for
 
 
+def _umask() -> int:
+    """The process's umask; there is no way to ask for it without setting it."""
+    value = os.umask(0o022)
+    os.umask(value)
+    return value
+
+
 def read_record(path: Path) -> Record | None:
     """The record at `path`, None when it is not there or not readable."""
     if not path.is_file():
@@ -59,7 +67,7 @@ class Stages:
     """The stages of one run folder, in the order in which they are asked for."""
 
     def __init__(self, folder: RunFolder, progress: ConsoleProgress, trusted: Iterable[str] = ()) -> None:
-        """Stages named in `trusted` are taken as they are in the folder, whatever settings and source say now, if the stages before them are the same."""
+        """Stages named in `trusted` are taken as they are, whatever settings and source say now, if the stages before them are the same."""
         self.folder = folder
         self.progress = progress
         self.trusted = set(trusted)
@@ -111,7 +119,14 @@ class Stages:
         return self._make(name, key, before, make, save, in_place, keeps)
 
     def _make(
-        self, name: str, key: str, before: dict[str, str], make: Callable[[], T], save: Callable[[T], Iterable[Path]], in_place: bool, keeps: bool
+        self,
+        name: str,
+        key: str,
+        before: dict[str, str],
+        make: Callable[[], T],
+        save: Callable[[T], Iterable[Path]],
+        in_place: bool,
+        keeps: bool,
     ) -> T:
         old = self.record(name)
         if in_place:
@@ -123,8 +138,12 @@ class Stages:
             stopped = keeps and self.progress.stopping()
             remove(self._path(name))
             paths = [Path(path) for path in save(value)]
+        for path in paths:
+            path.chmod(0o666 & ~_umask())  # some writers make files that only their owner may read
         outputs = {path.relative_to(self.folder.path).as_posix(): path.stat().st_size for path in paths}
-        record = Record(name, key, uuid.uuid4().hex[:16], round(time.monotonic() - start, 3), round(memory.megabytes, 1), outputs, before, stopped)
+        record = Record(
+            name, key, uuid.uuid4().hex[:16], round(time.monotonic() - start, 3), round(memory.megabytes, 1), outputs, before, stopped
+        )
         write_json(self._path(name), asdict(record))
         for gone in set(old.outputs if old else ()) - set(outputs):
             remove(self.folder / gone)
@@ -152,7 +171,9 @@ class Stages:
     def usable(self, name: str) -> bool:
         """True when the stage is finished and stands on the results that this run has."""
         record = self.finished(name)
-        return record is not None and all(other in self.records and self.records[other].made == made for other, made in record.after.items())
+        return record is not None and all(
+            other in self.records and self.records[other].made == made for other, made in record.after.items()
+        )
 
     def finished(self, name: str) -> Record | None:
         """The stage's record, if all files that it lists are there in the size that was written."""

@@ -17,6 +17,7 @@ from toolkit.files import read_json, write_json
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Capture, Views
+    from toolkit.poses.result import PoseResult
     from toolkit.poses.scene import Scene
     from toolkit.render.field import Field
 
@@ -29,7 +30,9 @@ def wants_tsdf(job: Job, capture: Capture) -> bool:
     """
     wanted = job.settings.tsdf.enabled
     if wanted == "on" and not capture.has_depth:
-        raise InputError(f"{job.source} holds no depth pictures, which a TSDF surface is made of; leave out tsdf.enabled=on or give an RGB-D capture")
+        raise InputError(
+            f"{job.source} holds no depth pictures, which a TSDF surface is made of; leave out tsdf.enabled=on or give an RGB-D capture"
+        )
     return wanted != "off" and capture.has_depth
 
 
@@ -51,39 +54,61 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views) -> Pictures:
         return [kept, *made, *write_pngs(kept.parent, "tsdf", pictures)]
 
     return job.stages.run(
-        "tsdf", make=make, save=save, load=lambda: load_pictures(kept), uses=[asdict(job.settings.tsdf), pixel_state(posed)], after=["scene", "views"]
+        "tsdf",
+        make=make,
+        save=save,
+        load=lambda: load_pictures(kept),
+        uses=[asdict(job.settings.tsdf), pixel_state(posed)],
+        after=["scene", "views"],
     )
 
 
-def fit_radiance_field(job: Job, views: Views, scene: Scene) -> tuple[Field, list[dict[str, Any]]]:
-    """Optimise the field on the training views; held-out views only measure the timeline."""
+Fitted = tuple["Field", list[dict[str, Any]]]
+
+
+def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False) -> Fitted:
+    """Optimise the field on the training views; held-out views only measure the timeline.
+
+    With `go_on` the field that the folder has is the start, and the budget is for what is added.
+    """
     from toolkit.render.field import Field
     from toolkit.training.fit import fit_field
 
     settings = job.settings
     path, times = job.folder / "field.safetensors", job.folder / "timeline.json"
+    start = job.stages.record("field") if go_on and job.stages.usable("field") and not job.other_field else None
 
-    def make() -> tuple[Field, list[dict[str, Any]]]:
+    def load() -> Fitted:
+        return Field.load(path).to(settings.device), read_json(times)
+
+    def make() -> Fitted:
         set_seeds(settings.seed)
-        result = fit_field(views, scene, settings, job.progress)
-        return result.field, result.timeline
+        if start is None:
+            result = fit_field(views, scene, settings, job.progress)
+            return result.field, result.timeline
+        field, timeline = load()
+        result = fit_field(views, scene, settings, job.progress, start=field)
+        spent = timeline[-1]["seconds"] if timeline else 0.0
+        return result.field, timeline + [{**point, "seconds": round(spent + point["seconds"], 3)} for point in result.timeline]
 
-    def save(value: tuple[Field, list[dict[str, Any]]]) -> list[Path]:
+    def save(value: Fitted) -> list[Path]:
         field, timeline = value
         field.save(path, scene.working_from_input, {"budget": settings.fit.budget, "seed": settings.seed})
         write_json(times, timeline)
         return [path, times]
 
-    uses = [asdict(settings.field), asdict(settings.fit), settings.preset, settings.engine, settings.device, settings.seed]
-    return job.stages.run(
-        "field",
-        make=make,
-        save=save,
-        load=lambda: (Field.load(path).to(settings.device), read_json(times)),
-        uses=uses,
-        after=["scene", "views"],
-        keeps=True,
-    )
+    uses = [
+        asdict(settings.field),
+        asdict(settings.fit),
+        settings.preset,
+        settings.engine,
+        settings.device,
+        settings.seed,
+        start and start.made,
+    ]
+    value = job.stages.run("field", make, save, load, uses=uses, after=["scene", "views"], keeps=True)
+    # The file holds less precision than memory: what is shown and scored is what everybody can load.
+    return value if job.stages.cached["field"] else load()
 
 
 def render_test_views(job: Job, field: Field, views: Views) -> Pictures:
@@ -110,7 +135,7 @@ def render_test_views(job: Job, field: Field, views: Views) -> Pictures:
     return job.stages.run("render", make=make, save=save, load=lambda: load_pictures(kept), after=["field", "views"])
 
 
-def export_results(job: Job, field: Field, posed: Capture, scene: Scene) -> dict[str, Any]:
+def export_results(job: Job, field: Field, poses: PoseResult, scene: Scene, views: Views) -> dict[str, Any]:
     """Points, meshes, cameras and video in the input's own frame; answers the mesh's facts."""
     facts_path = job.folder / "exports" / "facts.json"
     made: list[Path] = []
@@ -118,7 +143,7 @@ def export_results(job: Job, field: Field, posed: Capture, scene: Scene) -> dict
     def make() -> dict[str, Any]:
         from pipelines.surface import export_field
 
-        facts, paths = export_field(job, job.folder / "exports", field, posed, scene)
+        facts, paths = export_field(job, job.folder / "exports", field, poses, scene, views)
         made.extend(paths)
         return facts
 
@@ -127,7 +152,12 @@ def export_results(job: Job, field: Field, posed: Capture, scene: Scene) -> dict
         return [facts_path, *made]
 
     return job.stages.run(
-        "export", make=make, save=save, load=lambda: read_json(facts_path), uses=asdict(job.settings.export), after=["field", "poses", "scene"]
+        "export",
+        make=make,
+        save=save,
+        load=lambda: read_json(facts_path),
+        uses=asdict(job.settings.export),
+        after=["field", "poses", "scene", "views"],
     )
 
 
@@ -152,5 +182,10 @@ def score_pictures(job: Job, views: Views, pictures: dict[str, Pictures]) -> dic
         return [path]
 
     return job.stages.run(
-        "evaluate", make=make, save=save, load=lambda: read_json(path), uses=sorted(pictures), after=["views", *last_of(job, "tsdf", "render")]
+        "evaluate",
+        make=make,
+        save=save,
+        load=lambda: read_json(path),
+        uses=sorted(pictures),
+        after=["views", *last_of(job, "tsdf", "render")],
     )

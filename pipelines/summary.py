@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,10 @@ if TYPE_CHECKING:
     from toolkit.poses.scene import Scene
     from toolkit.render.field import Field
 
-SEEN_BY_SFM = "poses were computed from all pictures, the held-out ones included, so scores are a little kinder than with poses known beforehand"
+SEEN_BY_SFM = (
+    "poses were computed from all pictures, the held-out ones included, so scores are a little kinder than with poses known beforehand"
+)
+OPENED = {".ply", ".obj", ".glb", ".mp4", ".txt", ".json"}
 NO_TEST_VIEWS = "no picture was held out, so there are no scores; give --holdout 8 to keep every 8th picture for testing"
 
 
@@ -71,7 +74,7 @@ def base_data(job: Job, capture: Capture, poses: PoseResult) -> dict[str, Any]:
     return {
         "version": __version__,
         "command": command_line(),
-        "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "source": str(job.source),
         "capture": describe_capture(capture),
         "poses": describe_poses(poses),
@@ -88,7 +91,7 @@ def summarise_poses(job: Job, capture: Capture, poses: PoseResult) -> dict[str, 
     folder = job.folder / "exports" / "cameras"
     write_cameras(folder, poses.names, poses.intrinsics, poses.world_from_camera, poses.points)
     data = base_data(job, capture, poses)
-    return {**data, "warnings": unique([*capture.warnings, *poses.warnings]), "exports": str(folder)}
+    return {**data, "warnings": unique([*capture.warnings, *poses.warnings]), "exports": [{"path": "exports/cameras/transforms.json"}]}
 
 
 def unique(texts: list[str]) -> list[str]:
@@ -102,7 +105,9 @@ def warnings_of(job: Job, capture: Capture, poses: PoseResult, scene: Scene, vie
         texts.append(NO_TEST_VIEWS)
     elif poses.source == "sfm":
         texts.append(SEEN_BY_SFM)
-    texts += [f"the stage {name!r} was stopped early on request; run the same command again to do it in full" for name in job.stages.stopped()]
+    texts += [
+        f"the stage {name!r} was stopped early on request; run the same command again to do it in full" for name in job.stages.stopped()
+    ]
     return unique(texts)
 
 
@@ -110,7 +115,13 @@ def describe_field(field: Field | None) -> dict[str, Any] | None:
     """The report's part `field`; the voxel size is in working units."""
     if field is None:
         return None
-    return {"voxel_size": field.voxel_size, "blocks": field.blocks, "voxels": field.voxels, "bytes": field.bytes, "resolution": field.resolution}
+    return {
+        "voxel_size": field.voxel_size,
+        "blocks": field.blocks,
+        "voxels": field.voxels,
+        "bytes": field.bytes,
+        "resolution": field.resolution,
+    }
 
 
 def exported_files(job: Job) -> list[dict[str, Any]]:
@@ -123,7 +134,8 @@ def exported_files(job: Job) -> list[dict[str, Any]]:
 
 
 def is_export(path: str) -> bool:
-    return path.startswith(("exports/", "tsdf/", "mesh")) and Path(path).suffix in {".ply", ".obj", ".glb", ".mp4", ".txt", ".json"} and not path.endswith("facts.json")
+    """True for what other programs open."""
+    return path.startswith(("exports/", "tsdf/", "mesh")) and Path(path).suffix in OPENED and not path.endswith("facts.json")
 
 
 def put_report(
@@ -147,7 +159,12 @@ def put_report(
         **base_data(job, capture, poses),
         "warnings": warnings_of(job, capture, poses, scene, views),
         "scene": scene.to_dict(),
-        "views": {"total": len(views), "test": int(np.sum(views.test)), "width": views.intrinsics[0].width, "height": views.intrinsics[0].height},
+        "views": {
+            "total": len(views),
+            "test": int(np.sum(views.test)),
+            "width": views.intrinsics[0].width,
+            "height": views.intrinsics[0].height,
+        },
         "field": describe_field(field),
         "evaluation": {"field": scores.get("field"), "tsdf": scores.get("tsdf")},
         "baseline": scores.get("nearest_image"),

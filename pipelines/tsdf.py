@@ -12,7 +12,9 @@ from pipelines.options import Config, Holdout, ImageSize, Json, OptionalOut, Pai
 def tsdf(
     target: Target,
     out: OptionalOut = None,
-    voxel_size: Annotated[float | None, typer.Option(help="Side of a voxel in working units (metres for metric captures).", show_default=False)] = None,
+    voxel_size: Annotated[
+        float | None, typer.Option(help="Side of a voxel in working units (metres for metric captures).", show_default=False)
+    ] = None,
     depth_max: Annotated[float | None, typer.Option(help="Depth beyond this is ignored, same unit.", show_default=False)] = None,
     image_size: ImageSize = None,
     holdout: Holdout = None,

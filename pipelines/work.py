@@ -11,14 +11,24 @@ from typing import Any
 from pipelines.console import make_progress, show_table
 
 
-def work(target: Path, out: Path | None, options: dict[str, Any], goals: Iterable[str], *, quiet: bool, as_json: bool, trusted: Iterable[str] | None = None) -> None:
+def work(
+    target: Path,
+    out: Path | None,
+    options: dict[str, Any],
+    goals: Iterable[str],
+    *,
+    quiet: bool,
+    as_json: bool,
+    trusted: Iterable[str] | None = None,
+    go_on: bool = False,
+) -> None:
     """Make `goals` in the run's folder and show the report's numbers."""
     from pipelines.job import bound_threads
 
     bound_threads(options)
     from pipelines.reconstruct import BEFORE, run_job
 
-    data = run_job(target, out, options, goals, make_progress(quiet), BEFORE if trusted is None else trusted)
+    data = run_job(target, out, options, goals, make_progress(quiet), BEFORE if trusted is None else trusted, go_on)
     show(data, quiet, as_json, folder=target if out is None else out)
 
 
@@ -28,4 +38,6 @@ def show(data: dict[str, Any], quiet: bool, as_json: bool, folder: Path) -> None
         sys.stdout.write(json.dumps(data, indent=1) + "\n")
     elif not quiet:
         show_table(data)
-        sys.stdout.write(f"{folder / 'report.html'}\n")
+        for warning in data.get("warnings", []):
+            sys.stdout.write(f"note: {warning}\n")
+        sys.stdout.write(f"{folder / ('report.html' if data.get('evaluation') else 'exports/cameras')}\n")

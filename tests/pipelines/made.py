@@ -130,5 +130,3 @@ def environment(**more: str) -> dict[str, str]:
 def spawn(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
     """Run `fieldfuse …` as a process of its own until it ends."""
     return subprocess.run(command(*arguments), capture_output=True, text=True, env=environment(), **options)
-
-

@@ -231,7 +231,9 @@ def test_unknown_key_in_a_settings_file(tmp_path: Path, capsys: Capsys) -> None:
     assert "mine.yaml" in answer.sentence() and "fit.budget" in answer.sentence()
 
 
-@pytest.mark.parametrize("arguments", [["run"], ["run", "x"], ["run", "x", "--out", "y", "--budget", "soon"], ["dance"], ["run", "x", "--otu", "y"]])
+@pytest.mark.parametrize(
+    "arguments", [["run"], ["run", "x"], ["run", "x", "--out", "y", "--budget", "soon"], ["dance"], ["run", "x", "--otu", "y"]]
+)
 def test_wrong_flags(arguments: list[str], capsys: Capsys) -> None:
     answer = call(capsys, *arguments)
     assert answer.code == 2

@@ -37,12 +37,16 @@ class Chain:
             value, before = start, []
             for name in ("first", "second", "third"):
                 uses = {"first": start, "second": shift, "third": None}[name]
-                value = self._stage(stages, folder, name, value + (shift if name == "second" else 1), uses, before, keeps and name == "second", stop)
+                value = self._stage(
+                    stages, folder, name, value + (shift if name == "second" else 1), uses, before, keeps and name == "second", stop
+                )
                 before = [name]
             self.stages = stages
             return value
 
-    def _stage(self, stages: Stages, folder: RunFolder, name: str, result: int, uses: Any, after: list[str], keeps: bool, stop: bool) -> int:
+    def _stage(
+        self, stages: Stages, folder: RunFolder, name: str, result: int, uses: Any, after: list[str], keeps: bool, stop: bool
+    ) -> int:
         path = folder / f"{name}.value"
 
         def make() -> int:
@@ -216,9 +220,8 @@ def test_kill_leaves_a_finished_stage_or_none(tmp_path: Path, moment: str, again
 
 
 def test_two_commands_in_one_folder(tmp_path: Path) -> None:
-    with RunFolder(tmp_path / "run"):
-        with pytest.raises(OutputError, match="another fieldfuse command is working"):
-            RunFolder(tmp_path / "run").__enter__()
+    with RunFolder(tmp_path / "run"), pytest.raises(OutputError, match="another fieldfuse command is working"):
+        RunFolder(tmp_path / "run").__enter__()
     with RunFolder(tmp_path / "run"):
         pass
 
