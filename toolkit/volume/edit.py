@@ -64,13 +64,15 @@ def dilate(topology: Topology, occupied: Tensor, steps: int = 1, grow: bool = Tr
     """Occupied voxels grown by `steps` voxels in the 26-neighbourhood, across block borders.
 
     Returns:
-        the topology (these blocks in their order, then, when `grow`, the new ones that were needed) and the new occupancy.
+        the topology (these blocks in their order, then, when `grow`, the new ones that were needed) and the new occupancy. Without
+        `grow` it is the same growth, cut to these blocks.
     """
-    for _ in range(steps):
-        if grow:
+    here = topology
+    for step in range(steps):
+        if grow or step < steps - 1:  # a later step may come back out of a block that is not here
             topology, occupied = _extended(_with_reached_blocks(topology, occupied, -1), occupied)
         occupied = _pooled(topology, occupied, 1)
-    return topology, occupied
+    return (topology, occupied) if grow else (here, occupied[: here.zero_row])
 
 
 def _extended(topology: Topology, occupied: Tensor) -> tuple[Topology, Tensor]:
