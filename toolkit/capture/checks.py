@@ -65,7 +65,9 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
     sizes = Counter(_upright_size(header, turns_by_exif(capture)) for header in headers)
     warnings = [*_size_warnings(capture, sizes), *_picture_warnings(capture, looks, copies), *check_depth(capture, progress)]
     extra = {**capture.extra, "sizes": {f"{width}x{height}": number for (width, height), number in sizes.most_common()}}
-    return replace(capture, extra=extra, warnings=capture.warnings + tuple(warning for warning in warnings if warning not in capture.warnings))
+    return replace(
+        capture, extra=extra, warnings=capture.warnings + tuple(warning for warning in warnings if warning not in capture.warnings)
+    )
 
 
 def _look_at_all(capture: Capture, progress: Progress) -> tuple[list[Header], list[Look], int]:
@@ -134,7 +136,9 @@ def _refuse_blank(capture: Capture, looks: list[Look]) -> None:
     blank = [look for look in looks if look.deviation < FLAT]
     if len(blank) > 0.5 * len(looks):
         kind = "black" if np.mean([look.tiny.mean() for look in blank]) < 20 else "of one colour"
-        raise InputError(f"{len(blank)} of {len(looks)} pictures in {capture.root} are {kind}, there is nothing to see in them; check the camera and the files")
+        raise InputError(
+            f"{len(blank)} of {len(looks)} pictures in {capture.root} are {kind}, there is nothing to see in them; check the camera and the files"
+        )
 
 
 def _refuse_same(capture: Capture, looks: list[Look]) -> None:
@@ -156,7 +160,9 @@ def _upright_size(header: Header, exif: bool) -> tuple[int, int]:
 def _size_warnings(capture: Capture, sizes: Counter[tuple[int, int]]) -> list[str]:
     if len(sizes) == 1:
         return []
-    listed = ", ".join(f"{width}×{height} ({number})" for (width, height), number in sizes.most_common(4)) + (", …" if len(sizes) > 4 else "")
+    listed = ", ".join(f"{width}×{height} ({number})" for (width, height), number in sizes.most_common(4)) + (
+        ", …" if len(sizes) > 4 else ""
+    )
     if all(frame.intrinsics is not None for frame in capture.frames):
         return [f"the pictures have {len(sizes)} sizes: {listed}; each comes with its own camera, so this is fine"]
     return [f"the pictures have {len(sizes)} sizes: {listed}; each size gets its own camera, which is less certain than one camera for all"]

@@ -75,7 +75,9 @@ def check_depth(capture: Capture, progress: Progress = SILENT) -> list[str]:
             if camera is not None and frame.world_from_camera is not None:
                 samples.append(Sample.of(depth, camera, frame.world_from_camera))
     if not medians:
-        raise InputError(f"no depth map in {capture.root} holds a value (all are 0, NaN or 65535); check how depth was written, or remove it")
+        raise InputError(
+            f"no depth map in {capture.root} holds a value (all are 0, NaN or 65535); check how depth was written, or remove it"
+        )
     _refuse_wrong_unit(capture, float(np.median(medians)), samples)
     warnings = []
     empty = sum(share == 0 for share in filled)
@@ -99,7 +101,9 @@ def _refuse_wrong_unit(capture: Capture, median: float, samples: list[Sample]) -
             f"so its unit is probably another one; {advice}"
         )
     if capture.metric and not NEAREST <= median <= FARTHEST:
-        raise InputError(f"the median depth in {capture.root} is {median:.3g} m, which no depth camera measures, so its unit is probably another one; {advice}")
+        raise InputError(
+            f"the median depth in {capture.root} is {median:.3g} m, which no depth camera measures, so its unit is probably another one; {advice}"
+        )
 
 
 def unit_factor(samples: list[Sample]) -> float:

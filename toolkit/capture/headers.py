@@ -65,7 +65,9 @@ def read_header(data: bytes, path: Path) -> Header:
     except (OSError, ValueError, SyntaxError, EOFError, KeyError, TypeError) as error:  # what Pillow's parsers raise on damaged headers
         raise InputError(f"the header of the picture {path} is damaged; copy it again or remove it") from error
     if width * height > MAX_PIXELS:
-        raise InputError(f"the picture {path} has {width}×{height} pixels, more than the {MAX_PIXELS // 10**6} megapixels that are read; make it smaller")
+        raise InputError(
+            f"the picture {path} has {width}×{height} pixels, more than the {MAX_PIXELS // 10**6} megapixels that are read; make it smaller"
+        )
     if width < 1 or height < 1:
         raise InputError(f"the picture {path} has no pixels ({width}×{height}); remove it")
     if not _complete(data, kind):

@@ -55,7 +55,9 @@ def load_depth(frame: Frame, capture: Capture) -> Array:
     if raw.ndim == 3 and raw.shape[2] == 1:
         raw = raw[:, :, 0]
     if raw.ndim != 2 or raw.size == 0:
-        raise InputError(f"the depth map {path} has the shape {raw.shape}, it must hold one value a pixel; store it as 16-bit grey PNG or float .npy")
+        raise InputError(
+            f"the depth map {path} has the shape {raw.shape}, it must hold one value a pixel; store it as 16-bit grey PNG or float .npy"
+        )
     depth = raw.astype(np.float32) / np.float32(capture.depth_scale)
     missing = ~np.isfinite(depth) | (depth <= 0)
     if raw.dtype == np.uint16:
@@ -113,7 +115,9 @@ def _decode(path: Path) -> tuple[Array, int]:
     except cv2.error:
         picture = None
     if picture is None:
-        raise InputError(f"the picture {path} ({header.format}) is damaged or of a kind that cannot be decoded; copy it again or convert it to PNG")
+        raise InputError(
+            f"the picture {path} ({header.format}) is damaged or of a kind that cannot be decoded; copy it again or convert it to PNG"
+        )
     return np.asarray(picture), header.orientation
 
 
@@ -123,8 +127,10 @@ def _load_npy(path: Path) -> Array:
         mapped = np.load(path, mmap_mode="r", allow_pickle=False)
     except OSError as error:
         raise InputError(f"cannot read the depth map {path}: {error.strerror or error}") from error
-    except (ValueError, EOFError, TypeError, SyntaxError) as error:
-        raise InputError(f"the depth map {path} is not a plain .npy array of numbers, or it is cut short; write it with numpy.save") from error
+    except Exception as error:  # the header is parsed as Python text, which on damaged files raises many families
+        raise InputError(
+            f"the depth map {path} is not a plain .npy array of numbers, or it is cut short; write it with numpy.save"
+        ) from error
     if not isinstance(mapped, np.ndarray) or mapped.dtype.kind not in "fiu" or mapped.size > MAX_PIXELS:
         raise InputError(f"the depth map {path} is not an array of numbers of at most {MAX_PIXELS // 10**6} megapixels")
     return np.array(mapped)

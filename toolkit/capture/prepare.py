@@ -65,7 +65,9 @@ def prepare_views(capture: Capture, working_from_input: Similarity, settings: Ca
         views.intrinsics.append(target)
         views.alpha.append(None if alpha is None else np.where(seen, shrink(source, alpha)[1], 0).astype(np.uint8))
         views.valid.append(None if usable.all() else usable)
-        views.depths.append(None if frame.depth is None else aligned_depth(frame, capture, source, target) * np.float32(working_from_input.scale))
+        views.depths.append(
+            None if frame.depth is None else aligned_depth(frame, capture, source, target) * np.float32(working_from_input.scale)
+        )
         poses.append(working_from_input.poses(frame.world_from_camera))
     views.world_from_camera = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
     progress.update(count, count)

@@ -64,18 +64,24 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
     measure = _measured(video, announced, Path(out) / "selection.json", progress)
     readable = len(measure.sharpness)
     if readable < 2:
-        raise InputError(f"only {readable} of {announced} frames of the video {video} can be decoded; the file is damaged, copy or convert it again")
+        raise InputError(
+            f"only {readable} of {announced} frames of the video {video} can be decoded; the file is damaged, copy or convert it again"
+        )
     if np.median(measure.sharpness) < BLANK:
         raise InputError(f"the video {video} shows nothing (its frames are black or of one colour); check the camera and the file")
     if measure.motion[-1] < STILL:
-        raise InputError(f"the camera does not move in the video {video}; depth needs views from different places, film while walking around the scene")
+        raise InputError(
+            f"the camera does not move in the video {video}; depth needs views from different places, film while walking around the scene"
+        )
     chosen = choose(measure, settings.max_frames)
     folder = Path(out) / "frames"
     names = [f"frame_{index:06d}" for index in chosen]
     _write(video, chosen, folder, announced, progress)
     frames = [Frame(name=name, image=(folder / f"{name}.jpg").resolve()) for name in names]
     extra = {**capture.extra, "selected_from": readable, "video": str(video)}
-    picked = replace(capture, frames=tuple(frames), ordered=True, extra=extra, warnings=capture.warnings + tuple(_remarks(measure, chosen, announced)))
+    picked = replace(
+        capture, frames=tuple(frames), ordered=True, extra=extra, warnings=capture.warnings + tuple(_remarks(measure, chosen, announced))
+    )
     return check_capture(picked, progress)
 
 
@@ -141,7 +147,7 @@ def displacement(before: Array, after: Array) -> float:
     if corners is None or len(corners) < 8:
         # Nothing to track. Blank pictures that stay alike have not moved; others have, unknown how far.
         return 0.0 if float(np.abs(before.astype(np.float32) - after).mean()) < 2.0 else JUMP
-    moved, found, error = cv2.calcOpticalFlowPyrLK(before, after, corners, None, winSize=(21, 21), maxLevel=3)
+    moved, found, error = cv2.calcOpticalFlowPyrLK(before, after, corners, corners.copy(), winSize=(21, 21), maxLevel=3)
     tracked = (found.ravel() == 1) & (error.ravel() < 25)
     if tracked.sum() < max(8, 0.25 * len(corners)):
         return JUMP
@@ -156,7 +162,11 @@ def _measured(video: Path, announced: int, path: Path, progress: Progress) -> Me
         try:
             kept = read_json(path)
             measure = Measure([float(value) for value in kept["sharpness"]], [float(value) for value in kept["motion"]])
-            if kept["key"] == key and len(measure.sharpness) == len(measure.motion) > 0 and np.isfinite([measure.sharpness, measure.motion]).all():
+            if (
+                kept["key"] == key
+                and len(measure.sharpness) == len(measure.motion) > 0
+                and np.isfinite([measure.sharpness, measure.motion]).all()
+            ):
                 return measure
         except (InputError, KeyError, TypeError, ValueError):
             log.info("%s is not readable, frames are measured again", path)
@@ -207,7 +217,9 @@ def _remarks(measure: Measure, chosen: list[int], announced: int) -> list[str]:
     steps = np.diff(np.asarray(measure.motion)[chosen])
     wide = int((steps > MAX_STEP).sum())
     if wide:
-        remarks.append(f"the camera moves so fast that {wide} of {len(steps)} neighbouring frames overlap little; film slower, or raise max_frames")
+        remarks.append(
+            f"the camera moves so fast that {wide} of {len(steps)} neighbouring frames overlap little; film slower, or raise max_frames"
+        )
     return remarks
 
 

@@ -38,7 +38,9 @@ def read_video(path: Path) -> Capture:
     try:
         ok, first = stream.read()
         if not ok or first is None:
-            raise InputError(f"not one frame of the video {path} can be decoded; convert it (for instance with ffmpeg to H.264 mp4) and try again")
+            raise InputError(
+                f"not one frame of the video {path} can be decoded; convert it (for instance with ffmpeg to H.264 mp4) and try again"
+            )
         announced = stream.get(cv2.CAP_PROP_FRAME_COUNT)
         fps = stream.get(cv2.CAP_PROP_FPS)
         rotation = stream.get(cv2.CAP_PROP_ORIENTATION_META)
@@ -99,7 +101,9 @@ def _open(path: Path) -> cv2.VideoCapture:
         cv2.utils.logging.setLogLevel(level)
     if not stream.isOpened():
         stream.release()
-        raise InputError(f"{path} is not a video that can be read; give an mp4, mov, avi or mkv file (one that was not cut off while copying)")
+        raise InputError(
+            f"{path} is not a video that can be read; give an mp4, mov, avi or mkv file (one that was not cut off while copying)"
+        )
     # The one place where rotation metadata is applied: the decoder turns each frame before it hands it out.
     stream.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
     return stream
@@ -135,7 +139,9 @@ def _check_container(path: Path) -> None:
     except OSError as error:
         raise InputError(f"cannot read the video {path}: {error.strerror or error}") from error
     if expected is not None and expected > size:
-        raise InputError(f"the video {path} is cut short (it has {size} bytes and announces at least {expected}); copy it again from the camera")
+        raise InputError(
+            f"the video {path} is cut short (it has {size} bytes and announces at least {expected}); copy it again from the camera"
+        )
 
 
 def _expected_size(file: BinaryIO, head: bytes, size: int) -> int | None:

@@ -43,7 +43,11 @@ def save_views(path: Path, views: Views) -> None:
     }
     with atomic_path(path) as temporary:
         try:
-            save_file(tensors, temporary, metadata={"format": "fieldfuse-views", "version": str(VERSION), "views": json.dumps(facts, allow_nan=False)})
+            save_file(
+                tensors,
+                temporary,
+                metadata={"format": "fieldfuse-views", "version": str(VERSION), "views": json.dumps(facts, allow_nan=False)},
+            )
         except SafetensorError as error:  # a full disk arrives as this, not as an OSError
             raise OutputError(f"cannot write {path}: {error}; free space or choose another --out folder") from error
 
@@ -60,13 +64,13 @@ def load_views(path: Path) -> Views:
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
-            if metadata.get("format") != "fieldfuse-views" or metadata.get("version") != str(VERSION):
-                raise InputError(f"{path} does not hold prepared views of version {VERSION}; remove it and run the job again")
-            keys = set(file.keys())
-            return _assemble(json.loads(metadata["views"]), keys, file)
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+            known = metadata.get("format") == "fieldfuse-views" and metadata.get("version") == str(VERSION)
+            if known:
+                return _assemble(json.loads(metadata["views"]), set(file.keys()), file)
+    except (InputError, SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         detail = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"the prepared views {path} are damaged ({detail}); remove the file and run the job again") from error
+    raise InputError(f"{path} does not hold prepared views of version {VERSION}; remove it and run the job again")
 
 
 def _assemble(facts: dict[str, Any], keys: set[str], file: Any) -> Views:
