@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import open3d as o3d
+import open3d.core as o3c
 
 from toolkit.camera import Array, Intrinsics
 from toolkit.tsdf.mesh import Mesh
 
-ROWS_AT_ONCE = 1 << 20  # rays
+RAYS_AT_ONCE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class SurfaceCaster:
         self.threads = threads
         self.scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
         if len(mesh.triangles):
-            self.scene.add_triangles(mesh.vertices.astype(np.float32), mesh.triangles.astype(np.uint32))
+            self.scene.add_triangles(o3c.Tensor.from_numpy(mesh.vertices.astype(np.float32)), o3c.Tensor.from_numpy(mesh.triangles.astype(np.uint32)))
 
     def render(self, intrinsics: Intrinsics, world_from_camera: Array) -> MeshView:
         """The view of a camera without lens distortion (its pinhole is used)."""
@@ -48,7 +49,7 @@ class SurfaceCaster:
         depth = np.zeros((height, width), np.float32)
         if len(self.mesh.triangles) == 0:
             return MeshView(rgb, depth, depth > 0)
-        step = max(1, ROWS_AT_ONCE // width)
+        step = max(1, RAYS_AT_ONCE // width)
         for top in range(0, height, step):
             rows = slice(top, min(top + step, height))
             rgb[rows], depth[rows] = self._rows(intrinsics, np.asarray(world_from_camera, dtype=np.float64), rows)
@@ -60,7 +61,7 @@ class SurfaceCaster:
         camera = np.stack([(u + 0.5 - intrinsics.cx) / intrinsics.fx, (v + 0.5 - intrinsics.cy) / intrinsics.fy, np.ones_like(u)], axis=-1)
         directions = camera @ pose[:3, :3].T
         rays = np.concatenate([np.broadcast_to(pose[:3, 3], directions.shape), directions], axis=-1).astype(np.float32)
-        hits = self.scene.cast_rays(o3d.core.Tensor(rays), nthreads=self.threads)
+        hits = self.scene.cast_rays(o3c.Tensor.from_numpy(rays), nthreads=self.threads)
         distance = hits["t_hit"].numpy()
         hit = np.isfinite(distance) & (distance > 0)
         corner = self.mesh.triangles[hits["primitive_ids"].numpy()[hit]]  # (hits, 3)
