@@ -52,6 +52,8 @@ def doctor(json: Json = False) -> None:
         typer.echo(writer.dumps([asdict(check) for check in checks], indent=1))
     else:
         examination.show(checks)
+    if any(check.status == examination.FAIL for check in checks):
+        raise typer.Exit(1)
 
 
 def main() -> None:

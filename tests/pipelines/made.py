@@ -18,7 +18,9 @@ from toolkit.camera import Array, Intrinsics, opengl_from_world
 
 ROOT = Path(__file__).resolve().parents[2]
 HALF = np.array([2.0, 1.5, 2.0])  # half size of the room, metres
-CAMERA = Intrinsics(64, 48, 55.0, 55.0, 32.0, 24.0)
+TILE = 0.45  # metres
+FINE = 3  # samples along each side of a pixel, so that edges are soft as in photos
+CAMERA = Intrinsics(96, 72, 82.5, 82.5, 48.0, 36.0)
 
 
 def look_at(eye: Array, target: Array) -> Array:
@@ -42,22 +44,30 @@ def circle(count: int) -> list[Array]:
 
 
 def colour_at(points: Array) -> Array:
-    """(N, 3) points → (N, 3) RGB in [0, 1]: waves of several lengths, different on every wall."""
+    """(N, 3) points → (N, 3) RGB in [0, 1]: tiles of many colours with soft waves over them."""
+    cells = np.floor(points / TILE + 0.37).astype(np.int64) % 32
+    table = np.random.default_rng(7).random((32, 32, 32, 3))
     x, y, z = points.T
-    waves = [np.sin(3.1 * x + 1.7 * y - 2.3 * z), np.sin(7.3 * y - 5.1 * x + 1.0), np.sin(6.1 * z + 4.3 * y + 2.0)]
-    mixed = np.stack([waves[0] + 0.6 * waves[1], waves[1] + 0.6 * waves[2], waves[2] + 0.6 * waves[0]], axis=1)
-    return 0.5 + 0.3 * mixed / 1.1
+    waves = np.stack([np.sin(3.1 * x + 1.7 * y - 2.3 * z), np.sin(4.3 * y - 5.1 * x + 1.0), np.sin(3.1 * z + 4.3 * y + 2.0)], axis=1)
+    return 0.1 + 0.6 * table[cells[:, 0], cells[:, 1], cells[:, 2]] + 0.1 * (1 + waves)
 
 
 def shoot(pose: Array, camera: Intrinsics = CAMERA) -> tuple[Array, Array]:
     """(H, W, 3) uint8 RGB and (H, W) float64 depth along z of the room."""
+    fine = camera.scaled(camera.width * FINE, camera.height * FINE)
+    rgb, _ = trace(pose, fine)
+    rgb = rgb.reshape(camera.height, FINE, camera.width, FINE, 3).mean(axis=(1, 3))
+    return (np.clip(rgb, 0, 1) * 255 + 0.5).astype(np.uint8), trace(pose, camera)[1]
+
+
+def trace(pose: Array, camera: Intrinsics) -> tuple[Array, Array]:
+    """(H, W, 3) RGB and (H, W) depth at the pixels' centres."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
     rays = np.stack([(u + 0.5 - camera.cx) / camera.fx, (v + 0.5 - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1).reshape(-1, 3)
     directions, eye = rays @ pose[:3, :3].T, pose[:3, 3]
     with np.errstate(divide="ignore"):
         distance = np.max(np.stack([(HALF - eye) / directions, (-HALF - eye) / directions]), axis=0).min(axis=1)
-    rgb = np.clip(colour_at(eye + directions * distance[:, None]), 0, 1)
-    return (rgb.reshape(*u.shape, 3) * 255 + 0.5).astype(np.uint8), distance.reshape(u.shape)
+    return colour_at(eye + directions * distance[:, None]).reshape(*u.shape, 3), distance.reshape(u.shape)
 
 
 def save_picture(path: Path, rgb: Array) -> Path:

@@ -64,7 +64,7 @@ def not_a_video(path: Path) -> Path:
 def no_readable_frame(path: Path) -> Path:
     """The head of a film whose pictures are cut off."""
     whole = path.with_suffix(".avi")
-    writer = cv2.VideoWriter(str(whole), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    writer = cv2.VideoWriter(str(whole), cv2.VideoWriter.fourcc(*"MJPG"), 10, (CAMERA.width, CAMERA.height))
     for pose in circle(12):
         writer.write(shoot(pose)[0])
     writer.release()

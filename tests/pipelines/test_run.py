@@ -68,7 +68,7 @@ def test_report_has_the_keys_that_others_rely_on(done: Path) -> None:
     assert data["timeline"][-1]["seconds"] <= 3 * 1.05 + 2
     assert data["seconds_total"] > sum(stage["seconds"] for stage in data["stages"]) * 0.9
     assert data["version"] and data["command"].startswith("fieldfuse run ") and "--budget 3" in data["command"]
-    assert data["capture"]["frames"] == 16 and (data["capture"]["width"], data["capture"]["height"]) == (64, 48)
+    assert data["capture"]["frames"] == 16 and (data["capture"]["width"], data["capture"]["height"]) == (96, 72)
     assert data["poses"] == data["poses"] | {"source": "given", "registered": 16, "total": 16}
 
 
@@ -135,9 +135,9 @@ def test_info_on_source_and_run(done: Path, capsys: Capsys) -> None:
     answer = call(capsys, "info", done.parent / "room", "--json")
     data = json.loads(answer.out)
     assert (data["kind"], data["frames"], data["depth"]) == ("transforms", 16, 16)
-    assert data["intrinsics"][0]["fx"] == 55.0
+    assert data["intrinsics"][0]["fx"] == 82.5
     text = call(capsys, "info", done.parent / "room", "--fast").out
-    assert "transforms" in text and "fx 55" in text
+    assert "transforms" in text and "fx 82.5" in text
     answer = call(capsys, "info", done, "--json")
     assert [stage["name"] for stage in json.loads(answer.out)["stages"]][:2] == ["capture", "poses"]
 
