@@ -37,7 +37,7 @@ class Model:
 
 
 def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str, Any]]]:
-    """The largest trustworthy model, and what every attempt gave: `{"attempt", "models": [frames, …]}`, largest first."""
+    """The largest trustworthy model in a settled frame, and what every attempt gave: `{"attempt", "models": [frames, …]}`, largest first."""
     attempts: list[tuple[str, Callable[[], list[pycolmap.Reconstruction]]]] = [
         ("incremental", lambda: _incremental(job, report, loose=False)),
         ("incremental, small angles", lambda: _incremental(job, report, loose=True)),
@@ -57,6 +57,8 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
                 best = model
         if best is not None and best.size[0] >= ENOUGH * len(job.pictures):
             break
+    if best is not None:
+        settle(best)
     return best, history
 
 
@@ -132,6 +134,20 @@ def _empty(folder: Path) -> Path:
 
 
 # --------------------------------------------------------------------------------------------------- results
+
+
+def settle(model: Model) -> None:
+    """Fix the frame that structure from motion leaves free: the first registered camera's axes, cameras at mean distance 1 from their centre.
+
+    COLMAP's own choice depends on the order in which threads finish.
+    """
+    reconstruction = model.reconstruction
+    first = min(model.registered, key=lambda image_id: int(reconstruction.image(image_id).name))
+    centres = np.array([reconstruction.image(image_id).projection_center() for image_id in model.registered])
+    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
+    pose = reconstruction.image(first).cam_from_world()
+    scale = 1.0 / max(spread, 1e-12)
+    reconstruction.transform(pycolmap.Sim3d(scale, pose.rotation, scale * np.asarray(pose.translation)))
 
 
 def save_model(model: Model, names: list[str], folder: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -96,10 +96,12 @@ def describe_scene(capture: Capture, progress: Progress = SILENT) -> Scene:
     """
     if not capture.posed:
         raise PoseError(f"{capture.root}: not every frame has a pose and intrinsics; run the poses stage first")
-    poses = np.array([frame.world_from_camera for frame in capture.frames], dtype=np.float64)
-    # Inputs may lie far from their origin (6000 km in earth-centred frames): all that follows is about offsets from here.
-    origin = np.median(poses[:, :3, 3], axis=0)
-    cloud = find_cloud(capture, progress)
+    # Inputs may lie far from their origin (6000 km in earth-centred frames): all that follows happens near zero.
+    origin = np.median([frame.world_from_camera[:3, 3] for frame in capture.frames if frame.world_from_camera is not None], axis=0)
+    near_zero = Similarity(1.0, np.eye(3), -origin)
+    local = _moved(capture, near_zero)
+    poses = np.array([frame.world_from_camera for frame in local.frames], dtype=np.float64)
+    cloud = find_cloud(local, progress)
     if len(cloud.points) < FEW_POINTS or len(cloud.point) == 0:
         raise PoseError(
             f"{capture.root}: only {len(cloud.points)} points could be triangulated with the given poses, so they or their axis convention do not fit the pictures; check them or use --set poses.source=sfm"
@@ -108,25 +110,24 @@ def describe_scene(capture: Capture, progress: Progress = SILENT) -> Scene:
     scale = 1.0 if capture.metric else MEDIAN_DEPTH / depth
     up, reason = up_direction(poses, capture.up)
     rotation = rotation_to_z(up)
-    upright = Similarity(scale, rotation, -scale * (rotation @ origin))
+    upright = Similarity(scale, rotation, np.zeros(3))
     found = layout(upright.poses(poses), with_depth=cloud.source == "depth")
     points = upright.points(cloud.points)
     bounded = cloud.source in ("silhouettes", "depth")
     turn = turn_about_z(_turn(found, upright.poses(poses), points, cloud, bounded))
     centre, half, inside = _region(Layout(found.kind, turn @ found.focus, found.distance, found.nearest), points @ turn.T, cloud, bounded)
-    working = Similarity(scale, turn @ rotation, turn @ upright.translation - centre)
+    working = Similarity(scale, turn @ rotation, -centre)
     views = cloud.views
     beyond = float((views * ~inside).sum() / max(views.sum(), 1))
     depths = cloud.depth * scale
-    corners = working.poses(poses)[:, :3, 3]
-    reach = float((np.linalg.norm(corners, axis=1) + np.linalg.norm(half)).max())
+    reach = float(np.linalg.norm(working.poses(poses)[:, :3, 3], axis=1).max() + np.linalg.norm(half))
     return Scene(
-        working_from_input=working,
+        working_from_input=working.after(near_zero),
         centre=np.zeros(3),
         half_size=half,
         median_depth=depth * scale,
         near=0.7 * float(np.percentile(depths, 0.5)),
-        far=float(max(1.2 * np.percentile(depths, 99.5), min(reach, 1e3 * depth * scale))),
+        far=float(max(1.2 * np.percentile(depths, 99.5), reach)),
         background_share=beyond,
         # Without alpha or depth, pictures are full to the rim, and what has no texture left no points to count.
         has_background=not bounded or beyond > BEYOND,
@@ -153,6 +154,13 @@ def find_cloud(capture: Capture, progress: Progress = SILENT) -> Cloud:
         if len(cloud.point) >= FEW_POINTS:
             return cloud
     return triangulate(capture, progress)
+
+
+def _moved(capture: Capture, move: Similarity) -> Capture:
+    """The capture in another frame."""
+    frames = [replace(frame, world_from_camera=move.poses(frame.world_from_camera)) for frame in capture.frames if frame.world_from_camera is not None]
+    points = None if capture.points is None else move.points(capture.points)
+    return replace(capture, frames=tuple(frames), points=points)
 
 
 def _turn(found: Layout, poses: Array, points: Array, cloud: Cloud, bounded: bool) -> float:
