@@ -75,7 +75,8 @@ class Intrinsics:
             raise InputError(f"{where}: the lens model {self.lens!r} is not known; known are {', '.join(LENSES)}")
         most = {PINHOLE: 0, FISHEYE: 4}.get(self.lens, 14)
         if len(self.distortion) > most and any(self.distortion[most:]):
-            raise InputError(f"{where}: the lens model {self.lens!r} takes at most {most} coefficients, here are {len(self.distortion)}; correct them")
+            given = len(self.distortion)
+            raise InputError(f"{where}: the lens model {self.lens!r} takes at most {most} coefficients, here are {given}; correct them")
         return self
 
     def to_dict(self) -> dict[str, Any]:
@@ -216,7 +217,9 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     if abs(np.linalg.det(rotation)) < 1e-6:
         raise InputError(f"{where}: the pose's rotation is singular; remove this frame or correct it")
     if np.linalg.det(rotation) < 0:
-        raise InputError(f"{where}: the pose mirrors space (its rotation has determinant < 0); its axis convention is not what this kind of capture uses")
+        raise InputError(
+            f"{where}: the pose mirrors space (its rotation has determinant < 0); its axis convention is not what this kind of capture uses"
+        )
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > tolerance:
         raise InputError(f"{where}: the pose is not rigid (its rotation is scaled or sheared by more than {tolerance:g}); correct it")
     u, _, vt = np.linalg.svd(rotation)

@@ -32,7 +32,7 @@ def atomic_path(target: Path | str) -> Iterator[Path]:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
-        os.replace(temporary, target)
+        temporary.replace(target)
     except OSError as error:
         raise OutputError(f"cannot write {target}: {error.strerror or error}; free space or choose another --out folder") from error
     finally:
@@ -65,7 +65,8 @@ def read_json(path: Path | str, max_bytes: int = MAX_JSON_BYTES) -> Any:
     try:
         size = path.stat().st_size
         if size > max_bytes:
-            raise InputError(f"{path} holds {size / 2**20:.0f} MB of JSON, more than the {max_bytes / 2**20:.0f} MB that is read; remove what is not needed")
+            most = f"{max_bytes / 2**20:.0f} MB"
+            raise InputError(f"{path} holds {size / 2**20:.0f} MB of JSON, more than the {most} that is read; remove what is not needed")
         return json.loads(path.read_text(encoding="utf-8"))
     except RecursionError as error:
         raise InputError(f"{path} is nested too deeply to be read as JSON; check how it was written") from error

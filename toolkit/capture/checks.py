@@ -137,7 +137,8 @@ def _refuse_blank(capture: Capture, looks: list[Look]) -> None:
     if len(blank) > 0.5 * len(looks):
         kind = "black" if np.mean([look.tiny.mean() for look in blank]) < 20 else "of one colour"
         raise InputError(
-            f"{len(blank)} of {len(looks)} pictures in {capture.root} are {kind}, there is nothing to see in them; check the camera and the files"
+            f"{len(blank)} of {len(looks)} pictures in {capture.root} are {kind}, there is nothing to see in them; "
+            "check the camera and the files"
         )
 
 
@@ -145,7 +146,8 @@ def _refuse_same(capture: Capture, looks: list[Look]) -> None:
     difference = max(float(np.abs(look.tiny - looks[0].tiny).mean()) for look in looks)
     if difference < SAME:
         raise InputError(
-            f"all {len(capture.frames)} pictures in {capture.root} show the same view; depth needs a camera that moves, take each picture from another place"
+            f"all {len(capture.frames)} pictures in {capture.root} show the same view; depth needs a camera that moves, "
+            "take each picture from another place"
         )
 
 

@@ -102,7 +102,8 @@ def _refuse_wrong_unit(capture: Capture, median: float, samples: list[Sample]) -
         )
     if capture.metric and not NEAREST <= median <= FARTHEST:
         raise InputError(
-            f"the median depth in {capture.root} is {median:.3g} m, which no depth camera measures, so its unit is probably another one; {advice}"
+            f"the median depth in {capture.root} is {median:.3g} m, which no depth camera measures, "
+            f"so its unit is probably another one; {advice}"
         )
 
 
@@ -117,15 +118,16 @@ def unit_factor(samples: list[Sample]) -> float:
     for a, b in _pairs(samples):
         here = agreement(a, b, 1.0)
         scores = {factor: agreement(a, b, factor) for factor in FACTORS}
-        best = max(scores, key=lambda factor: scores[factor])
-        if max(here, scores[best]) < SEEN:
+        best = max(scores.values())
+        if max(here, best) < SEEN:
             continue
-        if scores[best] > 2 * here:
-            others[best] += 1
+        if best > 2 * here:
+            # Of units that fit about as well (a flat wall, little motion), the one that changes least.
+            others[min((f for f in FACTORS if scores[f] > 0.95 * best), key=lambda f: abs(np.log(f)))] += 1
         else:
             own += 1
-    best = max(others, key=lambda factor: others[factor])
-    return best if others[best] >= 2 and others[best] > 2 * own else 1.0
+    likely = max(others, key=lambda factor: others[factor])
+    return likely if others[likely] >= 2 and others[likely] > 2 * own else 1.0
 
 
 def _pairs(samples: list[Sample]) -> list[tuple[Sample, Sample]]:

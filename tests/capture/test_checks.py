@@ -1,0 +1,277 @@
+"""The first look at a capture: each kind of bad input refused in one sentence, weaknesses told, good captures left alone."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.capture.board import capture_of, save, texture
+from tests.conftest import shared_data
+from toolkit.camera import Array, Intrinsics
+from toolkit.capture import open_capture
+from toolkit.capture.checks import check_capture
+from toolkit.capture.types import Capture, Frame
+from toolkit.errors import FieldfuseError, InputError, Interrupted
+from toolkit.progress import Progress
+
+SIZE = (120, 160)
+
+
+def photos(folder: Path, pictures: list[Array], suffix: str = ".jpg") -> Capture:
+    frames = [Frame(f"{index:02d}", save(folder / f"{index:02d}{suffix}", picture)) for index, picture in enumerate(pictures)]
+    return capture_of(folder, frames, kind="photos")
+
+
+def scenery(count: int = 8, size: tuple[int, int] = SIZE) -> list[Array]:
+    wide = texture(size[0], size[1] + 20 * count, seed=1)
+    return [np.ascontiguousarray(wide[:, 20 * index : 20 * index + size[1]]) for index in range(count)]
+
+
+def refused(capture: Capture, text: str) -> None:
+    with pytest.raises(InputError, match=text) as caught:
+        check_capture(capture)
+    message = str(caught.value)
+    assert "\n" not in message and len(message) < 400
+
+
+# ---------------------------------------------------------------------------------------------------- refused
+
+
+def test_no_and_one_picture(tmp_path: Path) -> None:
+    refused(capture_of(tmp_path, [], kind="photos"), "no pictures")
+    refused(photos(tmp_path, scenery(1)), "only one picture")
+
+
+def test_ten_identical_photos(tmp_path: Path) -> None:
+    refused(photos(tmp_path / "same", [scenery(1)[0]] * 10), "same view")
+    # The same view taken ten times: not the same bytes, but nothing new in them either.
+    rng = np.random.default_rng(0)
+    view = texture(480, 640, blur=4)
+    noisy = [np.clip(view + rng.normal(0, 3, view.shape), 0, 255).astype(np.uint8) for _ in range(10)]
+    refused(photos(tmp_path / "noisy", noisy), "same view")
+
+
+def test_a_small_move_is_not_identical(tmp_path: Path) -> None:
+    wide = texture(SIZE[0], SIZE[1] + 20, seed=1)
+    check_capture(photos(tmp_path, [np.ascontiguousarray(wide[:, index : index + SIZE[1]]) for index in range(0, 16, 2)]))
+
+
+@pytest.mark.parametrize(("level", "text"), [(0, "black"), (255, "of one colour")])
+def test_black_and_constant_photos(tmp_path: Path, level: int, text: str) -> None:
+    rng = np.random.default_rng(0)
+    pictures = [np.clip(level + rng.normal(0, 1, (*SIZE, 3)), 0, 255).astype(np.uint8) for _ in range(10)]
+    refused(photos(tmp_path, pictures), text)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_a_truncated_picture_is_named(tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]) -> None:
+    capture = photos(tmp_path, scenery(), suffix)
+    path = capture.frames[5].image
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    refused(capture, rf"05\{suffix}.*cut short")
+    assert capfd.readouterr().err == ""
+
+
+def test_a_missing_picture_is_named(tmp_path: Path) -> None:
+    capture = photos(tmp_path, scenery())
+    capture.frames[3].image.unlink()
+    refused(capture, r"03\.jpg")
+
+
+def test_a_picture_of_another_shape_than_its_camera(tmp_path: Path) -> None:
+    capture = photos(tmp_path, scenery())
+    camera = Intrinsics(SIZE[1], SIZE[0] + 40, 150.0, 150.0, 80.0, 80.0)
+    refused(capture.with_frames([replace(frame, intrinsics=camera) for frame in capture.frames]), r"00\.jpg.*another shape")
+
+
+# ---------------------------------------------------------------------------------------------------- told
+
+
+def warnings_of(capture: Capture) -> str:
+    return " | ".join(check_capture(capture).warnings)
+
+
+def test_good_photos_pass_without_a_word(tmp_path: Path) -> None:
+    checked = check_capture(photos(tmp_path, scenery()))
+    assert checked.warnings == () and checked.extra["sizes"] == {"160x120": 8}
+
+
+def test_mixed_sizes(tmp_path: Path) -> None:
+    pictures = scenery(6) + [np.ascontiguousarray(picture[:, :100]) for picture in scenery(8)[6:]]
+    capture = photos(tmp_path, pictures)
+    checked = check_capture(capture)
+    assert checked.extra["sizes"] == {"160x120": 6, "100x120": 2}
+    assert "each size gets its own camera" in checked.warnings[0] and "160×120 (6)" in checked.warnings[0]
+    cameras = [Intrinsics(picture.shape[1], picture.shape[0], 150.0, 150.0, 80.0, 60.0) for picture in pictures]
+    with_cameras = capture.with_frames([replace(frame, intrinsics=camera) for frame, camera in zip(capture.frames, cameras, strict=True)])
+    assert "this is fine" in warnings_of(with_cameras)
+
+
+def test_sizes_are_counted_upright_for_photos(tmp_path: Path) -> None:
+    tags = Image.Exif()
+    tags[0x0112] = 6
+    capture = photos(tmp_path, scenery())
+    for frame in capture.frames[:4]:  # four held upright, stored lying
+        picture = np.rot90(np.asarray(Image.open(frame.image)))
+        Image.fromarray(np.ascontiguousarray(picture)).save(frame.image, exif=tags)
+    assert check_capture(capture).extra["sizes"] == {"160x120": 8}
+    assert len(check_capture(replace(capture, kind="llff")).extra["sizes"]) == 2
+
+
+def test_some_bad_pictures_are_told(tmp_path: Path) -> None:
+    pictures = scenery(12)
+    pictures[4] = np.zeros_like(pictures[4])
+    pictures[7] = pictures[6]
+    for index in (1, 9):
+        pictures[index] = cv2.GaussianBlur(pictures[index], (0, 0), 5)
+    text = warnings_of(photos(tmp_path, pictures))
+    assert "1 of 12 pictures show nothing but one colour (04)" in text
+    assert "exact cop" in text
+    assert "2 of 12 pictures are much less sharp" in text
+
+
+def test_dark_and_overexposed_pictures_are_told(tmp_path: Path) -> None:
+    dark = [(picture / 8).astype(np.uint8) for picture in scenery()]
+    assert "8 of 8 pictures are very dark" in warnings_of(photos(tmp_path / "dark", dark))
+    bright = [np.clip(picture.astype(int) * 4, 0, 255).astype(np.uint8) for picture in scenery()]
+    assert "white in large parts" in warnings_of(photos(tmp_path / "bright", bright))
+    assert "white" not in warnings_of(replace(photos(tmp_path / "object", bright), alpha=True))
+
+
+def test_stopping_is_heard(tmp_path: Path) -> None:
+    class Stop(Progress):
+        def stopping(self) -> bool:
+            return True
+
+    with pytest.raises(Interrupted):
+        check_capture(photos(tmp_path, scenery()), Stop())
+
+
+def test_progress_has_totals(tmp_path: Path) -> None:
+    class Keep(Progress):
+        def __init__(self) -> None:
+            self.calls: list[tuple[float, float]] = []
+
+        def update(self, done: float, total: float, note: str = "") -> None:
+            self.calls.append((done, total))
+
+    keep = Keep()
+    check_capture(photos(tmp_path, scenery()), keep)
+    assert len(keep.calls) >= 8 and all(0 <= done <= total for done, total in keep.calls)
+
+
+def test_many_large_photos_take_seconds(tmp_path: Path) -> None:
+    base = cv2.resize(texture(600, 800, blur=1), (4000, 3000), interpolation=cv2.INTER_CUBIC)
+    sources = [
+        save(tmp_path / f"source{index}.jpg", np.roll(base, 300 * index, axis=1), cv2.IMWRITE_JPEG_QUALITY, 90) for index in range(2)
+    ]
+    frames = []
+    for index in range(60):
+        path = tmp_path / f"{index:03d}.jpg"
+        path.hardlink_to(sources[index % 2])
+        frames.append(Frame(path.stem, path))
+    started = time.process_time()
+    check_capture(capture_of(tmp_path, frames, kind="photos"))
+    assert time.process_time() - started < 6  # 200 of them: under 10 s on one core; headroom for slow machines
+
+
+# ---------------------------------------------------------------------------------------------------- depth
+
+
+CAMERA = Intrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
+
+
+def corner_of_a_room(pose: Array) -> Array:
+    """(60, 80) depth along z of a floor, a back wall and a side wall, each n · x = d, from inside."""
+    v, u = np.mgrid[0:60, 0:80]
+    rays = np.stack([(u + 0.5 - 40) / 70, (v + 0.5 - 30) / 70, np.ones((60, 80))], axis=-1) @ pose[:3, :3].T
+    depths = []
+    for normal, distance in (((0, 1, 0), 1.0), ((0, 0, 1), 4.0), ((-1, 0, 0), 1.5), ((0, -1, 0), 1.5), ((1, 0, 0), 3.0)):
+        towards = rays @ np.array(normal, float)
+        depths.append(np.where(towards > 1e-6, (distance - pose[:3, 3] @ np.array(normal, float)) / np.maximum(towards, 1e-6), np.inf))
+    return np.asarray(np.min(depths, axis=0))
+
+
+def rgbd(folder: Path, depth_factor: float = 1.0, kind: str = "7scenes", step: float = 0.25, count: int = 8) -> Capture:
+    """A walk into the corner of a room, looking about; depth is stored in millimetres × depth_factor."""
+    frames = []
+    for index, picture in enumerate(scenery(count, (60, 80))):
+        pose = np.eye(4)
+        pose[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.08 * (index - 3), 0.0]))[0]
+        pose[:3, 3] = step * index * np.array([0.7, 0.1, 1.0])
+        path = folder / f"{index}.npy"
+        folder.mkdir(parents=True, exist_ok=True)
+        np.save(path, (corner_of_a_room(pose) * 1000 * depth_factor).astype(np.float32))
+        image = save(folder / f"{index}.png", picture)
+        frames.append(Frame(f"{index}", image, intrinsics=CAMERA, world_from_camera=pose, depth=path))
+    return capture_of(folder, frames, kind=kind, metric=kind != "transforms", ordered=True)
+
+
+def test_depth_in_the_right_unit_passes(tmp_path: Path) -> None:
+    assert check_capture(rgbd(tmp_path)).warnings == ()
+
+
+@pytest.mark.parametrize("factor", [1000.0, 100.0, 10.0, 5.0, 0.2, 0.1, 0.01, 0.001])
+@pytest.mark.parametrize("kind", ["7scenes", "transforms"])
+def test_depth_in_a_wrong_unit_is_noticed(tmp_path: Path, factor: float, kind: str) -> None:
+    with pytest.raises(InputError, match=rf"{max(factor, 1 / factor):g} times {'smaller' if factor > 1 else 'larger'}") as caught:
+        check_capture(rgbd(tmp_path, factor, kind))
+    assert ("depth_unit_scale_factor" if kind == "transforms" else "millimetres") in str(caught.value)
+
+
+def test_impossible_metric_depth_is_noticed_without_motion(tmp_path: Path) -> None:
+    still = rgbd(tmp_path / "far", 1000.0, step=1e-3)
+    refused(still, "e[+]03 m, which no depth camera measures")
+    refused(rgbd(tmp_path / "near", 0.001, step=1e-6), "0.00[0-9]* m, which no depth camera measures")
+    check_capture(replace(still, metric=False, kind="transforms"))  # without metres nothing is impossible
+
+
+@pytest.mark.parametrize("value", [0, 65535, np.nan, -1.0])
+def test_depth_without_a_value(tmp_path: Path, value: float) -> None:
+    capture = rgbd(tmp_path)
+    for index, frame in enumerate(capture.frames):
+        assert frame.depth is not None
+        if isinstance(value, int):
+            path = save(tmp_path / f"{index}_depth.png", np.full((60, 80), value, np.uint16))
+            capture = capture.with_frames([replace(f, depth=path) if f.name == frame.name else f for f in capture.frames])
+        else:
+            np.save(frame.depth, np.full((60, 80), value, np.float32))
+    refused(capture, "no depth map .* holds a value")
+
+
+def test_missing_depth_is_told(tmp_path: Path) -> None:
+    capture = rgbd(tmp_path)
+    for index, frame in enumerate(capture.frames):
+        assert frame.depth is not None
+        depth = np.load(frame.depth)
+        depth[:30] = 0
+        np.save(frame.depth, depth if index != 2 else 0 * depth)
+    frames = [*capture.frames[:-1], replace(capture.frames[-1], depth=None)]
+    text = warnings_of(capture.with_frames(frames))
+    assert "50% of the depth is missing" in text and "1 of 7 depth maps" in text and "1 of 8 frames have no depth" in text
+    assert capture.frames[1].depth is not None
+    capture.frames[1].depth.unlink()
+    refused(capture, r"1\.npy")
+
+
+REAL = ["fox_540x960", "lego_400", "dtu_scan24_384", "redkitchen", "scannet_sample_11", "llff_fern_8", "redwood_livingroom1", "gum_360x640"]
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_captures_pass(name: str) -> None:
+    capture = open_capture(shared_data(name))
+    assert len(check_capture(capture).frames) == len(capture.frames)
+
+
+@pytest.mark.parametrize("name", ["redkitchen", "redwood_livingroom1"])
+@pytest.mark.parametrize("factor", [1000.0, 0.001])
+def test_wrong_units_of_real_depth_are_noticed(name: str, factor: float) -> None:
+    capture = open_capture(shared_data(name))
+    with pytest.raises(FieldfuseError, match="1000 times"):
+        check_capture(replace(capture, depth_scale=capture.depth_scale * factor))
