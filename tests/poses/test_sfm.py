@@ -70,7 +70,7 @@ def found(pictures, tmp_path_factory) -> tuple[PoseResult, Path, Listener]:
 
 
 def test_every_camera_is_found_where_it_was(found, pictures):
-    result, out, listener = found
+    result, out, _ = found
     assert (result.registered, result.total, result.missing, result.models[0]) == (8, 8, [], 8)
     assert result.names == [f"{n:03d}" for n in range(8)]
     assert aligned_error(result.world_from_camera[:, :3, 3], pictures[1][:, :3, 3]) < 0.01

@@ -9,34 +9,43 @@ from toolkit.camera import Array
 LEVEL = 0.25  # eigenvalue ratio below which the cameras' x axes lie in a plane (held level while turning)
 ORBIT = 0.05  # the same for camera centres: they lie in a plane
 AGREE = 15.0  # degrees between two estimates that count as one
-NEAR = 40.0  # degrees that an estimate may lie off the mean up vector of the cameras
+NEAR = 60.0  # degrees that an estimate may lie off the mean up vector of the cameras
+TURNED = 0.01  # least share of the x axes' second direction: about 6° of turning
+UNDECIDED = 0.15  # length of a mean of unit vectors below which it points nowhere
+SHORT = 0.5  # and below which it does not overrule the x axes
 GAIN = 0.9  # the turned footprint must shrink to this share to be worth turning
 
 
 def up_direction(world_from_camera: Array, given: tuple[float, float, float] | None = None) -> tuple[Array, str]:
     """A unit up vector (3,) in the frame of the poses, and the reason for it.
 
-    Without a given one: people hold cameras level, so the direction across all x axes is up, when the camera turned enough to
-    tell; else the median up vector of the cameras (−y). Where the camera centres lie in a plane whose normal agrees within
+    Without a given one: people hold cameras level, so the direction across all x axes is up, when the cameras turned enough to
+    tell; else the mean up vector of the cameras (−y). Where the camera centres lie in a plane whose normal agrees within
     15°, as on an orbit, the two are averaged.
     """
     if given is not None:
         vector = np.asarray(given, dtype=np.float64)
         return vector / np.linalg.norm(vector), "given by the source"
-    mean = _unit(np.median(-world_from_camera[:, :3, 1], axis=0))
-    if not np.isfinite(mean).all():
-        return np.array([0.0, 0.0, 1.0]), "cameras point their up vectors everywhere: kept as it is"
-    up, reason = mean, "median up vector of the cameras"
+    mean = -world_from_camera[:, :3, 1].mean(axis=0)  # shorter than 1 the more cameras disagree
+    behind = -world_from_camera[:, :3, 2].mean(axis=0)
+    length = float(np.linalg.norm(mean))
     x = world_from_camera[:, :3, 0]
     values, vectors = np.linalg.eigh(x.T @ x / len(x))
-    level = _towards(vectors[:, 0], mean)
-    if values[0] < LEVEL * values[1] and _degrees(level, mean) < NEAR:
+    level = vectors[:, 0]
+    # Cameras that look straight down have their up vectors in the ground plane: then up is where they stand.
+    level = _towards(level, mean if abs(level @ mean) > UNDECIDED else behind)
+    turned = values[0] < LEVEL * values[1] and values[1] > TURNED
+    if turned and (length < SHORT or _degrees(level, mean / length) < NEAR):
         up, reason = level, "direction across the cameras' x axes (held level)"
+    elif length > UNDECIDED:
+        up, reason = mean / length, "mean up vector of the cameras"
+    else:
+        return np.array([0.0, 0.0, 1.0]), "kept as it is: the cameras' up vectors point everywhere"
     centres = world_from_camera[:, :3, 3] - world_from_camera[:, :3, 3].mean(axis=0)
     values, vectors = np.linalg.eigh(centres.T @ centres / len(centres))
     normal = _towards(vectors[:, 0], up)
     if values[0] < ORBIT * values[1] and _degrees(normal, up) < AGREE:
-        up, reason = _unit(up + normal), reason + ", averaged with the normal of the cameras' plane"
+        up, reason = (up + normal) / np.linalg.norm(up + normal), reason + ", averaged with the normal of the cameras' plane"
     return up, reason
 
 
@@ -69,11 +78,6 @@ def tight_turn(points: Array, percents: tuple[float, float] = (0.5, 99.5)) -> fl
     areas = np.prod(high - low, axis=1)
     best = int(np.argmin(areas))
     return float(angles[best]) if areas[best] < GAIN * areas[np.flatnonzero(angles == 0)[0]] else 0.0
-
-
-def _unit(vector: Array) -> Array:
-    length = float(np.linalg.norm(vector))
-    return vector / length if length > 1e-6 else np.full(3, np.nan)
 
 
 def _towards(vector: Array, other: Array) -> Array:
