@@ -17,7 +17,12 @@ from toolkit.tsdf.fuse import BLOCK, DEVICE, TsdfVolume
 
 
 def bare_loop_seconds(
-    raw: Sequence[tuple[o3c.Tensor, o3c.Tensor]], frames: Sequence[DepthFrame], voxel_size: float, depth_max: float, truncation: float, blocks: int
+    raw: Sequence[tuple[o3c.Tensor, o3c.Tensor]],
+    frames: Sequence[DepthFrame],
+    voxel_size: float,
+    depth_max: float,
+    truncation: float,
+    blocks: int,
 ) -> float:
     """Seconds of the shortest loop one can write: 16-bit millimetres and 8-bit colour as stored, nothing checked, room for all `blocks`."""
     grid = o3d.t.geometry.VoxelBlockGrid(

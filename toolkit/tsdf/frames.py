@@ -55,7 +55,7 @@ def load_depth_frame(frame: Frame, capture: Capture, working_from_input: Similar
     usable = load_mask(frame)
     if picture.shape[2] == 4:
         opaque = picture[:, :, 3] >= 128
-        usable = opaque if usable is None else usable & (cv2.resize(opaque.astype(np.uint8), usable.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0)
+        usable = opaque if usable is None else _resized(usable, opaque.shape) & opaque
     if usable is not None:
         depth = np.where(_seen_from(usable, colour_camera, depth_camera), depth, np.float32(0))
     colour = np.ascontiguousarray(picture[:, :, :3])
@@ -124,13 +124,17 @@ def _valid(depths: Sequence[Array]) -> Array:
     values = [depth[np.isfinite(depth) & (depth > 0)][::7] for depth in depths]
     joined = np.concatenate(values) if values else np.zeros(0)
     if len(joined) == 0:
-        raise InputError("no frame holds a valid depth value (all are zero, negative or not finite), so there is nothing to fuse; check the depth maps")
+        raise InputError("no frame holds a valid depth value (all are zero, negative or not finite); check the depth maps")
     return joined
 
 
 def _at_size(intrinsics: Intrinsics, picture: Array) -> Intrinsics:
     height, width = picture.shape[:2]
     return intrinsics if (intrinsics.width, intrinsics.height) == (width, height) else intrinsics.scaled(width, height)
+
+
+def _resized(mask: Array, shape: tuple[int, ...]) -> Array:
+    return np.asarray(cv2.resize(mask.astype(np.uint8), (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST) > 0)
 
 
 def _seen_from(mask: Array, colour_camera: Intrinsics, depth_camera: Intrinsics) -> Array:

@@ -53,7 +53,8 @@ class Points:
 
 
 def default_weight_threshold(sightings: float) -> float:
-    """Voxels seen this often or less are left out, by how many frames saw a block on average: once is enough up to 6, twice up to 25, then three times.
+    """Voxels seen this often or less are left out. By how many frames saw a block on average: up to 6 once is enough, up to 25 twice, then
+    three times.
 
     Open3D's own 3 (four sightings) takes a tenth of the surface of a capture whose places are seen 8 times on average; where each place is
     seen often, what was seen once is mostly noise at depth edges.
@@ -108,8 +109,22 @@ class TsdfVolume:
         """Memory of the voxels that are in use."""
         return self.blocks * BYTES_PER_BLOCK
 
-    def integrate(self, frame: DepthFrame) -> bool:
+    def reserve(self, keys: Array) -> None:
+        """Make the blocks (B, 3) int32 part of the volume before anything is fused, for `integrate(frame, carve=True)`.
+
+        Raises:
+            InputError: the volume would outgrow its memory.
+        """
+        if len(keys):
+            wanted = o3c.Tensor.from_numpy(np.ascontiguousarray(keys, dtype=np.int32))
+            self._make_room(wanted)
+            self.grid.hashmap().activate(wanted)
+
+    def integrate(self, frame: DepthFrame, carve: bool = False) -> bool:
         """Fuse one frame; False when it holds no depth within range.
+
+        A frame writes to the blocks around its own surface. With `carve` it also writes to all blocks of the volume that it sees, so that it
+        marks as empty what another frame put in front of its surface (several times slower).
 
         Raises:
             InputError: the volume would outgrow its memory.
@@ -121,6 +136,14 @@ class TsdfVolume:
             self.empty_frames += 1
             return False
         self._make_room(keys)
+        self.touches += len(keys)
+        if carve:
+            table = self.grid.hashmap()
+            table.activate(keys)
+            keys = table.key_tensor()[table.active_buf_indices().to(o3c.int64)]
+            inside = self._in_view(keys.numpy(), frame)
+            keys = keys[o3c.Tensor.from_numpy(inside)]
+            self._make_room(keys)
         self.grid.integrate(
             keys,
             depth,
@@ -133,7 +156,6 @@ class TsdfVolume:
             self.truncation,
         )
         self.frames += 1
-        self.touches += len(keys)
         return True
 
     def touched(self, frame: DepthFrame) -> Array:
@@ -142,7 +164,7 @@ class TsdfVolume:
         return np.zeros((0, 3), np.int32) if keys is None else keys.numpy()
 
     def mesh(self, weight_threshold: float | None = None) -> Mesh:
-        """The surface, uncleaned, in the working frame; voxels seen `weight_threshold` times or less do not count (None: see `weight_threshold`).
+        """The surface, uncleaned, in the working frame; voxels seen `weight_threshold` times or less do not count (None: the default).
 
         Raises:
             InputError: no frame with valid depth was fused.
@@ -196,6 +218,20 @@ class TsdfVolume:
                 raise
             return None
 
+    def _in_view(self, keys: Array, frame: DepthFrame) -> Array:
+        """(B,) bool: blocks whose bounding sphere reaches into the frame's field of view and range."""
+        camera, side = frame.depth_intrinsics, BLOCK * self.voxel_size
+        pose = invert(frame.world_from_camera)
+        centre = ((keys + 0.5) * side) @ pose[:3, :3].T + pose[:3, 3]
+        radius = side * 3**0.5 / 2
+        inside = (centre[:, 2] > -radius) & (centre[:, 2] < self.depth_max + radius)
+        for axis, focal, middle, size in ((0, camera.fx, camera.cx, camera.width), (1, camera.fy, camera.cy, camera.height)):
+            # The view's four side planes go through the camera; distance = (normal · centre) with normals pointing inwards.
+            low, high = (0 - middle) / focal, (size - middle) / focal
+            inside &= (centre[:, axis] - low * centre[:, 2]) / np.hypot(1, low) > -radius
+            inside &= (high * centre[:, 2] - centre[:, axis]) / np.hypot(1, high) > -radius
+        return np.asarray(inside)
+
     def _make_room(self, keys: o3c.Tensor) -> None:
         table = self.grid.hashmap()
         needed = table.size() + len(keys)
@@ -212,7 +248,7 @@ class TsdfVolume:
     def _require_frames(self) -> None:
         if self.frames == 0:
             raise InputError(
-                f"no frame has valid depth between 0 and {self.depth_max:g}, so there is nothing to fuse; check the depth maps and tsdf.depth_max"
+                f"no frame has valid depth between 0 and {self.depth_max:g} to fuse; check the depth maps and tsdf.depth_max"
             )
 
 
@@ -245,7 +281,12 @@ def estimate_blocks(sample: Sequence[DepthFrame], volume: TsdfVolume, total: int
 
 
 def fuse_frames(
-    frames: Iterable[DepthFrame], voxel_size: float, depth_max: float, total: int = 0, expected_blocks: int = 4000, progress: Progress = SILENT
+    frames: Iterable[DepthFrame],
+    voxel_size: float,
+    depth_max: float,
+    total: int = 0,
+    expected_blocks: int = 4000,
+    progress: Progress = SILENT,
 ) -> TsdfVolume:
     """Fuse all `frames` (`total` of them, for the progress).
 
@@ -260,7 +301,8 @@ def fuse_frames(
         progress.update(number, max(total, number), f"{volume.blocks} blocks")
     volume._require_frames()
     if volume.empty_frames:
-        log.warning("%d of %d frames hold no depth within %g and were left out of the TSDF", volume.empty_frames, volume.frames + volume.empty_frames, depth_max)
+        seen = volume.frames + volume.empty_frames
+        log.warning("%d of %d frames hold no depth within %g and were left out of the TSDF", volume.empty_frames, seen, depth_max)
     return volume
 
 
@@ -278,7 +320,8 @@ def fuse_capture(
         Interrupted: the user asked to stop.
     """
     settings = settings or TsdfSettings()
-    wanted = [i for i in (range(len(capture.frames)) if indices is None else [int(i) for i in indices]) if capture.frames[i].depth is not None]
+    chosen = range(len(capture.frames)) if indices is None else [int(i) for i in indices]
+    wanted = [i for i in chosen if capture.frames[i].depth is not None]
     if not wanted:
         raise InputError(f"{capture.root} holds no depth maps, which the TSDF needs; set tsdf.enabled=off")
     spread = np.unique(np.linspace(0, len(wanted) - 1, SAMPLE_FRAMES).round().astype(int))
@@ -293,7 +336,7 @@ def fuse_capture(
 
 
 def _colour_matrix(colour: Intrinsics, depth: Intrinsics) -> Array:
-    """(3, 3) K for `integrate`, which projects the corner of the depth pixel and rounds: half a depth pixel is added, half a colour pixel taken off."""
+    """(3, 3) K for `integrate`, which projects the depth pixel's corner and rounds: half a depth pixel on, half a colour pixel off."""
     matrix = colour.matrix_integer_centres()
     matrix[0, 2] += 0.5 * colour.fx / depth.fx
     matrix[1, 2] += 0.5 * colour.fy / depth.fy

@@ -36,7 +36,7 @@ class Mesh:
             if array is not None and array.shape != vertices.shape:
                 raise InputError(f"a mesh of {len(vertices)} vertices has {name} of shape {array.shape}; one row a vertex is needed")
         if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
-            raise InputError(f"a mesh of {len(vertices)} vertices has triangles that point to vertex {triangles.max()}; the mesh is damaged")
+            raise InputError(f"a mesh of {len(vertices)} vertices has a triangle that points to vertex {triangles.max()}; it is damaged")
         if not np.isfinite(vertices).all():
             raise InputError("a mesh has vertices that are not finite; the mesh is damaged")
         return mesh

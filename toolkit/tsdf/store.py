@@ -53,7 +53,8 @@ def load_volume(path: Path | str) -> TsdfVolume:
     facts, arrays = _read(Path(path))
     keys = arrays["keys"]
     try:
-        volume = TsdfVolume(float(facts["voxel_size"]), float(facts["depth_max"]), float(facts["truncation"]), expected_blocks=2 * len(keys))
+        voxel_size, depth_max, truncation = (float(facts[name]) for name in ("voxel_size", "depth_max", "truncation"))
+        volume = TsdfVolume(voxel_size, depth_max, truncation, expected_blocks=2 * len(keys))
         volume.frames, volume.empty_frames, volume.touches = int(facts["frames"]), int(facts["empty_frames"]), int(facts["touches"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is no TSDF volume of this program (its description lacks or misstates {error}); fuse again") from error

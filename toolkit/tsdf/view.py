@@ -40,7 +40,8 @@ class SurfaceCaster:
         self.threads = threads
         self.scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
         if len(mesh.triangles):
-            self.scene.add_triangles(o3c.Tensor.from_numpy(mesh.vertices.astype(np.float32)), o3c.Tensor.from_numpy(mesh.triangles.astype(np.uint32)))
+            vertices, triangles = mesh.vertices.astype(np.float32), mesh.triangles.astype(np.uint32)
+            self.scene.add_triangles(o3c.Tensor.from_numpy(vertices), o3c.Tensor.from_numpy(triangles))
 
     def render(self, intrinsics: Intrinsics, world_from_camera: Array) -> MeshView:
         """The view of a camera without lens distortion (its pinhole is used)."""

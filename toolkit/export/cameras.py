@@ -1,0 +1,150 @@
+"""Cameras in the input's frame: `transforms.json` (instant-ngp and nerfstudio) and COLMAP's text model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from toolkit.camera import FISHEYE, Array, Intrinsics, Similarity, invert, opengl_from_world
+from toolkit.errors import InputError
+from toolkit.files import atomic_path, write_json
+from toolkit.tsdf.mesh import as_bytes
+
+LENS_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # OpenCV's order
+FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
+
+
+def write_cameras(
+    folder: Path | str,
+    names: Sequence[str],
+    intrinsics: Sequence[Intrinsics],
+    world_from_camera: Array,
+    points: Array | None = None,
+    colours: Array | None = None,
+    working_from_input: Similarity | None = None,
+    files: Sequence[str] | None = None,
+) -> None:
+    """Write `folder/transforms.json` and `folder/colmap/{cameras,images,points3D}.txt`.
+
+    Args:
+        names: of the pictures; COLMAP ends a name at a space, so spaces become underscores there.
+        intrinsics: one each, lens included.
+        world_from_camera: (N, 4, 4) in OpenCV axes.
+        points, colours: (P, 3) sparse points and their colours (None: grey).
+        working_from_input: when given, poses and points are in the working frame and are brought back to the input's.
+        files: paths of the pictures for `file_path`; None: the names.
+
+    Raises:
+        InputError: lists of different length.
+        OutputError: a file cannot be written.
+    """
+    folder = Path(folder)
+    poses = np.asarray(world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
+    files = list(names) if files is None else list(files)
+    if not len(names) == len(intrinsics) == len(poses) == len(files):
+        counts = f"{len(names)} names, {len(intrinsics)} intrinsics, {len(poses)} poses and {len(files)} files"
+        raise InputError(f"cameras need one of each, but there are {counts}; give lists of one length")
+    if working_from_input is not None:
+        back = working_from_input.inverse()
+        poses = back.poses(poses)
+        points = None if points is None else back.points(points)
+    write_json(folder / "transforms.json", transforms(files, intrinsics, poses))
+    write_colmap(folder / "colmap", names, intrinsics, poses, points, colours)
+
+
+def transforms(files: Sequence[str], intrinsics: Sequence[Intrinsics], world_from_camera: Array) -> dict[str, Any]:
+    """The `transforms.json` of (N, 4, 4) cameras: OpenGL axes, pixel centres at +0.5, intrinsics shared where all are equal."""
+    shared = bool(intrinsics) and all(camera == intrinsics[0] for camera in intrinsics)
+    out: dict[str, Any] = _camera_keys(intrinsics[0]) if shared else {}
+    # nerfstudio takes one lens model for the file; a pinhole is an OPENCV lens without coefficients.
+    fisheye = bool(intrinsics) and all(camera.lens == FISHEYE for camera in intrinsics)
+    out["camera_model"] = "OPENCV_FISHEYE" if fisheye else "OPENCV"
+    if fisheye:
+        out["is_fisheye"] = True
+    frames = []
+    for file, camera, pose in zip(files, intrinsics, opengl_from_world(world_from_camera), strict=True):
+        frame: dict[str, Any] = {"file_path": file, "transform_matrix": pose.tolist()}
+        if not shared:
+            frame.update(_camera_keys(camera))
+            if camera.lens == FISHEYE and not fisheye:
+                frame.update(camera_model="OPENCV_FISHEYE", is_fisheye=True)
+        frames.append(frame)
+    out["frames"] = frames
+    return out
+
+
+def write_colmap(
+    folder: Path,
+    names: Sequence[str],
+    intrinsics: Sequence[Intrinsics],
+    world_from_camera: Array,
+    points: Array | None = None,
+    colours: Array | None = None,
+) -> None:
+    """Write COLMAP's three text files; equal intrinsics share a camera. Points have no tracks."""
+    numbers: dict[Intrinsics, int] = {}
+    for camera in intrinsics:
+        numbers.setdefault(camera, len(numbers) + 1)
+    camera_lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]
+    for camera, number in numbers.items():
+        model, parameters = colmap_model(camera)
+        camera_lines.append(f"{number} {model} {camera.width} {camera.height} {_numbers(parameters)}")
+    image_lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of points (empty)"]
+    for number, (name, camera, pose) in enumerate(zip(names, intrinsics, invert(world_from_camera), strict=True), 1):
+        row = _numbers([*quaternion(pose[:3, :3]), *pose[:3, 3]])
+        image_lines += [f"{number} {row} {numbers[camera]} {'_'.join(name.split())}", ""]
+    point_lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
+    if points is not None:
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        colours = np.full(points.shape, 128, np.uint8) if colours is None else as_bytes(colours)
+        for number, (point, colour) in enumerate(zip(points.tolist(), colours.tolist(), strict=True), 1):
+            point_lines.append(f"{number} {_numbers(point)} {colour[0]} {colour[1]} {colour[2]} 0")
+    for file, lines in (("cameras.txt", camera_lines), ("images.txt", image_lines), ("points3D.txt", point_lines)):
+        with atomic_path(folder / file) as temporary:
+            temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def colmap_model(camera: Intrinsics) -> tuple[str, list[float]]:
+    """COLMAP's name and parameters of a camera (the smallest model that holds its lens)."""
+    base = [camera.fx, camera.fy, camera.cx, camera.cy]
+    if camera.lens == FISHEYE:
+        return "OPENCV_FISHEYE", base + _padded(camera.distortion, 4)
+    if not camera.distorted:
+        return "PINHOLE", base
+    if any(camera.distortion[4:]):
+        return "FULL_OPENCV", base + _padded(camera.distortion, 8)
+    return "OPENCV", base + _padded(camera.distortion, 4)
+
+
+def quaternion(rotation: Array) -> Array:
+    """(w, x, y, z) with w ≥ 0 of a rotation matrix: the largest eigenvector of its symmetric 4×4 form (Bar-Itzhack 2000)."""
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)
+    form = np.array([
+        [a + e + i, h - f, c - g, d - b],
+        [h - f, a - e - i, b + d, c + g],
+        [c - g, b + d, e - a - i, f + h],
+        [d - b, c + g, f + h, i - a - e],
+    ])
+    out = np.linalg.eigh(form)[1][:, -1]
+    return np.asarray(-out if out[0] < 0 else out)
+
+
+def _camera_keys(camera: Intrinsics) -> dict[str, Any]:
+    out: dict[str, Any] = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    out["camera_angle_x"] = float(2 * np.arctan(camera.width / (2 * camera.fx)))
+    out["camera_angle_y"] = float(2 * np.arctan(camera.height / (2 * camera.fy)))
+    keys = FISHEYE_KEYS if camera.lens == FISHEYE else LENS_KEYS
+    coefficients = _padded(camera.distortion, 4)
+    out.update({key: float(value) for key, value in zip(keys, coefficients, strict=False)})
+    return out
+
+
+def _padded(values: Sequence[float], count: int) -> list[float]:
+    return [float(value) for value in values] + [0.0] * (count - len(values))
+
+
+def _numbers(values: Sequence[float] | Array) -> str:
+    return " ".join(repr(float(value)) for value in values)

@@ -1,0 +1,94 @@
+"""Meshes as PLY, OBJ or GLB with vertex colours, in the input's frame; and facts about a mesh."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from toolkit.camera import Array, Similarity
+from toolkit.errors import InputError
+from toolkit.export.ply import single_precision, write_ply
+from toolkit.files import atomic_path
+from toolkit.tsdf.mesh import Mesh
+
+FORMATS = (".ply", ".obj", ".glb")
+ROWS_AT_ONCE = 100_000
+
+
+def write_mesh(path: Path | str, mesh: Mesh, working_from_input: Similarity | None = None) -> None:
+    """Write a mesh in the format that the suffix names: .ply, .obj (colours behind the positions, `v x y z r g b`) or .glb.
+
+    With `working_from_input` the mesh is in the working frame and is brought back to the input's; without it it is written as it is.
+    Axes are kept as they are in every format: glTF viewers take y as up, so a z-up model lies on its side there and is right again in
+    tools that read it back.
+
+    Raises:
+        InputError: another suffix, or an empty mesh as .glb (glTF has none).
+        OutputError: the file cannot be written.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind not in FORMATS:
+        raise InputError(f"a mesh is written as {', '.join(FORMATS)}, not {path.suffix or 'without a suffix'}; rename {path.name}")
+    if working_from_input is not None:
+        mesh = mesh.transformed(working_from_input.inverse())
+    if kind == ".ply":
+        write_ply(path, mesh.vertices, mesh.colours, mesh.normals, mesh.triangles)
+    elif kind == ".obj":
+        _write_obj(path, mesh)
+    else:
+        _write_glb(path, mesh)
+
+
+def mesh_facts(mesh: Mesh) -> dict[str, Any]:
+    """`vertices`, `triangles`, `watertight` (every edge has two triangles, by trimesh), `components`, `area` and `bounds` of a mesh."""
+    components = mesh.components()
+    return {
+        "vertices": len(mesh.vertices),
+        "triangles": len(mesh.triangles),
+        "watertight": bool(len(mesh.triangles)) and bool(to_trimesh(mesh).is_watertight),
+        "components": int(components.max()) + 1 if len(components) else 0,
+        "area": float(mesh.areas().sum()),
+        "bounds": mesh.bounds().tolist(),
+    }
+
+
+def to_trimesh(mesh: Mesh, offset: Array | None = None) -> trimesh.Trimesh:
+    """As a trimesh mesh, nothing merged or removed; `offset` (3,) is taken off the positions."""
+    vertices = mesh.vertices if offset is None else mesh.vertices - offset
+    colours = np.concatenate([mesh.colours, np.full((len(mesh.colours), 1), 255, np.uint8)], axis=1)
+    return trimesh.Trimesh(vertices, mesh.triangles, vertex_normals=mesh.normals, vertex_colors=colours, process=False)
+
+
+def _write_obj(path: Path, mesh: Mesh) -> None:
+    normals = mesh.normals
+    with atomic_path(path) as temporary, temporary.open("w", encoding="ascii") as file:
+        file.write("# vertices: x y z red green blue (colours 0 to 1)\n")
+        for start in range(0, len(mesh.vertices), ROWS_AT_ONCE):
+            part = slice(start, start + ROWS_AT_ONCE)
+            rows = np.concatenate([mesh.vertices[part], mesh.colours[part] / 255], axis=1)
+            file.writelines("v {:.12g} {:.12g} {:.12g} {:.5g} {:.5g} {:.5g}\n".format(*row) for row in rows.tolist())
+            if normals is not None:
+                file.writelines("vn {:.5g} {:.5g} {:.5g}\n".format(*row) for row in normals[part].tolist())
+        template = "f {}//{} {}//{} {}//{}\n" if normals is not None else "f {} {} {}\n"
+        for start in range(0, len(mesh.triangles), ROWS_AT_ONCE):
+            corners = mesh.triangles[start : start + ROWS_AT_ONCE] + 1
+            rows = np.repeat(corners, 2, axis=1) if normals is not None else corners
+            file.writelines(template.format(*row) for row in rows.tolist())
+
+
+def _write_glb(path: Path, mesh: Mesh) -> None:
+    if len(mesh.triangles) == 0:
+        raise InputError(f"the mesh has no triangles, which {path.name} cannot hold; write it as .ply or check the depth it was made from")
+    # glTF positions are float32: a model far from its origin keeps its place in the node, whose matrix is written in full.
+    offset = np.zeros(3) if single_precision(mesh.vertices) else mesh.bounds().mean(axis=0)
+    node = np.eye(4)
+    node[:3, 3] = offset
+    scene = trimesh.Scene()
+    scene.add_geometry(to_trimesh(mesh, offset), node_name="mesh", geom_name="mesh", transform=node)
+    data = scene.export(file_type="glb", include_normals=mesh.normals is not None)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)

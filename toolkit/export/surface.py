@@ -1,0 +1,162 @@
+"""A clean surface of a radiance field: depth rendered from many views, what is uncertain left out, the rest fused into a TSDF."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+
+from toolkit.camera import Array, Intrinsics
+from toolkit.errors import InputError
+from toolkit.progress import SILENT, Progress
+from toolkit.tsdf.frames import DepthFrame, automatic_depth_max, automatic_voxel_size
+from toolkit.tsdf.fuse import Points, TsdfVolume, estimate_blocks
+from toolkit.tsdf.mesh import Mesh, as_bytes
+
+# (intrinsics, world_from_camera) → (rgb, depth, opacity), or an object with these names, as `render_view` gives.
+Render = Callable[[Intrinsics, Array], Any]
+
+STEEPEST = 4.0  # tangent of the angle between view and surface normal (76°) beyond which a depth step is taken as an edge
+SMALLEST_EDGE = 0.02  # share of depth: smaller steps are never an edge
+COARSER = 1.4
+
+
+def reliable_depth(depth: Array, opacity: Array, focal: float, min_opacity: float = 0.7) -> Array:
+    """(H, W) depth with 0 where it cannot be trusted: little opacity, or next to a depth edge, where a rendered depth lies between two surfaces.
+
+    An edge is a range over 3×3 pixels larger than a plane seen at 76° would have. Missing neighbours do not make an edge.
+    """
+    depth = np.where(np.isfinite(depth) & (depth > 0) & (opacity >= min_opacity), depth, 0).astype(np.float32)
+    window = np.ones((3, 3), np.uint8)
+    farthest = cv2.dilate(depth, window)
+    nearest = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), window)
+    step = np.maximum(SMALLEST_EDGE, 2 * STEEPEST / focal)
+    return np.asarray(np.where(farthest - nearest <= step * depth, depth, np.float32(0)))
+
+
+def rendered_frame(
+    render: Render,
+    intrinsics: Intrinsics,
+    world_from_camera: Array,
+    min_opacity: float = 0.7,
+    region: tuple[Array, Array] | None = None,
+) -> DepthFrame:
+    """Render one view and keep its reliable depth; `region` (lowest corner, highest corner) drops what lies outside that box."""
+    rendered = render(intrinsics, world_from_camera)
+    rgb, depth, opacity = (rendered.rgb, rendered.depth, rendered.opacity) if hasattr(rendered, "rgb") else rendered
+    camera = intrinsics.pinhole()
+    depth = reliable_depth(np.asarray(depth), np.asarray(opacity), camera.fx, min_opacity)
+    pose = np.asarray(world_from_camera, dtype=np.float64)
+    if region is not None:
+        v, u = np.nonzero(depth)
+        z = depth[v, u].astype(np.float64)
+        points = np.stack([(u + 0.5 - camera.cx) / camera.fx * z, (v + 0.5 - camera.cy) / camera.fy * z, z], axis=1)
+        points = points @ pose[:3, :3].T + pose[:3, 3]
+        outside = ((points < region[0]) | (points > region[1])).any(axis=1)
+        depth[v[outside], u[outside]] = 0
+    return DepthFrame(depth, as_bytes(np.asarray(rgb)), camera, camera, pose)
+
+
+def field_volume(
+    render: Render,
+    poses: Array,
+    intrinsics: Intrinsics | Sequence[Intrinsics],
+    voxel_size: float | None = None,
+    depth_max: float | None = None,
+    *,
+    min_opacity: float = 0.7,
+    region: tuple[Array, Array] | None = None,
+    carve: bool = True,
+    progress: Progress = SILENT,
+) -> TsdfVolume:
+    """Render all (N, 4, 4) poses and fuse their reliable depth.
+
+    Args:
+        render: see `Render`.
+        intrinsics: one for all, or one a pose.
+        voxel_size, depth_max: working units; None: from the rendered depth, the voxel size made coarser until it fits into memory.
+        region: lowest and highest corner (3,) of the box that is kept, working frame.
+        carve: views also empty what others put in front of their surface, which removes most floaters.
+
+    Raises:
+        InputError: no view shows a surface, or the voxel size that was asked for is too fine for the memory.
+        Interrupted: the user asked to stop.
+    """
+    poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
+    cameras = [intrinsics] * len(poses) if isinstance(intrinsics, Intrinsics) else list(intrinsics)
+    if len(cameras) != len(poses) or not cameras:
+        raise InputError(f"a surface needs one camera a pose, there are {len(cameras)} cameras and {len(poses)} poses")
+    frames = []
+    for number, (camera, pose) in enumerate(zip(cameras, poses, strict=True), 1):
+        progress.check()
+        frames.append(rendered_frame(render, camera, pose, min_opacity, region))
+        progress.update(number, 1.1 * len(poses), "views rendered for the surface")
+    shown = [frame for frame in frames if (frame.depth > 0).any()]
+    if not shown:
+        raise InputError("no rendered view shows a surface (nothing is opaque), so no mesh can be made; fit the field longer or check its poses")
+    depths = [frame.depth for frame in shown]
+    depth_max = depth_max or automatic_depth_max(depths)
+    size = voxel_size or automatic_voxel_size(depths, min(frame.depth_intrinsics.fx for frame in shown))
+    while True:
+        volume = TsdfVolume(size, depth_max, expected_blocks=64)
+        try:
+            expected = estimate_blocks(shown, volume, len(shown))
+            break
+        except InputError:
+            if voxel_size is not None:
+                raise
+            size *= COARSER
+    volume = TsdfVolume(size, depth_max, expected_blocks=2 * expected)
+    if carve:
+        for frame in shown:
+            volume.reserve(volume.touched(frame))
+    for number, frame in enumerate(shown, 1):
+        progress.check()
+        volume.integrate(frame, carve)
+        progress.update(len(poses) * (1 + 0.1 * number / len(shown)), 1.1 * len(poses), "views fused")
+    if volume.frames == 0:
+        raise InputError(f"no rendered view shows a surface nearer than {depth_max:g}; raise the largest depth")
+    return volume
+
+
+def field_mesh(
+    render: Render,
+    poses: Array,
+    intrinsics: Intrinsics | Sequence[Intrinsics],
+    voxel_size: float | None = None,
+    depth_max: float | None = None,
+    *,
+    min_area_share: float = 2e-3,
+    max_triangles: int = 2_000_000,
+    min_opacity: float = 0.7,
+    region: tuple[Array, Array] | None = None,
+    carve: bool = True,
+    progress: Progress = SILENT,
+) -> Mesh:
+    """The field's surface in the working frame: `field_volume`, then components below `min_area_share` of the area removed, and thinned
+    out when there are more than `max_triangles`. Arguments and errors as there."""
+    volume = field_volume(
+        render, poses, intrinsics, voxel_size, depth_max, min_opacity=min_opacity, region=region, carve=carve, progress=progress
+    )
+    return volume.mesh().cleaned(min_area_share=min_area_share).decimated(max_triangles)
+
+
+def field_points(
+    render: Render,
+    poses: Array,
+    intrinsics: Intrinsics | Sequence[Intrinsics],
+    voxel_size: float | None = None,
+    depth_max: float | None = None,
+    *,
+    min_opacity: float = 0.7,
+    region: tuple[Array, Array] | None = None,
+    carve: bool = True,
+    progress: Progress = SILENT,
+) -> Points:
+    """The field's surface as coloured points with normals, in the working frame. Arguments and errors as `field_volume`."""
+    volume = field_volume(
+        render, poses, intrinsics, voxel_size, depth_max, min_opacity=min_opacity, region=region, carve=carve, progress=progress
+    )
+    return volume.points()

@@ -1,0 +1,206 @@
+"""Camera paths for videos: round an object, a small ellipse before a scene seen from one side, or a walk along a room's sweep."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from toolkit.camera import Array
+from toolkit.errors import InputError
+
+UP = (0.0, 0.0, 1.0)  # in the working frame
+FACING = 0.9  # length of the mean viewing direction above which all cameras look the same way (spread of about 25°)
+LOOKING_IN = 0.7  # median cosine between viewing direction and direction to the centre above which the cameras surround it
+FULL_CIRCLE = np.deg2rad(90)  # the largest gap in azimuth that a closed circle may cross
+KEY_CAMERAS = 12
+ARC_MARGIN = 0.02
+
+
+def orbit(world_from_camera: Array, centre: Array | None = None, frames: int = 90, up: tuple[float, float, float] = UP) -> Array:
+    """A smooth closed path of `frames` poses, (F, 4, 4) in OpenCV axes, that stays near the (N, 4, 4) captured cameras.
+
+    - Cameras that look the same way: an ellipse in their plane, about as wide as they are spread, looking at one point.
+    - Cameras round a centre: an ellipse round it at their distance and height; where they cover only an arc, along the arc and back.
+    - Everything else (rooms seen from inside, walks): smoothly through some of the cameras and back.
+
+    Args:
+        centre: (3,) of what is looked at; None: the point nearest to all viewing axes.
+
+    Raises:
+        InputError: no cameras, or fewer than one frame.
+    """
+    poses = _checked(world_from_camera, frames)
+    if len(poses) == 1:
+        return np.repeat(poses, frames, axis=0)
+    vertical = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    positions, forward = poses[:, :3, 3], poses[:, :3, 2]
+    target = focus(poses) if centre is None else np.asarray(centre, dtype=np.float64)
+    phase = 2 * np.pi * np.arange(frames) / frames
+    if np.linalg.norm(forward.mean(axis=0)) > FACING:
+        return _before(poses, target, phase)
+    inward = target - positions
+    inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
+    if np.median((forward * inward).sum(axis=1)) > LOOKING_IN:
+        return _around(positions, target, vertical, phase)
+    keys = _tour(positions)
+    keys = keys[np.unique(np.linspace(0, len(keys) - 1, KEY_CAMERAS).round().astype(int))]
+    return _along(poses[keys], (1 - np.cos(phase)) / 2)
+
+
+def interpolate(poses: Array, frames: int) -> Array:
+    """(F, 4, 4) rigid poses, evenly paced, through the (N, 4, 4) given ones from the first to the last.
+
+    Positions and quaternions follow cubic Hermite curves whose knots are spaced by distance moved and angle turned (slopes from
+    neighbours, as in Catmull and Rom 1974), so velocity has no jumps.
+
+    Raises:
+        InputError: no poses, or fewer than one frame.
+    """
+    return _along(_checked(poses, frames), np.linspace(0, 1, frames))
+
+
+def focus(world_from_camera: Array) -> Array:
+    """(3,) point with the least squared distance to all viewing axes; for parallel axes a point before the cameras' mean."""
+    forward, positions = world_from_camera[:, :3, 2], world_from_camera[:, :3, 3]
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # (N, 3, 3) projection away from each axis
+    spread = np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean()
+    prior = positions.mean(axis=0) + forward.mean(axis=0) * max(4 * spread, 1e-6)
+    # A weak pull towards the prior decides what parallel axes leave open.
+    matrix = across.sum(axis=0) + 1e-3 * len(positions) * np.eye(3)
+    return np.asarray(np.linalg.solve(matrix, np.einsum("nij,nj->i", across, positions) + 1e-3 * len(positions) * prior))
+
+
+def look_at(positions: Array, target: Array, up: Array) -> Array:
+    """(N, 4, 4) poses at (N, 3) positions that look at (3,) or (N, 3) targets, the picture's upper side towards `up`."""
+    positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
+    forward = _unit(np.broadcast_to(target, positions.shape) - positions)
+    right = np.cross(forward, up)
+    # Straight up or down: any horizontal direction does.
+    lost = np.linalg.norm(right, axis=1) < 1e-6
+    right[lost] = np.cross(forward[lost], np.roll(np.asarray(up, dtype=np.float64), 1))
+    right = _unit(right)
+    out = np.tile(np.eye(4), (len(positions), 1, 1))
+    out[:, :3, 0], out[:, :3, 1], out[:, :3, 2], out[:, :3, 3] = right, np.cross(forward, right), forward, positions
+    return out
+
+
+def _before(poses: Array, target: Array, phase: Array) -> Array:
+    positions = poses[:, :3, 3]
+    middle = np.median(positions, axis=0)
+    right, down, forward = (_unit(poses[:, :3, axis].mean(axis=0)) for axis in range(3))
+    offset = positions - middle
+    # The spread within which most cameras are: beyond them there are no pictures.
+    width, height = (np.quantile(np.abs(offset @ axis), 0.7) for axis in (right, down))
+    distance = max(float((target - middle) @ forward), 2 * width, 2 * height, 1e-6)
+    at = middle + np.cos(phase)[:, None] * width * right + np.sin(phase)[:, None] * height * down
+    return look_at(at, middle + distance * forward, -down)
+
+
+def _around(positions: Array, target: Array, up: Array, phase: Array) -> Array:
+    east = _unit(np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0]))
+    north = np.cross(up, east)
+    offset = positions - target
+    azimuth = np.arctan2(offset @ north, offset @ east)
+    ordered = np.sort(azimuth)
+    gaps = np.diff(np.append(ordered, ordered[0] + 2 * np.pi))
+    widest = int(np.argmax(gaps))
+    if gaps[widest] <= FULL_CIRCLE:
+        angle = phase
+    else:  # along the arc and back, never through the part that nobody saw
+        first = ordered[(widest + 1) % len(ordered)]
+        angle = first + (2 * np.pi - gaps[widest]) * (0.5 - (0.5 - ARC_MARGIN) * np.cos(phase))
+    # Distance, and height, as a constant plus one wave round the circle, by least squares with a pull towards the constant:
+    # it follows an off-centre or tilted ring of cameras and cannot swing out between them.
+    waves = np.stack([np.ones_like(azimuth), np.cos(azimuth), np.sin(azimuth)], axis=1)
+    pull = np.diag([0, 1, 1]) * 0.02 * len(azimuth)
+    ground = np.hypot(offset @ north, offset @ east)
+    fit = np.linalg.solve(waves.T @ waves + pull, waves.T @ np.stack([ground, offset @ up], axis=1))
+    radius, height = (np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=1) @ fit).T
+    radius = np.clip(radius, ground.min(), ground.max())[:, None]
+    at = target + radius * (np.cos(angle)[:, None] * east + np.sin(angle)[:, None] * north) + height[:, None] * up
+    return look_at(at, target, up)
+
+
+def _along(poses: Array, share: Array) -> Array:
+    """Poses at `share` (F,) of the way through the keys."""
+    if len(poses) == 1:
+        return np.repeat(poses, len(share), axis=0)
+    positions, turns = poses[:, :3, 3], _quaternions(poses[:, :3, :3])
+    moved = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    turned = 2 * np.arccos(np.clip((turns[1:] * turns[:-1]).sum(axis=1), -1, 1))
+    pace = moved / max(moved.mean(), 1e-12) + turned / max(turned.mean(), 0.2)
+    knots = np.concatenate([[0], np.cumsum(np.maximum(pace, 1e-3))])
+    curve = _hermite(knots, np.concatenate([positions, turns], axis=1), share * knots[-1])
+    out = np.tile(np.eye(4), (len(share), 1, 1))
+    out[:, :3, :3] = _rotations(_unit(curve[:, 3:]))
+    out[:, :3, 3] = curve[:, :3]
+    return out
+
+
+def _hermite(knots: Array, values: Array, at: Array) -> Array:
+    """(F, C) values of the cubic Hermite curve through (K, C) values, slopes weighted by the neighbouring intervals."""
+    width = np.diff(knots)[:, None]
+    rise = np.diff(values, axis=0) / width
+    inner = (rise[:-1] * width[1:] + rise[1:] * width[:-1]) / (width[1:] + width[:-1])
+    slopes = np.concatenate([rise[:1], inner, rise[-1:]])
+    part = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
+    span = width[part]
+    t = ((at - knots[part]) / span[:, 0])[:, None]
+    start, end = values[part], values[part + 1]
+    return np.asarray(
+        (2 * t**3 - 3 * t**2 + 1) * start
+        + (t**3 - 2 * t**2 + t) * span * slopes[part]
+        + (3 * t**2 - 2 * t**3) * end
+        + (t**3 - t**2) * span * slopes[part + 1]
+    )
+
+
+def _tour(positions: Array) -> Array:
+    """(N,) an order in which to visit the cameras: as captured, or from neighbour to neighbour where that is much shorter (loose photos)."""
+    left = list(range(1, len(positions)))
+    order = [0]
+    while left:
+        distance = np.linalg.norm(positions[left] - positions[order[-1]], axis=1)
+        order.append(left.pop(int(np.argmin(distance))))
+    captured = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
+    greedy = np.linalg.norm(np.diff(positions[order], axis=0), axis=1).sum()
+    return np.array(order) if greedy < 0.5 * captured else np.arange(len(positions))
+
+
+def _quaternions(rotations: Array) -> Array:
+    """(N, 4) w, x, y, z of (N, 3, 3), each on the side of the one before it."""
+    m = rotations
+    form = np.empty((len(m), 4, 4))
+    form[:, 0, 0] = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        form[:, 0, i + 1] = form[:, i + 1, 0] = m[:, k, j] - m[:, j, k]
+        form[:, i + 1, i + 1] = m[:, i, i] - m[:, j, j] - m[:, k, k]
+        form[:, i + 1, j + 1] = form[:, j + 1, i + 1] = m[:, i, j] + m[:, j, i]
+    out = np.linalg.eigh(form)[1][:, :, -1].copy()
+    for i in range(1, len(out)):
+        if out[i] @ out[i - 1] < 0:
+            out[i] *= -1
+    return out
+
+
+def _rotations(quaternions: Array) -> Array:
+    w, x, y, z = quaternions.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12))
+
+
+def _checked(poses: Array, frames: int) -> Array:
+    poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
+    if len(poses) == 0:
+        raise InputError("a camera path needs at least one camera, there is none; pass the poses of the capture")
+    if frames < 1:
+        raise InputError(f"a camera path needs at least one frame, not {frames}; raise export.video_frames")
+    return poses
