@@ -24,7 +24,7 @@ COARSER = 1.4
 
 
 def reliable_depth(depth: Array, opacity: Array, focal: float, min_opacity: float = 0.7) -> Array:
-    """(H, W) depth with 0 where it cannot be trusted: little opacity, or next to a depth edge, where a rendered depth lies between two surfaces.
+    """(H, W) depth with 0 where it cannot be trusted: little opacity, or beside a depth edge, where it lies between two surfaces.
 
     An edge is a range over 3×3 pixels larger than a plane seen at 76° would have. Missing neighbours do not make an edge.
     """
@@ -95,7 +95,7 @@ def field_volume(
         progress.update(number, 1.1 * len(poses), "views rendered for the surface")
     shown = [frame for frame in frames if (frame.depth > 0).any()]
     if not shown:
-        raise InputError("no rendered view shows a surface (nothing is opaque), so no mesh can be made; fit the field longer or check its poses")
+        raise InputError("no rendered view shows a surface (nothing is opaque) to make a mesh of; fit the field longer or check its poses")
     depths = [frame.depth for frame in shown]
     depth_max = depth_max or automatic_depth_max(depths)
     size = voxel_size or automatic_voxel_size(depths, min(frame.depth_intrinsics.fx for frame in shown))

@@ -155,7 +155,7 @@ def _hermite(knots: Array, values: Array, at: Array) -> Array:
 
 
 def _tour(positions: Array) -> Array:
-    """(N,) an order in which to visit the cameras: as captured, or from neighbour to neighbour where that is much shorter (loose photos)."""
+    """(N,) an order in which to visit the cameras: as captured, or from neighbour to neighbour where that is much shorter (photos)."""
     left = list(range(1, len(positions)))
     order = [0]
     while left:

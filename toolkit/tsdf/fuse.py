@@ -8,13 +8,14 @@ What Open3D 0.20 does and this file takes care of:
 - A frame without valid depth raises; the weight threshold is exclusive, so 3 needs four observations.
 - `VoxelBlockGrid.ray_cast` can hang on the CPU, leaves tiles empty, and its depth is off by up to a voxel: views are rendered by ray
   casting the extracted mesh.
-- The table grows when the keys passed would not fit, present or not, and growth copies everything: room is made beforehand.
+- The table grows when the keys passed would not fit, present or not, and growth copies everything: room is made beforehand, and keys are
+  passed in pieces that fit.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -40,6 +41,7 @@ DEPTH_STEPS = 60000  # 16-bit depth: this value is depth_max, what saturates abo
 BYTES_PER_BLOCK = BLOCK**3 * (1 + 1 + 3) * 4
 MAX_BYTES = 4 * 2**30
 SAMPLE_FRAMES = 12  # frames looked at before fusion, for voxel size, range and memory
+SLACK = 1024  # blocks of room beyond those in use
 DEVICE = o3c.Device("CPU:0")
 
 
@@ -89,7 +91,7 @@ class TsdfVolume:
             (o3c.SizeVector([1]), o3c.SizeVector([1]), o3c.SizeVector([3])),
             self.voxel_size,
             BLOCK,
-            int(np.clip(expected_blocks, 64, self.max_blocks)),
+            min(max(int(expected_blocks), 0), self.max_blocks) + SLACK,
             DEVICE,
         )
         self._scale = DEPTH_STEPS / self.depth_max
@@ -118,13 +120,13 @@ class TsdfVolume:
         if len(keys):
             wanted = o3c.Tensor.from_numpy(np.ascontiguousarray(keys, dtype=np.int32))
             self._make_room(wanted)
-            self.grid.hashmap().activate(wanted)
+            self._activate(wanted)
 
     def integrate(self, frame: DepthFrame, carve: bool = False) -> bool:
         """Fuse one frame; False when it holds no depth within range.
 
-        A frame writes to the blocks around its own surface. With `carve` it also writes to all blocks of the volume that it sees, so that it
-        marks as empty what another frame put in front of its surface (several times slower).
+        A frame writes to the blocks around its own surface. With `carve` it also writes to all blocks of the volume that it sees, so that
+        it marks as empty what another frame put in front of its surface (several times slower).
 
         Raises:
             InputError: the volume would outgrow its memory.
@@ -138,23 +140,13 @@ class TsdfVolume:
         self._make_room(keys)
         self.touches += len(keys)
         if carve:
-            table = self.grid.hashmap()
-            table.activate(keys)
-            keys = table.key_tensor()[table.active_buf_indices().to(o3c.int64)]
-            inside = self._in_view(keys.numpy(), frame)
-            keys = keys[o3c.Tensor.from_numpy(inside)]
-            self._make_room(keys)
-        self.grid.integrate(
-            keys,
-            depth,
-            o3d.t.geometry.Image(np.ascontiguousarray(frame.colour)),
-            o3c.Tensor(frame.depth_intrinsics.matrix()),
-            o3c.Tensor(_colour_matrix(frame.colour_intrinsics, frame.depth_intrinsics)),
-            extrinsic,
-            self._scale,
-            self.depth_max,
-            self.truncation,
-        )
+            self._activate(keys)
+            keys = self._keys_in_view(frame)
+        colour = o3d.t.geometry.Image(np.ascontiguousarray(frame.colour))
+        matrix = o3c.Tensor(frame.depth_intrinsics.matrix())
+        colour_matrix = o3c.Tensor(_colour_matrix(frame.colour_intrinsics, frame.depth_intrinsics))
+        for piece in self._pieces(keys):
+            self.grid.integrate(piece, depth, colour, matrix, colour_matrix, extrinsic, self._scale, self.depth_max, self.truncation)
         self.frames += 1
         return True
 
@@ -218,8 +210,14 @@ class TsdfVolume:
                 raise
             return None
 
-    def _in_view(self, keys: Array, frame: DepthFrame) -> Array:
-        """(B,) bool: blocks whose bounding sphere reaches into the frame's field of view and range."""
+    def _activate(self, keys: o3c.Tensor) -> None:
+        for piece in self._pieces(keys):
+            self.grid.hashmap().activate(piece)
+
+    def _keys_in_view(self, frame: DepthFrame) -> o3c.Tensor:
+        """Keys of the volume's blocks whose bounding sphere reaches into the frame's field of view and range."""
+        table = self.grid.hashmap()
+        keys = table.key_tensor().numpy()[table.active_buf_indices().numpy()]
         camera, side = frame.depth_intrinsics, BLOCK * self.voxel_size
         pose = invert(frame.world_from_camera)
         centre = ((keys + 0.5) * side) @ pose[:3, :3].T + pose[:3, 3]
@@ -230,20 +228,28 @@ class TsdfVolume:
             low, high = (0 - middle) / focal, (size - middle) / focal
             inside &= (centre[:, axis] - low * centre[:, 2]) / np.hypot(1, low) > -radius
             inside &= (high * centre[:, 2] - centre[:, axis]) / np.hypot(1, high) > -radius
-        return np.asarray(inside)
+        return o3c.Tensor.from_numpy(np.ascontiguousarray(keys[inside]))
 
     def _make_room(self, keys: o3c.Tensor) -> None:
+        """Room for the keys that are new, and SLACK more, so that Open3D itself never grows the table."""
         table = self.grid.hashmap()
-        needed = table.size() + len(keys)
-        if needed <= table.capacity():
+        if table.size() + len(keys) + SLACK <= table.capacity():
             return
+        _, present = table.find(keys)
+        needed = table.size() + int((~present.numpy()).sum())
         if needed > self.max_blocks:
-            _, present = table.find(keys)
-            fresh = int((~present.numpy()).sum())
-            if table.size() + fresh > self.max_blocks:
-                raise too_fine(self.voxel_size, table.size() + fresh, self.max_blocks)
-        # Open3D counts present keys again when it decides whether to grow, so the room must hold them twice.
-        table.reserve(max(needed, min(2 * table.capacity(), self.max_blocks)))
+            raise too_fine(self.voxel_size, needed, self.max_blocks)
+        if needed + SLACK > table.capacity():
+            table.reserve(max(needed, min(2 * table.capacity(), self.max_blocks)) + SLACK)
+
+    def _pieces(self, keys: o3c.Tensor) -> Iterator[o3c.Tensor]:
+        """The keys in pieces that Open3D, which counts present ones again, does not grow the table for (nearly always one)."""
+        table = self.grid.hashmap()
+        done = 0
+        while done < len(keys):
+            size = table.capacity() - table.size()
+            yield keys[done : done + size]
+            done += size
 
     def _require_frames(self) -> None:
         if self.frames == 0:
