@@ -33,7 +33,7 @@ TIMELINE_POINTS = 12
 TIMELINE_PIXELS = 8192
 PRUNE_EVERY = 150  # steps
 LAST_PRUNE = 0.8  # of the budget
-FIRST_BATCH = 1024
+FIRST_BATCH = 256  # rays a step at the coarsest level, doubled at each level: early on the number of steps counts
 
 
 @dataclass
@@ -173,16 +173,15 @@ def _first(
 
 
 def _rungs(count: int) -> list[float]:
-    """Share of the budget at which each level ends: little for the coarse ones, about half for the finest."""
-    ends = [0.05, 0.15, 0.35, 0.6]
-    return ends[: count - 1] if count <= 4 else [ends[min(i, 2)] if i < 3 else 0.35 + 0.25 * (i - 2) / (count - 4) for i in range(count - 1)]
+    """Share of the budget at which each level ends (at most five levels below the finest: 32 … 512)."""
+    return [0.06, 0.18, 0.4, 0.65, 0.8][: count - 1]
 
 
 def _rates(settings: Settings, done: float, opaque: bool) -> Rates:
     """Step sizes that fall to a tenth over the budget."""
     fall = 0.1**done
     fit = settings.fit
-    return Rates(fit.rate_density * fall, fit.rate_feature * fall, fit.rate_decoder * fall, fit.distortion)
+    return Rates(fit.rate_density * fall, fit.rate_feature * fall, fit.rate_decoder * fall, fit.distortion, fit.opacity if opaque else 0.0)
 
 
 def _measure(result: FitResult, held_out: _HeldOut, current: Field, seconds: float) -> None:
