@@ -78,6 +78,6 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
         if "render" in goals or stages.usable("render"):
             pictures["field"] = render_test_views(job, field, views)
         if "export" in goals or stages.usable("export"):
-            exported = export_results(job, field, poses, scene, views)
+            exported = export_results(job, field, poses, posed, scene, views)
     scores = score_pictures(job, views, pictures)
     return put_report(job, capture, poses, scene, views, field, timeline, pictures, scores, exported, time.monotonic() - start)

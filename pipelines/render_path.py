@@ -132,7 +132,7 @@ def orbit_cameras(views: Views, scene: Scene, frames: int) -> tuple[list[str], l
     """A closed path around what the training cameras look at."""
     from toolkit.render.paths import orbit
 
-    poses = orbit(views.world_from_camera, scene, frames)
+    poses = orbit(views.world_from_camera, scene.centre, frames)
     lens = even(views.intrinsics[0])
     return [f"orbit_{index:03d}" for index in range(len(poses))], [lens] * len(poses), poses
 

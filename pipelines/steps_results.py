@@ -135,7 +135,7 @@ def render_test_views(job: Job, field: Field, views: Views) -> Pictures:
     return job.stages.run("render", make=make, save=save, load=lambda: load_pictures(kept), after=["field", "views"])
 
 
-def export_results(job: Job, field: Field, poses: PoseResult, scene: Scene, views: Views) -> dict[str, Any]:
+def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, scene: Scene, views: Views) -> dict[str, Any]:
     """Points, meshes, cameras and video in the input's own frame; answers the mesh's facts."""
     facts_path = job.folder / "exports" / "facts.json"
     made: list[Path] = []
@@ -143,7 +143,7 @@ def export_results(job: Job, field: Field, poses: PoseResult, scene: Scene, view
     def make() -> dict[str, Any]:
         from pipelines.surface import export_field
 
-        facts, paths = export_field(job, job.folder / "exports", field, poses, scene, views)
+        facts, paths = export_field(job, job.folder / "exports", field, poses, posed, scene, views)
         made.extend(paths)
         return facts
 

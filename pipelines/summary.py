@@ -86,12 +86,18 @@ def base_data(job: Job, capture: Capture, poses: PoseResult) -> dict[str, Any]:
 
 def summarise_poses(job: Job, capture: Capture, poses: PoseResult) -> dict[str, Any]:
     """Cameras written for other programs, and what was found."""
-    from toolkit.export.cameras import write_cameras
-
-    folder = job.folder / "exports" / "cameras"
-    write_cameras(folder, poses.names, poses.intrinsics, poses.world_from_camera, poses.points)
+    put_cameras(job.folder / "exports" / "cameras", poses, poses.apply(capture))
     data = base_data(job, capture, poses)
     return {**data, "warnings": unique([*capture.warnings, *poses.warnings]), "exports": [{"path": "exports/cameras/transforms.json"}]}
+
+
+def put_cameras(folder: Path, poses: PoseResult, posed: Capture) -> None:
+    """Cameras as transforms.json and COLMAP text, to be put into the capture's folder: pictures are named as they lie there."""
+    from toolkit.export.cameras import write_cameras
+
+    root = posed.frames[0].image.parent.parent if posed.kind == "video" else posed.root
+    files = [frame.image.relative_to(root).as_posix() if frame.image.is_relative_to(root) else str(frame.image) for frame in posed.frames]
+    write_cameras(folder, files, poses.intrinsics, poses.world_from_camera, poses.points)
 
 
 def unique(texts: list[str]) -> list[str]:
@@ -155,9 +161,10 @@ def put_report(
     from toolkit.evaluate.pictures import make_pictures
     from toolkit.evaluate.report import report_data, write_report
 
+    notes = [export_facts["note"]] if export_facts and "note" in export_facts else []
     data = {
         **base_data(job, capture, poses),
-        "warnings": warnings_of(job, capture, poses, scene, views),
+        "warnings": warnings_of(job, capture, poses, scene, views) + notes,
         "scene": scene.to_dict(),
         "views": {
             "total": len(views),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,18 +11,21 @@ import numpy as np
 from pipelines.job import Job
 from pipelines.render_path import orbit_cameras, pictures
 from pipelines.rendered import Pictures, to_picture
-from toolkit.camera import Array, Intrinsics, Similarity
+from pipelines.summary import put_cameras
+from toolkit.camera import Intrinsics, Similarity
+from toolkit.errors import InputError
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Capture, Views
     from toolkit.poses.result import PoseResult
     from toolkit.poses.scene import Scene
     from toolkit.render.field import Field
-    from toolkit.tsdf.frames import DepthFrame
-    from toolkit.tsdf.fuse import Points, TsdfVolume
+    from toolkit.tsdf.fuse import Points
     from toolkit.tsdf.mesh import Mesh
 
-SMALL_PART = 0.002  # components of a mesh with less than this share of the triangles are specks
+SMALL_PART = 0.002  # components of a mesh with less than this share of its area are specks
+MOST_TRIANGLES = 2_000_000
+MESHES = ("ply", "obj", "glb")
 MESH_SIDE = 400  # pixels; finer depth than this adds little to a mesh and much to the time
 VIDEO_SIDE = 640
 FPS = 30
@@ -41,14 +43,13 @@ def fuse_training_frames(job: Job, folder: Path, posed: Capture, scene: Scene, v
         pictures, and the files written. `pictures.facts`: voxel size and range (working units), frames, blocks, seconds with decoding.
     """
     from toolkit.export.mesh import mesh_facts
-
     from toolkit.tsdf.fuse import fuse_capture
 
     train = [index for index, test in enumerate(views.test) if not test and posed.frames[index].depth is not None]
     start = time.monotonic()
     volume = fuse_capture(posed, scene.working_from_input, train, job.settings.tsdf, job.progress)
     fused = time.monotonic() - start
-    mesh = volume.mesh().cleaned(min_share=SMALL_PART)
+    mesh = volume.mesh().cleaned(min_area_share=SMALL_PART)
     write_surface(folder, scene, mesh, volume.points())
     found = Pictures()
     for index in np.flatnonzero(views.test):
@@ -85,33 +86,27 @@ def put_points(path: Path, points: Points, input_from_working: Similarity) -> Pa
     return path
 
 
-def export_field(job: Job, folder: Path, field: Field, poses: PoseResult, scene: Scene, views: Views) -> tuple[dict[str, Any], list[Path]]:
+def export_field(
+    job: Job, folder: Path, field: Field, poses: PoseResult, posed: Capture, scene: Scene, views: Views
+) -> tuple[dict[str, Any], list[Path]]:
     """What the settings' `export.formats` name, in the input's frame.
 
     Returns:
-        facts of the mesh (triangles, watertight, …), and the files written.
+        facts (of the mesh: triangles, watertight, …; a `note` when the field has no surface), and the files written.
     """
-    from toolkit.export.cameras import write_cameras
-    from toolkit.export.mesh import mesh_facts, write_mesh
     from toolkit.export.video import write_video
 
-    formats = job.settings.export.formats
-    facts: dict[str, Any] = {}
+    formats = set(job.settings.export.formats)
+    facts: dict[str, Any] = {"mesh": None}
     written: list[Path] = []
-    if set(formats) & {"points", "ply", "obj", "glb"}:
-        volume = fuse_rendered_depth(job, field, scene, views)
-        input_from_working = scene.working_from_input.inverse()
-        if "points" in formats:
-            written.append(put_points(folder / "points.ply", volume.points(), input_from_working))
-        mesh = volume.mesh().cleaned(min_share=SMALL_PART).transformed(input_from_working)
-        facts["mesh"] = mesh_facts(mesh)
-        for path in [job.folder / "mesh.ply", *(folder / f"mesh.{suffix}" for suffix in ("ply", "obj", "glb") if suffix in formats)]:
-            write_mesh(path, mesh)
-            written.append(path)
+    if formats & {"points", *MESHES}:
+        try:
+            facts["mesh"], written = export_surface(job, folder, formats, field, scene, views)
+        except InputError as error:
+            facts["note"] = f"points and meshes were left out: {error}"
     if "cameras" in formats:
-        cameras = folder / "cameras"
-        write_cameras(cameras, poses.names, poses.intrinsics, poses.world_from_camera, poses.points)
-        written += [path for path in sorted(cameras.rglob("*")) if path.is_file()]
+        put_cameras(folder / "cameras", poses, posed)
+        written += [path for path in sorted((folder / "cameras").rglob("*")) if path.is_file()]
     if "video" in formats:
         _, lenses, around = orbit_cameras(views, scene, job.settings.export.video_frames)
         job.progress.update(0, len(around), "orbit video")
@@ -120,32 +115,34 @@ def export_field(job: Job, folder: Path, field: Field, poses: PoseResult, scene:
     return facts, written
 
 
-def fuse_rendered_depth(job: Job, field: Field, scene: Scene, views: Views) -> TsdfVolume:
-    """The field's depth, rendered at the capture's own cameras, as a TSDF volume: its surface is clean where single views are not."""
-    from toolkit.tsdf.fuse import fuse_frames
+def export_surface(
+    job: Job, folder: Path, formats: set[str], field: Field, scene: Scene, views: Views
+) -> tuple[dict[str, Any], list[Path]]:
+    """The field's depth, rendered at the capture's own cameras and fused: points and meshes of the region of interest.
+
+    Raises:
+        InputError: the field has no surface.
+    """
+    from toolkit.export.mesh import mesh_facts, write_mesh
+    from toolkit.export.surface import field_volume
+    from toolkit.render.image import render_view
 
     chosen = spread(len(views), job.settings.export.mesh_views)
-    reach = np.linalg.norm(views.world_from_camera[:, :3, 3] - scene.centre, axis=1).max() + np.linalg.norm(scene.half_size)
-    depth_max = float(min(reach, scene.far))
-    return fuse_frames(rendered_depth(field, views, chosen), mesh_voxel(field, scene, views), depth_max, len(chosen), progress=job.progress)
-
-
-def mesh_voxel(field: Field, scene: Scene, views: Views) -> float:
-    """Not finer than the field, and not finer than the rendered depth can tell."""
-    lens = at_most(views.intrinsics[0], MESH_SIDE)
-    return float(max(field.voxel_size, 1.5 * scene.median_depth / lens.fx))
-
-
-def rendered_depth(field: Field, views: Views, chosen: list[int]) -> Iterator[DepthFrame]:
-    """Depth and colour of the field at some of the views, as frames to fuse."""
-    from toolkit.render.image import render_view
-    from toolkit.tsdf.frames import DepthFrame
-
-    for index in chosen:
-        lens = at_most(views.intrinsics[index], MESH_SIDE)
-        pose: Array = views.world_from_camera[index]
-        picture = to_picture(render_view(field, lens, pose))
-        yield DepthFrame(picture.depth, picture.rgb, lens, lens, pose)
+    volume = field_volume(
+        lambda lens, pose: render_view(field, lens, pose),
+        views.world_from_camera[chosen],
+        [at_most(views.intrinsics[index], MESH_SIDE) for index in chosen],
+        region=(scene.centre - scene.half_size, scene.centre + scene.half_size),
+        progress=job.progress,
+    )
+    input_from_working = scene.working_from_input.inverse()
+    written = [put_points(folder / "points.ply", volume.points(), input_from_working)] if "points" in formats else []
+    mesh = volume.mesh().cleaned(min_area_share=SMALL_PART).decimated(MOST_TRIANGLES).transformed(input_from_working)
+    facts = mesh_facts(mesh)
+    for path in [job.folder / "mesh.ply", *(folder / f"mesh.{suffix}" for suffix in MESHES if suffix in formats)]:
+        write_mesh(path, mesh)
+        written.append(path)
+    return facts, written
 
 
 def at_most(lens: Intrinsics, long_side: int) -> Intrinsics:

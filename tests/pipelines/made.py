@@ -19,7 +19,8 @@ from toolkit.camera import Array, Intrinsics, opengl_from_world
 ROOT = Path(__file__).resolve().parents[2]
 HALF = np.array([2.0, 1.5, 2.0])  # half size of the room, metres
 TILE = 0.45  # metres
-FINE = 3  # samples along each side of a pixel, so that edges are soft as in photos
+FINE = 2  # samples along each side of a pixel, so that edges are soft as in photos
+COLOURS = np.random.default_rng(7).random((32, 32, 32, 3))
 CAMERA = Intrinsics(96, 72, 82.5, 82.5, 48.0, 36.0)
 
 
@@ -34,10 +35,10 @@ def look_at(eye: Array, target: Array) -> Array:
     return pose
 
 
-def circle(count: int) -> list[Array]:
-    """Cameras on a circle in the room, each looking across its middle."""
+def circle(count: int, part: float = 1.0) -> list[Array]:
+    """Cameras on (part of) a circle in the room, each looking across its middle."""
     poses = []
-    for angle in np.arange(count) / count * 2 * np.pi:
+    for angle in np.arange(count) / count * 2 * np.pi * part:
         eye = np.array([np.cos(angle), 0.25 * np.sin(3 * angle), np.sin(angle)])
         poses.append(look_at(eye, np.array([0.1, 0.0, -0.1])))
     return poses
@@ -46,10 +47,9 @@ def circle(count: int) -> list[Array]:
 def colour_at(points: Array) -> Array:
     """(N, 3) points → (N, 3) RGB in [0, 1]: tiles of many colours with soft waves over them."""
     cells = np.floor(points / TILE + 0.37).astype(np.int64) % 32
-    table = np.random.default_rng(7).random((32, 32, 32, 3))
     x, y, z = points.T
     waves = np.stack([np.sin(3.1 * x + 1.7 * y - 2.3 * z), np.sin(4.3 * y - 5.1 * x + 1.0), np.sin(3.1 * z + 4.3 * y + 2.0)], axis=1)
-    return 0.1 + 0.6 * table[cells[:, 0], cells[:, 1], cells[:, 2]] + 0.1 * (1 + waves)
+    return 0.1 + 0.6 * COLOURS[cells[:, 0], cells[:, 1], cells[:, 2]] + 0.1 * (1 + waves)
 
 
 def shoot(pose: Array, camera: Intrinsics = CAMERA) -> tuple[Array, Array]:
@@ -91,6 +91,13 @@ def make_room(folder: Path, count: int = 12, depth: bool = False, camera: Intrin
     data = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "frames": frames}
     write_transforms(folder, data)
     return data
+
+
+def make_photos(folder: Path, poses: list[Array], camera: Intrinsics) -> Path:
+    """Bare photos of the room, nothing known of their cameras."""
+    for index, pose in enumerate(poses):
+        save_picture(folder / f"{index:02d}.jpg", shoot(pose, camera)[0])
+    return folder
 
 
 def write_transforms(folder: Path, data: dict[str, Any]) -> None:

@@ -1,0 +1,87 @@
+"""Captures without poses through the command line: poses found, or the reason why not."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import psutil
+import pytest
+
+from tests.pipelines.made import CAMERA, call, circle, command, environment, look_at, make_photos, shoot
+
+Capsys = pytest.CaptureFixture[str]
+PHOTO = CAMERA.scaled(288, 216)
+SHORT = ["--budget", "2", "--threads", "1", "--image-size", "96", "--set", "export.formats=[cameras]", "--quiet"]
+
+
+def as_json(text: str) -> dict[str, Any]:
+    data = json.loads(text)
+    assert isinstance(data, dict)
+    return data
+
+
+def test_photos_get_poses_and_the_report_says_what_the_poses_have_seen(tmp_path: Path, capsys: Capsys) -> None:
+    source = make_photos(tmp_path / "photos", circle(14, 0.3), PHOTO)
+    answer = call(capsys, "run", source, "--out", tmp_path / "out", *SHORT, "--json")
+    assert answer.code == 0, answer.err
+    data = as_json(answer.out)
+    assert data["capture"]["kind"] == "photos" and data["poses"]["source"] == "sfm"
+    assert data["poses"]["registered"] >= 12 and data["poses"]["total"] == 14
+    assert any("held-out ones included" in warning for warning in data["warnings"])
+    assert (tmp_path / "out" / "exports" / "cameras" / "colmap").is_dir()
+    again = as_json(call(capsys, "poses", tmp_path / "out", "--quiet", "--json").out)
+    assert {stage["name"]: stage["cached"] for stage in again["stages"]}["poses"]
+
+
+def test_video_is_cut_into_frames(tmp_path: Path, capsys: Capsys) -> None:
+    path = tmp_path / "film.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10, (PHOTO.width, PHOTO.height))
+    for pose in circle(30, 0.3):
+        writer.write(cv2.cvtColor(shoot(pose, PHOTO)[0], cv2.COLOR_RGB2BGR))
+    writer.release()
+    answer = call(capsys, "poses", path, "--out", tmp_path / "out", "--set", "capture.max_frames=12", "--threads", 1, "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    data = as_json(answer.out)
+    assert data["capture"]["kind"] == "video" and 6 <= data["capture"]["frames"] <= 12
+    assert (data["capture"]["width"], data["capture"]["height"]) == (288, 216)
+    frames = sorted((tmp_path / "out" / "frames").glob("*.jpg"))
+    assert len(frames) == data["capture"]["frames"]
+    frames[2].unlink()
+    again = as_json(call(capsys, "poses", path, "--out", tmp_path / "out", "--set", "capture.max_frames=12", "--quiet", "--json").out)
+    assert {stage["name"]: stage["cached"] for stage in again["stages"]} == {"capture": True, "frames": False, "poses": False}
+    assert frames[2].is_file()
+
+
+def test_turning_on_the_spot_is_named(tmp_path: Path, capsys: Capsys) -> None:
+    eye = np.array([0.3, 0.0, 0.0])
+    poses = [look_at(eye, eye + np.array([np.cos(angle), 0.1 * np.sin(5 * angle), np.sin(angle)])) for angle in np.linspace(0, 1.2, 10)]
+    source = make_photos(tmp_path / "photos", poses, PHOTO.scaled(480, 360))
+    answer = call(capsys, "run", source, "--out", tmp_path / "out", *SHORT)
+    assert answer.code == 2
+    sentence = answer.sentence()
+    assert "turn" in sentence or "rotat" in sentence, sentence
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_the_child_that_finds_poses_does_not_outlive_us(number: int, tmp_path: Path) -> None:
+    source = make_photos(tmp_path / "photos", circle(20, 0.4), PHOTO)
+    process = subprocess.Popen(command("poses", source, "--out", tmp_path / "out"), stderr=subprocess.PIPE, text=True, env=environment())
+    end = time.monotonic() + 60
+    children: list[psutil.Process] = []
+    while not children and time.monotonic() < end and process.poll() is None:
+        children = psutil.Process(process.pid).children(recursive=True)
+        time.sleep(0.02)
+    assert children, process.communicate()[1]
+    process.send_signal(number)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == (-signal.SIGKILL if number == signal.SIGKILL else 130), err
+    _, alive = psutil.wait_procs(children, timeout=10)
+    assert not alive
+    assert not (tmp_path / "out" / "stages" / "poses.json").exists()
