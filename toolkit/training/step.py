@@ -40,7 +40,6 @@ class Optimiser:
         self.feature = LazyAdam(field.feature_rows)
         self.decoder = torch.optim.Adam(field.decoder.parameters(), lr=1e-3, betas=(0.9, 0.99), eps=1e-10)
         self.seen = torch.zeros(len(field.occupied), device=field.device)
-        self._touched = torch.zeros(len(field.density_rows), dtype=torch.bool, device=field.device)
 
     def renew_rows(self, field: Field) -> None:
         """Go on with another field of the same decoder: the rows' state starts afresh, the decoder's is kept."""
@@ -53,12 +52,13 @@ class Optimiser:
         self.field = field
         self.seen.zero_()
 
-    def _touched_rows(self, rows: Tensor) -> Tensor:
-        self._touched[rows.reshape(-1)] = True
-        self._touched[-1] = False  # the zero row stays zero
-        touched = self._touched.nonzero().squeeze(1)
-        self._touched[touched] = False
-        return touched
+    def _move(self, rows: Tensor, corner_weights: Tensor, g_density: Tensor, g_feature: Tensor, rates: Rates) -> None:
+        """From gradients of what was looked up to a step of the rows that it was looked up from."""
+        touched, (density_gradient, feature_gradient) = scatter(rows, corner_weights, (g_density, g_feature))
+        if len(touched) and int(touched[-1]) == self.field.topology.zero_row:  # the zero row stays zero
+            touched, density_gradient, feature_gradient = touched[:-1], density_gradient[:-1], feature_gradient[:-1]
+        self.density.step(touched, density_gradient, rates.density)
+        self.feature.step(touched, feature_gradient, rates.feature)
 
     def step(self, batch: Batch, rates: Rates, generator: torch.Generator) -> tuple[float, int]:
         """One step. Returns the mean squared colour error of the batch and the number of samples that were looked at."""
@@ -112,11 +112,7 @@ class Optimiser:
             g_weight = g_weight + g_distortion * (rates.distortion / count)
         g_thickness = thickness_gradient(weight, transmittance, thickness, g_weight, kept.first, kept.ray, count)
         g_raw = torch.where(raw < RAW_MAX, g_thickness * thickness, torch.zeros_like(raw))  # ∂τ/∂raw = τ
-        scatter(self.density.gradient, rows, corner_weights, g_raw)
-        scatter(self.feature.gradient, rows, corner_weights, per_ray[:, :-1] * weight[:, None])
-        touched = self._touched_rows(rows)
-        self.density.step(touched, rates.density)
-        self.feature.step(touched, rates.feature)
+        self._move(rows, corner_weights, g_raw, per_ray[:, :-1] * weight[:, None], rates)
         return float(residual.square().mean())
 
     def _per_sample(self, batch: Batch, samples: Samples, rates: Rates, behind: Tensor) -> float:
@@ -144,9 +140,5 @@ class Optimiser:
         g_thickness = thickness_gradient(weight, transmittance, tau, g_weight, samples.first, samples.ray, count)
         torch.autograd.backward([thickness, colour], [g_thickness, weight[:, None] * g_mixed])
         assert features.grad is not None and base.grad is not None
-        scatter(self.density.gradient, rows, corner_weights, base.grad)
-        scatter(self.feature.gradient, rows, corner_weights, features.grad)
-        touched = self._touched_rows(rows)
-        self.density.step(touched, rates.density)
-        self.feature.step(touched, rates.feature)
+        self._move(rows, corner_weights, base.grad, features.grad, rates)
         return float(residual.square().mean())
