@@ -129,6 +129,10 @@ def test_missing_frames_are_grouped_by_cause():
     assert "too weakly or ambiguously to be placed: p06" in causes
     assert "no frame of the model (a gap in the overlap): p07, p08" in causes
     assert "too few features (dark, blurred or blank): p09" in causes
+    bare = facts(10, [pair(i, i + 1) for i in range(9)], model(list(range(6))))
+    for record in bare["pictures"][6:]:
+        record["keypoints"] = 300
+    assert "little texture (300 keypoints each, the others 900)" in shortfalls(bare)[1]
     assert shortfalls(facts(3, [], model([0, 1, 2]))) == []
 
 

@@ -233,3 +233,20 @@ def test_a_child_that_aborts_or_fails_is_reported(tmp_path):
         run_child("timeit", ["-n1", "-r1", "import os; os.abort()"], tmp_path / "log.txt", lambda message: None)
     with pytest.raises(PoseError, match="exit code 1.*nothing at all"):
         run_child("timeit", ["-n1", "-r1", "raise ValueError('nothing at all')"], tmp_path / "log.txt", lambda message: None)
+
+
+def test_a_full_disk_is_said_to_be_one(pictures, tmp_path):
+    """A limit on file size stands in for a full disk: SQLite meets the same failed write."""
+    capture = write_capture(tmp_path / "photos", pictures[0][:3])
+    script = (
+        "import resource, signal, sys; from pathlib import Path\n"
+        "from toolkit.capture.types import Capture, Frame; from toolkit.errors import OutputError; from toolkit.poses.sfm import find_poses\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000))\n"
+        "root = Path(sys.argv[1]); frames = tuple(Frame(p.stem, p) for p in sorted((root / 'photos').iterdir()))\n"
+        "try:\n    find_poses(Capture('photos', root, frames), root, threads=1)\n"
+        "except OutputError as error:\n    print('OUTPUT', error)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    done = subprocess.run([sys.executable, "-c", script, str(capture.root.parent)], env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert done.stdout.startswith("OUTPUT cannot write"), done.stdout + done.stderr
+    assert done.stdout.count("\n") == 1

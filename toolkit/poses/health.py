@@ -12,6 +12,7 @@ from toolkit.camera import Array
 from toolkit.poses.result import listed
 
 FEW_KEYPOINTS = 40  # below which a picture cannot be matched reliably
+BARE = 0.6  # of the usual number of keypoints, below which missing texture is named as a cause
 SAME = 1.0  # grey levels between thumbnails of pictures that count as identical
 BLACK = 2.0  # grey deviation of a picture without content
 FLAT_SHARE = 0.8  # of verified pairs explained by a homography before the scene or the motion is called degenerate
@@ -172,7 +173,11 @@ def shortfalls(facts: dict[str, Any]) -> list[str]:
     sizes: list[int] = next((attempt["models"] for attempt in facts["attempts"] if attempt["attempt"] == model["attempt"]), [])
     apart = f"; the scene split into models of {', '.join(str(size) for size in sizes)} frames" if len(sizes) > 1 else ""
     warnings = [f"{len(inside)} of {count} frames were registered{apart}"]
+    usual = float(np.median([pictures[i]["keypoints"] for i in inside]))
     for cause, frames in groups.items():
+        own = float(np.median([pictures[i]["keypoints"] for i in frames]))
+        if FEW_KEYPOINTS <= own < BARE * usual:
+            cause += f"; they show little texture ({own:.0f} keypoints each, the others {usual:.0f})"
         warnings.append(f"{len(frames)} frames are missing because {cause}: {listed(runs([pictures[i]['name'] for i in frames], frames))}")
     return warnings
 

@@ -19,6 +19,7 @@ from toolkit.poses.job import Job
 Report = Callable[[float, float, str], None]
 ENOUGH = 0.6  # share of registered pictures below which a looser attempt is worth its time
 FEW_POINTS = 12  # a picture that sees fewer of the model's points hangs in the air: not registered
+SMALLEST = 3  # registered pictures that make a model
 MAX_ERROR = 3.0  # pixels; the mean reprojection error of a model that can be trusted
 ANGLE_SAMPLE = 2000  # points looked at for the triangulation angle
 
@@ -47,7 +48,7 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
     history = []
     for name, attempt in attempts:
         models = sorted((_model(found, name) for found in attempt()), key=lambda model: model.size, reverse=True)
-        models = [model for model in models if len(model.registered) >= 2]
+        models = [model for model in models if len(model.registered) >= SMALLEST]
         history.append({"attempt": name, "models": [len(model.registered) for model in models]})
         for model in models:
             if model.reconstruction.compute_mean_reprojection_error() > MAX_ERROR:
@@ -72,7 +73,7 @@ def _incremental(job: Job, report: Report, loose: bool) -> list[pycolmap.Reconst
     options.num_threads = job.threads
     options.random_seed = job.seed
     options.extract_colors = False  # pictures may be frames of a video or turned: the points are coloured later where needed
-    options.min_model_size = 3
+    options.min_model_size = SMALLEST
     options.max_num_models = 10
     options.mapper.num_threads = job.threads
     options.mapper.random_seed = job.seed

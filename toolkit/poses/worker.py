@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 
 PR_SET_PDEATHSIG = 1
+PROBE_BYTES = 4 * 2**20
 WEIGHTS = {"features": (0.0, 0.3), "matching": (0.3, 0.4), "mapping": (0.7, 0.3)}  # start and share of the whole, for the bar
 
 
@@ -92,6 +93,21 @@ def work(job_file: Path, mouth: Mouth) -> None:
     write_json(job.result, facts)
 
 
+def unwritable(folder: Path) -> str | None:
+    """Why a file of the size of a database cannot be written in `folder` now; None when it can."""
+    probe = folder / f".probe-{os.getpid()}"
+    try:
+        with probe.open("wb") as file:
+            file.write(b"\0" * PROBE_BYTES)
+            file.flush()
+            os.fsync(file.fileno())
+        return None
+    except OSError as error:
+        return f"cannot write {folder}: {error.strerror or error}; free space or choose another --out folder"
+    finally:
+        probe.unlink(missing_ok=True)
+
+
 def main() -> int:
     die_with_parent()
     mouth = Mouth()
@@ -104,6 +120,11 @@ def main() -> int:
         work(Path(sys.argv[1]), mouth)
     except FieldfuseError as error:
         mouth.say(event="error", kind=type(error).__name__, message=str(error))
+    except (OSError, RuntimeError):  # SQLite's and COLMAP's own errors come as RuntimeError, often without their cause
+        reason = unwritable(Path(sys.argv[1]).parent)
+        if reason is None:
+            raise
+        mouth.say(event="error", kind="OutputError", message=reason)
     return 0
 
 
