@@ -73,6 +73,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     """
     from toolkit.render.field import Field
     from toolkit.training.fit import fit_field
+    from toolkit.volume.grid_host import GridHost
 
     settings = job.settings
     path, times = job.folder / "field.safetensors", job.folder / "timeline.json"
@@ -84,10 +85,10 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     def make() -> Fitted:
         set_seeds(settings.seed)
         if start is None:
-            result = fit_field(views, scene, settings, job.progress)
+            result = fit_field(views, scene, settings, job.progress, GridHost(settings.device))
             return result.field, result.timeline
         field, timeline = load()
-        result = fit_field(views, scene, settings, job.progress, start=field)
+        result = fit_field(views, scene, settings, job.progress, GridHost(settings.device), start=field)
         spent = timeline[-1]["seconds"] if timeline else 0.0
         return result.field, timeline + [{**point, "seconds": round(spent + point["seconds"], 3)} for point in result.timeline]
 
