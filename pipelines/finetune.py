@@ -21,6 +21,7 @@ def finetune(
 ) -> None:
     """Fit the field of a run for another --budget seconds, then render, export and score it.
 
+    The folder then holds these settings; the `run` command that made it would fit its own field again.
     With other settings of the field itself (its decoder, say) it is fitted anew on the same pictures and poses.
     """
     from pipelines.work import work

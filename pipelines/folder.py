@@ -69,6 +69,7 @@ class RunFolder:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._check_ours()
             self._remove_leftovers()
+            remove(self.path / ERROR_LOG)
         except BlockingIOError as error:
             self._unlock()
             raise OutputError(BUSY.format(self.path)) from error

@@ -77,7 +77,8 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
         field, timeline = fit_radiance_field(job, views, scene, go_on)
         if "render" in goals or stages.usable("render"):
             pictures["field"] = render_test_views(job, field, views)
-        if "export" in goals or stages.usable("export"):
+        # Who has asked to stop waits for the report, not for a video.
+        if stages.usable("export") or ("export" in goals and not stages.stopped()):
             exported = export_results(job, field, poses, posed, scene, views)
     scores = score_pictures(job, views, pictures)
     return put_report(job, capture, poses, scene, views, field, timeline, pictures, scores, exported, time.monotonic() - start)

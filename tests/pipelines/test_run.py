@@ -165,6 +165,23 @@ def test_info_on_source_and_run(done: Path, capsys: Capsys) -> None:
     assert [stage["name"] for stage in json.loads(answer.out)["stages"]][:2] == ["capture", "poses"]
 
 
+def test_a_changed_picture_is_noticed(tmp_path: Path, capsys: Capsys) -> None:
+    make_room(tmp_path / "room", 6)
+    arguments = ["poses", tmp_path / "room", "--out", tmp_path / "room" / "out", "--quiet", "--json"]
+    assert call(capsys, *arguments).code == 0
+    assert all(stages(json.loads(call(capsys, *arguments).out)).values())  # its own folder inside the source changes nothing
+    picture = tmp_path / "room" / "images" / "002.png"
+    cv2.imwrite(str(picture), cv2.imread(str(picture))[::-1])
+    assert not any(stages(json.loads(call(capsys, *arguments).out)).values())
+
+
+def test_doctor_as_json(capsys: Capsys) -> None:
+    answer = call(capsys, "doctor", "--json")
+    checks = json.loads(answer.out)
+    assert {"python", "torch", "pycolmap"} <= {check["name"] for check in checks}
+    assert answer.code == int(any(check["status"] == "fail" for check in checks))
+
+
 def test_poses_alone(tmp_path: Path, capsys: Capsys) -> None:
     make_room(tmp_path / "room", 6)
     answer = call(capsys, "poses", tmp_path / "room", "--out", tmp_path / "out", "--quiet", "--json")
@@ -281,8 +298,9 @@ def test_killed_at_several_moments_the_run_goes_on(done: Path, tmp_path: Path) -
     data = report(tmp_path / "out")
     cached = stages(data)
     assert cached["capture"] and cached["views"] and cached["field"]
-    for method in ("field", "tsdf"):
-        assert data["evaluation"][method]["psnr"] == pytest.approx(report(done)["evaluation"][method]["psnr"], abs=1.5)
+    # The surface repeats; how far a field gets in a few seconds depends on what else the machine does.
+    for method, noise in (("tsdf", 0.1), ("field", 3.0)):
+        assert data["evaluation"][method]["psnr"] == pytest.approx(report(done)["evaluation"][method]["psnr"], abs=noise)
     assert not list((tmp_path / "out").rglob(".tmp-*"))
 
 
@@ -300,6 +318,11 @@ def test_ctrl_c_while_fitting_keeps_the_field_and_reports(tmp_path: Path) -> Non
     assert any("stopped early" in warning for warning in data["warnings"])
     assert data["evaluation"]["field"]["views"] == 2
     assert "Traceback" not in err
+    assert not (tmp_path / "out" / "exports").exists()  # nobody waits for a video after Ctrl-C
+    answer = spawn("run", tmp_path / "room", "--out", tmp_path / "out", *FAST)
+    assert answer.returncode == 0, answer.stderr
+    again = report(tmp_path / "out")
+    assert not any("stopped early" in warning for warning in again["warnings"]) and not stages(again)["field"] and stages(again)["views"]
 
 
 def test_ctrl_c_before_the_field_says_how_to_go_on(tmp_path: Path) -> None:
