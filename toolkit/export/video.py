@@ -67,7 +67,7 @@ def _open(path: Path, shape: tuple[int, ...], fps: float, codecs: Iterable[str])
         if writer.isOpened():
             return writer, codec
         writer.release()
-    raise OutputError("this OpenCV writes no mp4 videos; `pip install --force-reinstall opencv-contrib-python-headless` brings one that can")
+    raise OutputError("this OpenCV writes no mp4 videos; `pip install --force-reinstall opencv-contrib-python-headless` helps")
 
 
 def _write(writer: cv2.VideoWriter, picture: Array, shape: tuple[int, ...], path: Path) -> int:

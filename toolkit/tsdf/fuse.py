@@ -41,6 +41,7 @@ DEPTH_STEPS = 60000  # 16-bit depth: this value is depth_max, what saturates abo
 BYTES_PER_BLOCK = BLOCK**3 * (1 + 1 + 3) * 4
 MAX_BYTES = 4 * 2**30
 SAMPLE_FRAMES = 12  # frames looked at before fusion, for voxel size, range and memory
+HOPELESS = 16  # how many times too many blocks are counted before counting stops
 SLACK = 1024  # blocks of room beyond those in use
 DEVICE = o3c.Device("CPU:0")
 
@@ -95,6 +96,8 @@ class TsdfVolume:
             DEVICE,
         )
         self._scale = DEPTH_STEPS / self.depth_max
+        # Read back larger by a millionth: a plane exactly on voxels would have distance 0 there, no change of sign, and vanish.
+        self._read_scale = self._scale * (1 - 1e-6)
         self._caster: tuple[int, SurfaceCaster] | None = None
 
     @property
@@ -146,7 +149,7 @@ class TsdfVolume:
         matrix = o3c.Tensor(frame.depth_intrinsics.matrix())
         colour_matrix = o3c.Tensor(_colour_matrix(frame.colour_intrinsics, frame.depth_intrinsics))
         for piece in self._pieces(keys):
-            self.grid.integrate(piece, depth, colour, matrix, colour_matrix, extrinsic, self._scale, self.depth_max, self.truncation)
+            self.grid.integrate(piece, depth, colour, matrix, colour_matrix, extrinsic, self._read_scale, self.depth_max, self.truncation)
         self.frames += 1
         return True
 
@@ -172,7 +175,7 @@ class TsdfVolume:
         )
 
     def points(self, weight_threshold: float | None = None) -> Points:
-        """Surface points where the distance changes sign along a lattice edge, in the working frame.
+        """Surface points where the distance changes sign along a lattice edge, in the working frame; their order is not fixed.
 
         Raises:
             InputError: no frame with valid depth was fused.
@@ -280,8 +283,10 @@ def estimate_blocks(sample: Sequence[DepthFrame], volume: TsdfVolume, total: int
         keys = volume.touched(frame)
         passed, largest = passed + len(keys), max(largest, len(keys))
         union = np.unique(np.concatenate([union, keys]), axis=0)
-        if len(union) > volume.max_blocks:
-            raise too_fine(volume.voxel_size, len(union), volume.max_blocks)
+        if len(union) > HOPELESS * volume.max_blocks:
+            break
+    if len(union) > volume.max_blocks:
+        raise too_fine(volume.voxel_size, len(union), volume.max_blocks)
     unseen = len(union) * (len(union) / max(passed, 1)) if total > len(sample) else 0.0
     return int(1.2 * (len(union) + unseen)) + largest
 

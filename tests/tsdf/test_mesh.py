@@ -1,0 +1,119 @@
+"""The mesh type: frames, cleaning, thinning."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+import pytest
+import trimesh
+
+from toolkit.camera import Similarity
+from toolkit.errors import InputError
+from toolkit.export.mesh import to_trimesh
+from toolkit.tsdf.mesh import Mesh, as_bytes
+
+
+def ball(radius: float = 1.0, centre: tuple[float, float, float] = (0, 0, 0), subdivisions: int = 3) -> Mesh:
+    made = trimesh.creation.icosphere(subdivisions, radius)
+    colours = np.random.default_rng(0).integers(0, 256, made.vertices.shape).astype(np.uint8)
+    return Mesh.create(made.vertices + np.array(centre), made.faces, colours, made.vertices / radius)
+
+
+def joined(*parts: Mesh) -> Mesh:
+    starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+    return Mesh.create(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.triangles + start for part, start in zip(parts, starts, strict=True)]),
+        np.concatenate([part.colours for part in parts]),
+    )
+
+
+def some_similarity(scale: float = 0.01) -> Similarity:
+    rotation = trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.7, 0.4]))[:3, :3]
+    return Similarity(scale, rotation, np.array([3.0, -2.0, 5.0]))
+
+
+def test_a_similarity_and_its_inverse_bring_a_mesh_back() -> None:
+    mesh, similarity = ball(2.0, (10, 20, 30)), some_similarity()
+    moved = mesh.transformed(similarity)
+    assert np.allclose(moved.bounds()[1] - moved.bounds()[0], 0.04, rtol=0.02)
+    back = moved.transformed(similarity.inverse())
+    assert np.abs(back.vertices - mesh.vertices).max() < 1e-12 * 40
+    assert np.allclose(np.linalg.norm(moved.normals, axis=1), 1)
+    assert np.allclose(back.normals, mesh.normals)
+
+
+def test_cleaning_removes_exactly_what_is_not_surface() -> None:
+    big, small = ball(1.0), ball(0.01, (3, 0, 0), subdivisions=0)
+    dirty = joined(big, small)
+    triangles = np.concatenate([dirty.triangles, dirty.triangles[5:7, [1, 2, 0]], [[4, 4, 9]]])  # two repeated, one degenerate
+    vertices = np.concatenate([dirty.vertices, [[9.0, 9, 9]]])  # used by nothing
+    dirty = Mesh.create(vertices, triangles, np.zeros(vertices.shape, np.uint8))
+    kept = dirty.cleaned()
+    assert len(kept.triangles) == len(big.triangles) + len(small.triangles)
+    assert len(kept.vertices) == len(vertices) - 1
+    without_small = dirty.cleaned(min_area_share=1e-3)
+    assert len(without_small.triangles) == len(big.triangles)
+    assert without_small.bounds()[1, 0] <= 1 + 1e-9
+    assert to_trimesh(without_small).is_watertight
+    assert len(dirty.cleaned(min_share=0.02).triangles) == len(big.triangles)
+    assert len(dirty.cleaned(min_share=0.001).triangles) == len(kept.triangles)
+
+
+def test_the_largest_component_stays_whatever_the_share() -> None:
+    parts = joined(ball(1.0), ball(0.9, (5, 0, 0)), ball(0.8, (-5, 0, 0)))
+    assert len(parts.cleaned(min_area_share=0.9).triangles) == len(parts.triangles) // 3
+
+
+def test_colours_follow_their_vertices_through_cleaning() -> None:
+    dirty = joined(ball(0.01, (3, 0, 0), subdivisions=0), ball(1.0))
+    cleaned = dirty.cleaned(min_area_share=0.01)
+    expected = ball(1.0)
+    assert np.array_equal(cleaned.vertices, expected.vertices)
+    assert np.array_equal(cleaned.colours, expected.colours)
+
+
+def test_thinning_keeps_shape_and_colour() -> None:
+    made = ball(1.0, subdivisions=5)
+    red_above = np.where(made.vertices[:, 2:] > 0, [[255, 0, 0]], [[0, 0, 255]]).astype(np.uint8)
+    mesh = Mesh.create(made.vertices, made.triangles, red_above, made.normals)
+    thin = mesh.decimated(2000)
+    assert 1500 < len(thin.triangles) <= 2000
+    assert np.abs(np.linalg.norm(thin.vertices, axis=1) - 1).max() < 0.01
+    far = np.abs(thin.vertices[:, 2]) > 0.1
+    assert np.array_equal(thin.colours[far, 0] > 128, thin.vertices[far, 2] > 0)
+    assert np.einsum("ij,ij->i", thin.normals, thin.vertices).min() > 0.9
+    assert mesh.decimated(len(mesh.triangles)) is mesh
+
+
+def test_components_are_counted_as_open3d_and_trimesh_do() -> None:
+    parts = joined(ball(1.0), ball(0.5, (5, 0, 0)), ball(0.2, (-5, 0, 0)))
+    assert len(np.unique(parts.components())) == 3 == to_trimesh(parts).body_count
+
+
+def test_damaged_meshes_are_refused() -> None:
+    with pytest.raises(InputError, match="points to vertex 7"):
+        Mesh.create(np.zeros((3, 3)), [[0, 1, 7]])
+    with pytest.raises(InputError, match="not finite"):
+        Mesh.create([[0, 0, np.nan]], np.zeros((0, 3)))
+    with pytest.raises(InputError, match="colours"):
+        Mesh.create(np.zeros((3, 3)), [[0, 1, 2]], np.zeros((2, 3)))
+
+
+def test_empty_meshes_pass_through_everything() -> None:
+    empty = Mesh.empty()
+    assert len(empty.cleaned(0.1, 0.1).decimated(10).transformed(some_similarity()).triangles) == 0
+    assert len(empty.components()) == 0
+    assert empty.bounds().tolist() == [[0, 0, 0], [0, 0, 0]]
+
+
+def test_open3d_round_trip_keeps_positions_in_double() -> None:
+    mesh = ball(1.0, (1e6, 0, 0))
+    back = Mesh.from_open3d(o3d.geometry.TriangleMesh(mesh.to_open3d()))
+    assert np.array_equal(back.vertices, mesh.vertices)
+    assert np.array_equal(back.colours, mesh.colours)
+
+
+def test_colours_as_bytes() -> None:
+    assert as_bytes(np.array([[0.0, 0.5, 1.2], [np.nan, -1, 1 / 255]])).tolist() == [[0, 128, 255], [0, 0, 1]]
+    assert as_bytes(np.array([[7, 300, -4]])).tolist() == [[7, 255, 0]]
