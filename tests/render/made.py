@@ -1,0 +1,35 @@
+"""Small random fields for tests."""
+
+from __future__ import annotations
+
+import torch
+
+from toolkit.networks.decoder import make_decoder
+from toolkit.render.field import Field
+from toolkit.training.levels import all_places, first_field
+from toolkit.volume.host import TorchHost
+from toolkit.volume.space import Space
+
+
+def random_field(shell: float = 0.0, resolution: int = 32, decoder: str = "deferred", keep: float = 1.0, seed: int = 0, raw: float = -1.0) -> Field:
+    """A field whose voxels are occupied with probability `keep`, with random densities, features and decoder."""
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)
+    space = Space((0.2, -0.1, 0.05), 1.3, shell)
+    places = all_places(space, resolution)
+    places = places[torch.rand(len(places), generator=generator) < keep]
+    net = make_decoder(decoder, 8, 16)
+    for parameter in net.parameters():
+        parameter.data.add_(0.2 * torch.randn(parameter.shape, generator=generator))
+    field = first_field(space, resolution, places, 8, raw, net, torch.tensor([0.2, 0.4, 0.6]), 0.0, 4, TorchHost(), generator)
+    field.density_rows[:-1] += torch.randn(len(field.density_rows) - 1, generator=generator)
+    field.feature_rows[:-1] += torch.randn(field.feature_rows[:-1].shape, generator=generator)
+    return field
+
+
+def random_rays(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Origins around the region, directions towards it."""
+    generator = torch.Generator().manual_seed(seed)
+    origins = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1) * 3
+    aims = torch.randn(count, 3, generator=generator) * 0.4
+    return origins, torch.nn.functional.normalize(aims - origins, dim=1)

@@ -1,0 +1,114 @@
+"""The hand-written step against autograd in float64-like loops, and the lazy Adam against torch's."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from tests.render.made import random_field, random_rays
+from toolkit.networks.decoder import Deferred
+from toolkit.render.field import Field, density
+from toolkit.render.march import Samples, march
+from toolkit.training import step as step_module
+from toolkit.training.adam import LazyAdam
+from toolkit.training.rays import Batch
+from toolkit.training.step import Optimiser, Rates
+from toolkit.volume.lookup import corners
+
+Tensor = torch.Tensor
+
+
+def reference_loss(field: Field, samples: Samples, batch: Batch, rates: Rates, raw_rows: Tensor, feature_rows: Tensor) -> Tensor:
+    """The loss written down as in the paper, one ray at a time."""
+    rows, corner_weights = corners(field.topology, samples.cell, samples.inside)
+    raw = (raw_rows[rows.long()] * corner_weights).sum(1)
+    features = (feature_rows[rows.long()] * corner_weights[..., None]).sum(1)
+    count, total = len(batch.origins), torch.zeros(())
+    if isinstance(field.decoder, Deferred):
+        colours = None
+    else:
+        extra, colours = field.decoder(features, batch.directions[samples.ray])
+        raw = raw + extra
+    tau = density(raw) * samples.length
+    for ray in range(count):
+        mine = (samples.ray == ray).nonzero().squeeze(1)
+        light, weights = torch.ones(()), []
+        for i in mine:
+            weights.append(light * (1 - torch.exp(-tau[i])))
+            light = light * torch.exp(-tau[i])
+        w = torch.stack(weights) if weights else torch.zeros(0)
+        opacity = w.sum()
+        if colours is None:
+            mean = (w[:, None] * features[mine]).sum(0) / opacity.clamp_min(1e-6)
+            colour = opacity * field.decoder(mean[None], batch.directions[ray][None])[0]  # type: ignore[operator]
+        else:
+            colour = (w[:, None] * colours[mine]).sum(0)
+        mixed = colour + (1 - opacity) * field.background
+        place = samples.place[mine]
+        spread = (w[:, None] * w[None] * (place[:, None] - place[None]).abs()).sum() + (w**2 * samples.length[mine]).sum() / 3
+        total = total + ((mixed - batch.colour[ray]) ** 2).sum() / (3 * count)
+        total = total + (rates.distortion * spread + rates.opacity * (1 - opacity) ** 2) / count
+    return total
+
+
+@pytest.mark.parametrize("decoder", ["deferred", "per_sample"])
+@pytest.mark.parametrize("shell", [0.0, 1.0])
+def test_gradients_match_autograd(decoder: str, shell: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    field = random_field(shell=shell, resolution=16, decoder=decoder, raw=-2.0)
+    origins, directions = random_rays(24)
+    batch = Batch(origins, directions, torch.rand(24, 3, generator=torch.Generator().manual_seed(1)), torch.zeros(24, dtype=torch.int64))
+    rates = Rates(0.0, 0.0, 0.0, 0.01, 0.03, colour_threshold=-1.0)
+    samples = march(field.grid, origins, directions, field.near, field.fine)
+    monkeypatch.setattr(step_module, "march", lambda *arguments: samples)  # the same samples for both, without jitter
+    raw_rows = field.density_rows.clone().requires_grad_(True)
+    feature_rows = field.feature_rows.clone().requires_grad_(True)
+    reference_loss(field, samples, batch, rates, raw_rows, feature_rows).backward()
+    expected = [parameter.grad.clone() for parameter in field.decoder.parameters() if parameter.grad is not None]
+    field.decoder.zero_grad()
+
+    caught: dict[str, tuple[Tensor, Tensor]] = {}
+    optimiser = Optimiser(field)
+    monkeypatch.setattr(optimiser.density, "step", lambda rows, gradient, rate: caught.__setitem__("density", (rows, gradient)))
+    monkeypatch.setattr(optimiser.feature, "step", lambda rows, gradient, rate: caught.__setitem__("feature", (rows, gradient)))
+    monkeypatch.setattr(optimiser.decoder, "zero_grad", lambda set_to_none=True: None)
+    optimiser.step(batch, rates, torch.Generator())
+    for name, reference in (("density", raw_rows.grad), ("feature", feature_rows.grad)):
+        rows, gradient = caught[name]
+        full = torch.zeros_like(field.density_rows if name == "density" else field.feature_rows)
+        full[rows] = gradient
+        assert reference is not None and float(reference.norm()) > 0
+        reference[-1] = 0
+        assert float((full - reference).norm() / reference.norm()) < 1e-4, name
+    for parameter, reference in zip(field.decoder.parameters(), expected, strict=True):
+        assert parameter.grad is not None
+        assert torch.allclose(parameter.grad, reference, rtol=1e-3, atol=1e-7)
+
+
+def test_lazy_adam_equals_adam_where_every_row_moves() -> None:
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(20, 4, generator=generator)
+    twin = values.clone().requires_grad_(True)
+    lazy, adam = LazyAdam(values), torch.optim.Adam([twin], lr=0.1, betas=(0.9, 0.99), eps=1e-10)
+    for _ in range(25):
+        gradient = torch.randn(20, 4, generator=generator)
+        lazy.step(torch.arange(20), gradient, 0.1)
+        twin.grad = gradient.clone()
+        adam.step()
+    assert torch.allclose(values, twin.detach(), atol=1e-5)
+
+
+def test_rows_that_are_not_touched_stay_bit_identical() -> None:
+    values = torch.randn(50)
+    before = values.clone()
+    LazyAdam(values).step(torch.tensor([3, 7]), torch.tensor([1.0, -1.0]), 0.1)
+    assert torch.equal(values[[0, 1, 2, 4, 5, 6, *range(8, 50)]], before[[0, 1, 2, 4, 5, 6, *range(8, 50)]])
+    assert float(values[3]) == pytest.approx(float(before[3]) - 0.1, abs=1e-5)
+
+
+def test_a_step_lowers_the_error() -> None:
+    field = random_field(shell=1.0, resolution=16, raw=-3.0)
+    origins, directions = random_rays(256)
+    batch = Batch(origins, directions, torch.full((256, 3), 0.7), torch.zeros(256, dtype=torch.int64))
+    optimiser, generator = Optimiser(field), torch.Generator().manual_seed(0)
+    errors = [optimiser.step(batch, Rates(0.1, 0.1, 3e-3, 0.001), generator)[0] for _ in range(40)]
+    assert errors[-1] < 0.1 * errors[0]
