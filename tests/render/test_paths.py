@@ -103,7 +103,7 @@ def test_an_arc_is_walked_to_and_fro_and_not_left(wraps: float) -> None:
 def test_cameras_before_a_scene_give_a_small_ellipse() -> None:
     rng = np.random.default_rng(2)
     at = np.stack([rng.uniform(-1, 1, 20), np.full(20, -5.0), rng.uniform(-0.5, 0.5, 20) + 1], axis=1)
-    cameras = look_at(at, at + [0, 1, 0], UP)  # parallel axes
+    cameras = look_at(at, at + np.array([0, 1, 0]), UP)  # parallel axes
     path = orbit(cameras, None, 60)
     closed_and_smooth(path)
     assert np.abs(path[:, 0, 3]).max() < 1

@@ -41,9 +41,7 @@ def orbit(world_from_camera: Array, centre: Array | None = None, frames: int = 9
     inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
     if np.median((forward * inward).sum(axis=1)) > LOOKING_IN:
         return _around(positions, target, vertical, phase)
-    keys = _tour(positions)
-    keys = keys[np.unique(np.linspace(0, len(keys) - 1, KEY_CAMERAS).round().astype(int))]
-    return _along(poses[keys], (1 - np.cos(phase)) / 2)
+    return _along(_keys(poses[_tour(positions)]), (1 - np.cos(phase)) / 2)
 
 
 def interpolate(poses: Array, frames: int) -> Array:
@@ -141,7 +139,9 @@ def _hermite(knots: Array, values: Array, at: Array) -> Array:
     width = np.diff(knots)[:, None]
     rise = np.diff(values, axis=0) / width
     inner = (rise[:-1] * width[1:] + rise[1:] * width[:-1]) / (width[1:] + width[:-1])
-    slopes = np.concatenate([rise[:1], inner, rise[-1:]])
+    # At the ends the slope of the parabola that the neighbour's slope and the first interval ask for.
+    first, last = (2 * rise[0] - inner[0], 2 * rise[-1] - inner[-1]) if len(inner) else (rise[0], rise[-1])
+    slopes = np.concatenate([first[None], inner, last[None]])
     part = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
     span = width[part]
     t = ((at - knots[part]) / span[:, 0])[:, None]
@@ -152,6 +152,20 @@ def _hermite(knots: Array, values: Array, at: Array) -> Array:
         + (3 * t**2 - 2 * t**3) * end
         + (t**3 - t**2) * span * slopes[part + 1]
     )
+
+
+def _keys(walk: Array) -> Array:
+    """Up to KEY_CAMERAS poses along a walk (N, 4, 4), their positions without the shake of the hand: means over neighbours."""
+    number = np.arange(len(walk))
+    chosen = np.unique(np.linspace(0, len(walk) - 1, KEY_CAMERAS).round().astype(int))
+    keys = walk[chosen].copy()
+    width = 0.4 * len(walk) / KEY_CAMERAS
+    if width > 1:
+        # A narrower mean towards the ends, so that they stay where they are.
+        reach = np.maximum(np.minimum(width, np.minimum(chosen, len(walk) - 1 - chosen) / 2), 0.1)
+        weight = np.exp(-0.5 * ((number[None] - chosen[:, None]) / reach[:, None]) ** 2)
+        keys[:, :3, 3] = weight @ walk[:, :3, 3] / weight.sum(axis=1, keepdims=True)
+    return keys
 
 
 def _tour(positions: Array) -> Array:

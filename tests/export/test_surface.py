@@ -1,0 +1,117 @@
+"""A field's surface: a stand-in field that renders exactly, with the faults that real ones have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from tests.tsdf.scenes import CAMERA, all_round, sphere_colour, sphere_depth, sphere_frame
+from toolkit.camera import Array, Intrinsics
+from toolkit.errors import InputError
+from toolkit.export.mesh import mesh_facts
+from toolkit.export.surface import field_mesh, field_points, field_volume, reliable_depth
+from toolkit.render.image import Rendered
+
+CENTRE = np.array([0.2, 0.1, -0.1])
+RADIUS = 0.5
+POSES = all_round(CENTRE, 1.6, 32)
+
+
+def exact(camera: Intrinsics, pose: Array) -> tuple[Array, Array, Array]:
+    frame = sphere_frame(pose, CENTRE, RADIUS, camera)
+    return frame.colour.astype(np.float32) / 255, frame.depth, (frame.depth > 0).astype(np.float32)
+
+
+def faulty(camera: Intrinsics, pose: Array) -> tuple[Array, Array, Array]:
+    """Silhouettes smeared to depths behind the surface, a faint fog before the sphere, a floater that a single view shows."""
+    rgb, depth, opacity = exact(camera, pose)
+    shifted = np.roll(depth, 1, axis=1)
+    smear = (depth == 0) & (shifted > 0)
+    depth = np.where(smear, shifted + 0.4, depth)
+    fog = depth == 0
+    depth, opacity = np.where(fog, 0.8, depth).astype(np.float32), np.where(fog, 0.3, np.maximum(opacity, smear)).astype(np.float32)
+    if np.allclose(pose, POSES[3]):
+        depth[5:25, 5:25], opacity[5:25, 5:25] = 0.9, 1.0
+    return rgb, depth, opacity
+
+
+@pytest.mark.parametrize("render", [exact, faulty])
+def test_the_mesh_is_the_sphere_and_nothing_else(render: Callable[..., tuple[Array, Array, Array]]) -> None:
+    mesh = field_mesh(render, POSES, CAMERA, 0.02)
+    offset = mesh.vertices - CENTRE
+    radius = np.linalg.norm(offset, axis=1)
+    assert np.quantile(np.abs(radius - RADIUS), 0.98) < 0.01
+    assert np.abs(radius - RADIUS).max() < 0.06
+    facts = mesh_facts(mesh)
+    assert facts["watertight"]
+    assert facts["components"] == 1
+    clear = np.abs(offset[:, 2]) > 0.04
+    assert np.median(np.abs(mesh.colours[clear].astype(int) - sphere_colour(mesh.vertices[clear], CENTRE))) <= 4
+
+
+def test_points_and_a_rendered_object() -> None:
+    cloud = field_points(lambda camera, pose: Rendered(*exact(camera, pose)), POSES, CAMERA, 0.02)
+    offset = cloud.points - CENTRE
+    assert len(cloud.points) > 3000
+    assert np.quantile(np.abs(np.linalg.norm(offset, axis=1) - RADIUS), 0.97) < 0.01
+    assert np.median(np.einsum("ij,ij->i", cloud.normals, offset) / RADIUS) > 0.95
+
+
+def test_sizes_are_chosen_and_one_camera_a_pose_is_fine() -> None:
+    small = Intrinsics(120, 90, 112.0, 112.0, 60.0, 45.0)
+    volume = field_volume(exact, POSES, [CAMERA, small] * 16)
+    assert 0.004 < volume.voxel_size < 0.03
+    assert 1.2 < volume.depth_max < 1.7
+
+
+def test_the_region_is_kept_and_the_rest_is_not() -> None:
+    region = (CENTRE - 1.0, CENTRE + np.array([1, 1, 0]))  # the lower half
+    mesh = field_mesh(exact, POSES, CAMERA, 0.02, region=region)
+    assert mesh.vertices[:, 2].max() < CENTRE[2] + 0.03
+    assert mesh.vertices[:, 2].min() < CENTRE[2] - RADIUS + 0.03
+
+
+def test_thinned_when_asked() -> None:
+    mesh = field_mesh(exact, POSES, CAMERA, 0.02, max_triangles=1500)
+    assert 1000 < len(mesh.triangles) <= 1500
+    assert np.quantile(np.abs(np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS), 0.9) < 0.02
+
+
+def test_edges_and_faint_pixels_are_dropped_and_slopes_are_not() -> None:
+    depth = np.full((20, 30), 2.0, np.float32)
+    depth[:, 15:] = 3.0
+    depth[4, 4] = np.nan
+    opacity = np.ones_like(depth)
+    opacity[10:, :5] = 0.6
+    kept = reliable_depth(depth, opacity, 100.0)
+    assert not kept[:, 14:16].any()
+    assert (kept[:10, 6:13] == 2).all()
+    assert (kept[:, 17:] == 3).all()
+    assert not kept[10:, :5].any()
+    assert kept[4, 4] == 0
+    assert kept[4, 5] == 2  # a missing neighbour is no edge
+    # A plane seen at 70°: its depth changes by 2.7 pixel widths a pixel, everywhere.
+    u = (np.arange(30) + 0.5 - 15) / 100.0
+    slope = np.broadcast_to(1 / (1 - np.tan(np.deg2rad(70)) * u), (20, 30)).astype(np.float32)
+    assert (reliable_depth(slope, np.ones_like(slope), 100.0)[:, :22] > 0).all()
+
+
+def test_what_has_no_surface_is_refused() -> None:
+    def nothing(camera: Intrinsics, pose: Array) -> tuple[Array, Array, Array]:
+        rgb, depth, _ = exact(camera, pose)
+        return rgb, depth, np.zeros_like(depth)
+
+    with pytest.raises(InputError, match="no rendered view shows a surface"):
+        field_mesh(nothing, POSES[:3], CAMERA, 0.02)
+    with pytest.raises(InputError, match="2 cameras and 3 poses"):
+        field_mesh(exact, POSES[:3], [CAMERA] * 2, 0.02)
+    with pytest.raises(InputError, match="nearer than"):
+        field_mesh(exact, POSES[:3], CAMERA, 0.02, depth_max=0.5)
+    with pytest.raises(InputError, match="finer than the pixels"):
+        field_volume(exact, POSES, CAMERA, 1e-4)
+
+
+def test_depth_of_the_scene_is_what_the_renderer_says() -> None:
+    assert exact(CAMERA, POSES[0])[1] == pytest.approx(sphere_depth(CAMERA, POSES[0], CENTRE, RADIUS))
