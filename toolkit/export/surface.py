@@ -18,6 +18,8 @@ from toolkit.tsdf.mesh import Mesh, as_bytes
 # (intrinsics, world_from_camera) → (rgb, depth, opacity), or an object with these names, as `render_view` gives.
 Render = Callable[[Intrinsics, Array], Any]
 
+CONFIRMED = 1.5  # surface that a single view shows is left out ...
+MANY_VIEWS = 10  # ... from so many views on
 STEEPEST = 4.0  # tangent of the angle between view and surface normal (76°) beyond which a depth step is taken as an edge
 SMALLEST_EDGE = 0.02  # share of depth: smaller steps are never an edge
 COARSER = 1.4
@@ -109,6 +111,7 @@ def field_volume(
                 raise
             size *= COARSER
     volume = TsdfVolume(size, depth_max, expected_blocks=2 * expected)
+    volume.min_weight = CONFIRMED if len(shown) >= MANY_VIEWS else None
     if carve:
         for frame in shown:
             volume.reserve(volume.touched(frame))
