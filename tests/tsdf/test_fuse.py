@@ -15,8 +15,9 @@ from toolkit.errors import InputError, Interrupted
 from toolkit.export.mesh import to_trimesh
 from toolkit.progress import Progress
 from toolkit.tsdf.frames import DepthFrame
-from toolkit.tsdf.fuse import BYTES_PER_BLOCK, SLACK, TsdfVolume, default_weight_threshold, estimate_blocks, fuse_frames
+from toolkit.tsdf.fuse import estimate_blocks, fuse_frames
 from toolkit.tsdf.view import SurfaceCaster
+from toolkit.tsdf.volume import BYTES_PER_BLOCK, SLACK, TsdfVolume, default_weight_threshold
 
 CENTRE = np.array([0.31, -0.17, 0.08])
 RADIUS = 0.5

@@ -12,8 +12,9 @@ from toolkit.camera import Array, Intrinsics
 from toolkit.errors import InputError
 from toolkit.progress import SILENT, Progress
 from toolkit.tsdf.frames import DepthFrame, automatic_depth_max, automatic_voxel_size
-from toolkit.tsdf.fuse import Points, TsdfVolume, estimate_blocks
+from toolkit.tsdf.fuse import estimate_blocks
 from toolkit.tsdf.mesh import Mesh, as_bytes
+from toolkit.tsdf.volume import Points, TsdfVolume
 
 # (intrinsics, world_from_camera) → (rgb, depth, opacity), or an object with these names, as `render_view` gives.
 Render = Callable[[Intrinsics, Array], Any]

@@ -13,7 +13,7 @@ import open3d.core as o3c
 from toolkit.camera import invert
 from toolkit.errors import InputError
 from toolkit.tsdf.frames import DepthFrame
-from toolkit.tsdf.fuse import BLOCK, DEVICE, TsdfVolume
+from toolkit.tsdf.volume import BLOCK, DEVICE, TsdfVolume
 
 
 def bare_loop_seconds(

@@ -13,7 +13,7 @@ from safetensors.numpy import save_file
 from toolkit.camera import Array
 from toolkit.errors import InputError
 from toolkit.files import atomic_path
-from toolkit.tsdf.fuse import BLOCK, TsdfVolume
+from toolkit.tsdf.volume import BLOCK, TsdfVolume
 
 VERSION = 1
 CHANNELS = {"tsdf": 1, "weight": 1, "color": 3}
