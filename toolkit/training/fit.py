@@ -32,6 +32,7 @@ START_RAW = -4.5  # of the first density: thin enough that every voxel along a r
 TIMELINE_POINTS = 12
 TIMELINE_PIXELS = 8192
 PRUNE_EVERY = 150  # steps
+LEVEL_STEPS = 100  # a level is not left, nor pruned, before so many: what has not had time to grow is not empty
 LAST_PRUNE = 0.8  # of the budget
 FIRST_BATCH = 256  # rays a step at the coarsest level, doubled at each level: early on the number of steps counts
 
@@ -121,7 +122,7 @@ def fit_field(views: Views, scene: Scene, settings: Settings, progress: Progress
 
     while (now := clock.seconds()) < budget and not progress.stopping():
         done = now / budget
-        if level < len(ladder) - 1 and done > rungs[level]:
+        if level < len(ladder) - 1 and done > rungs[level] and steps_here >= LEVEL_STEPS:
             level += 1
             current = finer(current, visible(current, optimiser.seen, settings.fit.prune_weight), ladder[level], host)
             optimiser.renew_rows(current)

@@ -6,6 +6,7 @@ through it (the visual hull), or, with depth, when no view measured past it (spa
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import torch
 
@@ -88,14 +89,15 @@ def _look(views: Views, index: int, points: Array, radius: Array) -> tuple[Array
     measured = views.depths[index] if views.depths else None
     if alpha is None and measured is None:
         return visible, empty
-    for row in np.flatnonzero(visible & (local[:, 2] > radius) & (reach < 0.25 * camera.width)):
-        x0, x1 = int(max(u[row] - reach[row], 0)), int(min(u[row] + reach[row] + 1, camera.width))
-        y0, y1 = int(max(v[row] - reach[row], 0)), int(min(v[row] + reach[row] + 1, camera.height))
-        if x1 <= x0 or y1 <= y0:
-            continue
+    judged = visible & (local[:, 2] > radius) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    size = np.ceil(np.log2(np.maximum(reach, 1))).astype(int)  # the window around a pixel: the next power of two
+    judged &= 2**size < 0.25 * camera.width
+    for step in np.unique(size[judged]):
+        rows = np.flatnonzero(judged & (size == step))
+        window = np.ones((2 * 2**step + 1,) * 2, np.uint8)
+        y, x = v[rows].astype(int), u[rows].astype(int)
         if alpha is not None:
-            empty[row] = not alpha[y0:y1, x0:x1].any()
-        elif measured is not None:
-            window = measured[y0:y1, x0:x1]
-            empty[row] = bool(window.all()) and float(window.min()) > local[row, 2] + 2 * radius[row]
+            empty[rows] = cv2.dilate(alpha, window)[y, x] == 0
+        elif measured is not None:  # a hole measures 0, the smallest there is, so it empties nothing
+            empty[rows] = cv2.erode(measured, window)[y, x] > local[rows, 2] + 2 * radius[rows]
     return visible, empty
