@@ -99,7 +99,7 @@ class TsdfVolume:
 
     @property
     def weight_threshold(self) -> float:
-        """What `mesh` and `points` go by unless told otherwise: `min_weight`, or by the volume's frames (see `default_weight_threshold`)."""
+        """What `mesh` and `points` go by unless told otherwise: `min_weight`, else by sightings (see `default_weight_threshold`)."""
         if self.min_weight is not None:
             return self.min_weight
         return default_weight_threshold(self.touches / max(self.blocks, 1))
