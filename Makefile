@@ -7,6 +7,9 @@ SHELL := /bin/bash
 VENV ?= .venv
 BIN := $(VENV)/bin
 
+# Threads that wait for each other sleep instead of spinning: on a machine with other work that is several times faster.
+export OMP_WAIT_POLICY ?= PASSIVE
+
 # The first interpreter that runs and is new enough; `make PYTHON=/path/to/python3.12 ...` chooses another.
 NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
 PYTHON ?= $(shell for name in python3.11 python3.12 python3.13 python3; do \
