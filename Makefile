@@ -49,7 +49,7 @@ lpips: $(VENV)/.installed-lpips
 system:
 	@if [[ -z "$(PYTHON)" ]]; then \
 		echo "Python 3.11 or newer is needed and was not found; install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; fi
-	@bash scripts/system_libraries.sh "$(PYTHON)"
+	@bash .ci/system_libraries.sh "$(PYTHON)"
 
 # Stamp files: each step runs again only when what it reads has changed.
 $(VENV)/.python: | system

@@ -62,6 +62,6 @@ def test_places_in_the_tree_exist() -> None:
 
 
 def test_scripts_parse() -> None:
-    for script in (".ci/run", "scripts/system_libraries.sh"):
+    for script in (".ci/run", ".ci/system_libraries.sh"):
         done = subprocess.run(["bash", "-n", str(ROOT / script)], capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
