@@ -111,7 +111,7 @@ CHOICES = {
 def _keys(node: DictConfig, prefix: str = "") -> list[str]:
     out = []
     for key, value in node.items():
-        name = f"{prefix}{key}"
+        name = f"{prefix}{key!s}"
         out += _keys(value, f"{name}.") if isinstance(value, DictConfig) else [name]
     return out
 
@@ -156,7 +156,7 @@ def load_settings(
     flags: dict[str, Any] | None = None,
     stored: dict[str, Any] | None = None,
 ) -> Settings:
-    """Defaults, then the preset's YAML, then `stored` (an earlier run's), then `file`, then `key=value` pairs, then flags that are not None.
+    """Defaults, then the preset's YAML, then `stored` (an earlier run's), then `file`, then `key=value` pairs, then flags if not None.
 
     Raises:
         InputError: unknown key (with the nearest name), a value that does not fit, an unreadable file.
@@ -189,7 +189,9 @@ def load_settings(
         value = OmegaConf.select(config, key)
         if value not in choices:
             near = difflib.get_close_matches(str(value), choices, n=1)
-            raise InputError(f"{key} is {value!r}; it must be one of {', '.join(choices)}" + (f" (did you mean {near[0]!r}?)" if near else ""))
+            raise InputError(
+                f"{key} is {value!r}; it must be one of {', '.join(choices)}" + (f" (did you mean {near[0]!r}?)" if near else "")
+            )
     settings = OmegaConf.to_object(config)
     assert isinstance(settings, Settings)
     _check_ranges(settings)

@@ -24,7 +24,14 @@ from toolkit.poses.health import (
 def picture(n: int, keypoints: int = 900, grey: int | None = None) -> dict[str, Any]:
     random = np.random.default_rng(n)
     thumbnail = random.integers(0, 255, 1024) if grey is None else np.full(1024, grey)
-    return {"name": f"p{n:02d}", "width": 640, "height": 480, "keypoints": keypoints, "deviation": 40.0 if grey is None else 0.0, "thumbnail": thumbnail.tolist()}
+    return {
+        "name": f"p{n:02d}",
+        "width": 640,
+        "height": 480,
+        "keypoints": keypoints,
+        "deviation": 40.0 if grey is None else 0.0,
+        "thumbnail": thumbnail.tolist(),
+    }
 
 
 def pair(first: int, second: int, inliers: int = 100, homography: Any = None, moved: float = 60.0) -> dict[str, Any]:
@@ -87,7 +94,10 @@ def test_the_verdict_names_turning_only_when_pairs_agree():
 
 def test_each_failure_has_its_own_sentence():
     chain = [pair(i, i + 1) for i in range(9)]
-    wall = [pair(i, i + 1, homography=homography(r, 600, np.array([0.4, 0, 0.1]), np.array([0, 0, 1.0])).tolist()) for i, r in enumerate(rotations(2, 9, 5.0))]
+    wall = [
+        pair(i, i + 1, homography=homography(r, 600, np.array([0.4, 0, 0.1]), np.array([0, 0, 1.0])).tolist())
+        for i, r in enumerate(rotations(2, 9, 5.0))
+    ]
     sentences = {
         "share enough features": failure(facts(10, [], None)),
         "hardly moved": failure(facts(10, [pair(i, i + 1, moved=0.5) for i in range(9)], None)),

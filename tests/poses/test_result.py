@@ -48,7 +48,7 @@ def test_given_poses_leave_out_what_has_none():
 
 def test_given_poses_need_two_cameras_on_two_spots():
     whole = capture()
-    with pytest.raises(PoseError, match="poses.source=sfm"):
+    with pytest.raises(PoseError, match=r"poses\.source=sfm"):
         given_poses(whole.with_frames(whole.frames[:1]))
     with pytest.raises(PoseError, match="one spot"):
         given_poses(whole.with_frames([replace(f, world_from_camera=np.eye(4)) for f in whole.frames]))

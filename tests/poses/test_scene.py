@@ -84,7 +84,9 @@ def test_triangulated_points_lie_on_the_surfaces_and_reproject(corner):
 
 def test_wrong_axes_are_noticed(corner):
     """OpenGL poses taken for OpenCV ones leave no consistent points: said so, not fitted to fog."""
-    wrong = without_depth(corner).with_frames([replace(f, world_from_camera=world_from_opengl(f.world_from_camera)) for f in without_depth(corner).frames])
+    wrong = without_depth(corner).with_frames(
+        [replace(f, world_from_camera=world_from_opengl(f.world_from_camera)) for f in without_depth(corner).frames]
+    )
     with pytest.raises(PoseError, match="axis convention"):
         describe_scene(wrong)
 
@@ -176,7 +178,9 @@ def test_undoing_the_working_frame_is_the_identity(seed, log_scale, far):
     random = np.random.default_rng(seed)
     rotation = cv2.Rodrigues(random.standard_normal(3))[0]
     whole = Similarity(10.0**log_scale, rotation, far * random.standard_normal(3) / 3)
-    there = Similarity(float(random.uniform(0.1, 10)), cv2.Rodrigues(random.standard_normal(3))[0], np.zeros(3)).after(Similarity(1.0, np.eye(3), -whole.translation))
+    there = Similarity(float(random.uniform(0.1, 10)), cv2.Rodrigues(random.standard_normal(3))[0], np.zeros(3)).after(
+        Similarity(1.0, np.eye(3), -whole.translation)
+    )
     points = whole.points(random.uniform(-1, 1, (50, 3)))
     back = there.inverse().points(there.points(points))
     assert np.abs(back - points).max() <= 1e-9 * max(1.0, 10.0**log_scale) + 4e-16 * 10 * np.abs(points).max()
@@ -269,7 +273,12 @@ def test_up_is_found_for_level_cameras_that_look_around_however_the_world_lies(s
 
 
 def test_up_of_cameras_that_look_straight_down_is_where_they_stand():
-    poses = np.array([look_at(np.array([0.1 * n, -2.0, 0.02 * n]), np.array([0.1 * n + 0.1 * np.cos(n), 0.0, 0.02 * n + 0.1 * np.sin(n)])) for n in range(24)])
+    poses = np.array(
+        [
+            look_at(np.array([0.1 * n, -2.0, 0.02 * n]), np.array([0.1 * n + 0.1 * np.cos(n), 0.0, 0.02 * n + 0.1 * np.sin(n)]))
+            for n in range(24)
+        ]
+    )
     up, _ = up_direction(poses)
     assert up @ [0, -1, 0] > 0.99
 
@@ -297,7 +306,12 @@ def test_layouts():
     np.testing.assert_allclose(layout(arc(12, 120.0)).focus, [-0.1, -0.7, 2.0], atol=1e-3)
     ahead = np.array([look_at(np.array([x, y, 0.0]), np.array([x, y, 9.0])) for x in (-1, 0, 1) for y in (-1, 0.5, 1)])
     assert layout(ahead).kind == FORWARD
-    around = np.array([look_at(np.zeros(3) + 0.1 * np.array([np.sin(3 * a), 0, np.cos(5 * a)]), np.array([np.cos(a), 0.1, np.sin(a)])) for a in np.linspace(0, 6, 20)])
+    around = np.array(
+        [
+            look_at(np.zeros(3) + 0.1 * np.array([np.sin(3 * a), 0, np.cos(5 * a)]), np.array([np.cos(a), 0.1, np.sin(a)]))
+            for a in np.linspace(0, 6, 20)
+        ]
+    )
     assert layout(around).kind == ROOM
 
 

@@ -29,7 +29,9 @@ def measured(tmp_path_factory) -> tuple[Capture, PoseResult]:
         z = depth.ravel()[pick].astype(np.float64)
         points.append(unproject(CAMERA, pose, pixel_grid(320, 240)[pick][z > 0], z[z > 0]))
     small = Similarity(1 / 7, np.eye(3), np.zeros(3))
-    result = PoseResult(SFM, 5, 5, [str(n) for n in range(5)], [CAMERA] * 5, small.poses(poses), models=[5], points=small.points(np.concatenate(points)))
+    result = PoseResult(
+        SFM, 5, 5, [str(n) for n in range(5)], [CAMERA] * 5, small.poses(poses), models=[5], points=small.points(np.concatenate(points))
+    )
     return Capture("tum", folder, tuple(frames), metric=True), result
 
 

@@ -34,11 +34,10 @@ SMALL = PosesSettings(max_features=800)
 
 
 def workers() -> list[psutil.Process]:
-    found = []
-    for process in psutil.process_iter(["cmdline"]):
-        if "toolkit.poses.worker" in (process.info["cmdline"] or []) and process.status() != psutil.STATUS_ZOMBIE:
-            found.append(process)
-    return found
+    def works(process: psutil.Process) -> bool:
+        return "toolkit.poses.worker" in (process.info["cmdline"] or []) and process.status() != psutil.STATUS_ZOMBIE
+
+    return [process for process in psutil.process_iter(["cmdline"]) if works(process)]
 
 
 def workers_on(folder: Path) -> list[psutil.Process]:
@@ -141,7 +140,9 @@ def test_a_partial_model_names_what_is_missing_and_why(pictures, tmp_path):
     result = find_poses(capture, tmp_path, SMALL, threads=1)
     assert (result.registered, result.total, result.missing) == (5, 7, ["005", "006"])
     text = " | ".join(result.warnings)
-    assert "5 of 7 frames" in text and "no other frame matches them: 005" in text and "too few features (dark, blurred or blank): 006" in text
+    assert (
+        "5 of 7 frames" in text and "no other frame matches them: 005" in text and "too few features (dark, blurred or blank): 006" in text
+    )
 
 
 def test_pictures_turned_by_exif_are_seen_upright(pictures, tmp_path):
@@ -166,7 +167,7 @@ def test_a_truncated_picture_is_an_input_error_not_a_crash(pictures, tmp_path):
     capture = write_capture(tmp_path / "photos", pictures[0][:3])
     broken = capture.frames[1].image
     broken.write_bytes(broken.read_bytes()[:400])
-    with pytest.raises(InputError, match="001.png"):
+    with pytest.raises(InputError, match=r"001\.png"):
         find_poses(capture, tmp_path, SMALL, threads=1)
 
 
@@ -231,7 +232,7 @@ def test_a_child_that_says_nothing_is_ended(tmp_path):
 def test_a_child_that_aborts_or_fails_is_reported(tmp_path):
     with pytest.raises(PoseError, match="SIGABRT"):
         run_child("timeit", ["-n1", "-r1", "import os; os.abort()"], tmp_path / "log.txt", lambda message: None)
-    with pytest.raises(PoseError, match="exit code 1.*nothing at all"):
+    with pytest.raises(PoseError, match=r"exit code 1.*nothing at all"):
         run_child("timeit", ["-n1", "-r1", "raise ValueError('nothing at all')"], tmp_path / "log.txt", lambda message: None)
 
 
@@ -240,13 +241,16 @@ def test_a_full_disk_is_said_to_be_one(pictures, tmp_path):
     capture = write_capture(tmp_path / "photos", pictures[0][:3])
     script = (
         "import resource, signal, sys; from pathlib import Path\n"
-        "from toolkit.capture.types import Capture, Frame; from toolkit.errors import OutputError; from toolkit.poses.sfm import find_poses\n"
+        "from toolkit.capture.types import Capture, Frame; from toolkit.errors import OutputError; from toolkit.poses.sfm import "
+        "find_poses\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000))\n"
         "root = Path(sys.argv[1]); frames = tuple(Frame(p.stem, p) for p in sorted((root / 'photos').iterdir()))\n"
         "try:\n    find_poses(Capture('photos', root, frames), root, threads=1)\n"
         "except OutputError as error:\n    print('OUTPUT', error)\n"
     )
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-    done = subprocess.run([sys.executable, "-c", script, str(capture.root.parent)], env=environment, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(capture.root.parent)], env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.stdout.startswith("OUTPUT cannot write"), done.stdout + done.stderr
     assert done.stdout.count("\n") == 1

@@ -65,7 +65,9 @@ def render(pose: Array, camera: Intrinsics = CAMERA) -> tuple[Array, Array]:
         a, b = hit @ first / (first @ first), hit @ second / (second @ second)
         nearer = (t > 1e-6) & (t < depth) & (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1)
         size = 512
-        surface = cv2.remap(texture(index), (a * size).astype(np.float32), (b * size).astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        surface = cv2.remap(
+            texture(index), (a * size).astype(np.float32), (b * size).astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+        )
         picture[nearer], depth[nearer] = surface[nearer], t[nearer]
     small = cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     z = depth[::2, ::2].astype(np.float32)
@@ -82,7 +84,9 @@ def turning(count: int, step_degrees: float = 4.0) -> list[Array]:
         yaw = np.radians((n - count / 2) * step_degrees)
         pitch = np.radians(3 * np.sin(n))
         rotation = cv2.Rodrigues(np.array([0, yaw, 0]))[0] @ cv2.Rodrigues(np.array([pitch, 0, 0]))[0]
-        pictures.append(cv2.warpPerspective(far, k @ invert(_rigid(rotation))[:3, :3] @ np.linalg.inv(wide), (320, 240), flags=cv2.INTER_AREA))
+        pictures.append(
+            cv2.warpPerspective(far, k @ invert(_rigid(rotation))[:3, :3] @ np.linalg.inv(wide), (320, 240), flags=cv2.INTER_AREA)
+        )
     return pictures
 
 

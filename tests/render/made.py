@@ -11,11 +11,13 @@ from toolkit.volume.host import TorchHost
 from toolkit.volume.space import Space
 
 
-def random_field(shell: float = 0.0, resolution: int = 32, decoder: str = "deferred", keep: float = 1.0, seed: int = 0, raw: float = -1.0) -> Field:
+def random_field(
+    background: float = 0.0, resolution: int = 32, decoder: str = "deferred", keep: float = 1.0, seed: int = 0, raw: float = -1.0
+) -> Field:
     """A field whose voxels are occupied with probability `keep`, with random densities, features and decoder."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
-    space = Space((0.2, -0.1, 0.05), 1.3, shell)
+    space = Space((0.2, -0.1, 0.05), 1.3, background)
     places = all_places(space, resolution)
     places = places[torch.rand(len(places), generator=generator) < keep]
     net = make_decoder(decoder, 8, 16)

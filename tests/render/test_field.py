@@ -18,7 +18,7 @@ from toolkit.render.rays import render_rays
 
 @pytest.mark.parametrize("decoder", ["deferred", "per_sample"])
 def test_a_saved_field_renders_the_same(tmp_path: Path, decoder: str) -> None:
-    field = random_field(shell=1.0, decoder=decoder, keep=0.3)
+    field = random_field(background=1.0, decoder=decoder, keep=0.3)
     path = tmp_path / "field.safetensors"
     field.save(path, Similarity(2.0, np.eye(3), np.ones(3)), {"note": "x"})
     again = Field.load(path)
@@ -32,7 +32,9 @@ def test_a_saved_field_renders_the_same(tmp_path: Path, decoder: str) -> None:
 def test_settling_changes_nothing_that_is_seen() -> None:
     field = random_field(keep=0.02)
     origins, directions = random_rays(100)
-    assert torch.allclose(render_rays(field, origins, directions).colour, render_rays(field.settled(), origins, directions).colour, atol=1e-6)
+    assert torch.allclose(
+        render_rays(field, origins, directions).colour, render_rays(field.settled(), origins, directions).colour, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("change", [{"resolution": -1}, {"decoder": "evil"}, {"space": {}}, {"hidden": 10**9}, {"background": ["a"]}])

@@ -31,7 +31,7 @@ def test_samples_are_those_of_a_dense_walk(keep: float) -> None:
 
 @pytest.mark.parametrize("shell", [0.0, 1.0])
 def test_samples_lie_where_they_say(shell: float) -> None:
-    field = random_field(shell=shell, resolution=128, keep=0.2)
+    field = random_field(background=shell, resolution=128, keep=0.2)
     origins, directions = random_rays(32)
     samples = march(field.grid, origins, directions)
     points = origins[samples.ray] + directions[samples.ray] * samples.distance[:, None]
@@ -47,7 +47,7 @@ def test_samples_lie_where_they_say(shell: float) -> None:
 
 
 def test_contracted_rays_reach_far_beyond_the_region() -> None:
-    field = random_field(shell=1.0, resolution=64)
+    field = random_field(background=1.0, resolution=64)
     origins, directions = random_rays(16)
     samples = march(field.grid, origins, directions)
     reached = torch.zeros(16).scatter_reduce_(0, samples.ray, samples.distance, "amax")
@@ -62,7 +62,10 @@ def test_axis_parallel_rays_and_rays_that_miss(direction: list[float]) -> None:
     hit = march(field.grid, -3 * d, d)
     assert len(hit) > 10
     assert len(march(field.grid, 3 * d, d)) == 0
-    assert len(march(field.grid, -3 * d + torch.tensor([[0, 0, 50.0]]), d * torch.tensor([1.0, 1.0, 0.0]) + torch.tensor([[0.0, 0, 1e-9]]))) == 0
+    assert (
+        len(march(field.grid, -3 * d + torch.tensor([[0, 0, 50.0]]), d * torch.tensor([1.0, 1.0, 0.0]) + torch.tensor([[0.0, 0, 1e-9]])))
+        == 0
+    )
 
 
 def test_jitter_moves_samples_by_less_than_a_step() -> None:

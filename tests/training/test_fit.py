@@ -122,7 +122,9 @@ def test_the_start_is_the_visual_hull() -> None:
     assert int(inner.sum()) <= len(kept)
 
 
-@pytest.mark.parametrize(("finest", "expected"), [(64, [32, 64]), (256, [32, 64, 128, 256]), (320, [32, 64, 128, 256, 320]), (288, [32, 64, 128, 288])])
+@pytest.mark.parametrize(
+    ("finest", "expected"), [(64, [32, 64]), (256, [32, 64, 128, 256]), (320, [32, 64, 128, 256, 320]), (288, [32, 64, 128, 288])]
+)
 def test_levels_end_at_the_finest(finest: int, expected: list[int]) -> None:
     assert levels(finest) == expected
 
@@ -147,6 +149,7 @@ def test_pruning_keeps_neighbours_of_what_was_seen() -> None:
     field = random_field(resolution=32)
     seen = torch.zeros(len(field.occupied))
     seen[field.occupied.nonzero()[5000]] = 0.5
-    kept = visible(field, seen, 0.05)
-    assert 8 <= int(kept.sum()) <= 27
-    assert bool(visible(field, torch.zeros_like(seen), 0.05).equal(field.occupied))  # nothing seen yet: nothing removed
+    often, never = torch.full_like(seen, 100.0), torch.zeros_like(seen)
+    assert 8 <= int(visible(field, seen, often, 0.05).sum()) <= 27
+    assert visible(field, never, often, 0.05).equal(field.occupied)  # nothing seen strongly yet: nothing removed
+    assert visible(field, seen, never, 0.05).equal(field.occupied)  # too few samples to tell

@@ -54,7 +54,7 @@ def reference_loss(field: Field, samples: Samples, batch: Batch, rates: Rates, r
 @pytest.mark.parametrize("decoder", ["deferred", "per_sample"])
 @pytest.mark.parametrize("shell", [0.0, 1.0])
 def test_gradients_match_autograd(decoder: str, shell: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    field = random_field(shell=shell, resolution=16, decoder=decoder, raw=-2.0)
+    field = random_field(background=shell, resolution=16, decoder=decoder, raw=-2.0)
     origins, directions = random_rays(24)
     batch = Batch(origins, directions, torch.rand(24, 3, generator=torch.Generator().manual_seed(1)), torch.zeros(24, dtype=torch.int64))
     rates = Rates(0.0, 0.0, 0.0, 0.01, 0.03, colour_threshold=-1.0)
@@ -106,7 +106,7 @@ def test_rows_that_are_not_touched_stay_bit_identical() -> None:
 
 
 def test_a_step_lowers_the_error() -> None:
-    field = random_field(shell=1.0, resolution=16, raw=-3.0)
+    field = random_field(background=1.0, resolution=16, raw=-3.0)
     origins, directions = random_rays(256)
     batch = Batch(origins, directions, torch.full((256, 3), 0.7), torch.zeros(256, dtype=torch.int64))
     optimiser, generator = Optimiser(field), torch.Generator().manual_seed(0)

@@ -55,7 +55,13 @@ def assert_same(one: FieldFile, two: FieldFile) -> None:
     for name in ("keys", "occupied", "node_index", "features", "density"):
         assert torch.equal(getattr(one, name), getattr(two, name)), name
     assert one.decoder.keys() == two.decoder.keys() and all(torch.equal(one.decoder[k], two.decoder[k]) for k in one.decoder)
-    assert (one.config, one.voxel_size, one.origin, one.meta, one.version) == (two.config, two.voxel_size, two.origin, two.meta, two.version)
+    assert (one.config, one.voxel_size, one.origin, one.meta, one.version) == (
+        two.config,
+        two.voxel_size,
+        two.origin,
+        two.meta,
+        two.version,
+    )
     assert one.working_from_input.to_dict() == two.working_from_input.to_dict()
 
 

@@ -1,7 +1,7 @@
 """Radiance decoders: from voxel features (and a viewing direction) to colour.
 
 `Deferred` decodes once a ray: features are composited along it first. `PerSample` is the paper's R: it decodes density and colour at
-every sample (NeRFusion eq. 5, section 3.3). The field's first three features are a colour of their own, so both start from something sensible.
+every sample (NeRFusion eq. 5, section 3.3). The field's first three features are a colour of their own, so both start well.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ class Deferred(nn.Module):
     def __init__(self, channels: int, hidden: int) -> None:
         super().__init__()
         self.channels, self.hidden = channels, hidden
-        self.net = nn.Sequential(nn.Linear(channels + 9, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 3))
-        nn.init.zeros_(self.net[-1].weight)  # the start is the features' own colour
-        nn.init.zeros_(self.net[-1].bias)
+        last = nn.Linear(hidden, 3)
+        nn.init.zeros_(last.weight)  # the start is the features' own colour
+        nn.init.zeros_(last.bias)
+        self.net = nn.Sequential(nn.Linear(channels + 9, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), last)
 
     def forward(self, features: Tensor, directions: Tensor) -> Tensor:
         """Colour of an opaque ray with these mean features."""

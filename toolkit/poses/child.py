@@ -98,7 +98,9 @@ def _ending(code: int) -> str:
         return f"was ended by signal {-code}"
 
 
-def _listen(process: subprocess.Popen[bytes], log: Path, on_message: Callable[[dict[str, Any]], None], progress: Progress, silence: float) -> None:
+def _listen(
+    process: subprocess.Popen[bytes], log: Path, on_message: Callable[[dict[str, Any]], None], progress: Progress, silence: float
+) -> None:
     lines: queue.Queue[bytes | None] = queue.Queue()
 
     def pump(stream: IO[bytes]) -> None:

@@ -41,7 +41,10 @@ def hopeless(records: Sequence[dict[str, Any]]) -> str | None:
     if rich < 2:
         dark = sum(record["deviation"] < BLACK for record in records)
         cause = f"{dark} of {count} pictures are one flat colour" if dark else "they are blank, blurred or without texture"
-        return f"no features to match: the pictures hold {int(np.median(keypoints))} keypoints each on the median, and {cause}; use sharp, lit pictures of a textured scene"
+        return (
+            f"no features to match: the pictures hold {int(np.median(keypoints))} keypoints each on the median, and {cause}; "
+            f"use sharp, lit pictures of a textured scene"
+        )
     thumbnails = np.array([record["thumbnail"] for record in records], dtype=np.float64)
     sizes = {(record["width"], record["height"]) for record in records}
     if len(sizes) == 1 and np.abs(thumbnails - thumbnails[0]).max() < SAME:
@@ -107,23 +110,44 @@ def failure(facts: dict[str, Any]) -> str | None:
     seen = motion(facts)
     if seen is None:
         keypoints = int(np.median([record["keypoints"] for record in facts["pictures"]]))
-        return f"no two of the {count} pictures share enough features ({keypoints} keypoints each on the median); take pictures that overlap by two thirds"
+        return (
+            f"no two of the {count} pictures share enough features ({keypoints} keypoints each on the median); take pictures "
+            f"that overlap by two thirds"
+        )
     narrow = model is None or model["angle"] < SMALL_ANGLE
     if seen.moved < STILL and narrow:
-        return f"the camera hardly moved: features shift by {100 * seen.moved:.2g}% of the picture on the median; move sideways around the scene while recording"
+        return (
+            f"the camera hardly moved: features shift by {100 * seen.moved:.2g}% of the picture on the median; move sideways "
+            f"around the scene while recording"
+        )
     # A turning camera can be fitted by a wrong lens and a tiny shift, so the verdict of the pairs stands whatever the mapper says.
     if turned_only(facts) and (model is None or model["angle"] < 2 * SMALL_ANGLE or found < TOO_FEW):
-        return "the camera only turned on the spot (rotations explain all matches), so depth cannot be told; move sideways around the scene while recording"
+        return (
+            "the camera only turned on the spot (rotations explain all matches), so depth cannot be told; move sideways around "
+            "the scene while recording"
+        )
     if narrow and model is not None:
-        return f"there is too little parallax: rays meet at {model['angle']:.2g}° on the median; move sideways around the scene while recording"
+        return (
+            f"there is too little parallax: rays meet at {model['angle']:.2g}° on the median; move sideways around the scene "
+            f"while recording"
+        )
     if found >= TOO_FEW:
         return None
     if seen.flat_share >= FLAT_SHARE:
-        return "all matches lie on one plane or show too little parallax to start from; include things at different depths and move sideways while recording"
+        return (
+            "all matches lie on one plane or show too little parallax to start from; include things at different depths and "
+            "move sideways while recording"
+        )
     parts = components(count, facts["pairs"])
     if len(parts[0]) < max(TOO_FEW, count // 2):
-        return f"the pictures overlap too little: the largest group that matches holds {len(parts[0])} of {count}; take more pictures in between"
-    return f"mapping found no consistent geometry from {len(facts['pairs'])} matched pairs of {count} pictures; take sharper pictures with more overlap, of a scene that stands still"
+        return (
+            f"the pictures overlap too little: the largest group that matches holds {len(parts[0])} of {count}; take more "
+            f"pictures in between"
+        )
+    return (
+        f"mapping found no consistent geometry from {len(facts['pairs'])} matched pairs of {count} pictures; take sharper "
+        f"pictures with more overlap, of a scene that stands still"
+    )
 
 
 def components(count: int, pairs: Sequence[dict[str, Any]], least: int = 15) -> list[list[int]]:

@@ -72,6 +72,13 @@ def _carved(capture: Capture, chosen: list[int], silhouettes: list[Array], cells
 def _surface(full: Array) -> Array:
     """Cells of a (G, G, G) bool grid that have an empty neighbour."""
     padded = np.pad(full, 1)
-    inner = padded[2:, 1:-1, 1:-1] & padded[:-2, 1:-1, 1:-1] & padded[1:-1, 2:, 1:-1] & padded[1:-1, :-2, 1:-1] & padded[1:-1, 1:-1, 2:] & padded[1:-1, 1:-1, :-2]
+    inner = (
+        padded[2:, 1:-1, 1:-1]
+        & padded[:-2, 1:-1, 1:-1]
+        & padded[1:-1, 2:, 1:-1]
+        & padded[1:-1, :-2, 1:-1]
+        & padded[1:-1, 1:-1, 2:]
+        & padded[1:-1, 1:-1, :-2]
+    )
     surface: Array = full & ~inner
     return surface

@@ -28,7 +28,11 @@ class Picture:
     def frame(self) -> Frame:
         """As the capture's readers want it."""
         return Frame(
-            name=self.name, image=Path(self.image), mask=None if self.mask is None else Path(self.mask), video_index=self.video_index, focal_prior=self.focal_prior
+            name=self.name,
+            image=Path(self.image),
+            mask=None if self.mask is None else Path(self.mask),
+            video_index=self.video_index,
+            focal_prior=self.focal_prior,
         )
 
 

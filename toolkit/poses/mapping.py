@@ -38,7 +38,8 @@ class Model:
 
 
 def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str, Any]]]:
-    """The largest trustworthy model in a settled frame, and what every attempt gave: `{"attempt", "models": [frames, …]}`, largest first."""
+    """The largest trustworthy model in a settled frame, and what every attempt gave: `{"attempt", "models": [frames, …]}`, largest
+    first."""
     attempts: list[tuple[str, Callable[[], list[pycolmap.Reconstruction]]]] = [
         ("incremental", lambda: _incremental(job, report, loose=False)),
         ("incremental, small angles", lambda: _incremental(job, report, loose=True)),
@@ -138,7 +139,7 @@ def _empty(folder: Path) -> Path:
 
 
 def settle(model: Model) -> None:
-    """Fix the frame that structure from motion leaves free: the first registered camera's axes, cameras at mean distance 1 from their centre.
+    """Fix the frame that structure from motion leaves free: the first registered camera's axes, cameras at mean distance 1 of their centre.
 
     COLMAP's own choice depends on the order in which threads finish.
     """
@@ -194,7 +195,9 @@ def _intrinsics(camera: pycolmap.Camera) -> Intrinsics:
         fx, cx, cy, k = values
         fy, lens = fx, [k, 0.0, 0.0, 0.0]
     else:
-        raise PoseError(f"the lens model {camera.model_name} came back from mapping, which was not asked for; remove the sparse folder and run again")
+        raise PoseError(
+            f"the lens model {camera.model_name} came back from mapping, which was not asked for; remove the sparse folder and run again"
+        )
     return Intrinsics(int(camera.width), int(camera.height), fx, fy, cx, cy, OPENCV, tuple(lens))
 
 

@@ -80,7 +80,8 @@ def parallax(world_from_camera: Array, depth: float | Array) -> Array:
 
 
 def worth(angles: Array, sweet: float = SWEET) -> Array:
-    """How good degrees of parallax are for a pair, 0–1: a bump at `sweet`, steeper below than above (as in view selection for MVS, Yao 2018)."""
+    """How good degrees of parallax are for a pair, 0–1: a bump at `sweet`, steeper below than above (as in view selection for MVS, Yao
+    2018)."""
     off = angles - sweet
     width = np.where(off < 0, NARROW, WIDE)
     bump: Array = np.exp(-0.5 * (off / width) ** 2)

@@ -52,7 +52,9 @@ def common(first: Array, second: Array) -> int:
     return int(np.count_nonzero(angle[:, 1] < RATIO * angle[:, 0]))
 
 
-def loop_pairs(sketches: list[Array], stride: int, each: int = 3, gap: int = LOOP_GAP, tick: Callable[[], None] | None = None) -> list[tuple[int, int]]:
+def loop_pairs(
+    sketches: list[Array], stride: int, each: int = 3, gap: int = LOOP_GAP, tick: Callable[[], None] | None = None
+) -> list[tuple[int, int]]:
     """Pairs of far-apart frames of an ordered capture that look alike: every `stride`-th frame against every other such frame."""
     anchors = list(range(0, len(sketches), max(1, stride)))
     pairs = set()

@@ -204,7 +204,8 @@ def _closest(centres: Array, rays: Array, track: Array, weights: Array, count: i
 
 
 def _spread(centres: Array, points: Array, track: Array, usable: Array, count: int) -> Array:
-    """(count,) degrees between a track's first ray and the one farthest from it: exact for two views, a lower bound of the widest for more."""
+    """(count,) degrees between a track's first ray and the one farthest from it: exact for two views, a lower bound of the widest for
+    more."""
     towards = centres - points[track]
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-15)
     first = np.zeros((count, 3))

@@ -104,7 +104,8 @@ def describe_scene(capture: Capture, progress: Progress = SILENT) -> Scene:
     cloud = find_cloud(local, progress)
     if len(cloud.points) < FEW_POINTS or len(cloud.point) == 0:
         raise PoseError(
-            f"{capture.root}: only {len(cloud.points)} points could be triangulated with the given poses, so they or their axis convention do not fit the pictures; check them or use --set poses.source=sfm"
+            f"{capture.root}: only {len(cloud.points)} points could be triangulated with the given poses, so they or their axis "
+            f"convention do not fit the pictures; check them or use --set poses.source=sfm"
         )
     depth = cloud.median_depth()
     scale = 1.0 if capture.metric else MEDIAN_DEPTH / depth
@@ -140,7 +141,8 @@ def describe_scene(capture: Capture, progress: Progress = SILENT) -> Scene:
 
 
 def find_cloud(capture: Capture, progress: Progress = SILENT) -> Cloud:
-    """Points of a posed capture in the input's frame, from the best there is: silhouettes, depth, the source's own points, or triangulated."""
+    """Points of a posed capture in the input's frame, from the best there is: silhouettes, depth, the source's own points, or
+    triangulated."""
     if capture.alpha:
         cloud = silhouette_cloud(capture, progress)
         if len(cloud.points) >= FEW_POINTS:
@@ -158,7 +160,11 @@ def find_cloud(capture: Capture, progress: Progress = SILENT) -> Cloud:
 
 def _moved(capture: Capture, move: Similarity) -> Capture:
     """The capture in another frame."""
-    frames = [replace(frame, world_from_camera=move.poses(frame.world_from_camera)) for frame in capture.frames if frame.world_from_camera is not None]
+    frames = [
+        replace(frame, world_from_camera=move.poses(frame.world_from_camera))
+        for frame in capture.frames
+        if frame.world_from_camera is not None
+    ]
     points = None if capture.points is None else move.points(capture.points)
     return replace(capture, frames=tuple(frames), points=points)
 

@@ -36,10 +36,28 @@ def scale_to_depth(result: PoseResult, capture: Capture) -> PoseResult:
         ratios.append(sensed[sensed > 0] / z[inside][sensed > 0])
     found = np.concatenate(ratios) if ratios else np.zeros(0)
     if len(found) < LEAST:
-        return replace(result, warnings=[*result.warnings, "the depth maps share too few points with the poses found, so the scale stays unknown and depth is of no use here"])
+        return replace(
+            result,
+            warnings=[
+                *result.warnings,
+                "the depth maps share too few points with the poses found, so the scale stays unknown and depth is of no use here",
+            ],
+        )
     low, scale, high = np.percentile(found, [20, 50, 80])
     if (high - low) / (2 * scale) > SPREAD:
-        return replace(result, warnings=[*result.warnings, f"the depth maps and the poses found disagree on scale (ratios from {low:.3g} to {high:.3g}); check the depth's unit and alignment"])
+        return replace(
+            result,
+            warnings=[
+                *result.warnings,
+                f"the depth maps and the poses found disagree on scale (ratios from "
+                f"{low:.3g} to {high:.3g}); check the depth's unit and alignment",
+            ],
+        )
     poses = result.world_from_camera.copy()
     poses[:, :3, 3] *= scale
-    return replace(result, world_from_camera=poses, points=None if result.points is None else result.points * scale, metric=capture.metric or capture.has_depth)
+    return replace(
+        result,
+        world_from_camera=poses,
+        points=None if result.points is None else result.points * scale,
+        metric=capture.metric or capture.has_depth,
+    )

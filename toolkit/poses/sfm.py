@@ -28,7 +28,12 @@ MAX_RESULT_BYTES = 2 * 2**30
 
 
 def find_poses(
-    capture: Capture, out: Path, settings: PosesSettings | None = None, seed: int = 0, threads: int | None = None, progress: Progress = SILENT
+    capture: Capture,
+    out: Path,
+    settings: PosesSettings | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress = SILENT,
 ) -> PoseResult:
     """Structure from motion over the capture's pictures; poses and intrinsics that it brings are not looked at.
 
@@ -42,7 +47,10 @@ def find_poses(
     """
     settings = settings or PosesSettings()
     if len(capture.frames) < 2:
-        raise PoseError(f"{capture.root}: {len(capture.frames)} picture is not enough to find poses, at least 3 from different places are needed; add photos that overlap")
+        raise PoseError(
+            f"{capture.root}: {len(capture.frames)} picture is not enough to find poses, at least 3 from different "
+            f"places are needed; add photos that overlap"
+        )
     workers = max(1, threads or os.cpu_count() or 1)
     job = plan(capture, Path(out).resolve() / "sparse", settings, seed, workers)
     seconds: dict[str, float] = {}
@@ -100,7 +108,10 @@ def _result(capture: Capture, job: Job, facts: dict[str, Any]) -> PoseResult:
     sizes = next(attempt["models"] for attempt in facts["attempts"] if attempt["attempt"] == model["attempt"])
     warnings = shortfalls(facts)
     if model["attempt"] != facts["attempts"][0]["attempt"]:
-        warnings.append(f"poses come from a fallback ({model['attempt']} mapping), the strict attempt registered {max(facts['attempts'][0]['models'], default=0)} of {len(names)} frames")
+        warnings.append(
+            f"poses come from a fallback ({model['attempt']} mapping), the strict attempt registered "
+            f"{max(facts['attempts'][0]['models'], default=0)} of {len(names)} frames"
+        )
     return PoseResult(
         source=SFM,
         registered=len(placed),

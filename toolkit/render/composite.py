@@ -33,7 +33,9 @@ def ray_sum(values: Tensor, ray: Tensor, rays: int) -> Tensor:
     return out.index_add_(0, ray, values)
 
 
-def thickness_gradient(weight: Tensor, transmittance: Tensor, thickness: Tensor, weight_gradient: Tensor, first: Tensor, ray: Tensor, rays: int) -> Tensor:
+def thickness_gradient(
+    weight: Tensor, transmittance: Tensor, thickness: Tensor, weight_gradient: Tensor, first: Tensor, ray: Tensor, rays: int
+) -> Tensor:
     """∂L/∂τ (samples,) from ∂L/∂w (samples,), which already holds everything that depends on w (also through the opacity).
 
     ∂w_i/∂τ_i = T_i exp(-τ_i) and ∂w_j/∂τ_i = -w_j for j > i, so

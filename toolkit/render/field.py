@@ -95,7 +95,9 @@ class Field:
 
     def settled(self) -> Field:
         """A copy in memory of its own, without the blocks that hold nothing."""
-        topology, occupied, (density_rows, feature_rows) = erase_empty_blocks(self.topology, self.occupied, [self.density_rows, self.feature_rows])
+        topology, occupied, (density_rows, feature_rows) = erase_empty_blocks(
+            self.topology, self.occupied, [self.density_rows, self.feature_rows]
+        )
         return replace(self, topology=topology, occupied=occupied, density_rows=density_rows.clone(), feature_rows=feature_rows.clone())
 
     def save(self, path: Path | str, working_from_input: Similarity | None = None, meta: dict[str, Any] | None = None) -> None:

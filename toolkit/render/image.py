@@ -17,7 +17,8 @@ SOLID = 0.5  # depth is given where at least this much of the light is stopped
 
 @dataclass(frozen=True)
 class Rendered:
-    """A picture: `rgb` (H, W, 3) float32 in [0, 1], `depth` (H, W) float32 along z in working units (0 = none), `opacity` (H, W) float32."""
+    """A picture: `rgb` (H, W, 3) float32 in [0, 1], `depth` (H, W) float32 along z in working units (0 = none), `opacity` (H, W)
+    float32."""
 
     rgb: Array
     depth: Array

@@ -112,7 +112,7 @@ def _coarse_distances(grid: MarchGrid, origins: Tensor, directions: Tensor, near
         low, high = (-box - origins) / safe, (box - origins) / safe
         enter = torch.minimum(low, high).amax(1).clamp_min(near)
         leave = torch.maximum(low, high).amin(1)
-        count = int(math.ceil(float(((leave - enter) * speed).clamp_min(0).max()) / step)) + 1 if len(origins) else 1
+        count = math.ceil(float(((leave - enter) * speed).clamp_min(0).max()) / step) + 1 if len(origins) else 1
         lattice = torch.arange(count + 1, device=origins.device) - jitter[:, None]
         distance = enter[:, None] + lattice * (step / speed)[:, None]
         return torch.where((leave > enter)[:, None], distance, torch.full_like(distance, -1.0)).clamp_max(leave.clamp_min(-1.0)[:, None])

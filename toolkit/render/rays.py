@@ -18,7 +18,8 @@ OPACITY_FLOOR = 1e-6
 
 @dataclass(frozen=True)
 class RayValues:
-    """Per ray: `colour` (B, 3), `distance` (B,) along the unit direction where half of the light is stopped (0 if none is), `opacity` (B,)."""
+    """Per ray: `colour` (B, 3), `distance` (B,) along the unit direction where half of the light is stopped (0 if none is), `opacity`
+    (B,)."""
 
     colour: Tensor
     distance: Tensor

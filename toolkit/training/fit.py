@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field as default
 
 import numpy as np
 import torch
@@ -42,7 +43,7 @@ class FitResult:
     """The fitted field in memory of its own, and how it came to be."""
 
     field: Field
-    timeline: list[dict[str, float]] = field(default_factory=list)  # fitting seconds, held-out PSNR over a fixed sample of pixels
+    timeline: list[dict[str, float]] = default(default_factory=list)  # fitting seconds, held-out PSNR over a fixed sample of pixels
     seconds: float = 0.0
     steps: int = 0
     rays: int = 0
@@ -83,7 +84,9 @@ class _HeldOut:
         return float(-10 * torch.log10((colour - self.batch.colour).square().mean().clamp_min(1e-10)))
 
 
-def fit_field(views: Views, scene: Scene, settings: Settings, progress: Progress = SILENT, host: Host | None = None, start: Field | None = None) -> FitResult:
+def fit_field(
+    views: Views, scene: Scene, settings: Settings, progress: Progress = SILENT, host: Host | None = None, start: Field | None = None
+) -> FitResult:
     """Fit a field to the training views.
 
     Args:
@@ -124,11 +127,11 @@ def fit_field(views: Views, scene: Scene, settings: Settings, progress: Progress
         done = now / budget
         if level < len(ladder) - 1 and done > rungs[level] and steps_here >= LEVEL_STEPS:
             level += 1
-            current = finer(current, visible(current, optimiser.seen, settings.fit.prune_weight), ladder[level], host)
+            current = finer(current, visible(current, optimiser.seen, optimiser.visits, settings.fit.prune_weight), ladder[level], host)
             optimiser.renew_rows(current)
             steps_here = 0
         elif steps_here and steps_here % PRUNE_EVERY == 0 and done < LAST_PRUNE:
-            current = pruned(current, visible(current, optimiser.seen, settings.fit.prune_weight))
+            current = pruned(current, visible(current, optimiser.seen, optimiser.visits, settings.fit.prune_weight))
             optimiser.go_on_with(current)
         rays = min(FIRST_BATCH << level, settings.fit.max_rays)
         optimiser.step(pool.batch(rays, generator), _rates(settings, done, opaque), generator)

@@ -15,6 +15,7 @@ from toolkit.volume.topology import BLOCK, VOXELS, Topology
 
 Tensor = torch.Tensor
 FEATURE_NOISE = 0.05
+ENOUGH_VISITS = 4
 
 
 def all_places(space: Space, resolution: int) -> Tensor:
@@ -52,7 +53,9 @@ def _housed(field: Field, topology: Topology, occupied: Tensor, density: Tensor,
     hosted.density[:-1].view(-1, VOXELS).copy_(density[:-1].view(-1, VOXELS)[slot])
     hosted.feature[:-1].view(len(slot), -1).copy_(feature[:-1].view(len(slot), -1)[slot])
     ordered = occupied.view(-1, VOXELS)[slot].reshape(-1)
-    return replace(field, resolution=resolution, topology=hosted.topology, occupied=ordered, density_rows=hosted.density, feature_rows=hosted.feature)
+    return replace(
+        field, resolution=resolution, topology=hosted.topology, occupied=ordered, density_rows=hosted.density, feature_rows=hosted.feature
+    )
 
 
 def first_field(
@@ -77,15 +80,21 @@ def first_field(
     return _housed(start, topology, occupied, density, feature, resolution, host)
 
 
-def visible(field: Field, seen: Tensor, threshold: float) -> Tensor:
-    """(M · 512,) bool: occupied voxels within one voxel of one that a training ray saw with a weight T·α above `threshold`.
+def visible(field: Field, seen: Tensor, visits: Tensor, threshold: float) -> Tensor:
+    """(M · 512,) bool: the occupied voxels that stay.
 
-    When nothing was seen that strongly (a very thin start), everything occupied stays.
+    A voxel stays within one voxel of one that training rays saw with a weight T·α above `threshold`, and as long as too few samples fell
+    into it to tell: in captures with many pixels a few hundred steps do not look everywhere. When nothing was seen that strongly (a very
+    thin start), everything stays.
+
+    Args:
+        seen: (M · 512,) largest weight since the last pruning.
+        visits: (M · 512,) samples since then.
     """
     strong = seen > threshold
     if not bool(strong.any()):
         return field.occupied
-    return dilate(field.topology, strong, 1, grow=False)[1] & field.occupied
+    return (dilate(field.topology, strong, 1, grow=False)[1] | (visits < ENOUGH_VISITS)) & field.occupied
 
 
 def pruned(field: Field, keep: Tensor) -> Field:

@@ -40,6 +40,7 @@ class Optimiser:
         self.feature = LazyAdam(field.feature_rows)
         self.decoder = torch.optim.Adam(field.decoder.parameters(), lr=1e-3, betas=(0.9, 0.99), eps=1e-10)
         self.seen = torch.zeros(len(field.occupied), device=field.device)
+        self.visits = torch.zeros(len(field.occupied), device=field.device)
 
     def renew_rows(self, field: Field) -> None:
         """Go on with another field of the same decoder: the rows' state starts afresh, the decoder's is kept."""
@@ -51,6 +52,7 @@ class Optimiser:
         """Go on with the same rows after pruning; what was seen is counted afresh."""
         self.field = field
         self.seen.zero_()
+        self.visits.zero_()
 
     def _move(self, rows: Tensor, corner_weights: Tensor, g_density: Tensor, g_feature: Tensor, rates: Rates) -> None:
         """From gradients of what was looked up to a step of the rows that it was looked up from."""
@@ -67,6 +69,7 @@ class Optimiser:
         samples = march(field.grid, batch.origins, batch.directions, field.near, field.fine, jitter)
         for group in self.decoder.param_groups:
             group["lr"] = rates.decoder
+        self.visits.index_add_(0, samples.cell, torch.ones_like(samples.distance))
         deferred = isinstance(field.decoder, Deferred)
         behind = torch.rand(len(batch.origins), 3, generator=generator).to(field.device) if rates.random_background else field.background
         error = (self._deferred if deferred else self._per_sample)(batch, samples, rates, behind)

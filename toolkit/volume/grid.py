@@ -230,7 +230,8 @@ class BlockGrid:
     # ------------------------------------------------------------------------------------------------ life
 
     def close(self) -> None:
-        """Let go of all memory, views included. Called at exit for grids still open: Open3D complains about longer held buffers and fails the exit status."""
+        """Let go of all memory, views included. Called at exit for grids still open: Open3D complains about longer held buffers and
+        fails the exit status."""
         self._let_go()
         self._map = self._host = None
         _OPEN.discard(self)

@@ -163,7 +163,13 @@ def _checked(tensors: dict[str, Tensor], text: str) -> FieldFile:
     features, density = tensors["features"], tensors["density"]
     blocks, stored = len(keys) if keys.ndim else 0, nodes.numel()
     channels = features.shape[1] if features.ndim == 2 else 0
-    shapes = {"keys": (blocks, 3), "occupied": (blocks, _BITS), "node_index": (stored,), "features": (stored, channels), "density": (stored,)}
+    shapes = {
+        "keys": (blocks, 3),
+        "occupied": (blocks, _BITS),
+        "node_index": (stored,),
+        "features": (stored, channels),
+        "density": (stored,),
+    }
     for name, shape in shapes.items():
         if tuple(tensors[name].shape) != shape:
             raise _Unusable(f"its tensor {name!r} has the shape {tuple(tensors[name].shape)} where {shape} belongs")

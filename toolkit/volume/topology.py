@@ -158,7 +158,8 @@ class Topology:
         return self.halo_chunk(0, self.blocks)
 
     def dilated_keys(self, steps: int = 1) -> Tensor:
-        """(M', 3) int32 keys grown by `steps` blocks in the 26-neighbourhood: these keys first, in their order, then new ones by (z, y, x)."""
+        """(M', 3) int32 keys grown by `steps` blocks in the 26-neighbourhood: these keys first, in their order, then new ones by (z,
+        y, x)."""
         if self.blocks == 0 or steps < 1:
             return self.keys.clone()
         sx, sy, sz = (size + 2 * steps for size in self.table_size)
