@@ -18,7 +18,7 @@ PYTHON ?= $(shell for name in python3.11 python3.12 python3.13 python3; do \
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar off --constraint constraints.txt
 
 # ruff does not read setup.cfg, so its options stand here.
-RUFF_RULES := E,F,W,I,B,UP,PTH,RUF,PERF,SIM,C4,PIE,RET,T20,S102,S301,S307,S506,S602,S604,S605
+RUFF_RULES := E,F,W,I,B,UP,PTH,RUF,PERF,SIM,C4,PIE,RET,T20,S102,S301,S307,S506,S602,S605
 # RUF001-003: × and – are meant. PERF203: a try inside a loop is how one bad frame is told from a bad capture.
 RUFF := $(BIN)/ruff check --isolated --line-length 140 --target-version py311 --select $(RUFF_RULES) --ignore RUF001,RUF002,RUF003,PERF203
 SOURCES := toolkit pipelines configs tests
