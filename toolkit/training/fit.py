@@ -35,6 +35,7 @@ TIMELINE_PIXELS = 8192
 PRUNE_EVERY = 150  # steps
 LEVEL_STEPS = 100  # a level is not left, nor pruned, before so many: what has not had time to grow is not empty
 LAST_PRUNE = 0.8  # of the budget
+MANY_VOXELS = 2_000_000  # beyond this a finer level is made only where rays came
 FIRST_BATCH = 256  # rays a step at the coarsest level, doubled at each level: early on the number of steps counts
 
 
@@ -127,7 +128,10 @@ def fit_field(
         done = now / budget
         if level < len(ladder) - 1 and done > rungs[level] and steps_here >= LEVEL_STEPS:
             level += 1
-            current = finer(current, visible(current, optimiser.seen, optimiser.visits, settings.fit.prune_weight), ladder[level], host)
+            keep = visible(current, optimiser.seen, optimiser.visits, settings.fit.prune_weight)
+            if int(keep.sum()) * (ladder[level] / current.resolution) ** 3 > MANY_VOXELS:
+                keep &= optimiser.visits > 0  # memory is bounded: what no ray came to is the first to go
+            current = finer(current, keep, ladder[level], host)
             optimiser.renew_rows(current)
             steps_here = 0
         elif steps_here and steps_here % PRUNE_EVERY == 0 and done < LAST_PRUNE:
