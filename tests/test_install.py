@@ -139,7 +139,7 @@ def test_demo_and_test_share_the_steps_in_order(tmp_path: Path) -> None:
 
 
 def libraries(python: str, path: str) -> subprocess.CompletedProcess[str]:
-    script = str(ROOT / "scripts" / "system_libraries.sh")
+    script = str(ROOT / ".ci" / "system_libraries.sh")
     return subprocess.run(
         ["/bin/bash", script, python], env={"PATH": path}, capture_output=True, text=True, stdin=subprocess.DEVNULL, check=False
     )
@@ -187,7 +187,7 @@ def test_a_python_without_venv_is_told(tmp_path: Path) -> None:
         found = shutil.which(name, path="/usr/sbin:/sbin:/usr/bin:/bin")
         if found:
             (tools / name).symlink_to(found)
-    script = (ROOT / "scripts" / "system_libraries.sh").read_text().replace("PATH=$PATH:/usr/sbin:/sbin", f"PATH={tools}")
+    script = (ROOT / ".ci" / "system_libraries.sh").read_text().replace("PATH=$PATH:/usr/sbin:/sbin", f"PATH={tools}")
     (tmp_path / "script.sh").write_text(script)
     done = subprocess.run(
         ["/bin/bash", str(tmp_path / "script.sh"), str(broken)], env={"PATH": str(tools)}, capture_output=True, text=True, check=False
