@@ -20,7 +20,6 @@ SHELL = 1.0  # width of the contracted shell, in half sizes of the region
 MARGIN = 1.05  # the region grows by this much, so that its border is not cut
 COARSEST = 32
 FINEST = 512
-COARSE_ENOUGH = 128  # no capture is so small that a coarser lattice would do
 PIXELS = 1.8
 SEEN_BY = 3  # training views that must see a voxel: fewer cannot tell its depth
 
@@ -41,12 +40,8 @@ def finest_resolution(space: Space, views: Views, scene: Scene) -> int:
     Finer lattices fitted worse at equal seconds (more unknowns than the pixels can tell apart).
     """
     focal = float(np.median([camera.fx for camera in views.intrinsics]))
-    # The region may lie well before most of what is seen (a small thing on a desk), so its own distance counts when it is nearer.
-    distance = float(np.median(np.linalg.norm(views.world_from_camera[:, :3, 3] - np.array(space.centre), axis=1)))
-    if scene.layout == "room":
-        distance = scene.median_depth
-    wanted = 2 * space.extent * space.half / (PIXELS * min(scene.median_depth, distance) / focal)
-    return int(np.clip(round(wanted / 32) * 32, COARSE_ENOUGH, FINEST))
+    wanted = 2 * space.extent * space.half / (PIXELS * scene.median_depth / focal)
+    return int(np.clip(round(wanted / 32) * 32, 64, FINEST))
 
 
 def levels(finest: int) -> list[int]:
