@@ -10,6 +10,8 @@ import torch
 
 Tensor = torch.Tensor
 
+OPAQUE = 128.0  # optical thickness whose transmittance is 0 in float32
+
 
 def exclusive_sum(values: Tensor, first: Tensor) -> Tensor:
     """(samples,) → sum over the earlier samples of the same ray, float64 (differences of one long running sum need the digits)."""
@@ -23,7 +25,9 @@ def weights(thickness: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
 
     NeRFusion eq. 6: T_i = exp(-Σ_{j<i} τ_j), α_i = 1 - exp(-τ_i), with expm1 so that thin media keep their digits.
     """
-    transmittance = torch.exp(-exclusive_sum(thickness, first)).to(thickness.dtype)
+    # One running sum serves all rays: opaque samples would fill it with digits that thin rays behind them in the list need.
+    # Beyond OPAQUE exp(-τ) is 0 in float32, so the bound changes nothing else.
+    transmittance = torch.exp(-exclusive_sum(thickness.clamp_max(OPAQUE), first)).to(thickness.dtype)
     return transmittance * -torch.expm1(-thickness), transmittance
 
 
