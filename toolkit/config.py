@@ -74,7 +74,7 @@ class Settings:
     """Everything that a run can be told. `budget`, `image_size` and friends of the command line land here too."""
 
     preset: str = "balanced"
-    engine: str = "torch"
+    engine: str = "auto"  # auto (numba on the CPU, torch on CUDA) | numba | torch
     device: str = "auto"
     threads: int | None = None  # None: all cores
     seed: int = 0
@@ -97,7 +97,7 @@ SHORT_NAMES = {
 }
 CHOICES = {
     "preset": ("fast", "balanced", "quality"),
-    "engine": ("torch",),
+    "engine": ("auto", "numba", "torch"),
     "device": ("auto", "cpu", "cuda"),
     "poses.source": ("auto", "given", "sfm"),
     "poses.matching": ("auto", "exhaustive", "sequential"),

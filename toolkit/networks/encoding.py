@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 
 Tensor = torch.Tensor
+# Constants of the real spherical harmonics, orthonormal on the sphere: 1; y, z, x; xy, yz, xz; 3z² - 1; x² - y²
+SH = (0.28209479177387814, 0.4886025119029199, 1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
@@ -12,15 +14,15 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
     x, y, z = directions.unbind(-1)
     return torch.stack(
         [
-            torch.full_like(x, 0.28209479177387814),
-            -0.4886025119029199 * y,
-            0.4886025119029199 * z,
-            -0.4886025119029199 * x,
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (3 * z * z - 1),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (x * x - y * y),
+            torch.full_like(x, SH[0]),
+            -SH[1] * y,
+            SH[1] * z,
+            -SH[1] * x,
+            SH[2] * x * y,
+            -SH[2] * y * z,
+            SH[3] * (3 * z * z - 1),
+            -SH[2] * x * z,
+            SH[4] * (x * x - y * y),
         ],
         dim=-1,
     )

@@ -12,6 +12,11 @@ Tensor = torch.Tensor
 
 OPAQUE = 128.0  # optical thickness whose transmittance is 0 in float32
 
+UNITS = 32.0  # σ is counted per 1/32 of normalised space, so raw densities mean the same at every resolution
+THRESHOLD = 1e-3  # samples of smaller weight have no colour and get no gradient
+STOP = 1e-4  # a ray ends where less than this part of the light is left
+RAW_MAX = 12.0  # exp(12) is opaque over a thousandth of a voxel; the clamp keeps forward values and gradients finite
+
 
 def exclusive_sum(values: Tensor, first: Tensor) -> Tensor:
     """(samples,) → sum over the earlier samples of the same ray, float64 (differences of one long running sum need the digits)."""

@@ -11,6 +11,7 @@ import torch
 from toolkit.camera import Similarity
 from toolkit.errors import InputError
 from toolkit.networks.decoder import Deferred, PerSample, make_decoder
+from toolkit.render.composite import RAW_MAX, UNITS
 from toolkit.render.march import MarchGrid
 from toolkit.volume.edit import corner_nodes, erase_empty_blocks
 from toolkit.volume.space import Space
@@ -19,13 +20,9 @@ from toolkit.volume.topology import BLOCK, VOXELS, Topology
 
 Tensor = torch.Tensor
 
-DENSITY_VOXEL = 1 / 32  # σ is counted per this length of normalised space, so raw densities mean the same at every resolution
-RAW_MAX = 12.0  # exp(12) is opaque over a thousandth of a voxel; the clamp keeps forward values and gradients finite
-
-
 def density(raw: Tensor) -> Tensor:
     """Raw density → σ ≥ 0 per normalised unit: exp, clamped in its forward value (a zero-length interval must not meet an infinite σ)."""
-    return torch.exp(raw.clamp_max(RAW_MAX)) / DENSITY_VOXEL
+    return torch.exp(raw.clamp_max(RAW_MAX)) * UNITS
 
 
 @dataclass

@@ -27,8 +27,9 @@ class Samples:
     ray: Tensor  # int64 index of the ray
     first: Tensor  # int64 index of the first sample of the same ray
     distance: Tensor  # float32 along the unit direction, working units
+    span: Tensor  # float32 interval along the direction, working units
     length: Tensor  # float32 interval in normalised contracted units (the unit of 1/σ)
-    place: Tensor  # float32 position along the ray in contracted units, about 0 … 1
+    place: Tensor  # float32 position along the ray's own lattice, about 0 … 1
     cell: Tensor  # int64 row of the voxel (lower corner) that holds the sample
     inside: Tensor  # (samples, 3) float32 position within that voxel, 0 … 1
 
@@ -39,7 +40,8 @@ class Samples:
         """The samples where `mask` (samples,) is true, with `first` renewed."""
         kept = mask.nonzero().squeeze(1)
         ray = self.ray[kept]
-        return Samples(ray, first_of_ray(ray), self.distance[kept], self.length[kept], self.place[kept], self.cell[kept], self.inside[kept])
+        values = (self.distance, self.span, self.length, self.place, self.cell, self.inside)
+        return Samples(ray, first_of_ray(ray), *(value[kept] for value in values))
 
 
 def first_of_ray(ray: Tensor) -> Tensor:
@@ -74,6 +76,7 @@ class MarchGrid:
         place = topology.keys[filled[:, 0]].long().flip(1) * 2 + filled[:, 1:] + 1  # z, y, x
         place = place.clamp(0, side + 1)
         bricks[place[:, 0], place[:, 1], place[:, 2]] = 1
+        self.bricks = bricks
         # A coarse step is as long as a brick, so what it crosses lies in its own brick or next to it.
         self._bricks = F.max_pool3d(bricks[None, None], 3, 1, 1)[0, 0].bool()
         self._side = side
@@ -86,9 +89,9 @@ class MarchGrid:
 
     def voxels(self, contracted: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 3) contracted points → (N,) row of the voxel around each, −1 where nothing is occupied, and (N, 3) place within it."""
-        lattice = (contracted + self.space.extent) * (1 / self.voxel)
+        lattice = ((contracted + self.space.extent) * (1 / self.voxel)).clamp_(0, self.resolution - 1e-3)
         whole = lattice.floor()
-        cell = whole.long().clamp_(0, self.resolution - 1)
+        cell = whole.long()
         block, local = cell >> 3, cell & 7
         (ox, oy, oz), (sx, sy, sz) = self.topology.table_origin, self.topology.table_size
         # The table's outermost layer is empty: far blocks are moved there.
@@ -116,20 +119,19 @@ def _coarse_distances(grid: MarchGrid, origins: Tensor, directions: Tensor, near
         lattice = torch.arange(count + 1, device=origins.device) - jitter[:, None]
         distance = enter[:, None] + lattice * (step / speed)[:, None]
         return torch.where((leave > enter)[:, None], distance, torch.full_like(distance, -1.0)).clamp_max(leave.clamp_min(-1.0)[:, None])
-    # Beyond the region a step grows with the square of the distance along a ray that leaves radially, and only linearly across:
-    # the ray's closest approach to the centre bounds which of the two it is.
-    closest = (origins - directions * ((origins * directions).sum(1) / speed**2)[:, None]).norm(dim=1)
-    far = space.shell / grid.voxel  # |y| in the outermost voxel
+    # Beyond the region a place moves in contracted space by at most c / n² of its way, c² = b² + (extent · closest approach)².
+    closest = origins - directions * ((origins * directions).sum(1) / speed**2)[:, None]
+    rise = 1 / (space.shell**2 + space.extent**2 * closest.square().sum(1)).sqrt()
+    far = space.shell / grid.voxel  # |y| in the outermost voxel: the last step starts before it
     distance = near - jitter * step / speed
-    out = [distance.clone()]
+    out = [distance]
     limit = int(2 * math.sqrt(3) * 2 * space.extent / step) + 8
-    for _ in range(limit):
+    for _ in range(2 * limit):
         norm = torch.addcmul(origins, directions, distance[:, None]).abs_().amax(1).clamp_min_(1.0)
         if bool((norm > far).all()):
             break
-        across = closest * (space.extent - space.shell / norm)
-        stretch = torch.where(norm > 1, norm * norm / (space.shell**2 + across * across).sqrt(), norm).clamp_max_(MAX_STRETCH)
-        distance = distance + stretch * (step / speed)
+        stretch = (norm * norm * rise).clamp_(1.0, MAX_STRETCH)
+        distance = torch.where(norm > far, distance, distance + stretch * (step / speed))
         out.append(distance)
     return torch.stack(out, 1)
 
@@ -168,16 +170,14 @@ def march(grid: MarchGrid, origins: Tensor, directions: Tensor, near: float = 0.
     begin = distance.reshape(-1)[start]
     span = distance.reshape(-1)[start + 1] - begin
     t = begin[which] + span[which] * along
-    total = torch.cumsum(length, 1)
-    before = (total - length).view(-1)[crossed]
-    whole = length.view(-1)[crossed]
     samples_ray = ray[which]
     return Samples(
         ray=samples_ray,
         first=first_of_ray(samples_ray),
         distance=t,
-        length=whole[which] / fine,
-        place=(before[which] + whole[which] * along) / (2 * space.extent),
+        span=span[which] / fine,
+        length=length.view(-1)[crossed][which] / fine,
+        place=((crossed - ray * steps)[which] + along) * (step / (2 * space.extent)),
         cell=row[held],
         inside=inside[held],
     )

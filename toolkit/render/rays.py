@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from toolkit.networks.decoder import Deferred
-from toolkit.render.composite import ray_sum, weights
+from toolkit.render.composite import STOP, ray_sum, weights
 from toolkit.render.field import Field, density
 from toolkit.render.march import Samples, march
 from toolkit.volume.lookup import corners, gather
@@ -35,7 +35,7 @@ def render_rays(field: Field, origins: Tensor, directions: Tensor, threshold: fl
         rows, corner_weights = corners(field.topology, samples.cell, samples.inside)
         thickness = density(gather(field.density_rows, rows, corner_weights)) * samples.length
         weight, transmittance = weights(thickness, samples.first)
-        seen = weight > threshold
+        seen = (weight > threshold) & (transmittance >= STOP)
         kept = samples.keep(seen)
         w = weight[seen]
         features = gather(field.feature_rows, rows[seen], corner_weights[seen])
@@ -60,9 +60,6 @@ def median_distance(samples: Samples, transmittance: Tensor, thickness: Tensor, 
     after = transmittance * torch.exp(-thickness)
     crossing = ((transmittance > 0.5) & (after <= 0.5)).nonzero().squeeze(1)
     part = torch.log(2 * transmittance[crossing]) / thickness[crossing].clamp_min(1e-12)  # T e^{-p τ} = ½
-    following = (crossing + 1).clamp_max(max(len(samples) - 1, 0))
-    same = (samples.ray[following] == samples.ray[crossing]) & (following != crossing)
-    spacing = torch.where(same, samples.distance[following] - samples.distance[crossing], torch.zeros_like(part))
     out = torch.zeros(count, device=transmittance.device)
-    out[samples.ray[crossing]] = samples.distance[crossing] + (part - 0.5) * spacing.clamp_max(0.1 * samples.distance[crossing])
+    out[samples.ray[crossing]] = samples.distance[crossing] + (part - 0.5) * samples.span[crossing]
     return out

@@ -21,11 +21,11 @@ from toolkit.networks.decoder import make_decoder
 from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
-from toolkit.render.rays import render_rays
 from toolkit.training.levels import all_places, finer, first_field, pruned, visible
 from toolkit.training.rays import PixelPool
 from toolkit.training.start import finest_resolution, levels, make_space, possible
-from toolkit.training.step import Optimiser, Rates
+from toolkit.training.engine import Engine, make_engine
+from toolkit.training.step import Rates
 from toolkit.volume.host import Host, TorchHost
 
 DEFAULT_BUDGET = 120.0
@@ -78,10 +78,10 @@ class _HeldOut:
             pick = torch.randperm(len(pool), generator=torch.Generator().manual_seed(0))[:TIMELINE_PIXELS]
             self.batch = pool.take(pick.to(device))
 
-    def psnr(self, current: Field) -> float | None:
+    def psnr(self, engine: Engine) -> float | None:
         if self.batch is None:
             return None
-        colour = render_rays(current, self.batch.origins, self.batch.directions).colour
+        colour = engine.colours(self.batch.origins, self.batch.directions)
         return float(-10 * torch.log10((colour - self.batch.colour).square().mean().clamp_min(1e-10)))
 
 
@@ -117,7 +117,7 @@ def fit_field(
     else:
         keep = torch.ones_like(start.occupied)
         current, ladder = finer(start, keep, start.resolution, host), [start.resolution]
-    optimiser = Optimiser(current)
+    engine = make_engine(settings.engine, current, pool, settings.seed)
     result = FitResult(current)
     rungs = _rungs(len(ladder))
     level, steps_here = 0, 0
@@ -128,24 +128,24 @@ def fit_field(
         done = now / budget
         if level < len(ladder) - 1 and done > rungs[level] and steps_here >= LEVEL_STEPS:
             level += 1
-            keep = visible(current, optimiser.seen, optimiser.visits, settings.fit.prune_weight)
+            keep = visible(current, engine.seen, engine.visits, settings.fit.prune_weight)
             if int(keep.sum()) * (ladder[level] / current.resolution) ** 3 > MANY_VOXELS:
-                keep &= optimiser.visits > 0  # memory is bounded: what no ray came to is the first to go
+                keep &= engine.visits > 0  # memory is bounded: what no ray came to is the first to go
             current = finer(current, keep, ladder[level], host)
-            optimiser.renew_rows(current)
+            engine.renew_rows(current)
             steps_here = 0
         elif steps_here and steps_here % PRUNE_EVERY == 0 and done < LAST_PRUNE:
-            current = pruned(current, visible(current, optimiser.seen, optimiser.visits, settings.fit.prune_weight))
-            optimiser.go_on_with(current)
+            current = pruned(current, visible(current, engine.seen, engine.visits, settings.fit.prune_weight))
+            engine.go_on_with(current)
         rays = min(FIRST_BATCH << level, settings.fit.max_rays)
-        optimiser.step(pool.batch(rays, generator), _rates(settings, done, opaque), generator)
+        engine.step(rays, _rates(settings, done, opaque))
         steps_here += 1
         result.steps += 1
         result.rays += rays
         if marks and now > marks[0]:
             clock.pause()
             marks = [mark for mark in marks if mark > now]
-            _measure(result, held_out, current, now)
+            _measure(result, held_out, engine, now)
             clock.go_on()
         if result.steps % 5 == 0:
             note = f"{ladder[level]}³, {result.timeline[-1]['psnr']:.1f} dB" if result.timeline else f"{ladder[level]}³"
@@ -153,8 +153,8 @@ def fit_field(
     clock.pause()
     result.interrupted = progress.stopping()
     result.seconds = clock._spent
-    _measure(result, held_out, current, result.seconds)
-    result.field = current.settled()
+    _measure(result, held_out, engine, result.seconds)
+    result.field = engine.sync().settled()
     host.close()
     return result
 
@@ -192,7 +192,7 @@ def _rates(settings: Settings, done: float, opaque: bool) -> Rates:
     return Rates(fit.rate_density * fall, fit.rate_feature * fall, fit.rate_decoder * fall, fit.distortion, fit.opacity if opaque else 0.0)
 
 
-def _measure(result: FitResult, held_out: _HeldOut, current: Field, seconds: float) -> None:
-    value = held_out.psnr(current)
+def _measure(result: FitResult, held_out: _HeldOut, engine: Engine, seconds: float) -> None:
+    value = held_out.psnr(engine)
     if value is not None and math.isfinite(value):
         result.timeline.append({"seconds": round(seconds, 3), "psnr": round(value, 4)})

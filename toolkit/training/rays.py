@@ -35,6 +35,7 @@ class PixelPool:
         self.colour = torch.cat(colours).to(device)
         self.place = torch.cat(places).to(device)
         self.view = torch.cat(which).to(device)
+        self.height = max((c.height for c in views.intrinsics), default=0)
         k = [(c.fx, c.fy, c.cx, c.cy, c.width) for c in views.intrinsics]
         self.camera = torch.tensor(k, dtype=torch.float32, device=device)
         self.pose = torch.from_numpy(views.world_from_camera.astype(np.float32)).to(device)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 
 from toolkit.networks.decoder import Deferred
-from toolkit.render.composite import distortion, ray_sum, thickness_gradient, weights
-from toolkit.render.field import RAW_MAX, Field, density
-from toolkit.render.march import Samples, march
+from toolkit.render.composite import RAW_MAX, STOP, distortion, ray_sum, thickness_gradient, weights
+from toolkit.render.field import Field, density
+from toolkit.render.march import BRICK, Samples, march
 from toolkit.render.rays import OPACITY_FLOOR
 from toolkit.training.adam import LazyAdam
 from toolkit.training.rays import Batch
@@ -54,6 +54,15 @@ class Optimiser:
         self.seen.zero_()
         self.visits.zero_()
 
+    def _mark(self, samples: Samples, weight: Tensor, alive: Tensor) -> None:
+        """Remember how strongly and how often voxels were seen, before the light was spent."""
+        self.seen.scatter_reduce_(0, samples.cell, torch.where(alive, weight, 0.0), "amax")
+        self.visits.index_add_(0, samples.cell, alive.float())
+
+    def _spread(self, weight: Tensor) -> Tensor:
+        """Interval of every sample in the units of `Samples.place`."""
+        return torch.full_like(weight, BRICK / (self.field.fine * self.field.resolution))
+
     def _move(self, rows: Tensor, corner_weights: Tensor, g_density: Tensor, g_feature: Tensor, rates: Rates) -> None:
         """From gradients of what was looked up to a step of the rows that it was looked up from."""
         touched, (density_gradient, feature_gradient) = scatter(rows, corner_weights, (g_density, g_feature))
@@ -69,7 +78,6 @@ class Optimiser:
         samples = march(field.grid, batch.origins, batch.directions, field.near, field.fine, jitter)
         for group in self.decoder.param_groups:
             group["lr"] = rates.decoder
-        self.visits.index_add_(0, samples.cell, torch.ones_like(samples.distance))
         deferred = isinstance(field.decoder, Deferred)
         behind = torch.rand(len(batch.origins), 3, generator=generator).to(field.device) if rates.random_background else field.background
         error = (self._deferred if deferred else self._per_sample)(batch, samples, rates, behind)
@@ -85,9 +93,9 @@ class Optimiser:
         raw = gather(field.density_rows, rows, corner_weights)
         thickness = density(raw) * samples.length
         weight, transmittance = weights(thickness, samples.first)
-        self.seen.scatter_reduce_(0, samples.cell, weight, "amax")
-
-        chosen = weight > rates.colour_threshold
+        alive = transmittance >= STOP
+        self._mark(samples, weight, alive)
+        chosen = (weight > rates.colour_threshold) & alive
         kept = samples.keep(chosen)
         rows, corner_weights, raw, thickness = rows[chosen], corner_weights[chosen], raw[chosen], thickness[chosen]
         weight, transmittance = weight[chosen], transmittance[chosen]
@@ -111,7 +119,7 @@ class Optimiser:
         per_ray = torch.cat([g_sum, (g_opacity - (g_sum * mean.detach()).sum(1))[:, None]], 1)[kept.ray]
         g_weight = (features * per_ray[:, :-1]).sum(1) + per_ray[:, -1]
         if rates.distortion > 0:
-            _, g_distortion = distortion(weight, kept.place, kept.length, kept.first, kept.ray, count)
+            _, g_distortion = distortion(weight, kept.place, self._spread(weight), kept.first, kept.ray, count)
             g_weight = g_weight + g_distortion * (rates.distortion / count)
         g_thickness = thickness_gradient(weight, transmittance, thickness, g_weight, kept.first, kept.ray, count)
         g_raw = torch.where(raw < RAW_MAX, g_thickness * thickness, torch.zeros_like(raw))  # ∂τ/∂raw = τ
@@ -129,7 +137,7 @@ class Optimiser:
         # Weights and their gradient as in the deferred step; colours and raw densities hang on the decoder's graph.
         tau = thickness.detach()
         weight, transmittance = weights(tau, samples.first)
-        self.seen.scatter_reduce_(0, samples.cell, weight, "amax")
+        self._mark(samples, weight, transmittance >= STOP)
         opacity = ray_sum(weight, samples.ray, count)
         mixed = ray_sum(weight[:, None] * colour.detach(), samples.ray, count) + (1 - opacity)[:, None] * behind
         residual = mixed - batch.colour
@@ -138,7 +146,7 @@ class Optimiser:
         g_mixed = g_rays[samples.ray]
         g_weight = (g_mixed * colour.detach()).sum(1) + g_opacity[samples.ray]
         if rates.distortion > 0:
-            _, g_distortion = distortion(weight, samples.place, samples.length, samples.first, samples.ray, count)
+            _, g_distortion = distortion(weight, samples.place, self._spread(weight), samples.first, samples.ray, count)
             g_weight = g_weight + g_distortion * (rates.distortion / count)
         g_thickness = thickness_gradient(weight, transmittance, tau, g_weight, samples.first, samples.ray, count)
         torch.autograd.backward([thickness, colour], [g_thickness, weight[:, None] * g_mixed])

@@ -1,0 +1,152 @@
+"""A field as the compiled kernels see it, and pictures of it through them: the CPU's fast path for rendering."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+
+from toolkit.networks.decoder import Deferred
+from toolkit.render import kernels as K
+from toolkit.render.composite import STOP, THRESHOLD
+from toolkit.render.field import Field
+from toolkit.volume.topology import VOXELS
+
+Tensor = torch.Tensor
+MOST_KEPT = 1024  # samples of one ray whose weight exceeds the threshold: they sum to at most 1
+FARTHEST = 15  # bricks; distances are capped here
+PIECE = 4096  # rays that a thread takes at a time
+
+
+def decoder_arrays(decoder: Deferred) -> K.Decoder:
+    """Copies of the weights, input-major."""
+    first, second, last = (decoder.net[i] for i in (0, 2, 4))
+    w1, w2, w3 = (np.array(layer.weight.detach().cpu().numpy(), dtype=np.float32) for layer in (first, second, last))
+    b1, b2, b3 = (np.array(layer.bias.detach().cpu().numpy(), dtype=np.float32) for layer in (first, second, last))
+    return K.Decoder(np.ascontiguousarray(w1.T), b1, np.ascontiguousarray(w2.T), b2, w3, b3)
+
+
+@njit(**K.OPTIONS)
+def chessboard_distance(bricks: Any, most: Any) -> None:
+    """In place: 0 where something is, else `most` → distance along the longest axis, capped; two sweeps are exact for it."""
+    a, b, c = bricks.shape
+    for sweep in range(2):
+        way = -1 if sweep == 0 else 1
+        for i0 in range(a):
+            i = i0 if sweep == 0 else a - 1 - i0
+            for j0 in range(b):
+                j = j0 if sweep == 0 else b - 1 - j0
+                for k0 in range(c):
+                    k = k0 if sweep == 0 else c - 1 - k0
+                    best = bricks[i, j, k]
+                    if best == 0:
+                        continue
+                    for u in range(-1, 2):
+                        for v in range(-1, 2):
+                            for w in range(-1, 2):
+                                if (u * 9 + v * 3 + w) * way <= 0:  # only the half of the neighbours that this sweep has been to
+                                    continue
+                                p, q, r = i + u, j + v, k + w
+                                if 0 <= p < a and 0 <= q < b and 0 <= r < c:
+                                    best = min(best, np.uint8(bricks[p, q, r] + 1))
+                    bricks[i, j, k] = min(best, np.uint8(most))
+
+
+def make_space(field: Field) -> K.Space:
+    """The field's scalars."""
+    space, f = field.space, np.float32
+    return K.Space(
+        *(f(c) for c in space.centre),
+        f(space.half),
+        f(space.shell),
+        f(space.extent),
+        *(f(b) for b in space.box),
+        f(field.grid.voxel),
+        f(field.near),
+        int(field.fine),
+        int(field.resolution),
+        *(int(c) for c in field.topology.table_origin),
+    )
+
+
+def make_volume(field: Field) -> K.Volume:
+    """The field's arrays; densities and features are the field's own memory, so what a fit changes is seen here at once."""
+    topology = field.topology
+    assert topology.table is not None
+    upper = topology.around[:, [13, 14, 16, 17, 22, 23, 25, 26]]
+    upper = torch.where(upper < 0, topology.blocks, upper).to(torch.int32).contiguous()
+    bricks = np.where(field.grid.bricks.numpy() > 0, np.uint8(0), np.uint8(FARTHEST))
+    chessboard_distance(bricks, FARTHEST)
+    bits = np.packbits(field.occupied.numpy().reshape(-1, VOXELS), axis=1, bitorder="little").view(np.uint64)
+    return K.Volume(
+        topology.table.numpy(), bricks, bits, upper.numpy(), field.density_rows.detach().numpy(), field.feature_rows.detach().numpy()
+    )
+
+
+@njit(**K.OPTIONS)
+def render_pass(
+    space: Any, volume: Any, decoder: Any, background: Any, origins: Any, directions: Any, stop: Any, threshold: Any, out: Any
+) -> None:
+    """Deferred rendering: origins, directions (B, 3) → out (B, 5) colour, distance, opacity."""
+    channels, hidden = volume.feature.shape[1], decoder.b1.shape[0]
+    cells, values = np.empty(MOST_KEPT, np.int32), np.empty((MOST_KEPT, K.VALUES), np.float32)
+    rows, weights = np.empty(8, np.int64), np.empty(8, np.float32)
+    feature, given = np.empty(channels, np.float32), np.empty(channels + 9, np.float32)
+    h1, h2, colour, result = np.empty(hidden, np.float32), np.empty(hidden, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
+    marks = np.empty(0, np.uint16)
+    for ray in range(len(origins)):
+        ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
+        dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+        kept = K.march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, threshold, marks, cells, values, result)
+        for c in range(channels):
+            given[c] = K.ZERO
+        opacity = K.ZERO
+        for i in range(kept):
+            K.gather_feature(volume, cells[i], values[i, 0], values[i, 1], values[i, 2], rows, weights, feature)
+            weight = values[i, K.WEIGHT]
+            opacity += weight
+            for c in range(channels):
+                given[c] += weight * feature[c]
+        out[ray, 3], out[ray, 4] = result[0], opacity
+        if kept == 0:
+            for k in range(3):
+                out[ray, k] = background[k]
+            continue
+        for c in range(channels):
+            given[c] /= max(opacity, K.F(1e-6))
+        K.encode_direction(dx, dy, dz, given[channels:])
+        K.decode(decoder, given, channels, h1, h2, colour)
+        for k in range(3):
+            out[ray, k] = min(max(colour[k] * opacity + (K.ONE - opacity) * background[k], K.ZERO), K.ONE)
+
+
+class CompiledRenderer:
+    """Renders rays of one field (CPU, deferred decoder); makes the kernels' arrays once."""
+
+    def __init__(self, field: Field, threads: int | None = None) -> None:
+        assert isinstance(field.decoder, Deferred)
+        self.space, self.volume, self.decoder = make_space(field), make_volume(field), decoder_arrays(field.decoder)
+        self.background = field.background.numpy().astype(np.float32)
+        self.threads = threads or torch.get_num_threads()
+
+    def render(self, origins: Tensor, directions: Tensor, threshold: float = THRESHOLD) -> Tensor:
+        """(B, 3), (B, 3) → (B, 5): colour, distance, opacity. The same whatever the number of threads."""
+        out = np.empty((len(origins), 5), np.float32)
+        given = origins.float().contiguous().numpy(), directions.float().contiguous().numpy()
+
+        def part(piece: slice) -> None:
+            arguments = (given[0][piece], given[1][piece], np.float32(STOP), np.float32(threshold), out[piece])
+            render_pass(self.space, self.volume, self.decoder, self.background, *arguments)
+
+        size = max(min(PIECE, len(out) // self.threads), 1)
+        pieces = [slice(start, start + size) for start in range(0, len(out), size)]
+        if self.threads == 1 or len(pieces) == 1:
+            for piece in pieces:
+                part(piece)
+        else:
+            with ThreadPoolExecutor(self.threads) as pool:
+                list(pool.map(part, pieces))
+        return torch.from_numpy(out)

@@ -1,0 +1,85 @@
+"""Two engines, one field: what a fit asks of either, and which one it gets.
+
+`torch` is the reference, runs everywhere and is what CUDA uses; `numba` is the fast path of the CPU. They agree in values and gradients
+(tests compare them), not in the random numbers that they draw.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from toolkit.render.field import Field
+from toolkit.render.rays import render_rays
+from toolkit.training.rays import PixelPool
+from toolkit.training.step import Optimiser, Rates
+
+Tensor = torch.Tensor
+
+
+class Engine(Protocol):
+    """A field under optimisation."""
+
+    @property
+    def field(self) -> Field:
+        """The field; its decoder is up to date after `sync` only."""
+        ...
+
+    @property
+    def seen(self) -> Tensor:
+        """(M · 512,) largest weight that each voxel was seen with since the last pruning."""
+        ...
+
+    @property
+    def visits(self) -> Tensor:
+        """(M · 512,) samples that fell into each voxel since then."""
+        ...
+
+    def step(self, rays: int, rates: Rates) -> tuple[float, int]:
+        """One step on `rays` random pixels → mean squared colour error, samples looked up."""
+        ...
+
+    def renew_rows(self, field: Field) -> None:
+        """Go on with another field of the same decoder; the rows' state starts afresh."""
+        ...
+
+    def go_on_with(self, field: Field) -> None:
+        """Go on with the same rows after pruning."""
+        ...
+
+    def colours(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """(B, 3) colours that the field has now."""
+        ...
+
+    def sync(self) -> Field:
+        """The field with everything that was learnt written into it."""
+        ...
+
+
+class TorchEngine(Optimiser):
+    """The reference, on any device."""
+
+    def __init__(self, field: Field, pool: PixelPool, seed: int) -> None:
+        self.pool, self.generator = pool, torch.Generator().manual_seed(seed)
+        super().__init__(field)
+
+    def step(self, rays: int, rates: Rates) -> tuple[float, int]:  # type: ignore[override]
+        return super().step(self.pool.batch(rays, self.generator), rates, self.generator)
+
+    def colours(self, origins: Tensor, directions: Tensor) -> Tensor:
+        return render_rays(self.field, origins, directions).colour
+
+    def sync(self) -> Field:
+        return self.field
+
+
+def make_engine(name: str, field: Field, pool: PixelPool, seed: int) -> Engine:
+    """`name`: auto | numba | torch."""
+    on_cpu = field.device.type == "cpu"
+    if name == "torch" or not on_cpu:
+        return TorchEngine(field, pool, seed)
+    from toolkit.training.fused import FusedOptimiser
+
+    return FusedOptimiser(field, pool, seed)

@@ -1,0 +1,163 @@
+"""The CPU's fast engine: the same step as `step.Optimiser`, through compiled kernels, on the field's own memory."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import torch
+
+from toolkit.networks.decoder import Deferred
+from toolkit.render import kernels as K
+from toolkit.render.composite import STOP, THRESHOLD
+from toolkit.render.field import Field
+from toolkit.render.compiled import decoder_arrays, make_space, make_volume, render_pass
+from toolkit.training import fused_kernels as kernels
+from toolkit.training.rays import PixelPool
+from toolkit.training.step import Rates
+
+Array = np.ndarray[Any, Any]
+GUESS_CELL = 8  # pixels a side of the tiles that remember how far a view sees
+BETAS, EPSILON = (0.9, 0.99), 1e-10
+GROWTH = 1.5  # of the Adam records, when they are full
+
+
+class FusedOptimiser:
+    """A field, its pixels, and the optimiser state of the rows that rays have come to.
+
+    Memory beside the field: a lattice corner costs 4 bytes and 6 more a thread, and 4 (2 C + 4) bytes once a gradient has come to it.
+    """
+
+    def __init__(self, field: Field, pool: PixelPool, seed: int = 0, threads: int | None = None) -> None:
+        assert isinstance(field.decoder, Deferred)
+        self.pool, self.threads = pool, threads or torch.get_num_threads()
+        self.generator = np.random.default_rng(seed)
+        self.pixels = kernels.Pixels(pool.colour.numpy(), pool.place.numpy(), pool.view.numpy(), pool.camera.numpy(), pool.pose.numpy())
+        widths, heights = pool.camera[:, 4].max(), pool.height
+        shape = (len(pool.pose), int(heights) // GUESS_CELL + 1, int(widths) // GUESS_CELL + 1)
+        self.guess = np.zeros(shape, np.float32)
+        self.decoder = decoder_arrays(field.decoder)
+        self.moments = [(np.zeros_like(w), np.zeros_like(w)) for w in self.decoder]
+        self.decoder_steps = 0
+        steps = np.arange(1, 2049)
+        self.scales = np.concatenate([[1], np.sqrt(1 - BETAS[1] ** steps) / (1 - BETAS[0] ** steps)]).astype(np.float32)
+        self.executor = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
+        self.renew_rows(field)
+
+    def renew_rows(self, field: Field) -> None:
+        """Go on with another field of the same decoder: the rows' state starts afresh, the decoder's is kept."""
+        self.field = field
+        rows, channels = len(field.density_rows), field.feature_rows.shape[1]
+        self.state = np.full(rows, -1, np.int32)
+        self.records = np.zeros((min(rows, 1 << 14), 2 * channels + 4), np.float32)
+        self.next_record = 0
+        self.slots = np.full((self.threads, rows), -1, np.int32)
+        # Sized for the worst case; the system gives memory only to the part that is written.
+        self.touched = np.empty((self.threads, rows), np.int32)
+        self.sums = np.empty((self.threads, rows, channels + 1), np.float32)
+        self.partial = [[np.zeros_like(w) for w in self.decoder] for _ in range(self.threads)]
+        self.go_on_with(field)
+
+    def go_on_with(self, field: Field) -> None:
+        """Go on with the same rows after pruning; what was seen is counted afresh."""
+        self.field = field
+        self.space, self.volume = make_space(field), make_volume(field)
+        self.background = field.background.numpy().astype(np.float32)
+        self.marks = np.zeros((self.threads, len(field.occupied)), np.uint16)
+
+    @property
+    def seen(self) -> torch.Tensor:
+        """(M · 512,) largest weight that each voxel was seen with."""
+        return torch.from_numpy((self.marks.max(0) >> 4).astype(np.float32) / 4095)
+
+    @property
+    def visits(self) -> torch.Tensor:
+        """(M · 512,) how often samples fell into each voxel (saturating at 15 a thread)."""
+        return torch.from_numpy((self.marks & 15).sum(0, dtype=np.int32))
+
+    def sync(self) -> Field:
+        """The field with the decoder's weights written back."""
+        net = self.field.decoder.net
+        assert isinstance(self.field.decoder, Deferred)
+        d = self.decoder
+        with torch.no_grad():
+            for layer, weight, bias in ((net[0], d.w1.T, d.b1), (net[2], d.w2.T, d.b2), (net[4], d.w3, d.b3)):
+                layer.weight.copy_(torch.from_numpy(np.ascontiguousarray(weight)))
+                layer.bias.copy_(torch.from_numpy(bias))
+        return self.field
+
+    def step(self, rays: int, rates: Rates) -> tuple[float, int]:
+        """One step on `rays` random pixels. Returns the mean squared colour error and the number of samples that were looked up."""
+        picks = self.generator.integers(0, len(self.pool), rays)
+        return self.step_on(picks, self.generator.random(rays, np.float32), rates)
+
+    def step_on(self, picks: Array, jitter: Array, rates: Rates) -> tuple[float, int]:
+        """One step on the pixels `picks` (B,) with the rays' lattices moved by `jitter` (B,)."""
+        rays = len(picks)
+        codes = np.empty(rays, np.uint32)
+        kernels.hit_codes(self.space, self.pixels, picks, self.guess, GUESS_CELL, codes)
+        order = np.argsort(codes)
+        picks, jitter = picks[order], jitter[order]
+        losses = kernels.Losses(*(np.float32(v) for v in (rates.distortion, rates.opacity, rates.colour_threshold, STOP)))
+        depths = np.empty(rays, np.float32)
+        cuts = [rays * t // self.threads for t in range(self.threads + 1)]
+
+        def gradients(thread: int) -> tuple[int, float, int]:
+            part = slice(cuts[thread], cuts[thread + 1])
+            sums = self.partial[thread]
+            for array in sums:
+                array.fill(0)
+            own = kernels.Gradients(self.slots[thread], self.touched[thread], self.sums[thread], *sums)
+            arguments = (self.pixels, picks[part], jitter[part], rays, losses, self.marks[thread], own, depths[part])
+            out: tuple[int, float, int] = kernels.gradient_pass(self.space, self.volume, self.decoder, self.background, *arguments)
+            return out
+
+        results = self._each(gradients)
+        used = [result[0] for result in results]
+        self._reserve(sum(used))
+        for thread, count in enumerate(used):
+            self.next_record = kernels.assign_records(self.state, self.touched[thread, :count], self.next_record)
+        step_sizes = np.array([rates.density, rates.feature], np.float32)
+
+        def move(thread: int) -> None:
+            state = (self.volume, self.state, self.records, self.slots, self.touched, self.sums)
+            betas = (np.float32(BETAS[0]), np.float32(BETAS[1]), np.float32(EPSILON))
+            kernels.adam_pass(*state, thread, used[thread], self.scales, step_sizes, *betas)
+
+        self._each(move)
+        self._each(lambda thread: kernels.forget(self.slots[thread], self.touched[thread, : used[thread]]))
+        self._move_decoder(rates.decoder)
+        kernels.remember_depths(self.pixels, picks, depths, self.guess, GUESS_CELL)
+        return sum(result[1] for result in results) / (3 * rays), sum(result[2] for result in results)
+
+    def colours(self, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+        """(B, 3) colours that the field has now."""
+        out = np.empty((len(origins), 5), np.float32)
+        limits = (np.float32(STOP), np.float32(THRESHOLD))
+        render_pass(self.space, self.volume, self.decoder, self.background, origins.numpy(), directions.numpy(), *limits, out)
+        return torch.from_numpy(out[:, :3])
+
+    def _each(self, work: Any) -> list[Any]:
+        return [work(0)] if self.executor is None else list(self.executor.map(work, range(self.threads)))
+
+    def _reserve(self, more: int) -> None:
+        """Room for `more` Adam records."""
+        needed = self.next_record + more
+        if needed > len(self.records):
+            grown = np.zeros((min(int(needed * GROWTH), len(self.state)), self.records.shape[1]), np.float32)
+            grown[: self.next_record] = self.records[: self.next_record]
+            self.records = grown
+
+    def _move_decoder(self, rate: float) -> None:
+        self.decoder_steps += 1
+        n = self.decoder_steps
+        scale = np.float32(rate * np.sqrt(1 - BETAS[1] ** n) / (1 - BETAS[0] ** n))
+        for index, weight in enumerate(self.decoder):
+            gradient = self.partial[0][index]
+            for other in self.partial[1:]:
+                gradient = gradient + other[index]
+            m, v = self.moments[index]
+            m += np.float32(1 - BETAS[0]) * (gradient - m)
+            v += np.float32(1 - BETAS[1]) * (gradient * gradient - v)
+            weight -= scale * m / (np.sqrt(v) + np.float32(EPSILON))

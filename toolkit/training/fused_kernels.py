@@ -1,0 +1,383 @@
+"""One optimisation step on a batch of rays, compiled: march, decode, composite, loss, all gradients, and the lazy Adam that uses them.
+
+The gradients are those of `step.Optimiser` (torch, the reference), written out per ray; the equations stand there.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from toolkit.render import kernels as K
+
+F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
+COUNT, M_DENSITY, V_DENSITY, FIRST = 0, 1, 2, 4  # columns of a row's Adam record: steps, moments of the density, then of the features
+
+
+class Pixels(NamedTuple):
+    """The training pixels: see `rays.PixelPool`."""
+
+    colour: Any  # (N, 3) uint8
+    place: Any  # (N,) int32
+    source: Any  # (N,) int32 which view
+    camera: Any  # (V, 5) float32 fx, fy, cx, cy, width
+    pose: Any  # (V, 4, 4) float32
+
+
+class Gradients(NamedTuple):
+    """What one thread gathers of a batch."""
+
+    slot: Any  # (M · 512 + 1,) int32 index into the arrays below, −1: not touched
+    touched: Any  # (T,) int32 rows
+    values: Any  # (T, C + 1) float32: density, then features
+    w1: Any
+    b1: Any
+    w2: Any
+    b2: Any
+    w3: Any
+    b3: Any
+
+
+class Losses(NamedTuple):
+    """Weights of a step's losses, float32."""
+
+    distortion: Any
+    opacity: Any
+    threshold: Any
+    stop: Any
+
+
+@njit(**K.OPTIONS)
+def pixel_ray(pixels: Any, pick: Any, ray: Any) -> None:
+    """Origin and unit direction of pixel `pick` into ray[0 … 5]."""
+    view = pixels.source[pick]
+    camera, pose = pixels.camera[view], pixels.pose[view]
+    width = int(camera[4])
+    place = pixels.place[pick]
+    row = place // width
+    x = (F(place - row * width) + K.HALF - camera[2]) / camera[0]
+    y = (F(row) + K.HALF - camera[3]) / camera[1]
+    dx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]
+    dy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]
+    dz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]
+    scale = ONE / np.sqrt(dx * dx + dy * dy + dz * dz)
+    ray[0], ray[1], ray[2] = pose[0, 3], pose[1, 3], pose[2, 3]
+    ray[3], ray[4], ray[5] = dx * scale, dy * scale, dz * scale
+
+
+@njit(**K.OPTIONS)
+def _decoder_backward(
+    decoder: Any, gradients: Any, given: Any, channels: Any, h1: Any, h2: Any, g_logit: Any, g1: Any, g2: Any, g_given: Any
+) -> None:
+    """Back through `kernels.decode`: weights' gradients are added to `gradients`, the features' go to g_given[:C]."""
+    hidden = h1.shape[0]
+    for j in range(hidden):
+        g2[j] = ZERO
+    for k in range(3):
+        g = g_logit[k]
+        gradients.b3[k] += g
+        for j in range(hidden):
+            gradients.w3[k, j] += g * h2[j]
+            g2[j] += g * decoder.w3[k, j]
+    for j in range(hidden):
+        g2[j] = g2[j] if h2[j] > ZERO else ZERO
+        gradients.b2[j] += g2[j]
+    for i in range(hidden):
+        total, value = ZERO, h1[i]
+        for j in range(hidden):
+            total += g2[j] * decoder.w2[i, j]
+        g1[i] = total if value > ZERO else ZERO
+        if value > ZERO:
+            for j in range(hidden):
+                gradients.w2[i, j] += value * g2[j]
+    for j in range(hidden):
+        gradients.b1[j] += g1[j]
+    for i in range(channels + 9):
+        value = given[i]
+        for j in range(hidden):
+            gradients.w1[i, j] += value * g1[j]
+    for i in range(channels):
+        total = g_logit[i] if i < 3 else ZERO
+        for j in range(hidden):
+            total += g1[j] * decoder.w1[i, j]
+        g_given[i] = total
+
+
+@njit(**K.OPTIONS)
+def gradient_pass(
+    space: Any,
+    volume: Any,
+    decoder: Any,
+    background: Any,
+    pixels: Any,
+    picks: Any,
+    jitter: Any,
+    count: Any,
+    losses: Any,
+    marks: Any,
+    gradients: Any,
+    depths: Any,
+) -> Any:
+    """Forward and backward over the rays of pixels `picks`.
+
+    Args:
+        count: rays of the whole batch, of which these may be a part.
+        marks: (M · 512,) uint16, this thread's own, or of length 0.
+        gradients: this thread's; `slot` all −1 on entry.
+        depths: (len(picks),) distance where half of the light was stopped, for those that ask; or of length 0.
+
+    Returns:
+        rows touched, sum of squared colour errors, samples looked up.
+    """
+    channels, hidden = volume.feature.shape[1], decoder.b1.shape[0]
+    most = 1024
+    cells, values = np.empty(most, np.int32), np.empty((most, K.VALUES), np.float32)
+    rows, weights = np.empty((most, 8), np.int64), np.empty((most, 8), np.float32)
+    features = np.empty((most, channels), np.float32)
+    g_weight = np.empty(most, np.float32)
+    given = np.empty(channels + 9, np.float32)
+    g_given = np.empty(channels, np.float32)
+    h1, h2, g1, g2 = np.empty(hidden, np.float32), np.empty(hidden, np.float32), np.empty(hidden, np.float32), np.empty(hidden, np.float32)
+    colour, g_logit, result, ray = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(3, np.float32), np.empty(6, np.float32)
+    slot, touched, sums = gradients.slot, gradients.touched, gradients.values
+    zero_row = volume.density.shape[0] - 1
+    per_value = TWO / (F(3) * F(count))
+    spread = F(4) / (F(space.fine) * F(space.resolution))
+    distortion, opacity_loss = losses.distortion / F(count), TWO * losses.opacity / F(count)
+    used, looked = 0, 0
+    error = 0.0
+    for index in range(len(picks)):
+        pick = picks[index]
+        pixel_ray(pixels, pick, ray)
+        kept = K.march_ray(
+            space,
+            volume,
+            ray[0],
+            ray[1],
+            ray[2],
+            ray[3],
+            ray[4],
+            ray[5],
+            jitter[index],
+            losses.stop,
+            losses.threshold,
+            marks,
+            cells,
+            values,
+            result,
+        )
+        looked += int(result[2])
+        if depths.shape[0] > 0:
+            depths[index] = result[0]
+        # composite the features
+        for c in range(channels):
+            given[c] = ZERO
+        opacity = ZERO
+        for i in range(kept):
+            feature = features[i]
+            K.gather_feature(volume, cells[i], values[i, 0], values[i, 1], values[i, 2], rows[i], weights[i], feature)
+            weight = values[i, K.WEIGHT]
+            opacity += weight
+            for c in range(channels):
+                given[c] += weight * feature[c]
+        scale = ONE / max(opacity, F(1e-6))
+        for c in range(channels):
+            given[c] *= scale
+        K.encode_direction(ray[3], ray[4], ray[5], given[channels:])
+        K.decode(decoder, given, channels, h1, h2, colour)
+        # loss: mean over rays and channels of the squared error
+        g_opacity = -(ONE - opacity) * opacity_loss
+        for k in range(3):
+            residual = opacity * colour[k] + (ONE - opacity) * background[k] - F(pixels.colour[pick, k]) * F(1 / 255)
+            error += residual * residual
+            g_mixed = residual * per_value
+            g_opacity += g_mixed * (colour[k] - background[k])
+            g_logit[k] = g_mixed * opacity * colour[k] * (ONE - colour[k])
+        if kept == 0:
+            continue
+        _decoder_backward(decoder, gradients, given, channels, h1, h2, g_logit, g1, g2, g_given)
+        # ∂L/∂w: mean = Σ w f / A and A = Σ w
+        dot = ZERO
+        for c in range(channels):
+            g_given[c] *= scale
+            dot += g_given[c] * given[c]
+        constant = g_opacity - dot
+        total, total_place = ZERO, ZERO
+        for i in range(kept):
+            total += values[i, K.WEIGHT]
+            total_place += values[i, K.WEIGHT] * values[i, K.PLACE]
+        before, before_place = ZERO, ZERO
+        for i in range(kept):
+            g = constant
+            for c in range(channels):
+                g += features[i, c] * g_given[c]
+            weight, place = values[i, K.WEIGHT], values[i, K.PLACE]
+            after, after_place = total - before - weight, total_place - before_place - weight * place
+            pull = place * (before - after) - (before_place - after_place)
+            g_weight[i] = g + TWO * distortion * (pull + weight * spread * K._THIRD)
+            before += weight
+            before_place += weight * place
+        # ∂L/∂τ_i = T_i e^{-τ_i} g_i - Σ_{j>i} w_j g_j, far to near; then to the lattice
+        behind = ZERO
+        for back in range(kept):
+            i = kept - 1 - back
+            weight, raw = values[i, K.WEIGHT], values[i, K.RAW]
+            g_raw = (values[i, K.AFTER] * g_weight[i] - behind) * values[i, K.TAU]
+            if raw >= K._RAW_MAX:
+                g_raw = ZERO
+            behind += weight * g_weight[i]
+            for corner in range(8):
+                row = rows[i, corner]
+                if row == zero_row:
+                    continue
+                at = slot[row]
+                if at < 0:
+                    at = used
+                    if used == len(touched):
+                        continue  # cannot happen: the caller sizes the arrays for the worst case
+                    slot[row] = at
+                    touched[at] = row
+                    for c in range(channels + 1):
+                        sums[at, c] = ZERO
+                    used += 1
+                share = weights[i, corner]
+                sums[at, channels] += share * g_raw
+                share *= weight
+                for c in range(channels):
+                    sums[at, c] += share * g_given[c]
+    return used, error, looked
+
+
+@njit(**K.OPTIONS)
+def adam_pass(
+    volume: Any,
+    state: Any,
+    records: Any,
+    slots: Any,
+    touched: Any,
+    sums: Any,
+    thread: Any,
+    used: Any,
+    scales: Any,
+    rates: Any,
+    b1: Any,
+    b2: Any,
+    epsilon: Any,
+) -> None:
+    """Lazy Adam on rows that thread `thread` touched. A row that several touched is moved by the first of them, with the sum in their
+    order, so that the result depends on the number of threads alone.
+
+    Args:
+        state: (M · 512 + 1,) int32 record of a row, all of the touched assigned.
+        records: (K, 2 C + 4) float32.
+        slots, touched, sums: (threads, …) of all `Gradients`.
+        scales: (S,) float32 bias correction sqrt(1 - b2^n) / (1 - b1^n) for n steps; 1 beyond.
+        rates: (2,) float32 of density and features.
+    """
+    channels = volume.feature.shape[1]
+    density, feature = volume.density, volume.feature
+    c1, c2 = ONE - b1, ONE - b2
+    threads = slots.shape[0]
+    for at in range(used):
+        row = touched[thread, at]
+        own = sums[thread, at]
+        mine = True
+        for other in range(threads):
+            if other == thread:
+                continue
+            twin = slots[other, row]
+            if twin >= 0:
+                if other < thread:
+                    mine = False
+                    break
+                for c in range(channels + 1):
+                    own[c] += sums[other, twin, c]
+        if not mine:
+            continue
+        record = records[state[row]]
+        steps = record[COUNT] + ONE
+        record[COUNT] = steps
+        scale = scales[min(int(steps), len(scales) - 1)]
+        g = own[channels]
+        m = b1 * record[M_DENSITY] + c1 * g
+        v = b2 * record[V_DENSITY] + c2 * g * g
+        record[M_DENSITY], record[V_DENSITY] = m, v
+        density[row] -= rates[0] * scale * m / (np.sqrt(v) + epsilon)
+        step = rates[1] * scale
+        for c in range(channels):
+            g = own[c]
+            m = b1 * record[FIRST + c] + c1 * g
+            v = b2 * record[FIRST + channels + c] + c2 * g * g
+            record[FIRST + c], record[FIRST + channels + c] = m, v
+            feature[row, c] -= step * m / (np.sqrt(v) + epsilon)
+
+
+@njit(**K.OPTIONS)
+def assign_records(state: Any, touched: Any, next_record: Any) -> Any:
+    """Give rows that are touched for the first time their Adam record; returns the next free one."""
+    for at in range(len(touched)):
+        if state[touched[at]] < 0:
+            state[touched[at]] = next_record
+            next_record += 1
+    return next_record
+
+
+@njit(**K.OPTIONS)
+def forget(slot: Any, touched: Any) -> None:
+    """Reset `slot` for the next batch."""
+    for at in range(len(touched)):
+        slot[touched[at]] = -1
+
+
+@njit(**K.OPTIONS)
+def _spread_bits(value: Any) -> Any:
+    """10 bits → every third bit."""
+    v = np.uint32(value)
+    v = (v | (v << np.uint32(16))) & np.uint32(0x030000FF)
+    v = (v | (v << np.uint32(8))) & np.uint32(0x0300F00F)
+    v = (v | (v << np.uint32(4))) & np.uint32(0x030C30C3)
+    return (v | (v << np.uint32(2))) & np.uint32(0x09249249)
+
+
+@njit(**K.OPTIONS)
+def hit_codes(space: Any, pixels: Any, picks: Any, guess: Any, cell: Any, codes: Any) -> None:
+    """Morton codes of where rays are expected to hit: rays that look at the same place come one after the other, so that the memory
+    which they share is still in the cache.
+
+    Args:
+        guess: (V, gh, gw) float32 distances last seen from each view, in tiles of `cell` pixels; 0: unknown.
+    """
+    ray = np.empty(6, np.float32)
+    top = F(1023)
+    for index in range(len(picks)):
+        pick = picks[index]
+        pixel_ray(pixels, pick, ray)
+        view = pixels.source[pick]
+        width = int(pixels.camera[view, 4])
+        row = pixels.place[pick] // width
+        column = pixels.place[pick] - row * width
+        t = guess[view, row // cell, column // cell] / space.half
+        x = (ray[0] - space.cx) / space.half + t * ray[3]
+        y = (ray[1] - space.cy) / space.half + t * ray[4]
+        z = (ray[2] - space.cz) / space.half + t * ray[5]
+        n = max(max(abs(x), abs(y)), max(abs(z), ONE))
+        q = (space.extent - space.shell / n) / n * (top / (TWO * space.extent))
+        centre = top * K.HALF
+        i = int(min(max(x * q + centre, ZERO), top))
+        j = int(min(max(y * q + centre, ZERO), top))
+        k = int(min(max(z * q + centre, ZERO), top))
+        codes[index] = _spread_bits(i) | (_spread_bits(j) << np.uint32(1)) | (_spread_bits(k) << np.uint32(2))
+
+
+@njit(**K.OPTIONS)
+def remember_depths(pixels: Any, picks: Any, depths: Any, guess: Any, cell: Any) -> None:
+    """Write the distances of a batch into `guess`."""
+    for index in range(len(picks)):
+        if depths[index] > ZERO:
+            pick = picks[index]
+            view = pixels.source[pick]
+            width = int(pixels.camera[view, 4])
+            row = pixels.place[pick] // width
+            guess[view, row // cell, (pixels.place[pick] - row * width) // cell] = depths[index]
