@@ -84,7 +84,7 @@ def expand(values: Tensor, node_index: Tensor, blocks: int) -> Tensor:
 
 
 def write_field(path: Path | str, data: FieldFile, precision: str = "float32") -> None:
-    """Write a field; features in `precision` ("float32" or "float16", half the size), the rest in float32.
+    """Write a field; features in `precision` ("float32" or "float16", half the size, where they fit into it), the rest in float32.
 
     Raises:
         OutputError: the field does not pass the reader's own checks (a value that is not finite, …), or it cannot be written.
@@ -92,7 +92,10 @@ def write_field(path: Path | str, data: FieldFile, precision: str = "float32") -
     if precision not in ("float16", "float32"):
         raise ValueError(f"features are stored as float16 or float32, not {precision!r}")
     path = Path(path)
-    features = data.features.detach().to("cpu", getattr(torch, precision)).contiguous()
+    kind = getattr(torch, precision)
+    if data.features.numel() and float(data.features.detach().abs().max()) > torch.finfo(kind).max:
+        kind = torch.float32  # beyond float16's range they would become infinite, and a finished fit could not be kept
+    features = data.features.detach().to("cpu", kind).contiguous()
     tensors = {name: getattr(data, name).detach().cpu().contiguous() for name in ("keys", "node_index", "density")}
     tensors["features"] = features
     tensors["occupied"] = pack_bits(data.occupied.detach().cpu())
