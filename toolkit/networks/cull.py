@@ -1,0 +1,49 @@
+"""Which blocks of a lattice a few cameras can see at all, judged before anything is unprojected."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from toolkit.networks.cameras import Cameras
+from toolkit.networks.lattice import Lattice
+from toolkit.volume.topology import BLOCK
+
+SLACK = 1.05  # blocks of the contracted shell are bent: their ball grows by this much
+
+
+def all_blocks(lattice: Lattice, device: torch.device | str = "cpu") -> Tensor:
+    """(M, 3) int32 keys of every block that holds a corner of the space (without a shell: of its box)."""
+    space = lattice.space
+    line = torch.arange(lattice.resolution // BLOCK + 1, device=device)
+    z, y, x = torch.meshgrid(line, line, line, indexing="ij")
+    keys = torch.stack([x, y, z], -1).view(-1, 3)
+    if space.shell == 0:
+        box = torch.tensor(space.box, device=device) + lattice.voxel
+        low = keys * (BLOCK * lattice.voxel) - space.extent
+        high = low + (BLOCK - 1) * lattice.voxel
+        keys = keys[((low <= box) & (high >= -box)).all(1)]
+    return keys.int()
+
+
+def block_balls(lattice: Lattice, keys: Tensor) -> tuple[Tensor, Tensor]:
+    """(M, 3) keys → centres (M, 3) and radii (M,) of balls around each block's corners, working frame."""
+    offsets = torch.tensor([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], device=keys.device) * (BLOCK - 1)
+    corners = (keys[:, None].long() * BLOCK + offsets).float() * lattice.voxel - lattice.space.extent
+    centre = lattice.space.to_working(corners.mean(1))
+    radius = (lattice.space.to_working(corners.view(-1, 3)).view(-1, 8, 3) - centre[:, None]).norm(dim=2).amax(1)
+    return centre, radius * SLACK
+
+
+def visible_blocks(centres: Tensor, radii: Tensor, cameras: Cameras, near: float, far: float) -> Tensor:
+    """(M,) bool: a part of the ball lies in at least one camera's frustum between the depths `near` and `far` (never too few)."""
+    local = cameras.local(centres)  # (K, M, 3)
+    fx, fy, cx, cy = (value[:, None] for value in cameras.intrinsics.unbind(1))
+    width, height = (value[:, None] for value in cameras.size.unbind(1))
+    x, y, z = local.unbind(2)
+    inside = (z > near - radii) & (z < far + radii)
+    # Distance to the four side planes through the camera: n · p with unit normals that point inwards.
+    for focal, across, low, high in ((fx, x, -cx, width - cx), (fy, y, -cy, height - cy)):
+        inside &= (focal * across - low * z) / (focal**2 + low**2).sqrt() > -radii
+        inside &= (high * z - focal * across) / (focal**2 + high**2).sqrt() > -radii
+    return inside.any(0)

@@ -1,0 +1,83 @@
+"""The image encoder: one map of 64 channels at a quarter of the picture's size, a feature pyramid fused top down.
+
+Every stride-2 convolution has an even kernel, so cell j of a map of stride s is centred at s · (j + ½) pixels exactly; unprojection
+relies on it. Normalisation by groups keeps the features alive from the first step on (plain deep stacks die without notice).
+"""
+
+from __future__ import annotations
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+STRIDE = 4  # pixels a cell of the map
+DEEPEST = 16  # pixels a cell of the deepest level; pictures are padded to multiples of it
+GROUP = 8  # channels normalised together
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's pictures, RGB
+
+
+class _Conv(nn.Sequential):
+    """Convolution, group norm, ReLU; Kaiming initialisation."""
+
+    def __init__(self, inside: int, outside: int, kernel: int, stride: int = 1) -> None:
+        conv = nn.Conv2d(inside, outside, kernel, stride, (kernel - 1) // 2, bias=False)
+        nn.init.kaiming_normal_(conv.weight, nonlinearity="relu")
+        super().__init__(conv, nn.GroupNorm(outside // GROUP, outside), nn.ReLU())
+
+
+class _Residual(nn.Module):
+    """x + two convolutions."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first, self.second = _Conv(channels, channels, 3), _Conv(channels, channels, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.second(self.first(x))
+
+
+class ImageEncoder(nn.Module):
+    """(V, 3, H, W) RGB in [0, 1] → (V, channels, ⌈H/16⌉·4, ⌈W/16⌉·4), of unit deviation.
+
+    Args:
+        channels: of the result.
+        widths: channels of the levels at 1/2, 1/4, 1/8 and 1/16.
+    """
+
+    def __init__(self, channels: int = 64, widths: tuple[int, int, int, int] = (16, 32, 48, 96)) -> None:
+        super().__init__()
+        half, quarter, eighth, sixteenth = widths
+        self.stages = nn.ModuleList(
+            [
+                nn.Sequential(_Conv(3, half, 4, 2), _Conv(half, quarter, 4, 2), _Residual(quarter)),
+                nn.Sequential(_Conv(quarter, eighth, 4, 2), _Residual(eighth)),
+                nn.Sequential(_Conv(eighth, sixteenth, 4, 2), _Residual(sixteenth)),
+            ]
+        )
+        self.laterals = nn.ModuleList(_linear(width, channels, 1) for width in (quarter, eighth, sixteenth))
+        self.smooth = _linear(channels, channels, 3)
+        self.norm = nn.GroupNorm(channels // GROUP, channels)
+
+    def forward(self, images: Tensor) -> Tensor:
+        x = (padded(images) - images.new_tensor(MEAN).view(3, 1, 1)) / images.new_tensor(DEVIATION).view(3, 1, 1)
+        levels = []
+        for stage in self.stages:
+            x = stage(x)
+            levels.append(x)
+        fused = self.laterals[2](levels[2])
+        for level in (1, 0):
+            fused = self.laterals[level](levels[level]) + F.interpolate(fused, scale_factor=2, mode="bilinear", align_corners=False)
+        features: Tensor = self.norm(self.smooth(fused))
+        return features
+
+
+def _linear(inside: int, outside: int, kernel: int) -> nn.Conv2d:
+    conv = nn.Conv2d(inside, outside, kernel, padding=kernel // 2)
+    nn.init.kaiming_normal_(conv.weight, nonlinearity="linear")
+    return conv
+
+
+def padded(images: Tensor) -> Tensor:
+    """(V, 3, H, W) → the same with the last rows and columns repeated up to multiples of the deepest stride."""
+    height, width = images.shape[-2:]
+    right, below = -width % DEEPEST, -height % DEEPEST
+    return F.pad(images, (0, right, 0, below), mode="replicate") if right or below else images

@@ -1,0 +1,85 @@
+"""The GRU that fuses a local volume into the global one (NeRFusion, section 3.2, eq. 3).
+
+    z = σ(M_z([H, V]) − log n)      r = σ(M_r([H, V]))
+    T = tanh(V_raw + M_t([r ∘ H, V]))
+    H' = (1 − z) ∘ H + z ∘ T
+
+H is the global volume, V = tanh(V_raw) the local one, n the number of key frames that a voxel was in before. What differs from the
+paper are the two known terms: with M_z = M_t = 0 (the start) this is the running mean of the local volumes, the fusion that needs no
+learning, and z = 1 where nothing was known. n is capped, so that late frames still count. H stays within (−1, 1) for ever: it is
+always a mixture of values of tanh.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from toolkit.networks.block_conv import BlockConv3d
+from toolkit.volume.topology import Topology
+
+
+class _Gate(nn.Module):
+    """Three sparse convolutions [H, V] → channels; the last starts near zero."""
+
+    def __init__(self, channels: int, hidden: int, layers: int) -> None:
+        super().__init__()
+        widths = [2 * channels] + [hidden] * (layers - 1) + [channels]
+        self.convolutions = nn.ModuleList(BlockConv3d(a, b) for a, b in pairwise(widths))
+        last = self.convolutions[-1]
+        assert isinstance(last, BlockConv3d)
+        with torch.no_grad():
+            last.weight.mul_(0.1)
+
+    def forward(self, rows: Tensor, topology: Topology, inside: Tensor) -> Tensor:
+        for number, convolution in enumerate(self.convolutions):
+            rows = convolution(torch.relu(rows) if number else rows, topology, inside)
+        return rows
+
+
+class FusionGRU(nn.Module):
+    """One step of the recurrence on the voxels of a local volume.
+
+    Args:
+        most: cap on n.
+    """
+
+    def __init__(self, channels: int, hidden: int, layers: int = 3, most: int = 16) -> None:
+        super().__init__()
+        self.update, self.reset, self.candidate = (_Gate(channels, hidden, layers) for _ in range(3))
+        self.most = most
+
+    def forward(self, state: Tensor, count: Tensor, local: Tensor, raw: Tensor, topology: Topology, inside: Tensor) -> Tensor:
+        """H' on the local volume's rows.
+
+        Args:
+            state: (M · 512 + 1, C) H, zero outside the local volume and where nothing is known.
+            count: (M · 512,) n.
+            local, raw: (M · 512 + 1, C) V and V_raw.
+            inside: (M · 512,) bool, the voxels of the local volume.
+
+        Returns:
+            (M · 512 + 1, C), zero outside.
+        """
+        both = torch.cat([state, local], 1)
+        known = torch.log(count.clamp_max(self.most))  # −∞ where nothing is known: z = 1
+        known = torch.cat([known, known.new_full((1,), -torch.inf)])[:, None]
+        z = torch.sigmoid(self.update(both, topology, inside) - known)
+        r = torch.sigmoid(self.reset(both, topology, inside))
+        candidate = torch.tanh(raw + self.candidate(torch.cat([r * state, local], 1), topology, inside))
+        return (1 - z) * state + z * candidate
+
+
+class RunningMean(nn.Module):
+    """The fusion without learning, for the ablation: the mean of the local volumes, n capped as in the GRU."""
+
+    def __init__(self, most: int = 16) -> None:
+        super().__init__()
+        self.most = most
+
+    def forward(self, state: Tensor, count: Tensor, local: Tensor, raw: Tensor, topology: Topology, inside: Tensor) -> Tensor:
+        """See `FusionGRU.forward`."""
+        z = 1 / (1 + torch.cat([count, count.new_zeros(1)]).clamp_max(self.most))[:, None]
+        return (1 - z) * state + z * local

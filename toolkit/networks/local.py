@@ -1,0 +1,57 @@
+"""J, the local reconstruction network of NeRFusion (section 3.1, eq. 2): sparse convolutions from evidence to a local volume."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from toolkit.networks.block_conv import BlockConv3d
+from toolkit.volume.topology import Topology
+
+COLOUR_SCALE = 4.0  # a latent colour of ±1 is a colour logit of ±4
+MOST = 0.93  # latent colours are kept inside this, so that tanh is not driven to its ends
+
+
+def colour_latent(colour: Tensor) -> Tensor:
+    """(N, 3) RGB in [0, 1] → p with sigmoid(COLOUR_SCALE · tanh p) = colour, within what `MOST` allows."""
+    latent = torch.logit(colour, eps=1e-4) / COLOUR_SCALE
+    return torch.atanh(latent.clamp(-MOST, MOST))
+
+
+class LocalReconstruction(nn.Module):
+    """Per-voxel projection to few channels, then `layers` sparse 3×3×3 convolutions with ReLU between them.
+
+    The views' mean colour is added to the first three outputs, which by convention are the voxel's colour: at the start a local volume
+    already carries the pictures' colours and the network learns what to change.
+    """
+
+    def __init__(self, inputs: int, hidden: int, channels: int, layers: int = 5) -> None:
+        super().__init__()
+        self.project = nn.Linear(inputs, hidden)
+        nn.init.kaiming_normal_(self.project.weight, nonlinearity="relu")
+        nn.init.zeros_(self.project.bias)
+        widths = [hidden] * layers + [channels]
+        self.convolutions = nn.ModuleList(BlockConv3d(a, b) for a, b in pairwise(widths))
+        last = self.convolutions[-1]
+        assert isinstance(last, BlockConv3d)
+        nn.init.kaiming_normal_(last.weight, nonlinearity="linear")
+        with torch.no_grad():
+            last.weight.mul_(0.5)  # mostly within tanh's straight part
+            last.weight[:3].mul_(0.1)  # the first three start as the mean colour
+
+    def forward(self, rows: Tensor, colours: Tensor, topology: Topology, seen: Tensor) -> Tensor:
+        """Raw local volume, before tanh.
+
+        Args:
+            rows: (M · 512 + 1, hidden) projected evidence (`project`, with ReLU), zero where nothing is seen.
+            colours: (M · 512 + 1, 3) latent mean colours, zero where nothing is seen.
+            seen: (M · 512,) bool.
+
+        Returns:
+            (M · 512 + 1, channels), zero where nothing is seen.
+        """
+        for number, convolution in enumerate(self.convolutions):
+            rows = convolution(torch.relu(rows) if number else rows, topology, seen)
+        return torch.cat([rows[:, :3] + colours, rows[:, 3:]], 1)

@@ -1,0 +1,204 @@
+"""NeRFusion's networks as one module with functional methods, in the order of the paper.
+
+    views  = model.encode(images, cameras)                          # once a picture
+    local  = model.local_volume(views[:K], cameras[:K], lattice)    # a key frame and its neighbours
+    state  = model.fuse(state, local)                               # H' from H; start with `model.start(lattice)`
+    values = model.head(state)                                      # rows of a radiance field; also of a local volume
+    model.decoder                                                   # R, shared by local and global volumes
+
+No method changes anything: gradients flow through all of them, and a state is an ordinary value. `toolkit.render.fused.make_field` turns
+a volume into a field that can be rendered, with or without gradients; `toolkit.fusion` runs the loop over key frames.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from toolkit.networks.aggregate import FLAGS, aggregate, direction_spread, evidence
+from toolkit.networks.cameras import Cameras
+from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
+from toolkit.networks.decoder import make_decoder
+from toolkit.networks.direction import DirectionCode
+from toolkit.networks.encoder import STRIDE, ImageEncoder, padded
+from toolkit.networks.gru import FusionGRU, RunningMean
+from toolkit.networks.head import FieldHead
+from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume, empty_volume
+from toolkit.networks.local import LocalReconstruction, colour_latent
+from toolkit.networks.pyramid import Pyramid
+from toolkit.networks.unproject import EncodedView, look_up, project
+from toolkit.volume.topology import VOXELS, Topology
+
+CHUNK = 2**15  # voxels at a time: what the views show of them is many times larger than what is kept
+COLOURS = 3
+COLOUR_GAIN = 4.0  # pictures' RGB as numbers of about unit deviation
+LEVELS = 3  # of the feature maps
+COLOUR_LEVELS = 5
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Sizes and switches of the networks. The defaults are what the shipped weights were trained with."""
+
+    image_channels: int = 64  # of the encoder's map
+    sampled: int = 16  # of them kept where voxels look
+    direction: int = 16  # of the direction code; 0: off (ablation)
+    hidden: int = 16  # of J between its first and last layer
+    channels: int = 16  # of local and global volumes
+    gru_hidden: int = 16
+    features: int = 16  # of the radiance field
+    head_hidden: int = 32
+    decoder: str = "deferred"  # deferred | per_sample (the paper's)
+    decoder_hidden: int = 32
+    variance: bool = True  # False: mean only (ablation)
+    fusion: str = "gru"  # gru | mean (ablation)
+
+
+class NerfusionModel(nn.Module):
+    """Encoder, direction code, local reconstruction, fusion, head and decoder."""
+
+    def __init__(self, config: ModelConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = config or ModelConfig()
+        self.encoder = ImageEncoder(config.image_channels)
+        self.sample = nn.Conv2d(config.image_channels, config.sampled, 1)
+        nn.init.kaiming_normal_(self.sample.weight, nonlinearity="linear")
+        self.direction = DirectionCode(config.direction) if config.direction else None
+        inputs = 3 * (config.sampled + config.direction + COLOURS) + FLAGS
+        self.local = LocalReconstruction(inputs, config.hidden, config.channels)
+        self.fusion: FusionGRU | RunningMean = FusionGRU(config.channels, config.gru_hidden) if config.fusion == "gru" else RunningMean()
+        self.to_field = FieldHead(config.channels, config.head_hidden, config.features)
+        self.decoder = make_decoder(config.decoder, config.features, config.decoder_hidden)
+
+    @property
+    def device(self) -> torch.device:
+        return self.sample.weight.device
+
+    def encode(self, images: Tensor, cameras: Cameras) -> list[EncodedView]:
+        """Everything that voxels look up in pictures.
+
+        A viewing direction is the same for a pixel and for every voxel behind it, so G is evaluated for the cells of the maps and not
+        for each voxel and view.
+
+        Args:
+            images: (V, 3, H, W) RGB in [0, 1], undistorted; of one size.
+            cameras: V cameras for exactly these pictures.
+        """
+        maps = self.sample(self.encoder(images))
+        whole = padded((images - 0.5) * COLOUR_GAIN)
+        views = []
+        for index in range(len(images)):
+            features = Pyramid.of(maps[index], STRIDE, LEVELS)
+            if self.direction is not None:
+                codes = self.direction(cameras.directions(index, features.pixels()))
+                features = features.with_columns(codes.to(features.rows.dtype))
+            views.append(EncodedView(features, Pyramid.of(whole[index], 1, COLOUR_LEVELS)))
+        return views
+
+    def local_volume(
+        self,
+        views: Sequence[EncodedView],
+        cameras: Cameras,
+        lattice: Lattice,
+        topology: Topology | None = None,
+        wanted: Tensor | None = None,
+        near: float = 0.0,
+        far: float = math.inf,
+    ) -> LocalVolume:
+        """The local volume of a key frame and its neighbours (section 3.1). Any number of views ≥ 1, in any order.
+
+        Args:
+            views, cameras: K of each.
+            topology: blocks to work on; None: every block that a view can see.
+            wanted: (M · 512,) bool, corners of these blocks to work on; None: all. Only what a view sees is ever filled.
+            near, far: depths along z within which views are asked, working units.
+        """
+        if topology is None:
+            keys = all_blocks(lattice, cameras.intrinsics.device)
+            topology = Topology(keys[visible_blocks(*block_balls(lattice, keys), cameras, near, far)])
+        found, projected, colours, counts = [], [], [], []
+        rows = torch.arange(topology.zero_row, device=topology.device) if wanted is None else wanted.nonzero().view(-1)
+        for part in rows.split(CHUNK):
+            seen, rows_projected, colour, count = self._observe(views, cameras, lattice, topology, part, near, far)
+            found.append(seen)
+            projected.append(rows_projected)
+            colours.append(colour)
+            counts.append(count)
+        config, size = self.config, topology.zero_row
+        where = torch.cat(found) if found else rows
+        count = torch.zeros(size, device=topology.device)
+        latent = torch.zeros((size + 1, config.hidden), device=topology.device)
+        colour = torch.zeros((size + 1, COLOURS), device=topology.device)
+        if len(where):
+            count = count.index_copy(0, where, torch.cat(counts))
+            latent = latent.index_copy(0, where, torch.cat(projected).to(latent.dtype))
+            colour = colour.index_copy(0, where, torch.cat(colours).to(colour.dtype))
+        raw = self.local(latent, colour, topology, count > 0)
+        return LocalVolume(lattice, topology, torch.tanh(raw), count, raw)
+
+    def _observe(
+        self, views: Sequence[EncodedView], cameras: Cameras, lattice: Lattice, topology: Topology, rows: Tensor, near: float, far: float
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Of the corners `rows`: those that a view sees, their evidence projected to few channels, latent mean colour, and view count."""
+        contracted = lattice.contracted(topology.keys, rows)
+        points, size = lattice.working(contracted)
+        projection = project(points, size, cameras, near, far)
+        seen = projection.visible.any(0)
+        if lattice.space.shell == 0:
+            seen &= (contracted.abs() <= contracted.new_tensor(lattice.space.box) + 1.01 * lattice.voxel).all(1)
+        kept = seen.nonzero().view(-1)
+        rows, points, projection = rows[kept], points[kept], projection[kept]
+        visible = projection.visible
+        mean, variance, count = aggregate(look_up(views, projection), visible, self.config.variance)
+        footprint = torch.exp((torch.log(projection.footprint) * visible).sum(0) / count.clamp_min(1))
+        spread = direction_spread(points, cameras.positions, visible)
+        projected = torch.relu(self.local.project(evidence(mean, variance, count, footprint, spread)))
+        colour = colour_latent((mean[:, -COLOURS:] / COLOUR_GAIN + 0.5).clamp(0, 1))
+        return rows, projected, colour, count.to(torch.float32)
+
+    def start(self, lattice: Lattice) -> LatentVolume:
+        """The global volume before the first key frame."""
+        return empty_volume(lattice, self.config.channels, self.device)
+
+    def fuse(self, state: LatentVolume, local: LocalVolume) -> LatentVolume:
+        """The global volume after one more key frame (section 3.2). Only voxels of the local volume change, all others keep every bit.
+
+        Blocks keep their slots; new ones come after them.
+        """
+        keys = local.topology.keys
+        slots = state.topology.find(keys)
+        fresh = (slots < 0).nonzero().view(-1)
+        topology, rows, count = state.topology, state.rows, state.count
+        if len(fresh):
+            slots[fresh] = topology.blocks + torch.arange(len(fresh), device=keys.device)
+            topology = Topology(torch.cat([topology.keys, keys[fresh]]))
+            new = len(fresh) * VOXELS
+            rows = torch.cat([rows[:-1], rows.new_zeros((new + 1, rows.shape[1]))])
+            count = torch.cat([count, count.new_zeros(new)])
+        inside = local.known
+        place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=keys.device)).view(-1)
+        n = count[place] * inside
+        before = torch.cat([rows[place] * (n > 0)[:, None], rows.new_zeros((1, rows.shape[1]))])
+        after = self.fusion(before, n, local.rows, local.raw, local.topology, inside)
+        changed = inside.nonzero().view(-1)
+        rows = rows.index_copy(0, place[changed], after[changed].to(rows.dtype))
+        count = count.index_copy(0, place[changed], n[changed] + 1)
+        return LatentVolume(state.lattice, topology, rows, count)
+
+    def head(self, volume: LatentVolume) -> tuple[Tensor, Tensor]:
+        """What the radiance field stores.
+
+        Returns:
+            (M · 512 + 1,) logarithm of the optical thickness of a voxel, and (M · 512 + 1, features); zero at corners that are not known.
+        """
+        known = volume.known.nonzero().view(-1)
+        thickness, features = self.to_field(volume.rows[known])
+        size = len(volume.rows)
+        return (
+            torch.zeros(size, device=known.device).index_copy(0, known, thickness.float()),
+            torch.zeros((size, features.shape[1]), device=known.device).index_copy(0, known, features.float()),
+        )

@@ -1,0 +1,96 @@
+"""Maps of a picture at several sizes as one table of rows, and bilinear lookup in it at places of its own size each.
+
+A voxel that covers many pixels must read a map of coarse cells, or what it reads is a matter of chance (aliasing), and the variance
+over views says nothing. So each lookup names its level.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """Maps of halving size, rows of all levels one after the other.
+
+    Attributes:
+        rows: (R, C), each level row by row.
+        sizes: (height, width) of each level.
+        stride: pixels of the picture a cell of the first level; it doubles from level to level.
+    """
+
+    rows: Tensor
+    sizes: tuple[tuple[int, int], ...]
+    stride: int
+
+    @classmethod
+    def of(cls, image: Tensor, stride: int, levels: int) -> Pyramid:
+        """(C, h, w), the first level → a pyramid by averaging 2×2 cells, as long as both sides are even."""
+        maps = [image]
+        while len(maps) < levels and maps[-1].shape[1] % 2 == 0 and maps[-1].shape[2] % 2 == 0:
+            maps.append(F.avg_pool2d(maps[-1][None], 2)[0])
+        rows = torch.cat([level.flatten(1).T for level in maps])
+        return cls(rows.contiguous(), tuple((level.shape[1], level.shape[2]) for level in maps), stride)
+
+    def with_columns(self, columns: Tensor) -> Pyramid:
+        """More channels (R, C') beside these."""
+        return Pyramid(torch.cat([self.rows, columns], 1), self.sizes, self.stride)
+
+    def pixels(self) -> Tensor:
+        """(R, 2) the pixel of the picture (centres at +0.5) at the middle of each cell."""
+        parts = []
+        for level, (height, width) in enumerate(self.sizes):
+            v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+            parts.append((torch.stack([u, v], -1).view(-1, 2) + 0.5) * self.stride * 2**level)
+        return torch.cat(parts).to(self.rows)
+
+    def lookup(self, pixels: Tensor, footprint: Tensor) -> Tensor:
+        """Bilinear values.
+
+        Args:
+            pixels: (N, 2) in the picture; beyond the border the border's value is taken.
+            footprint: (N,) pixels that what is looked for covers: the level whose cells are nearest to that size (by ratio) is read.
+
+        Returns:
+            (N, C); differentiable in `rows`.
+        """
+        level = torch.log2(footprint / self.stride).round_().clamp_(0, len(self.sizes) - 1).long()
+        table = torch.tensor(self.sizes, device=pixels.device)
+        starts = torch.cat([table.new_zeros(1), table.prod(1).cumsum(0)[:-1]])
+        height, width = table[level].unbind(1)
+        place = pixels / (self.stride * 2.0**level)[:, None] - 0.5
+        place = torch.minimum(place.clamp_min(0), torch.stack([width - 1, height - 1], 1).to(place))
+        low = place.floor()
+        fx, fy = (place - low).unbind(1)
+        x, y = low.long().unbind(1)
+        right, below = (x + 1 < width).long(), (y + 1 < height).long() * width
+        first = starts[level] + y * width + x
+        rows = torch.stack([first, first + right, first + below, first + below + right], 1)
+        weights = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], 1)
+        found: Tensor = _Lookup.apply(self.rows, rows, weights)
+        return found
+
+
+class _Lookup(torch.autograd.Function):
+    """Weighted sums of four rows; the gradient goes back by four additions (that of `embedding_bag` is much dearer)."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+        ctx.save_for_backward(rows, weights)
+        ctx.size = len(table)
+        return F.embedding_bag(rows, table, mode="sum", per_sample_weights=weights.to(table.dtype))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, None, None]:
+        rows, weights = ctx.saved_tensors
+        total = gradient.new_zeros((ctx.size, gradient.shape[1]))
+        for corner in range(4):
+            total.index_add_(0, rows[:, corner], gradient * weights[:, corner, None].to(gradient.dtype))
+        return total, None, None

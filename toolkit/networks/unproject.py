@@ -1,0 +1,72 @@
+"""Voxels seen by views: projection with visibility, and what each view shows there (NeRFusion, section 3.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from toolkit.networks.cameras import Cameras
+from toolkit.networks.pyramid import Pyramid
+
+
+@dataclass(frozen=True)
+class EncodedView:
+    """What is looked up of a view: `features` (image features and direction codes) and `colours` (RGB in [−2, 2])."""
+
+    features: Pyramid
+    colours: Pyramid
+
+    @property
+    def channels(self) -> int:
+        return self.features.rows.shape[1] + self.colours.rows.shape[1]
+
+
+@dataclass(frozen=True)
+class Projection:
+    """N voxels in K views.
+
+    Attributes:
+        pixels: (K, N, 2), finite also where a view does not see the voxel.
+        visible: (K, N) bool.
+        footprint: (K, N) pixels that a voxel covers.
+    """
+
+    pixels: Tensor
+    visible: Tensor
+    footprint: Tensor
+
+    def __getitem__(self, kept: Tensor) -> Projection:
+        """The voxels at `kept`."""
+        return Projection(self.pixels[:, kept], self.visible[:, kept], self.footprint[:, kept])
+
+
+def project(points: Tensor, size: Tensor, cameras: Cameras, near: float, far: float) -> Projection:
+    """Project voxels into all views.
+
+    A view sees a voxel when its depth lies in (near, far] and its pixel inside the picture. What hides it is not known here.
+
+    Args:
+        points: (N, 3) working frame.
+        size: (N,) side of each voxel, working units.
+    """
+    local = cameras.local(points)  # (K, N, 3)
+    depth = local[..., 2]
+    deep = (depth > max(near, 0.0)) & (depth <= far)
+    safe = torch.where(deep, depth, torch.ones_like(depth))
+    focal, middle = cameras.intrinsics[:, None, :2], cameras.intrinsics[:, None, 2:]
+    pixels = local[..., :2] / safe[..., None] * focal + middle
+    inside = ((pixels >= 0) & (pixels <= cameras.size[:, None])).all(2)
+    visible = deep & inside
+    footprint = torch.where(visible, size * focal.mean(2) / safe, torch.ones_like(safe))
+    return Projection(torch.where(visible[..., None], pixels, torch.zeros_like(pixels)), visible, footprint)
+
+
+def look_up(views: Sequence[EncodedView], projection: Projection) -> Tensor:
+    """(K, N, C) what each view shows at the voxels: features, direction code, colour. Where it does not see one: anything finite."""
+    parts = []
+    for view, pixels, footprint in zip(views, projection.pixels, projection.footprint, strict=True):
+        parts.append(torch.cat([view.features.lookup(pixels, footprint), view.colours.lookup(pixels, footprint)], 1))
+    return torch.stack(parts)
