@@ -37,4 +37,11 @@ class FieldHead(nn.Module):
 
     def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         hidden = self.body(latent)
-        return START + SCALE * self.density(hidden).squeeze(1), self.features(hidden) + self.skip(latent)
+        return self._thickness(hidden), self.features(hidden) + self.skip(latent)
+
+    def thickness(self, latent: Tensor) -> Tensor:
+        """The first of the two alone."""
+        return self._thickness(self.body(latent))
+
+    def _thickness(self, hidden: Tensor) -> Tensor:
+        return START + SCALE * self.density(hidden).squeeze(1)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -30,6 +30,7 @@ from toolkit.networks.head import FieldHead
 from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume, empty_volume
 from toolkit.networks.local import LocalReconstruction, colour_latent
 from toolkit.networks.pyramid import Pyramid
+from toolkit.networks.refine import with_blocks
 from toolkit.networks.unproject import EncodedView, look_up, project
 from toolkit.volume.topology import VOXELS, Topology
 
@@ -169,25 +170,28 @@ class NerfusionModel(nn.Module):
 
         Blocks keep their slots; new ones come after them.
         """
-        keys = local.topology.keys
-        slots = state.topology.find(keys)
-        fresh = (slots < 0).nonzero().view(-1)
-        topology, rows, count = state.topology, state.rows, state.count
-        if len(fresh):
-            slots[fresh] = topology.blocks + torch.arange(len(fresh), device=keys.device)
-            topology = Topology(torch.cat([topology.keys, keys[fresh]]))
-            new = len(fresh) * VOXELS
-            rows = torch.cat([rows[:-1], rows.new_zeros((new + 1, rows.shape[1]))])
-            count = torch.cat([count, count.new_zeros(new)])
+        state, slots = with_blocks(state, local.topology.keys)
+        place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
+        zero = state.rows.new_zeros((1, state.rows.shape[1]))
+        part = replace(state, topology=local.topology, rows=torch.cat([state.rows[place], zero]), count=state.count[place])
+        after = self.fuse_part(part, local)
+        changed = local.known.nonzero().view(-1)
+        rows = state.rows.index_copy(0, place[changed], after.rows[changed].to(state.rows.dtype))
+        return replace(state, rows=rows, count=state.count.index_copy(0, place[changed], after.count[changed]))
+
+    def fuse_part(self, part: LatentVolume, local: LocalVolume) -> LatentVolume:
+        """One step of the recurrence on the blocks of a local volume alone: `part` is the global volume there."""
         inside = local.known
-        place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=keys.device)).view(-1)
-        n = count[place] * inside
-        before = torch.cat([rows[place] * (n > 0)[:, None], rows.new_zeros((1, rows.shape[1]))])
-        after = self.fusion(before, n, local.rows, local.raw, local.topology, inside)
-        changed = inside.nonzero().view(-1)
-        rows = rows.index_copy(0, place[changed], after[changed].to(rows.dtype))
-        count = count.index_copy(0, place[changed], n[changed] + 1)
-        return LatentVolume(state.lattice, topology, rows, count)
+        count = part.count * inside
+        mask = torch.cat([count > 0, inside.new_zeros(1)])[:, None]
+        rows = self.fusion(part.rows * mask, count, local.rows, local.raw, local.topology, inside)
+        return replace(part, rows=rows, count=count + inside)
+
+    def thickness(self, volume: LatentVolume) -> Tensor:
+        """(M · 512 + 1,) the first of what `head` gives, alone."""
+        known = volume.known.nonzero().view(-1)
+        values = self.to_field.thickness(volume.rows[known]).float()
+        return torch.zeros(len(volume.rows), device=known.device).index_copy(0, known, values)
 
     def head(self, volume: LatentVolume) -> tuple[Tensor, Tensor]:
         """What the radiance field stores.

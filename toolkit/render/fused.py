@@ -6,8 +6,9 @@ import math
 
 import torch
 
-from toolkit.networks.lattice import LatentVolume, cells
+from toolkit.networks.lattice import LatentVolume
 from toolkit.networks.model import NerfusionModel
+from toolkit.networks.refine import solid_cells
 from toolkit.render.composite import UNITS
 from toolkit.render.field import Field
 from toolkit.volume.edit import erase_empty_blocks
@@ -27,9 +28,8 @@ def make_field(
 ) -> Field:
     """The field of a local or global volume. Gradients flow from its rows to the networks; it shares the model's decoder.
 
-    A cell takes part when all its eight corners are known. With `gamma`, cells are pruned by the paper's rule, made free of scale: gone
-    when exp(−optical thickness of the voxel) exceeds γ everywhere in it. Raw density is interpolated linearly, so its largest value in a
-    cell is at a corner, and looking at the corners is exact.
+    A cell takes part when all its eight corners are known and, with `gamma`, when it is not see-through: the paper's pruning rule, made
+    free of scale (gone when exp(−optical thickness of the voxel) exceeds γ everywhere in it).
 
     Args:
         background: (3,) colour behind everything.
@@ -38,20 +38,13 @@ def make_field(
         allowed: (M · 512,) bool, cells that may take part at all; None: every one.
     """
     thickness, features = model.head(volume)
-    occupied = cells(volume.topology, volume.known, every=True)
+    occupied = solid_cells(volume, thickness, gamma)
     if allowed is not None:
         occupied &= allowed
-    if gamma is not None:
-        occupied &= cells(volume.topology, volume.known & solid(thickness, gamma), every=False)
     # A voxel's optical thickness is σ · side, and σ = exp(raw) · UNITS per normalised unit.
     raw = thickness - math.log(volume.lattice.voxel * UNITS)
     lattice = volume.lattice
     return Field(lattice.space, lattice.resolution, volume.topology, occupied, raw, features, model.decoder, background, near, fine)
-
-
-def solid(thickness: Tensor, gamma: float) -> Tensor:
-    """(M · 512 + 1,) logarithm of optical thickness → (M · 512,) bool: exp(−thickness) ≤ γ."""
-    return thickness[:-1].detach() >= math.log(-math.log(gamma))
 
 
 def without_empty_blocks(field: Field) -> Field:

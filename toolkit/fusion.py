@@ -1,0 +1,215 @@
+"""The loop over key frames: local volumes in, one global volume out (NeRFusion, section 3.2), as frames stream in.
+
+Coarse to fine within each key frame: the coarse lattice is asked everywhere in the frusta, each finer one only in the cells that the coarse
+global volume does not see through, starting from the coarse latents there. Memory a key frame is bounded by its frusta at the coarse
+level and by surface at the finer ones; encoded pictures are kept only as long as a key frame near them may come.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from toolkit.camera import Array
+from toolkit.capture.types import Views
+from toolkit.errors import InputError
+from toolkit.keyframes import KeyFrames
+from toolkit.networks.cameras import Cameras
+from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
+from toolkit.networks.lattice import LatentVolume, Lattice
+from toolkit.networks.model import NerfusionModel
+from toolkit.networks.refine import adopt, children, solid_cells, split_volume
+from toolkit.networks.store import GlobalStore
+from toolkit.networks.unproject import EncodedView
+from toolkit.progress import SILENT, Progress
+from toolkit.volume.space import Space
+from toolkit.volume.topology import BLOCK, VOXELS, Topology
+
+KEPT_PICTURES = 12  # encoded pictures kept for key frames to come
+
+
+@dataclass(frozen=True)
+class FusionOptions:
+    """How key frames are fused.
+
+    Attributes:
+        levels: lattices, each of half the voxel size of the one before; 1: the paper's single one.
+        near, far: depths along z within which a view is asked, working units (the paper: 3 m).
+        gamma: coarse cells in which exp(−optical thickness) exceeds this are not looked at finer.
+        prune_every: key frames after which blocks without such cells are forgotten.
+    """
+
+    levels: int = 2
+    near: float = 0.0
+    far: float = math.inf
+    gamma: float = 0.95
+    prune_every: int = 8
+
+
+@dataclass(frozen=True)
+class Fused:
+    """The state after a key frame.
+
+    Attributes:
+        frame: index of the key frame's picture.
+        volume: the finest global volume; shares memory with the loop, valid until it goes on.
+        allowed: (M · 512,) bool, cells whose coarser ones are not see-through.
+        seconds: spent on this key frame.
+        encode_seconds: of these, on encoding pictures.
+    """
+
+    frame: int
+    volume: LatentVolume
+    allowed: Tensor
+    seconds: float
+    encode_seconds: float
+
+
+def fusion_lattice(space: Space, voxel_size: float, levels: int) -> Lattice:
+    """The finest lattice with voxels of about `voxel_size` (working units) that can be made in `levels` doublings.
+
+    Raises:
+        InputError: the voxel size is not positive, or too small for the space.
+    """
+    unit = BLOCK * 2 ** (levels - 1)
+    if not (math.isfinite(voxel_size) and voxel_size > 0):
+        raise InputError(f"the voxel size must be positive, not {voxel_size:g}")
+    resolution = max(round(2 * space.extent * space.half / voxel_size / unit), 1) * unit
+    if resolution > 4096:
+        raise InputError(f"voxels of {voxel_size:.3g} are too small for a space {2 * space.half:.3g} wide; choose larger ones")
+    return Lattice(space, resolution)
+
+
+class Fusion:
+    """The global volumes of all levels, and one step of the loop."""
+
+    def __init__(self, model: NerfusionModel, lattice: Lattice, options: FusionOptions | None = None) -> None:
+        """`lattice`: the finest.
+
+        Raises:
+            InputError: the lattice cannot be halved so often.
+        """
+        self.model, self.options = model, options or FusionOptions()
+        if self.options.levels < 1 or lattice.resolution % (BLOCK * 2 ** (self.options.levels - 1)):
+            raise InputError(f"a lattice of {lattice.resolution} voxels a side does not have {self.options.levels} levels; choose fewer")
+        steps = range(self.options.levels - 1, -1, -1)
+        self.stores = [
+            GlobalStore(Lattice(lattice.space, lattice.resolution >> step), model.config.channels, model.device) for step in steps
+        ]
+        self._keys = all_blocks(self.stores[0].lattice, model.device)
+        self._balls = block_balls(self.stores[0].lattice, self._keys)
+
+    @torch.no_grad()
+    def add(self, views: Sequence[EncodedView], cameras: Cameras) -> None:
+        """Fuse one key frame (first) and its neighbours."""
+        options = self.options
+        keys = self._keys[visible_blocks(*self._balls, cameras, options.near, options.far)]
+        if len(keys) == 0:
+            return
+        part = self._fuse(0, views, cameras, self.stores[0].part(Topology(keys)), None)
+        for level in range(1, options.levels):
+            thickness = self.model.thickness(part)
+            finer = split_volume(part, solid_cells(part, thickness, options.gamma))
+            if finer.topology.blocks == 0:
+                return
+            before = adopt(self.stores[level].part(finer.topology), finer)
+            part = self._fuse(level, views, cameras, before, finer.known)
+
+    def _fuse(
+        self, level: int, views: Sequence[EncodedView], cameras: Cameras, before: LatentVolume, wanted: Tensor | None
+    ) -> LatentVolume:
+        """Local volume and GRU on the blocks of `before`, written to the store. Returns the global volume on these blocks."""
+        options = self.options
+        local = self.model.local_volume(views, cameras, before.lattice, before.topology, wanted, options.near, options.far)
+        after = self.model.fuse_part(before, local)
+        inside = local.known
+        self.stores[level].write(after, inside)
+        mask = torch.cat([inside, inside.new_zeros(1)])[:, None]
+        # What was known but is not seen now is needed to tell whole cells at the border of what is.
+        return LatentVolume(
+            before.lattice, before.topology, torch.where(mask, after.rows, before.rows), torch.where(inside, after.count, before.count)
+        )
+
+    @property
+    def volume(self) -> LatentVolume:
+        """The finest global volume, sharing memory with the loop."""
+        return self.stores[-1].volume()
+
+    @torch.no_grad()
+    def allowed(self, level: int = -1) -> Tensor:
+        """(M · 512,) bool, cells of a level's volume (the finest) whose coarser ones are not see-through."""
+        level %= self.options.levels
+        fine = self.stores[level].topology
+        if level == 0:
+            return torch.ones(fine.zero_row, dtype=torch.bool, device=fine.device)
+        coarse = self.stores[level - 1].volume()
+        kept = solid_cells(coarse, self.model.thickness(coarse), self.options.gamma)
+        return children(coarse.topology, kept, fine)
+
+    def prune(self) -> None:
+        """Forget blocks of the finer levels in which no cell is allowed any more."""
+        for level in range(1, self.options.levels):
+            self.stores[level].keep(self.allowed(level).view(-1, VOXELS).any(1))
+
+
+class _Pictures:
+    """Encoded pictures, the most recently used ones kept."""
+
+    def __init__(self, model: NerfusionModel, views: Views) -> None:
+        self.model, self.views = model, views
+        self._kept: OrderedDict[int, tuple[EncodedView, Cameras]] = OrderedDict()
+
+    @torch.no_grad()
+    def __call__(self, index: int) -> tuple[EncodedView, Cameras]:
+        if index not in self._kept:
+            views, device = self.views, self.model.device
+            cameras = Cameras.of([views.intrinsics[index]], views.world_from_camera[index : index + 1], device)
+            image = torch.from_numpy(np.ascontiguousarray(views.images[index])).to(device).permute(2, 0, 1)[None].float() / 255
+            self._kept[index] = (self.model.encode(image, cameras)[0], cameras)
+        self._kept.move_to_end(index)
+        while len(self._kept) > KEPT_PICTURES:
+            self._kept.popitem(last=False)
+        return self._kept[index]
+
+
+def fuse_views(
+    model: NerfusionModel,
+    views: Views,
+    key_frames: KeyFrames,
+    lattice: Lattice,
+    options: FusionOptions | None = None,
+    progress: Progress = SILENT,
+) -> Iterator[Fused]:
+    """Fuse key frames one after the other; yields after each, so that a preview can be rendered meanwhile.
+
+    Raises:
+        InputError: no key frames, or a lattice that does not fit the options.
+        Interrupted: the user asked to stop.
+    """
+    if len(key_frames.indices) == 0:
+        raise InputError("there are no key frames to fuse; give more pictures")
+    fusion = Fusion(model, lattice, options)
+    encoded = _Pictures(model, views)
+    for done, (key, neighbours) in enumerate(zip(key_frames.indices, key_frames.neighbours, strict=True)):
+        progress.check()
+        begin = time.perf_counter()
+        group = [encoded(index) for index in _together(int(key), neighbours)]
+        encode_seconds = time.perf_counter() - begin
+        fusion.add([view for view, _ in group], Cameras.together([camera for _, camera in group]))
+        if (done + 1) % fusion.options.prune_every == 0:
+            fusion.prune()
+        seconds = time.perf_counter() - begin
+        yield Fused(int(key), fusion.volume, fusion.allowed(), seconds, encode_seconds)
+        progress.update(done + 1, len(key_frames.indices), f"{fusion.volume.topology.blocks} blocks")
+
+
+def _together(key: int, neighbours: Array) -> list[int]:
+    """The key frame and its neighbours, each once."""
+    return list(dict.fromkeys([key, *(int(n) for n in neighbours)]))

@@ -1,0 +1,95 @@
+"""From a coarse volume to a finer one: the networks work fine only where the coarse volume says that something may be."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from toolkit.networks.lattice import LatentVolume, cells
+from toolkit.volume.edit import corner_nodes, split
+from toolkit.volume.topology import BLOCK, VOXELS, Topology
+
+INHERITED = 1.0  # key frames that a latent taken over from the coarse volume counts for
+
+
+def solid(thickness: Tensor, gamma: float) -> Tensor:
+    """(M · 512 + 1,) logarithm of a voxel's optical thickness → (M · 512,) bool: exp(−thickness) ≤ γ (the paper's pruning rule)."""
+    return thickness[:-1].detach() >= math.log(-math.log(gamma))
+
+
+def solid_cells(volume: LatentVolume, thickness: Tensor, gamma: float | None) -> Tensor:
+    """(M · 512,) bool: cells with eight known corners that are not see-through.
+
+    Raw density is interpolated linearly, so its largest value in a cell is at a corner, and looking at the corners is exact.
+
+    Args:
+        thickness: (M · 512 + 1,) from the head.
+        gamma: None: see-through cells stay.
+    """
+    known = volume.known
+    whole = cells(volume.topology, known, every=True)
+    return whole if gamma is None else whole & cells(volume.topology, known & solid(thickness, gamma), every=False)
+
+
+def split_volume(volume: LatentVolume, kept: Tensor) -> LatentVolume:
+    """The cells `kept` (M · 512,) on the lattice of half the voxel size, latents interpolated; not differentiable.
+
+    Known are exactly the corners of the kept cells' children. They count as one key frame, so that what is seen finer soon prevails.
+    """
+    topology, occupied, (rows,) = split(volume.topology, kept, [volume.rows.detach()])
+    return LatentVolume(volume.lattice.finer(), topology, rows, corner_nodes(topology, occupied).float() * INHERITED)
+
+
+def adopt(state: LatentVolume, inherited: LatentVolume) -> LatentVolume:
+    """A volume that also knows what it inherits; what it knows already stays as it is, bit for bit."""
+    state, slots = with_blocks(state, inherited.topology.keys)
+    place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
+    new = (inherited.known & (state.count[place] == 0)).nonzero().view(-1)
+    return replace(
+        state,
+        rows=state.rows.index_copy(0, place[new], inherited.rows[new].to(state.rows.dtype)),
+        count=state.count.index_copy(0, place[new], inherited.count[new]),
+    )
+
+
+def with_blocks(state: LatentVolume, keys: Tensor) -> tuple[LatentVolume, Tensor]:
+    """The volume with at least these blocks — its own keep their slots, new ones follow, of which nothing is known — and their slots."""
+    slots = state.topology.find(keys)
+    fresh = (slots < 0).nonzero().view(-1)
+    if len(fresh) == 0:
+        return state, slots
+    slots[fresh] = state.topology.blocks + torch.arange(len(fresh), device=keys.device)
+    new = len(fresh) * VOXELS
+    rows, count = state.rows, state.count
+    return (
+        replace(
+            state,
+            topology=Topology(torch.cat([state.topology.keys, keys[fresh].to(torch.int32)])),
+            rows=torch.cat([rows[:-1], rows.new_zeros((new + 1, rows.shape[1]))]),
+            count=torch.cat([count, count.new_zeros(new)]),
+        ),
+        slots,
+    )
+
+
+def children(coarse: Topology, kept: Tensor, fine: Topology) -> Tensor:
+    """Cells of a lattice of half the voxel size whose parents are `kept`.
+
+    Args:
+        kept: (M · 512,) bool, cells of `coarse`.
+
+    Returns:
+        (M' · 512,) bool, cells of `fine`.
+    """
+    keys = fine.keys.long()
+    parent = coarse.find(keys >> 1)
+    octant = keys & 1
+    half = BLOCK // 2
+    cubes = torch.cat([kept, kept.new_zeros(VOXELS)]).view(-1, 2, half, 2, half, 2, half)  # the last block stands for absent parents
+    cube = cubes[parent, octant[:, 2], :, octant[:, 1], :, octant[:, 0]]  # (M', 4, 4, 4) z, y, x
+    for axis in (1, 2, 3):
+        cube = cube.repeat_interleave(2, axis)
+    return cube.reshape(-1)
