@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from toolkit.camera import Array
-from toolkit.simulate.scene import surface
+from toolkit.simulate.baked import surface
 from toolkit.simulate.trace import FAR, Rectangle, Shapes, Sphere
 
 

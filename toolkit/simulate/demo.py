@@ -18,7 +18,7 @@ from toolkit.errors import OutputError
 from toolkit.files import atomic_path
 from toolkit.progress import SILENT, Progress
 from toolkit.simulate import textures
-from toolkit.simulate.scene import Light, Scene
+from toolkit.simulate.baked import BakedScene, Light
 from toolkit.simulate.trace import Rectangle, Sphere
 
 FRAMES_A_SECOND = 12
@@ -42,12 +42,12 @@ BALLS = ((0.30, 0.10, 0.18, 0.18, 0.16), (-0.10, 0.10, 0.12, 0.12, 0.10), (0.12,
 class Filmed:
     """What the video shows, exactly: for comparing with what was found in it."""
 
-    scene: Scene
+    scene: BakedScene
     intrinsics: Intrinsics  # pinhole
     world_from_camera: Array  # (frames, 4, 4) float64, metres, z up
 
 
-def demo_scene(seed: int = 0) -> Scene:
+def demo_scene(seed: int = 0) -> BakedScene:
     """The furnished corner. Another seed gives other pictures on the same shapes."""
     rng = np.random.default_rng(seed)
     side, height = 3.6 + WALL, 2.4
@@ -71,7 +71,7 @@ def demo_scene(seed: int = 0) -> Scene:
             pictures.append(textures.carton(rng, size[0], size[1]))
     spheres = [Sphere(np.array(ball[:3]), ball[3]) for ball in BALLS]
     pictures += [textures.marble(rng, 360, 720) for _ in BALLS]
-    return Scene(rectangles, spheres, pictures, [ball[4] for ball in BALLS], Light())
+    return BakedScene(rectangles, spheres, pictures, [ball[4] for ball in BALLS], Light())
 
 
 def _box_faces(x: float, y: float, z: float, half_x: float, half_y: float, height: float, degrees: float) -> list[Rectangle]:

@@ -1,147 +1,214 @@
-"""A scene of textured rectangles and spheres with its light baked in, and pictures of it through a pinhole camera."""
+"""A procedural scene: solids, materials, lamps; pictures, depth and normals of it along any rays, on any torch device."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 
 from toolkit.camera import Array, Intrinsics, pixel_grid, rays
-from toolkit.simulate.trace import FAR, Hits, Rectangle, Shapes, Sphere
+from toolkit.effects import background, highlights, transfer
+from toolkit.effects.background import Background
+from toolkit.effects.highlights import Highlights
+from toolkit.simulate.cast import FAR, cast, tile_order
+from toolkit.simulate.materials import Material, Materials, TextureBank
+from toolkit.simulate.solids import ROOM, Solid, Solids
 
-GAMMA = 2.2
+Tensor = torch.Tensor
+
+CORNER = 0.35  # metres: how far the walls of a room darken what is near them
+EDGE_SIDE = 2  # rays across a pixel, each way, where it holds an edge
 
 
 @dataclass(frozen=True)
-class Light:
-    """A round lamp and an even sky."""
+class Lamp:
+    """A small lamp, or the sun."""
 
-    lamp: tuple[float, float, float] = (1.6, 1.1, 3.4)
-    radius: float = 0.35  # of the lamp: how soft shadows are
-    lamp_strength: float = 0.78
-    sky_strength: float = 0.42
-    samples: int = 12  # shadow rays a baked point
-    sky_samples: int = 28
+    position: tuple[float, float, float]
+    colour: tuple[float, float, float]  # linear irradiance on a surface that faces it, at `reach`
+    reach: float | None = 2.0  # metres; None: as strong everywhere (the sun; put it far away)
 
 
+@dataclass(frozen=True)
+class Rays:
+    """Rays of a picture or of any other list. Neighbours in the list should be neighbours in space."""
+
+    origins: Tensor  # (N, 3), or (1, 3) when they start at one place
+    directions: Tensor  # (N, 3) unit
+    spread: float  # angle between neighbouring rays in radians: what a pixel covers is spread · distance
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What rays see, one row a ray."""
+
+    linear: Tensor  # (N, 3) linear light, not clipped
+    distance: Tensor  # (N,) metres along the ray, `FAR` where nothing is hit
+    normals: Tensor  # (N, 3) unit, world axes; 0 where nothing is hit
+    albedo: Tensor  # (N, 3) linear reflectance
+    gloss: Tensor  # (N,)
+    part: Tensor  # (N,) int64: changes across visible edges (solid, face, shadow)
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """One picture with its truth."""
+
+    rgb: Tensor  # (H, W, 3) float32 sRGB in [0, 1]
+    depth: Tensor  # (H, W) float32 metres along z at pixel centres, 0 where nothing is hit
+    normals: Tensor  # (H, W, 3) float32 unit, world axes, towards the camera; 0 where nothing is hit
+
+
+@dataclass
 class Scene:
-    """Shapes with one texture each, rectangles first.
+    """Solids with materials under lamps. z is up, lengths are metres.
 
-    Args:
-        textures: (h, w, 3) sRGB float32, one a shape; a sphere's is a longitude × latitude map.
-        gloss: strength of the lamp's reflection on each sphere: the one part of the picture that depends on the view.
+    Attributes:
+        ambient: (above, below) linear light from all directions, on surfaces that face up and down.
+        free: (2, 3) box in which a camera can move without leaving the scene; what stands in it is told by `clearance`.
+        focus: (3,) what there is to look at.
+        background: what rays see that hit nothing; None: black, at no cost.
+        highlights: the lamps' reflection on glossy materials; None: none, at no cost.
     """
 
-    def __init__(self, rectangles: list[Rectangle], spheres: list[Sphere], textures: list[Array], gloss: list[float], light: Light) -> None:
-        self.light = light
-        self.shapes = Shapes(rectangles, spheres)
-        self.gloss = torch.tensor(gloss, dtype=torch.float32)
-        lit = [
-            texture.clip(0, 1) ** GAMMA * self._baked(rectangles + spheres, number, texture.shape[0], texture.shape[1])[..., None]
-            for number, texture in enumerate(textures)
-        ]
-        self._height = torch.tensor([texture.shape[0] for texture in textures])
-        self._width = torch.tensor([texture.shape[1] for texture in textures])
-        self._first = torch.tensor(np.cumsum([0, *[texture.shape[0] * texture.shape[1] for texture in textures]])[:-1])
-        self._texels = torch.from_numpy(np.concatenate([texture.reshape(-1, 3) for texture in lit]).astype(np.float32))
+    kind: str
+    solids: Solids
+    materials: Materials
+    bank: TextureBank
+    lamps: list[Lamp]
+    ambient: tuple[tuple[float, float, float], tuple[float, float, float]]
+    free: Array
+    focus: Array
+    background: Background | None = None
+    highlights: Highlights | None = None
+    _device: torch.device = field(default_factory=lambda: torch.device("cpu"))
 
-    def picture(self, intrinsics: Intrinsics, world_from_camera: Array, samples: int = 2) -> Array:
-        """(H, W, 3) uint8 sRGB; every pixel is the mean of samples × samples rays. Black where no shape is."""
-        fine = intrinsics.scaled(intrinsics.width * samples, intrinsics.height * samples)
-        origins, directions, _ = rays(fine, world_from_camera, pixel_grid(fine.width, fine.height))
-        hits = self.shapes.cast(origins[:1], directions)
-        linear = self._colour(hits, origins[:1], directions)
-        mean = linear.reshape(intrinsics.height, samples, intrinsics.width, samples, 3).mean(dim=(1, 3))
-        return (mean.clamp(0, 1) ** (1 / GAMMA) * 255).round().to(torch.uint8).numpy()
+    @classmethod
+    def build(cls, kind: str, solids: list[Solid], materials: list[Material], bank: TextureBank, **rest: object) -> Scene:
+        return cls(kind, Solids(solids), Materials(materials), bank, **rest)  # type: ignore[arg-type]
 
-    def depth(self, intrinsics: Intrinsics, world_from_camera: Array) -> Array:
-        """(H, W) float32 depth along z at pixel centres; 0 where no shape is."""
-        origins, directions, cosine = rays(intrinsics, world_from_camera, pixel_grid(intrinsics.width, intrinsics.height))
-        hits = self.shapes.cast(origins[:1], directions)
-        depth = torch.where(hits.distance < FAR, hits.distance * cosine, 0.0)
-        return depth.reshape(intrinsics.height, intrinsics.width).numpy()
+    @property
+    def device(self) -> torch.device:
+        return self._device
 
-    def _colour(self, hits: Hits, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-        """(N, 3) linear colour: the baked texture between its four nearest texels, and the gloss of spheres."""
-        shape = hits.shape.clamp(min=0)
-        height, width, first = self._height[shape], self._width[shape], self._first[shape]
-        x, y = hits.u * width - 0.5, hits.v * height - 0.5
-        column, row = x.floor(), y.floor()
-        right, below = (x - column)[:, None], (y - row)[:, None]
-        round_about = shape >= self.shapes.rectangles  # longitudes wrap
-        last = width - 1
-        left, past = (torch.where(round_about, c % width, c.clamp(min=0).minimum(last)) for c in (column.long(), column.long() + 1))
-        upper, lower = (first + r.clamp(min=0).minimum(height - 1) * width for r in (row.long(), row.long() + 1))
-        top = torch.lerp(self._texels[upper + left], self._texels[upper + past], right)
-        bottom = torch.lerp(self._texels[lower + left], self._texels[lower + past], right)
-        colour = torch.lerp(top, bottom, below)
-        balls = round_about.nonzero()[:, 0]
-        if len(balls):
-            colour[balls] += self._gloss(balls, hits, origins, directions)
-        colour[hits.shape < 0] = 0
-        return colour
+    def to(self, device: torch.device | str) -> Scene:
+        """The same scene with its tensors on another device."""
+        moved = Materials(self.materials.items, device)
+        return replace(self, solids=self.solids.to(device), materials=moved, bank=self.bank.to(device), _device=torch.device(device))
 
-    def _gloss(self, balls: torch.Tensor, hits: Hits, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-        """(B, 1) Phong reflection of the lamp on the spheres that were hit."""
-        which = hits.shape[balls] - self.shapes.rectangles
-        ray = directions[balls]
-        point = origins + hits.distance[balls, None] * ray
-        normal = (point - self.shapes.centre[which]) / self.shapes.radius[which, None]
-        mirrored = ray - 2 * (ray * normal).sum(1, keepdim=True) * normal
-        to_lamp = torch.nn.functional.normalize(torch.tensor(self.light.lamp) - point, dim=1)
-        return self.gloss[which, None] * (mirrored * to_lamp).sum(1, keepdim=True).clamp(min=0) ** 24
+    def clearance(self, points: Tensor) -> Tensor:
+        """(N,) metres from (N, 3) points to the nearest surface; negative inside a solid or outside the room."""
+        return self.solids.clearance(points.to(self.device, torch.float32))
 
-    def _baked(self, shapes: list[Rectangle | Sphere], number: int, height: int, width: int) -> Array:
-        """(height, width) light that arrives at a shape: soft shadow of the lamp and the visible part of the sky.
+    def render(self, intrinsics: Intrinsics, world_from_camera: Array, side: int = EDGE_SIDE) -> Rendered:
+        """A pinhole camera's picture, depth and normals.
 
-        It does not depend on the view, so it is found once per texture, on a grid of about a twelfth of its size.
+        Args:
+            world_from_camera: (4, 4).
+            side: pixels that hold an edge are the mean of side × side rays; 1: one ray a pixel everywhere.
         """
-        rows, columns = max(height // 12, 12), max(width // 12, 12)
-        v, u = np.mgrid[0:rows, 0:columns].astype(np.float64)
-        u, v = (u.ravel() + 0.5) / columns, (v.ravel() + 0.5) / rows
-        points, normals = surface(shapes[number], u, v)
-        at, up = torch.tensor(points, dtype=torch.float32), torch.tensor(normals, dtype=torch.float32)
-        at = at + 1e-3 * up
-        generator = np.random.default_rng(number)
-        lamp = torch.zeros(len(at))
-        for offset in _ball(generator, self.light.samples) * self.light.radius:
-            to_lamp = torch.tensor(np.array(self.light.lamp) + offset, dtype=torch.float32) - at
-            distance = to_lamp.norm(dim=1)
-            towards = to_lamp / distance[:, None]
-            facing = (towards * up).sum(1).clamp(min=0)
-            lit = (facing > 0).nonzero()[:, 0]
-            clear = ~self.shapes.blocked(at[lit], towards[lit], float(distance.min()) * 0.999)
-            lamp[lit] += facing[lit] * clear / self.light.samples
-        sky = torch.zeros(len(at))
-        for offset in _sphere(generator, self.light.sky_samples):
-            # Normal plus a point on the unit sphere: directions with a density of the cosine, as the irradiance asks for.
-            towards = torch.nn.functional.normalize(up + torch.tensor(offset, dtype=torch.float32), dim=1)
-            sky += ~self.shapes.blocked(at, towards, 1.2) / self.light.sky_samples
-        light = (self.light.lamp_strength * lamp + self.light.sky_strength * sky).reshape(1, 1, rows, columns)
-        smooth = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(light, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
-        return torch.nn.functional.interpolate(smooth, size=(height, width), mode="bilinear")[0, 0].numpy()
+        width, height = intrinsics.width, intrinsics.height
+        order, back = (index.to(self.device) for index in tile_order(width, height))
+        grid = pixel_grid(width, height)
+        origins, directions, cosine = rays(intrinsics, np.asarray(world_from_camera, dtype=np.float64), grid)
+        origin = origins[:1].to(self.device)
+        spread = 1 / intrinsics.fx
+        seen = self.see(Rays(origin, directions.to(self.device)[order], spread))
+        linear = seen.linear
+        if side > 1:
+            edge = edges(seen.part[back].reshape(height, width)).reshape(-1)[order].nonzero()[:, 0]
+            if len(edge):
+                centres = grid[order[edge].cpu().numpy()]
+                steps = (np.arange(side) + 0.5) / side - 0.5
+                inside = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(1, -1, 2)
+                _, finer, _ = rays(intrinsics, np.asarray(world_from_camera, dtype=np.float64), (centres[:, None] + inside).reshape(-1, 2))
+                fine = self.see(Rays(origin, finer.to(self.device), spread / side)).linear
+                linear[edge] = fine.reshape(len(edge), side * side, 3).mean(1)
+        hit = seen.distance < FAR
+        depth = torch.where(hit, seen.distance * cosine.to(self.device)[order], 0.0)
+        return Rendered(
+            transfer.encode(linear)[back].reshape(height, width, 3),
+            depth[back].reshape(height, width),
+            seen.normals[back].reshape(height, width, 3),
+        )
+
+    def see(self, beam: Rays) -> Seen:
+        """What rays see: light, distance, normals and material, one row a ray."""
+        origins, directions = beam.origins, beam.directions
+        distance, solid = cast(self.solids, origins, directions)
+        hit = (solid >= 0).nonzero()[:, 0]
+        every = len(hit) == len(solid)
+
+        def at_hits(values: Tensor) -> Tensor:
+            return values if every else values[hit]
+
+        def spread_out(values: Tensor) -> Tensor:
+            return values if every else values.new_zeros(len(solid), *values.shape[1:]).index_copy_(0, hit, values)
+
+        ray, far, number = at_hits(directions), at_hits(distance), at_hits(solid)
+        start = origins if len(origins) == 1 else at_hits(origins)
+        points = start + far[:, None] * ray
+        face, place, normals = self.solids.surface(number, points)
+        slant = (ray * normals).sum(1).abs().clamp(min=0.1).sqrt()  # between the narrow and the wide side of the footprint
+        material = self.solids.materials[number, face]
+        albedo = self.materials.albedo(self.bank, material, place, far * beam.spread / slant)
+        gloss = self.materials.gloss[material]
+        part = number * 6 + face + 1
+        linear = albedo * self._ambient(points, normals)
+        for lamp in self.lamps:
+            light, to_lamp, shadow = self._lamp(lamp, points, normals)
+            colour = torch.tensor(lamp.colour, dtype=torch.float32, device=self.device)
+            linear = torch.addcmul(linear, albedo * colour, light[:, None])
+            if self.highlights is not None:
+                shine = highlights.forward(self.highlights, ray, normals, to_lamp, gloss, self.materials.sharpness[material])
+                linear = torch.addcmul(linear, (shine * (light > 0))[:, None], colour)
+            part = 2 * part + shadow
+        linear, part = spread_out(linear), spread_out(part)
+        if not every and self.background is not None:
+            missed = (solid < 0).nonzero()[:, 0]
+            linear[missed] = background.forward(self.background, directions[missed])
+        return Seen(linear, distance, spread_out(normals), spread_out(albedo), spread_out(gloss), part)
+
+    def _ambient(self, points: Tensor, normals: Tensor) -> Tensor:
+        """(N, 3) light from all around: by the normal's height, less near a room's walls."""
+        above, below = (torch.tensor(colour, dtype=torch.float32, device=self.device) for colour in self.ambient)
+        share = 0.5 + 0.5 * normals[:, 2:]
+        light = below + share * (above - below)
+        first, last = self.solids.ranges[ROOM]
+        for room in range(first, last):
+            turn = self.solids.rotation[room]
+            local = (points - self.solids.centre[room]) @ turn
+            gap = (self.solids.half[room] - local.abs()).clamp(min=0)
+            away = 1 - (normals @ turn).abs()
+            light = light * (1 - 0.4 * away * torch.exp(-gap / CORNER)).prod(1, keepdim=True)
+        return light
+
+    def _lamp(self, lamp: Lamp, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(N,) light of one lamp that arrives, unit directions to it (N, 3), and (N,) int64 1 where it is shadowed."""
+        position = torch.tensor([lamp.position], dtype=torch.float32, device=self.device)
+        gap = position - points
+        distance = gap.norm(dim=1)
+        to_lamp = gap / distance[:, None]
+        facing = (to_lamp * normals).sum(1)
+        light = facing.clamp(min=0)
+        if lamp.reach is not None:
+            light = light * (2 * lamp.reach**2 / (lamp.reach**2 + distance.square()))
+        lit = (facing > 0).nonzero()[:, 0]
+        # From the lamp to the points: all rays start at one place, and neighbours stay neighbours.
+        reached, _ = cast(self.solids, position, -to_lamp[lit])
+        blocked = reached < distance[lit] * (1 - 1e-3) - 2e-3
+        shadow = torch.zeros(len(points), dtype=torch.int64, device=self.device)
+        shadow[lit] = blocked.long()
+        return light * (1 - shadow), to_lamp, shadow
 
 
-def surface(shape: Rectangle | Sphere, u: Array, v: Array) -> tuple[Array, Array]:
-    """Points (N, 3) and outward normals (N, 3) at texture places u, v (N,)."""
-    if isinstance(shape, Rectangle):
-        points = shape.corner + u[:, None] * shape.across + v[:, None] * shape.down
-        normal = np.cross(shape.down, shape.across)
-        return points, np.broadcast_to(normal / np.linalg.norm(normal), points.shape)
-    longitude, latitude = (u - 0.5) * 2 * np.pi, v * np.pi
-    normals = np.stack([np.cos(longitude) * np.sin(latitude), np.sin(longitude) * np.sin(latitude), np.cos(latitude)], axis=1)
-    return shape.centre + shape.radius * normals, normals
-
-
-def _sphere(generator: np.random.Generator, count: int) -> Array:
-    """(count, 3) evenly spread unit vectors, turned by a random angle."""
-    index = np.arange(count) + 0.5
-    z = 1 - 2 * index / count
-    angle = index * np.pi * (3 - np.sqrt(5)) + generator.uniform(0, 2 * np.pi)
-    return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
-
-
-def _ball(generator: np.random.Generator, count: int) -> Array:
-    """(count, 3) points spread through the unit ball."""
-    return _sphere(generator, count) * np.cbrt(generator.permutation(count) + 0.5)[:, None] / np.cbrt(count)
+def edges(part: Tensor) -> Tensor:
+    """(H, W) bool: pixels whose right, left, upper or lower neighbour shows another part."""
+    out = torch.zeros_like(part, dtype=torch.bool)
+    across, down = part[:, 1:] != part[:, :-1], part[1:] != part[:-1]
+    out[:, 1:] |= across
+    out[:, :-1] |= across
+    out[1:] |= down
+    out[:-1] |= down
+    return out

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from toolkit.camera import Array, Intrinsics, project, unproject
-from toolkit.simulate.scene import Light, Scene, _ball, _sphere
+from toolkit.simulate.baked import BakedScene, Light, _ball, _sphere
 from toolkit.simulate.trace import Rectangle, Sphere
 
 CAMERA = Intrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
@@ -22,7 +22,7 @@ def quadrants() -> Array:
 
 def test_textures_are_upright_and_not_mirrored() -> None:
     """A wall seen from its front shows its texture as one looks at a picture: the first row up, the first column left."""
-    scene = Scene([WALL], [], [quadrants()], [], EVEN)
+    scene = BakedScene([WALL], [], [quadrants()], [], EVEN)
     picture = scene.picture(CAMERA, FRONT)
     middle, _ = project(CAMERA, FRONT, np.array([[0.0, 0.0, 0.5]]))
     u, v = middle[0].astype(int)
@@ -35,7 +35,7 @@ def test_textures_are_upright_and_not_mirrored() -> None:
 def test_depth_lies_on_the_shapes_and_nothing_is_zero() -> None:
     ball = Sphere(np.array([0.3, -1.0, 0.6]), 0.5)
     wall = Rectangle(np.array([-1.0, 0, 1.4]), np.array([2.0, 0, 0]), np.array([0, 0, -2.0]))
-    scene = Scene([wall], [ball], [quadrants(), quadrants()], [0.0], EVEN)
+    scene = BakedScene([wall], [ball], [quadrants(), quadrants()], [0.0], EVEN)
     depth = scene.depth(CAMERA, FRONT)
     v, u = np.nonzero(depth)
     points = unproject(CAMERA, FRONT, np.stack([u + 0.5, v + 0.5], axis=1), depth[v, u])
@@ -55,8 +55,8 @@ def test_a_ball_throws_a_shadow() -> None:
     turn = np.array([[np.cos(0.6), -np.sin(0.6), 0], [np.sin(0.6), np.cos(0.6), 0], [0, 0, 1]])
     aside[:3, :3] = turn @ FRONT[:3, :3]
     aside[0, 3] = 2.0
-    alone = Scene([WALL], [], [white], [], lamp).picture(CAMERA, aside).astype(float)
-    beside = Scene([WALL], [ball], [white, white], [0.0], lamp).picture(CAMERA, aside).astype(float)
+    alone = BakedScene([WALL], [], [white], [], lamp).picture(CAMERA, aside).astype(float)
+    beside = BakedScene([WALL], [ball], [white, white], [0.0], lamp).picture(CAMERA, aside).astype(float)
     (behind, far), _ = project(CAMERA, aside, np.array([[0.0, 0.0, 0.5], [-0.2, 0.0, -0.6]]))
     shadow, lit = (beside[int(v), int(u)].mean() / alone[int(v), int(u)].mean() for u, v in (behind, far))
     assert shadow < 0.65
@@ -73,14 +73,14 @@ def test_gloss_moves_with_the_view() -> None:
         pose = FRONT.copy()
         pose[0, 3] = right
         (u, v), _ = project(CAMERA, pose, point)[0][0], None
-        return float(Scene([], [ball], [grey], [gloss], lamp).picture(CAMERA, pose, samples=3)[int(v), int(u)].mean())
+        return float(BakedScene([], [ball], [grey], [gloss], lamp).picture(CAMERA, pose, samples=3)[int(v), int(u)].mean())
 
     assert abs(seen(0.0, 0.0) - seen(0.0, 1.0)) < 4
     assert seen(0.4, 0.0) - seen(0.4, 1.0) > 15
 
 
 def test_supersampling_smooths_edges() -> None:
-    scene = Scene([WALL], [], [np.ones((64, 64, 3), dtype=np.float32)], [], EVEN)
+    scene = BakedScene([WALL], [], [np.ones((64, 64, 3), dtype=np.float32)], [], EVEN)
     tilted = FRONT.copy()
     tilt = np.array([[np.cos(0.2), -np.sin(0.2), 0], [np.sin(0.2), np.cos(0.2), 0], [0, 0, 1]])
     tilted[:3, :3] = FRONT[:3, :3] @ tilt

@@ -1,0 +1,139 @@
+"""Procedural scenes: every kind can be filmed, is exact, the same for the same seed, and the same along any rays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from toolkit.camera import Array, Intrinsics, project, unproject
+from toolkit.errors import InputError
+from toolkit.simulate.cast import FAR
+from toolkit.simulate.materials import TextureBank, texture_bank
+from toolkit.simulate.procedural import KINDS, random_scene
+from toolkit.simulate.scene import Lamp, Rays, Scene
+
+CAMERA = Intrinsics(96, 72, 80.0, 80.0, 48.0, 36.0)
+
+
+@pytest.fixture(scope="module")
+def bank() -> TextureBank:
+    return texture_bank(size=128)
+
+
+def looking(at: Array, target: Array) -> Array:
+    forward = (target - at) / np.linalg.norm(target - at)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(forward, right), forward, at], axis=1)
+    return pose
+
+
+def standing(scene: Scene, seed: int = 0, clear: float = 0.25) -> Array:
+    """A place to film from."""
+    places = np.random.default_rng(seed).uniform(*scene.free, (200, 3))
+    apart = (scene.clearance(torch.tensor(places)).numpy() > clear) & (np.linalg.norm((places - scene.focus)[:, :2], axis=1) > 0.8)
+    assert apart.mean() > 0.3
+    return np.asarray(places[apart][0])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_is_exact(kind: str, bank: TextureBank) -> None:
+    """Depth lies on surfaces, normals are the depth's, colours are sane, and no pixel of a closed room is empty."""
+    scene = random_scene(kind, np.random.default_rng(3), bank)
+    pose = looking(standing(scene), scene.focus)
+    got = scene.render(CAMERA, pose)
+    rgb, depth, normals = got.rgb.numpy(), got.depth.numpy(), got.normals.numpy()
+    assert rgb.shape == normals.shape == (72, 96, 3) and depth.shape == (72, 96)
+    assert rgb.min() >= 0 and rgb.max() <= 1 and 0.1 < rgb.mean() < 0.9
+    v, u = np.nonzero(depth)
+    assert kind == "street" or len(v) == 72 * 96
+    points = unproject(CAMERA, pose, np.stack([u + 0.5, v + 0.5], axis=1), depth[v, u])
+    off = scene.clearance(torch.tensor(points)).abs().numpy()
+    assert np.quantile(off, 0.98) < 2e-3  # the distance to ellipsoids is a bound, that to all else is exact
+    towards = pose[:3, 3] - points
+    assert ((normals[v, u] * towards).sum(1) > -1e-4).all()
+    # Neighbours on one flat face: their difference is perpendicular to the normal.
+    grid = np.full((72, 96, 3), np.nan)
+    grid[v, u] = points
+    step = grid[:, 1:] - grid[:, :-1]
+    same = np.abs(normals[:, 1:] - normals[:, :-1]).max(2) < 1e-6
+    near = np.linalg.norm(step, axis=2) < 0.05 * depth[:, 1:]
+    flat = np.abs((step * normals[:, 1:]).sum(2))[same & near]
+    assert len(flat) > 500 and np.quantile(flat, 0.9) < 1e-3  # but for parallel faces one behind the other
+
+
+@pytest.mark.parametrize("kind", ["room", "street"])
+def test_views_agree(kind: str, bank: TextureBank) -> None:
+    """What one view sees, another sees with the same colour where it is not hidden: nothing depends on the view."""
+    scene = random_scene(kind, np.random.default_rng(1), bank)
+    scene.highlights = None
+    first = looking(standing(scene, 1), scene.focus)
+    second = first.copy()
+    second[:3, 3] += 0.12 * first[:3, 0]
+    a, b = scene.render(CAMERA, first), scene.render(CAMERA, second)
+    v, u = np.mgrid[2:70:3, 2:94:3].reshape(2, -1)
+    depth = a.depth.numpy()[v, u]
+    v, u, depth = v[depth > 0], u[depth > 0], depth[depth > 0]
+    pixels, away = project(CAMERA, second, unproject(CAMERA, first, np.stack([u + 0.5, v + 0.5], axis=1), depth))
+    x, y = np.floor(pixels).astype(int).T
+    inside = (x >= 0) & (y >= 0) & (x < 96) & (y < 72)
+    seen = inside.copy()
+    seen[inside] = np.abs(b.depth.numpy()[y[inside], x[inside]] / away[inside] - 1) < 0.01
+    assert seen.sum() > 200
+    difference = np.abs(a.rgb.numpy()[v, u] - b.rgb.numpy()[y.clip(0, 71), x.clip(0, 95)]).mean(1)
+    assert np.median(difference[seen]) < 0.05
+
+
+def test_the_same_seed_gives_the_same_scene_and_another_another(bank: TextureBank) -> None:
+    pose = looking(np.array([0.9, 0.9, 1.4]), np.array([0, 0, 0.5]))
+    pictures = [random_scene("room", np.random.default_rng(seed), bank).render(CAMERA, pose).rgb for seed in (5, 5, 6)]
+    assert torch.equal(pictures[0], pictures[1])
+    assert not torch.allclose(pictures[0], pictures[2], atol=0.1)
+
+
+def test_scenes_are_diverse(bank: TextureBank) -> None:
+    counts = {len(random_scene("room", np.random.default_rng(seed), bank).solids) for seed in range(12)}
+    assert len(counts) > 5 and min(counts) > 10
+
+
+def test_a_picture_is_the_same_as_its_rays_in_any_order(bank: TextureBank) -> None:
+    scene = random_scene("table", np.random.default_rng(2), bank)
+    pose = looking(standing(scene), scene.focus)
+    picture = scene.render(CAMERA, pose, side=1)
+    pixels = np.random.default_rng(0).permutation(96 * 72)[:500]
+    from toolkit.camera import pixel_grid, rays
+
+    origins, directions, cosine = rays(CAMERA, pose, pixel_grid(96, 72)[pixels])
+    seen = scene.see(Rays(origins, directions, 1 / CAMERA.fx))  # an origin a ray, scattered
+    torch.testing.assert_close(seen.distance * cosine, picture.depth.reshape(-1)[pixels], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(seen.normals, picture.normals.reshape(-1, 3)[pixels], atol=1e-3, rtol=0)
+
+
+def test_edges_are_smooth_with_more_rays_and_flat_parts_do_not_change(bank: TextureBank) -> None:
+    scene = random_scene("thin", np.random.default_rng(2), bank)
+    pose = looking(standing(scene), scene.focus)
+    coarse, fine = scene.render(CAMERA, pose, side=1).rgb, scene.render(CAMERA, pose, side=3).rgb
+    changed = ((coarse - fine).abs().amax(2) > 0).float().mean()
+    assert 0.05 < changed < 0.9
+    reference = scene.render(CAMERA.scaled(960, 720), pose, side=1).rgb.reshape(72, 10, 96, 10, 3).mean(dim=(1, 3))
+    assert (fine - reference).square().mean() < 0.7 * (coarse - reference).square().mean()
+
+
+def test_lamps_throw_shadows(bank: TextureBank) -> None:
+    scene = random_scene("sphere", np.random.default_rng(0), bank)
+    scene.lamps = [Lamp((0.0, 0.0, 2.5), (0.9, 0.9, 0.9))]
+    below, beside = torch.tensor([[0.0, 0.0, -1.0]]), torch.tensor([[0.6, 0.0, -1.0]])
+    origin = torch.tensor([[0.9, 0.9, 0.4]])  # beside the stand: its lower part is what shadows the floor beneath it
+    under = torch.nn.functional.normalize(torch.tensor([[0.0, 0.0, 0.002]]) + below, dim=1)
+    seen = scene.see(Rays(origin, torch.cat([below, torch.nn.functional.normalize(beside, dim=1)]), 1e-3))
+    assert (seen.distance < FAR).all() and under.shape == (1, 3)
+    without = scene.see(Rays(origin, below, 1e-3)).linear
+    scene.lamps = []
+    assert (scene.see(Rays(origin, below, 1e-3)).linear < without).all()
+
+
+def test_unknown_kinds_are_refused() -> None:
+    with pytest.raises(InputError, match="did you mean 'room'"):
+        random_scene("rooms", np.random.default_rng(0))
