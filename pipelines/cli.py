@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines import evaluate, export, finetune, info, poses, render, run, tsdf
+from pipelines import evaluate, export, finetune, info, poses, render, run, train, tsdf
 from pipelines.options import Json
 from toolkit import __version__
 from toolkit.errors import FieldfuseError, Interrupted
@@ -81,7 +81,17 @@ def _fail(text: str, code: int, error: BaseException | None = None) -> None:
     sys.exit(code)
 
 
-for _command in (run.run, poses.poses, tsdf.tsdf, finetune.finetune, render.render, export.export, evaluate.evaluate, info.info):
+for _command in (
+    run.run,
+    poses.poses,
+    tsdf.tsdf,
+    finetune.finetune,
+    render.render,
+    export.export,
+    evaluate.evaluate,
+    info.info,
+    train.train,
+):
     app.command()(_command)
 
 

@@ -1,0 +1,40 @@
+"""`fieldfuse train`: train the NeRFusion networks across scenes; under `torchrun`, on many devices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipelines.options import Quiet, Threads
+
+
+def train(
+    config: Annotated[Path | None, typer.Option(help="Training settings (YAML); see configs/train/ and docs/training.md.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of checkpoints, learning curve, validation pictures and weights.")] = Path("training"),
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint in the folder.")] = False,
+    steps: Annotated[int | None, typer.Option(help="Stop after so many steps in all; the schedule stays.", min=1)] = None,
+    threads: Threads = None,
+    quiet: Quiet = False,
+) -> None:
+    """Train the networks that turn pictures into a field without fitting; writes `weights.safetensors`."""
+    from pipelines.job import bound_threads
+
+    bound_threads({"flags": {"threads": threads}})
+    from pipelines.console import make_progress
+    from pipelines.job import set_threads
+    from toolkit.training.nerfusion.distributed import join_crew
+    from toolkit.training.nerfusion.settings import load_train_settings
+    from toolkit.training.nerfusion.train import WEIGHTS, Trainer
+
+    settings = load_train_settings(config)
+    set_threads(threads or settings.threads)
+    with join_crew(settings.device) as crew:
+        trainer = Trainer(settings, out, crew, resume)
+        progress = make_progress(quiet or not crew.leads)
+        with progress.listening():
+            progress.begin("training")
+            taken = trainer.run(steps, progress)
+    if crew.leads and not quiet:
+        typer.echo(f"{out / WEIGHTS} ({taken} steps)")

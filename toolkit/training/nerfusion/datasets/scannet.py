@@ -1,0 +1,42 @@
+"""ScanNet: `scans/sceneXXXX_YY/{color,depth,pose,intrinsic}` as the site's exporter writes them; video of rooms with depth, metres.
+
+A `scannetv2_train.txt` beside the scans names the training scenes; without it every scene is used.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from toolkit.capture.scannet import read_scannet
+from toolkit.errors import InputError
+from toolkit.training.nerfusion.captured import CapturedScene
+from toolkit.training.nerfusion.datasets.folders import listed, scene_folders
+
+LISTS = ("scannetv2_train.txt", "train.txt")
+
+
+def _is_scene(path: Path) -> bool:
+    return (path / "color").is_dir() and (path / "pose").is_dir()
+
+
+def scannet_folders(root: Path | str) -> list[Path]:
+    """The training scenes under `root`.
+
+    Raises:
+        InputError: there is none, or none of those that the list names.
+    """
+    folders = scene_folders(root, _is_scene, "ScanNet", inside=("scans", "scans_train"))
+    wanted = listed(Path(root), LISTS)
+    chosen = folders if wanted is None else [path for path in folders if path.name in wanted]
+    if not chosen:
+        raise InputError(f"none of the scenes that the list in {root} names is there; export them or remove the list")
+    return chosen
+
+
+def scannet_scene(folder: Path, long_side: int) -> CapturedScene:
+    """One scan.
+
+    Raises:
+        InputError: it cannot be read as ScanNet's exported layout.
+    """
+    return CapturedScene(read_scannet(folder), "room", long_side)

@@ -1,0 +1,108 @@
+"""Losses of training across scenes: squared colour error as in the paper, opacity of solid rays, and the auxiliary depth likelihood.
+
+The paper trains on colours alone. The two others are additions: the opacity term says that rays which meet a surface end, and the depth
+term, which is annealed to zero early, keeps the networks from settling in fog that explains the colours just as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from toolkit.render.composite import ray_sum
+from toolkit.training.nerfusion.rays import TargetRays
+
+Tensor = torch.Tensor
+WIDTH = 0.03  # relative: how close to the true distance a weight counts as right
+FLOOR = 1e-3  # smallest likelihood: a ray with no weight near the truth costs this much and no more
+
+
+@dataclass(frozen=True)
+class Traced:
+    """What a renderer answers for R rays.
+
+    Attributes:
+        colour: (R, 3), already over its background.
+        opacity: (R,).
+        weight, distance: (S,) of all samples, distances along the rays.
+        ray: (S,) int64.
+    """
+
+    colour: Tensor
+    opacity: Tensor
+    weight: Tensor
+    distance: Tensor
+    ray: Tensor
+
+    def mean_distance(self) -> Tensor:
+        """(R,) expected distance where the ray ends; 0 where it is empty."""
+        total = ray_sum(self.weight * self.distance, self.ray, len(self.opacity))
+        return total / self.opacity.clamp_min(1e-6) * (self.opacity > 1e-3)
+
+    def median_distance(self) -> Tensor:
+        """(R,) distance at which half of a ray's own opacity is reached; 0 where it is empty. No gradient."""
+        with torch.no_grad():
+            rays = len(self.opacity)
+            total = torch.cumsum(self.weight.double(), 0)
+            before = torch.zeros(rays, dtype=torch.float64, device=total.device)
+            opacity = ray_sum(self.weight.double(), self.ray, rays)
+            before[1:] = opacity.cumsum(0)[:-1]
+            reached = total - before[self.ray] >= 0.5 * opacity[self.ray]
+            far = torch.full((rays,), torch.inf, device=self.distance.device)
+            found = far.scatter_reduce(0, self.ray, torch.where(reached, self.distance, torch.inf), "amin")
+            return torch.where(torch.isfinite(found) & (self.opacity > 1e-3), found, 0.0)
+
+
+def depth_likelihood(traced: Traced, distance: Tensor, width: float = WIDTH) -> tuple[Tensor, Tensor]:
+    """How much of each ray's weight lies where the surface truly is.
+
+    Args:
+        distance: (R,) true distances, 0 = unknown.
+        width: standard deviation of the window around them, relative to the distance.
+
+    Returns:
+        (R',) natural logarithm of Σ_i w_i exp(−½ ((t_i − t*) / (width · t*))²), not below log `FLOOR`, for the rays with a known
+        distance; and (R,) bool, which those are.
+    """
+    known = distance > 0
+    safe = torch.where(known, distance, torch.ones_like(distance))
+    true = safe[traced.ray]
+    window = torch.exp(-0.5 * ((traced.distance - true) / (width * true)).square())
+    mass = ray_sum(traced.weight * window, traced.ray, len(distance))
+    return torch.log(mass[known].clamp(0, 1) + FLOOR), known
+
+
+@dataclass(frozen=True)
+class LossParts:
+    """The loss of one rendering and what it is made of."""
+
+    total: Tensor
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+
+
+def rendering_loss(traced: Traced, rays: TargetRays, opacity_weight: float, depth_weight: float) -> LossParts:
+    """colour: mean squared error over rays and channels. opacity: mean of (1 − A)² over solid rays. depth: mean −log likelihood."""
+    colour = (traced.colour - rays.colour).square().mean()
+    zero = colour.new_zeros(())
+    solid = rays.solid
+    opacity = (1 - traced.opacity[solid]).square().mean() if bool(solid.any()) else zero
+    depth = zero
+    if depth_weight > 0:
+        likelihood, _ = depth_likelihood(traced, rays.distance)
+        depth = -likelihood.mean() if len(likelihood) else zero
+    return LossParts(colour + opacity_weight * opacity + depth_weight * depth, colour, opacity, depth)
+
+
+def annealed(start: float, step: int, steps: int) -> float:
+    """A weight that falls from `start` to exactly zero over `steps` steps, first slowly, then faster (half a cosine)."""
+    if steps <= 0 or step >= steps:
+        return 0.0
+    return float(start * 0.5 * (1 + torch.cos(torch.tensor(step / steps * torch.pi, dtype=torch.float64))))
+
+
+def psnr(error: Tensor | float) -> float:
+    """Mean squared error → decibels."""
+    return float(-10 * torch.log10(torch.as_tensor(error, dtype=torch.float64).clamp_min(1e-10)))

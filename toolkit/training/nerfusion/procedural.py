@@ -1,0 +1,110 @@
+"""Endless training scenes: procedural geometry and textures, random cameras and sizes, drawn frame by frame as samples ask for them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+import torch
+
+from toolkit.camera import Array, Intrinsics
+from toolkit.errors import InputError
+from toolkit.simulate.materials import TextureBank, texture_bank
+from toolkit.simulate.procedural import random_scene
+from toolkit.training.nerfusion.paths import around, hand_held
+from toolkit.training.nerfusion.samples import Pictures
+
+OBJECTS = ("table", "table", "thin", "sphere")
+ROOMS = ("room", "room", "room", "table", "table", "corridor", "street", "thin", "wall")
+SHAPES = (4 / 3, 4 / 3, 3 / 4, 16 / 9, 9 / 16, 1.0)  # width by height
+BANKS = 8  # sets of textures that scenes choose from
+TEXELS = 256  # a side of a texture: training pictures are small
+TRIES = 6
+
+
+@lru_cache(maxsize=BANKS)
+def _bank(number: int) -> TextureBank:
+    return texture_bank(number, TEXELS)
+
+
+class ProceduralScene:
+    """One random scene with a path through it.
+
+    Objects are looked at from around; rooms are filmed by hand. Lengths are multiplied by a random factor, so that nothing in a sample
+    tells metres from centimetres.
+
+    Args:
+        kind: "object" or "room".
+        bank: set of textures, 0 … `BANKS` − 1.
+        frames: cameras on the path.
+
+    Raises:
+        InputError: no path was found after several scenes.
+    """
+
+    ordered: bool
+    depth_hint: float | None
+
+    def __init__(self, kind: str, rng: np.random.Generator, long_side: int, frames: int, bank: int = 0) -> None:
+        self.kind = kind
+        poses = None
+        for _ in range(TRIES):
+            named = str(rng.choice(OBJECTS if kind == "object" else ROOMS))
+            self._scene = random_scene(named, rng, _bank(bank))
+            self.name = f"procedural {named}"
+            focus = np.asarray(self._scene.focus, dtype=np.float64)
+            make = around if kind == "object" and rng.random() < 0.75 else hand_held
+            poses = make(rng, frames, np.asarray(self._scene.free), focus, self._clearance)
+            if poses is not None:
+                break
+        if poses is None:
+            raise InputError(f"no camera path fits into {TRIES} procedural scenes; give fewer pictures.frames")
+        self.ordered = make is hand_held
+        self.depth_hint = None
+        self._scale = float(np.exp(rng.uniform(np.log(0.05), np.log(2.0))))
+        self._poses = poses
+        self.world_from_camera = poses.copy()
+        self.world_from_camera[:, :3, 3] *= self._scale
+        self._camera = _camera(rng, long_side)
+        # Exposure and white balance differ between captures, not within one.
+        self._gain = torch.from_numpy(np.exp(rng.normal(0, 0.12) + rng.normal(0, 0.04, 3))).float()
+        self._noise = float(rng.choice([0.0, rng.uniform(0.0, 0.02)]))
+        self._seed = int(rng.integers(2**31))
+        self._drawn: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
+        middle = self._frame(frames // 2)[1]
+        seen = middle[middle > 0]
+        self.depth_hint = float(seen.median()) if len(seen) else None
+
+    def _clearance(self, points: Array) -> Array:
+        return np.asarray(self._scene.clearance(torch.from_numpy(points)).numpy(), dtype=np.float64)
+
+    def _frame(self, index: int) -> tuple[torch.Tensor, torch.Tensor]:
+        if index not in self._drawn:
+            seen = self._scene.render(self._camera, self._poses[index])
+            picture = seen.rgb.permute(2, 0, 1) * self._gain[:, None, None]
+            if self._noise > 0:
+                generator = torch.Generator().manual_seed(self._seed + index)
+                picture = picture + self._noise * torch.randn(picture.shape, generator=generator)
+            self._drawn[index] = picture.clamp(0, 1).contiguous(), seen.depth * self._scale
+        return self._drawn[index]
+
+    def pictures(self, indices: Sequence[int]) -> Pictures:
+        """The frames at `indices`."""
+        drawn = [self._frame(int(index)) for index in indices]
+        c = self._camera
+        return Pictures(
+            images=torch.stack([picture for picture, _ in drawn]),
+            intrinsics=torch.tensor([[c.fx, c.fy, c.cx, c.cy]]).repeat(len(drawn), 1),
+            world_from_camera=torch.from_numpy(self.world_from_camera[list(indices)].astype(np.float32)),
+            depths=torch.stack([depth for _, depth in drawn]),
+        )
+
+
+def _camera(rng: np.random.Generator, long_side: int) -> Intrinsics:
+    """A pinhole camera of 40° to 80° along its long side, of a random shape, its axis a little off the middle."""
+    shape = float(rng.choice(SHAPES))
+    width, height = (long_side, round(long_side / shape)) if shape >= 1 else (round(long_side * shape), long_side)
+    focal = 0.5 * long_side / np.tan(0.5 * np.radians(rng.uniform(40, 80)))
+    cx, cy = (0.5 + rng.normal(0, 0.02, 2)) * [width, height]
+    return Intrinsics(width, height, float(focal), float(focal), float(cx), float(cy))

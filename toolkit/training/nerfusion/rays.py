@@ -1,0 +1,63 @@
+"""Pixels of a sample's targets that a step renders: rays, true colours and true depths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from toolkit.training.nerfusion.samples import Pictures
+
+Tensor = torch.Tensor
+
+
+@dataclass(frozen=True)
+class TargetRays:
+    """Rays of random pixels.
+
+    Attributes:
+        origins, directions: (R, 3), directions of unit length.
+        colour: (R, 3) true colour.
+        distance: (R,) true distance along the ray, 0 = unknown or nothing there.
+        cosine: (R,) depth along z = distance · cosine.
+        solid: (R,) bool, the ray meets something for certain.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    colour: Tensor
+    distance: Tensor
+    cosine: Tensor
+    solid: Tensor
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+
+def rays_through(pictures: Pictures, view: Tensor, row: Tensor, column: Tensor) -> TargetRays:
+    """Rays through pixel centres; `view`, `row`, `column` (R,) int64 into `pictures`."""
+    fx, fy, cx, cy = pictures.intrinsics[view].unbind(1)
+    local = torch.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, torch.ones_like(fx)], 1)
+    cosine = 1 / local.norm(dim=1)
+    pose = pictures.world_from_camera[view]
+    directions = (pose[:, :3, :3] @ (local * cosine[:, None])[:, :, None])[:, :, 0]
+    depth = pictures.depths[view, row, column]
+    solid = torch.ones_like(depth, dtype=torch.bool) if pictures.background is None else depth > 0
+    return TargetRays(pose[:, :3, 3], directions, pictures.images[view, :, row, column], depth / cosine, cosine, solid)
+
+
+def random_rays(pictures: Pictures, targets: Tensor, count: int, generator: torch.Generator) -> TargetRays:
+    """`count` random pixels, evenly over the pictures at `targets` (any shape). The generator is a CPU one, on every device."""
+    height, width = pictures.images.shape[2:]
+    flat = targets.reshape(-1).cpu()
+    view = flat[torch.arange(count) % len(flat)]
+    pixel = torch.randint(height * width, (count,), generator=generator)
+    device = pictures.images.device
+    return rays_through(pictures, view.to(device), (pixel // width).to(device), (pixel % width).to(device))
+
+
+def picture_rays(pictures: Pictures, view: int) -> TargetRays:
+    """All pixels of one picture, row by row."""
+    height, width = pictures.images.shape[2:]
+    pixel = torch.arange(height * width, device=pictures.images.device)
+    return rays_through(pictures, torch.full_like(pixel, view), pixel // width, pixel % width)

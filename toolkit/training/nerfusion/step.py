@@ -1,0 +1,165 @@
+"""One training step: stage 1 learns local volumes alone; stage 2 fuses key frames and learns from local and global volumes at every one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+
+from toolkit.networks.cameras import Cameras
+from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume
+from toolkit.networks.model import NerfusionModel
+from toolkit.render.fused import GAMMA, make_field
+from toolkit.training.nerfusion.health import feature_deviation, rendering_health
+from toolkit.training.nerfusion.losses import Traced, annealed, rendering_loss
+from toolkit.training.nerfusion.rays import TargetRays, random_rays
+from toolkit.training.nerfusion.samples import Pictures, Sample
+from toolkit.training.nerfusion.settings import TrainSettings
+from toolkit.training.nerfusion.tracing import trace
+
+Tensor = torch.Tensor
+LOCAL, FUSED = "local", "fused"
+
+
+@dataclass
+class Outcome:
+    """What a step measured; gradients are in the parameters."""
+
+    loss: float = 0.0
+    depth_loss: float = 0.0
+    numbers: dict[str, list[float]] = field(default_factory=dict)
+
+    def note(self, values: dict[str, float]) -> None:
+        for name, value in values.items():
+            self.numbers.setdefault(name, []).append(value)
+
+    def means(self) -> dict[str, float]:
+        """Each number's mean over the step."""
+        return {name: sum(values) / len(values) for name, values in self.numbers.items()}
+
+
+def cameras_of(pictures: Pictures, indices: Tensor) -> Cameras:
+    """The networks' cameras of some pictures."""
+    height, width = pictures.images.shape[2:]
+    return Cameras.same_size(pictures.intrinsics[indices], pictures.world_from_camera[indices], width, height)
+
+
+def background_of(pictures: Pictures, count: int, generator: torch.Generator | None) -> Tensor:
+    """(3,) or (count, 3) colour behind everything.
+
+    Where every ray meets something it is random for each ray, so that nothing cannot stand in for a surface; grey without a generator.
+    """
+    device = pictures.images.device
+    if pictures.background is not None:
+        return torch.tensor(pictures.background, device=device)
+    if generator is None:
+        return torch.full((3,), 0.5, device=device)
+    return torch.rand(count, 3, generator=generator).to(device)
+
+
+def local_of(model: NerfusionModel, sample: Sample, frame: int, log: Outcome | None = None) -> LocalVolume:
+    """The local volume of key frame `frame` of a sample."""
+    indices = sample.references[frame]
+    cameras = cameras_of(sample.pictures, indices)
+    views = model.encode(sample.pictures.images[indices], cameras)
+    if log is not None:
+        log.note({"feature_deviation": encoder_deviation(model, sample.pictures.images[indices[:1]])})
+    return model.local_volume(views, cameras, Lattice(sample.space, sample.resolution), near=sample.near, far=sample.far)
+
+
+@torch.no_grad()
+def encoder_deviation(model: NerfusionModel, images: Tensor) -> float:
+    """Spatial deviation of the encoder's features on these pictures."""
+    return feature_deviation(model.encoder(images))
+
+
+def render_volume(
+    model: NerfusionModel,
+    volume: LatentVolume,
+    rays: TargetRays,
+    behind: Tensor,
+    near: float,
+    generator: torch.Generator | None,
+    prune: bool,
+) -> Traced:
+    """Render a local or global volume along rays, with gradients where they are enabled."""
+    made = make_field(model, volume, behind if behind.ndim == 1 else behind[0], gamma=GAMMA if prune else None, near=near)
+    return trace(made, rays, behind, generator)
+
+
+class Stepper:
+    """Computes the gradients of steps."""
+
+    def __init__(self, model: NerfusionModel, settings: TrainSettings) -> None:
+        self.model, self.settings = model, settings
+        self.watched = True  # whether what costs extra is measured in this step
+
+    def depth_weight(self, step: int) -> float:
+        """Weight of the auxiliary depth loss at a step."""
+        return annealed(self.settings.loss.depth, step, self.settings.loss.depth_steps)
+
+    def prunes(self, step: int) -> bool:
+        """Whether the fused volume is pruned at a step: only in the later part of stage 2."""
+        stage = self.settings.stage
+        return step >= stage.steps + stage.prune_from * stage.fused_steps
+
+    def _loss(
+        self,
+        volume: LatentVolume,
+        sample: Sample,
+        targets: Tensor,
+        count: int,
+        which: str,
+        step: int,
+        generator: torch.Generator,
+        log: Outcome,
+    ) -> Tensor:
+        rays = random_rays(sample.pictures, targets, count, generator)
+        behind = background_of(sample.pictures, len(rays), generator)
+        prune = which == FUSED and self.prunes(step)
+        traced = render_volume(self.model, volume, rays, behind, 0.5 * sample.near, generator, prune)
+        parts = rendering_loss(traced, rays, self.settings.loss.opacity, self.depth_weight(step))
+        health = rendering_health(traced, rays)
+        log.note({f"psnr_{which}": health.pop("psnr")})
+        if which == LOCAL or self.settings.stage.steps <= step:
+            log.note(health)
+        log.depth_loss += float(parts.depth.detach())
+        return parts.total
+
+    def stage_one(self, sample: Sample, step: int, generator: torch.Generator) -> Outcome:
+        """Local loss of one key frame. Leaves gradients in the parameters."""
+        log = Outcome()
+        volume = local_of(self.model, sample, 0, log if self.watched else None)
+        loss = self._loss(volume, sample, sample.targets[0], self.settings.loss.rays, LOCAL, step, generator, log)
+        loss.backward()
+        log.loss = float(loss.detach())
+        return log
+
+    def stage_two(self, sample: Sample, step: int, generator: torch.Generator) -> Outcome:
+        """Local and global loss at every key frame; the gradient through the state is cut every `stage.truncate` key frames."""
+        log, settings = Outcome(), self.settings
+        frames = len(sample.references)
+        rays = max(1, settings.loss.rays // (2 * frames))
+        state = self.model.start(Lattice(sample.space, sample.resolution))
+        pending: list[Tensor] = []
+        for frame in range(frames):
+            local = local_of(self.model, sample, frame, log if self.watched and frame == 0 else None)
+            state = self.model.fuse(state, local)
+            near = self._loss(local, sample, sample.targets[frame], rays, LOCAL, step, generator, log)
+            # The global volume answers for every place it has seen, not only for the newest.
+            fused = self._loss(state, sample, sample.targets[: frame + 1], rays, FUSED, step, generator, log)
+            pending.append((settings.loss.local * near + settings.loss.fused * fused) / frames)
+            if (frame + 1) % settings.stage.truncate == 0 or frame + 1 == frames:
+                total = torch.stack(pending).sum()
+                total.backward()
+                log.loss += float(total.detach())
+                pending, state = [], state.detached()
+        log.depth_loss /= 2 * frames
+        return log
+
+
+def seeded(seed: int, rank: int, step: int) -> torch.Generator:
+    """The generator of one step's random pixels, the same whenever that step is taken."""
+    # A mixture of the three that keeps neighbouring steps apart; 64 bits are what a generator takes.
+    mixed = (seed * 0x9E3779B97F4A7C15 + rank * 0xC2B2AE3D27D4EB4F + step * 0x165667B19E3779F9) % 2**63
+    return torch.Generator().manual_seed(mixed)

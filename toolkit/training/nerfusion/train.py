@@ -1,0 +1,182 @@
+"""The training loop: samples → gradients → Adam; learning curve, health, validation, checkpoints. Can be stopped and gone on with."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+
+import torch
+
+from toolkit.errors import InputError
+from toolkit.networks.model import NerfusionModel
+from toolkit.networks.weights import config_from, load_model, save_model
+from toolkit.progress import SILENT, Progress
+from toolkit.training.nerfusion.checkpoint import checkpoints, load_checkpoint, save_checkpoint
+from toolkit.training.nerfusion.curve import Curve
+from toolkit.training.nerfusion.distributed import Crew
+from toolkit.training.nerfusion.gates import GateWatch
+from toolkit.training.nerfusion.mixture import Mixture
+from toolkit.training.nerfusion.real import Case, load_cases
+from toolkit.training.nerfusion.settings import TrainSettings, train_settings_dict
+from toolkit.training.nerfusion.step import Outcome, Stepper, seeded
+from toolkit.training.nerfusion.validate import validate
+
+WEIGHTS = "weights.safetensors"
+BETAS = (0.9, 0.999)
+BAD_STEPS = 20  # steps in a row without finite gradients after which training gives up
+
+
+def make_model(settings: TrainSettings) -> NerfusionModel:
+    """The networks as the settings ask, started from `start_from` or by chance from `seed`.
+
+    Raises:
+        InputError: a setting of the networks is not known, or the weights cannot be read.
+    """
+    if settings.start_from is not None:
+        return load_model(settings.start_from).train()
+    try:
+        config = config_from(dict(settings.model))
+    except ValueError as error:
+        raise InputError(f"model: {error}; see docs/training.md") from error
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        return NerfusionModel(config).train()
+
+
+def learning_rate(settings: TrainSettings, step: int) -> float:
+    """Linear warm-up, then half a cosine from the full rate to `final` of it at the last step."""
+    asked = settings.optimiser
+    if step < asked.warmup:
+        return asked.rate * (step + 1) / asked.warmup
+    done = (step - asked.warmup) / max(1, settings.total_steps - asked.warmup)
+    return asked.rate * (asked.final + (1 - asked.final) * 0.5 * (1 + math.cos(math.pi * min(1.0, done))))
+
+
+class Trainer:
+    """One training run in a folder.
+
+    Args:
+        out: folder of checkpoints, `curve.csv`, `curve.png`, `validation-*.png` and `weights.safetensors`; only the crew's leader writes.
+        resume: go on from the newest checkpoint in `out`, when there is one.
+
+    Raises:
+        InputError: data, weights or checkpoint cannot be used.
+    """
+
+    def __init__(self, settings: TrainSettings, out: Path, crew: Crew, resume: bool = False) -> None:
+        self.settings, self.out, self.crew = settings, out, crew
+        self.model = make_model(settings).to(crew.device)
+        self.adam = torch.optim.Adam(self.model.parameters(), lr=settings.optimiser.rate, betas=BETAS)
+        self.mixture = Mixture(settings, crew.rank)
+        self.stepper = Stepper(self.model, settings)
+        self.curve = Curve(out)
+        self.gates = GateWatch(self.model)
+        self.step = 0
+        found = checkpoints(out)
+        if resume and found:
+            self.step = load_checkpoint(found[-1], self.model, self.adam)
+            self.curve.load(self.step)
+        elif found and crew.leads:
+            raise InputError(f"{out} already holds a training run; go on with it by --resume, or choose another --out folder")
+        self.cases: list[Case] = []
+        if crew.leads:
+            self.cases = [case for folder in settings.record.captures for case in load_cases(folder, settings)]
+        self._gathered: list[dict[str, float]] = []
+        self._bad = 0
+
+    def run(self, until: int | None = None, progress: Progress = SILENT) -> int:
+        """Train up to step `until` (the settings' total by default); answers the steps taken in all.
+
+        A request to stop is honoured after the step at hand; what there is is kept.
+
+        Raises:
+            InputError: no finite gradient for many steps, or the data cannot be read.
+            OutputError: results cannot be written.
+        """
+        last = min(until or self.settings.total_steps, self.settings.total_steps)
+        record = self.settings.record
+        saved_at, saved_step = time.monotonic(), -1
+        while self.step < last:
+            row = self.one_step()
+            self._gathered.append(row)
+            self.step += 1
+            if self.step % record.log_every == 0 or self.step == last:
+                self._log()
+            if self.cases and (self.step % record.validate_every == 0 or self.step == self.settings.total_steps):
+                self._validate()
+            stop = self.crew.any(progress.stopping())
+            due = time.monotonic() - saved_at > 60 * record.checkpoint_minutes
+            if self.crew.leads and (due or stop or self.step % record.checkpoint_every == 0 or self.step == last):
+                self.save()
+                saved_at, saved_step = time.monotonic(), self.step
+            progress.update(self.step, last, f"loss {row['loss']:.4f}, {row.get('psnr_local', float('nan')):.1f} dB")
+            if stop:
+                break
+        if self.crew.leads and saved_step != self.step:
+            self.save()
+        self.crew.wait()
+        return self.step
+
+    def one_step(self) -> dict[str, float]:
+        """Take one step; answers its row of the learning curve."""
+        settings, step = self.settings, self.step
+        start = time.monotonic()
+        second = step >= settings.stage.steps
+        sample = self.mixture.sample(step, settings.pictures.key_frames if second else 1).to(self.crew.device)
+        drawn = time.monotonic()
+        self.adam.zero_grad(set_to_none=True)
+        generator = seeded(settings.seed, self.crew.rank, step)
+        # Measured in one step of each row of the curve: it costs another pass through the encoder.
+        self.stepper.watched = self.gates.on = (step + 1) % settings.record.log_every == 0
+        with torch.autocast(self.crew.device.type, torch.bfloat16, enabled=settings.optimiser.reduced):
+            outcome: Outcome = (self.stepper.stage_two if second else self.stepper.stage_one)(sample, step, generator)
+        self.crew.average_gradients(self.model.parameters())
+        norm = float(torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.optimiser.clip))
+        rate = learning_rate(settings, step)
+        if math.isfinite(norm):
+            for group in self.adam.param_groups:
+                group["lr"] = rate
+            self.adam.step()
+            self._bad = 0
+        else:
+            # One bad sample must not end a run of days; many in a row mean that the weights are gone.
+            self._bad += 1
+            if self._bad >= BAD_STEPS:
+                raise InputError(f"{BAD_STEPS} steps in a row had no finite gradient; lower optimiser.rate and go on from a checkpoint")
+        row = {"loss": outcome.loss, "loss_depth": outcome.depth_loss, "gradient_norm": norm, "rate": rate}
+        row |= outcome.means() | self.gates.shares()
+        row |= {"seconds_data": drawn - start, "seconds": time.monotonic() - start, "voxels": float(sample.resolution)}
+        return row
+
+    def _log(self) -> None:
+        rows, self._gathered = self._gathered, []
+        names = dict.fromkeys(name for row in rows for name in row)
+        mean = {}
+        for name in names:
+            values = [row[name] for row in rows if name in row and math.isfinite(row[name])]
+            if values:
+                mean[name] = sum(values) / len(values)
+        mean = self.crew.mean(mean)
+        stage = 2.0 if self.step > self.settings.stage.steps else 1.0
+        self.curve.add({"step": float(self.step), "stage": stage, "depth_weight": self.stepper.depth_weight(self.step), **mean})
+        if self.crew.leads and self.step % self.settings.record.health_every == 0:
+            self.curve.write()
+
+    def _validate(self) -> None:
+        sheet = self.out / f"validation-{self.step:07d}.png"
+        numbers, each = validate(self.model, self.cases, self.crew.device, sheet, self.stepper.prunes(self.step))
+        for name, values in each.items():
+            numbers |= {f"{key} {name}": value for key, value in values.items()}
+        self.curve.add({"step": float(self.step), **numbers})
+        self.curve.write()
+
+    def save(self) -> None:
+        """Write a checkpoint, the weights so far and the curve.
+
+        Raises:
+            OutputError: the folder is not writable.
+        """
+        save_checkpoint(self.out, self.step, self.model, self.adam, train_settings_dict(self.settings), self.settings.record.keep)
+        save_model(self.out / WEIGHTS, self.model, {"steps": self.step})
+        self.curve.write()
