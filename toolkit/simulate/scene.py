@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics, pixel_grid, rays
+from toolkit.camera import Array, Intrinsics
 from toolkit.effects import background, highlights, transfer
 from toolkit.effects.background import Background
 from toolkit.effects.highlights import Highlights
-from toolkit.simulate.cast import FAR, cast, tile_order
+from toolkit.simulate.cast import cast
+from toolkit.simulate.eye import eye_of, take
 from toolkit.simulate.materials import Material, Materials, TextureBank
+from toolkit.simulate.seen import Mesh, Rays, Seen
 from toolkit.simulate.solids import ROOM, Solid, Solids
+from toolkit.simulate.tessellate import tessellate
 
 Tensor = torch.Tensor
 
@@ -28,27 +30,6 @@ class Lamp:
     position: tuple[float, float, float]
     colour: tuple[float, float, float]  # linear irradiance on a surface that faces it, at `reach`
     reach: float | None = 2.0  # metres; None: as strong everywhere (the sun; put it far away)
-
-
-@dataclass(frozen=True)
-class Rays:
-    """Rays of a picture or of any other list. Neighbours in the list should be neighbours in space."""
-
-    origins: Tensor  # (N, 3), or (1, 3) when they start at one place
-    directions: Tensor  # (N, 3) unit
-    spread: float  # angle between neighbouring rays in radians: what a pixel covers is spread · distance
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What rays see, one row a ray."""
-
-    linear: Tensor  # (N, 3) linear light, not clipped
-    distance: Tensor  # (N,) metres along the ray, `FAR` where nothing is hit
-    normals: Tensor  # (N, 3) unit, world axes; 0 where nothing is hit
-    albedo: Tensor  # (N, 3) linear reflectance
-    gloss: Tensor  # (N,)
-    part: Tensor  # (N,) int64: changes across visible edges (solid, face, shadow)
 
 
 @dataclass(frozen=True)
@@ -82,7 +63,6 @@ class Scene:
     focus: Array
     background: Background | None = None
     highlights: Highlights | None = None
-    _device: torch.device = field(default_factory=lambda: torch.device("cpu"))
 
     @classmethod
     def build(cls, kind: str, solids: list[Solid], materials: list[Material], bank: TextureBank, **rest: object) -> Scene:
@@ -90,51 +70,33 @@ class Scene:
 
     @property
     def device(self) -> torch.device:
-        return self._device
+        return self.solids.centre.device
 
     def to(self, device: torch.device | str) -> Scene:
         """The same scene with its tensors on another device."""
-        moved = Materials(self.materials.items, device)
-        return replace(self, solids=self.solids.to(device), materials=moved, bank=self.bank.to(device), _device=torch.device(device))
+        materials = Materials(self.materials.items, device)
+        return replace(self, solids=self.solids.to(device), materials=materials, bank=self.bank.to(device))
 
     def clearance(self, points: Tensor) -> Tensor:
         """(N,) metres from (N, 3) points to the nearest surface; negative inside a solid or outside the room."""
         return self.solids.clearance(points.to(self.device, torch.float32))
 
+    def mesh(self) -> Mesh:
+        """All solids as triangles, also the parts that lie hidden inside or below others."""
+        return tessellate(self.solids.items)
+
     def render(self, intrinsics: Intrinsics, world_from_camera: Array, side: int = EDGE_SIDE) -> Rendered:
-        """A pinhole camera's picture, depth and normals.
+        """A camera's picture, depth and normals, through its lens.
 
         Args:
             world_from_camera: (4, 4).
             side: pixels that hold an edge are the mean of side × side rays; 1: one ray a pixel everywhere.
         """
-        width, height = intrinsics.width, intrinsics.height
-        order, back = (index.to(self.device) for index in tile_order(width, height))
-        grid = pixel_grid(width, height)
-        origins, directions, cosine = rays(intrinsics, np.asarray(world_from_camera, dtype=np.float64), grid)
-        origin = origins[:1].to(self.device)
-        spread = 1 / intrinsics.fx
-        seen = self.see(Rays(origin, directions.to(self.device)[order], spread))
-        linear = seen.linear
-        if side > 1:
-            edge = edges(seen.part[back].reshape(height, width)).reshape(-1)[order].nonzero()[:, 0]
-            if len(edge):
-                centres = grid[order[edge].cpu().numpy()]
-                steps = (np.arange(side) + 0.5) / side - 0.5
-                inside = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(1, -1, 2)
-                _, finer, _ = rays(intrinsics, np.asarray(world_from_camera, dtype=np.float64), (centres[:, None] + inside).reshape(-1, 2))
-                fine = self.see(Rays(origin, finer.to(self.device), spread / side)).linear
-                linear[edge] = fine.reshape(len(edge), side * side, 3).mean(1)
-        hit = seen.distance < FAR
-        depth = torch.where(hit, seen.distance * cosine.to(self.device)[order], 0.0)
-        return Rendered(
-            transfer.encode(linear)[back].reshape(height, width, 3),
-            depth[back].reshape(height, width),
-            seen.normals[back].reshape(height, width, 3),
-        )
+        picture = take(self, eye_of(intrinsics, side, self.device), world_from_camera[None])
+        return Rendered(transfer.encode(picture.linear), picture.depth, picture.normals)
 
-    def see(self, beam: Rays) -> Seen:
-        """What rays see: light, distance, normals and material, one row a ray."""
+    def see(self, beam: Rays, lit: bool = True) -> Seen:
+        """What rays see: light, distance, normals and material, one row a ray. Not `lit`: distance and normals only."""
         origins, directions = beam.origins, beam.directions
         distance, solid = cast(self.solids, origins, directions)
         hit = (solid >= 0).nonzero()[:, 0]
@@ -150,6 +112,10 @@ class Scene:
         start = origins if len(origins) == 1 else at_hits(origins)
         points = start + far[:, None] * ray
         face, place, normals = self.solids.surface(number, points)
+        if not lit:
+            nothing = torch.zeros_like(distance)
+            dark = nothing[:, None].expand(-1, 3)
+            return Seen(dark, distance, spread_out(normals), dark, nothing, spread_out(number * 6 + face + 1))
         slant = (ray * normals).sum(1).abs().clamp(min=0.1).sqrt()  # between the narrow and the wide side of the footprint
         material = self.solids.materials[number, face]
         albedo = self.materials.albedo(self.bank, material, place, far * beam.spread / slant)
@@ -201,14 +167,3 @@ class Scene:
         shadow = torch.zeros(len(points), dtype=torch.int64, device=self.device)
         shadow[lit] = blocked.long()
         return light * (1 - shadow), to_lamp, shadow
-
-
-def edges(part: Tensor) -> Tensor:
-    """(H, W) bool: pixels whose right, left, upper or lower neighbour shows another part."""
-    out = torch.zeros_like(part, dtype=torch.bool)
-    across, down = part[:, 1:] != part[:, :-1], part[1:] != part[:-1]
-    out[:, 1:] |= across
-    out[:, :-1] |= across
-    out[1:] |= down
-    out[:-1] |= down
-    return out
