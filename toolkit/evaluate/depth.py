@@ -10,13 +10,13 @@ from toolkit.camera import Array
 from toolkit.errors import InputError
 
 KEYS = ("abs_err", "abs_rel", "rmse", "median_rel", "delta_1", "delta_2", "delta_3", "within_5_percent", "coverage")
-NEAREST = 1e-12
+NEAREST, FARTHEST = 1e-12, 1e100
 
 
 def has_depth(depth: Array) -> Array:
-    """Where a depth map (H, W) holds a depth: finite and above 0 (by `NEAREST`, so that no ratio of depths overflows)."""
+    """Where a depth map (H, W) holds a depth: above 0 and finite, by bounds between which no ratio and no square overflows."""
     with np.errstate(invalid="ignore"):
-        return np.isfinite(depth) & (np.asarray(depth) > NEAREST)
+        return (np.asarray(depth) > NEAREST) & (np.asarray(depth) < FARTHEST)
 
 
 def depth_metrics(rendered: Array, truth: Array, valid: Array | None = None) -> dict[str, Any]:
