@@ -12,10 +12,14 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from toolkit.errors import InputError
+
+MAX_YAML = 2**18  # characters
+MAX_NESTING = 16
 
 
 @dataclass
@@ -143,10 +147,30 @@ def _flatten(data: Any, where: str, prefix: str = "") -> list[tuple[str, Any]]:
 
 def _read_yaml(text: str, where: str) -> list[tuple[str, Any]]:
     try:
+        _refuse_traps(text, where)
         data = OmegaConf.to_container(OmegaConf.create(text or "{}"), resolve=False)
+    except InputError:
+        raise
     except Exception as error:  # the YAML parser raises its own family
-        raise InputError(f"{where} is not valid YAML: {str(error).splitlines()[0]}") from error
+        raise InputError(f"{where} is not valid YAML: {(str(error).splitlines() or ['unreadable'])[0]}") from error
     return _flatten(data, where)
+
+
+def _refuse_traps(text: str, where: str) -> None:
+    """What breaks the parser itself: nesting (it recurses in C and takes the process with it) and aliases that multiply.
+
+    Raises:
+        InputError: too long, nested too deeply, or with aliases.
+    """
+    if len(text) > MAX_YAML:
+        raise InputError(f"{where} holds {len(text)} characters, more than the {MAX_YAML} that settings may have")
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):  # one event after the other, without recursion
+        if isinstance(event, yaml.AliasEvent):
+            raise InputError(f"{where} refers to the anchor {event.anchor[:40]!r}, which settings cannot; write the value out")
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_NESTING:
+            raise InputError(f"{where} is nested more than {MAX_NESTING} levels deep; settings are `group: {{key: value}}`")
 
 
 def load_settings(
@@ -175,6 +199,8 @@ def load_settings(
             layers.append((str(file), _read_yaml(Path(file).read_text(encoding="utf-8"), str(file))))
         except OSError as error:
             raise InputError(f"cannot read the settings file {file}: {error.strerror}") from error
+        except UnicodeDecodeError as error:
+            raise InputError(f"the settings file {file} is not text in UTF-8; check how it was written") from error
     for pair in pairs or []:
         key, separator, value = pair.partition("=")
         if not separator:
