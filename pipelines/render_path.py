@@ -94,12 +94,13 @@ def write(job: Job, field: Field, names: list[str], lenses: list[Intrinsics], po
 
 def pictures(field: Field, lenses: list[Intrinsics], poses: Array, progress: Progress) -> Iterator[Array]:
     """(H, W, 3) uint8 for each camera (working frame), one at a time."""
-    from toolkit.render.image import render_view
+    from toolkit.render.image import make_renderer, render_view
 
+    view = make_renderer(field)
     for index, (lens, pose) in enumerate(zip(lenses, poses, strict=True)):
         progress.check()
         progress.update(index, len(lenses))
-        yield to_picture(render_view(field, lens, pose)).rgb
+        yield to_picture(render_view(field, lens, pose, view)).rgb
 
 
 def sized(lens: Intrinsics, long_side: int | None) -> Intrinsics:

@@ -114,18 +114,19 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
 
 def render_test_views(job: Job, field: Field, views: Views) -> Pictures:
     """The field's pictures at the held-out views."""
-    from toolkit.render.image import render_view
+    from toolkit.render.image import make_renderer, render_view
 
     kept = job.folder / "renders" / "field.safetensors"
 
     def make() -> Pictures:
         pictures = Pictures()
+        view = make_renderer(field, job.settings.engine)
         indices = np.flatnonzero(views.test)
         for count, index in enumerate(indices):
             job.progress.update(count, len(indices), views.names[index])
             job.progress.check()
             start = time.monotonic()
-            picture = to_picture(render_view(field, views.intrinsics[index], views.world_from_camera[index]))
+            picture = to_picture(render_view(field, views.intrinsics[index], views.world_from_camera[index], view))
             pictures.add(views.names[index], picture, time.monotonic() - start)
         return pictures
 

@@ -125,11 +125,12 @@ def export_surface(
     """
     from toolkit.export.mesh import mesh_facts, write_mesh
     from toolkit.export.surface import field_volume
-    from toolkit.render.image import render_view
+    from toolkit.render.image import make_renderer, render_view
 
     chosen = spread(len(views), job.settings.export.mesh_views)
+    view = make_renderer(field, job.settings.engine)
     volume = field_volume(
-        lambda lens, pose: render_view(field, lens, pose),
+        lambda lens, pose: render_view(field, lens, pose, view),
         views.world_from_camera[chosen],
         [at_most(views.intrinsics[index], MESH_SIDE) for index in chosen],
         region=(scene.centre - scene.half_size, scene.centre + scene.half_size),

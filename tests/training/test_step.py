@@ -45,7 +45,9 @@ def reference_loss(field: Field, samples: Samples, batch: Batch, rates: Rates, r
             colour = (w[:, None] * colours[mine]).sum(0)
         mixed = colour + (1 - opacity) * field.background
         place = samples.place[mine]
-        spread = (w[:, None] * w[None] * (place[:, None] - place[None]).abs()).sum() + (w**2 * samples.length[mine]).sum() / 3
+        spread = (w[:, None] * w[None] * (place[:, None] - place[None]).abs()).sum() + (w**2).sum() * field.grid.voxel * 4 / field.fine / (
+            2 * field.space.extent
+        ) / 3
         total = total + ((mixed - batch.colour[ray]) ** 2).sum() / (3 * count)
         total = total + (rates.distortion * spread + rates.opacity * (1 - opacity) ** 2) / count
     return total
@@ -55,6 +57,7 @@ def reference_loss(field: Field, samples: Samples, batch: Batch, rates: Rates, r
 @pytest.mark.parametrize("shell", [0.0, 1.0])
 def test_gradients_match_autograd(decoder: str, shell: float, monkeypatch: pytest.MonkeyPatch) -> None:
     field = random_field(background=shell, resolution=16, decoder=decoder, raw=-2.0)
+    monkeypatch.setattr(step_module, "STOP", -1.0)
     origins, directions = random_rays(24)
     batch = Batch(origins, directions, torch.rand(24, 3, generator=torch.Generator().manual_seed(1)), torch.zeros(24, dtype=torch.int64))
     rates = Rates(0.0, 0.0, 0.0, 0.01, 0.03, colour_threshold=-1.0)

@@ -22,11 +22,12 @@ PIECE = 4096  # rays that a thread takes at a time
 
 
 def decoder_arrays(decoder: Deferred) -> K.Decoder:
-    """Copies of the weights, input-major."""
+    """Copies of the weights."""
     first, second, last = (decoder.net[i] for i in (0, 2, 4))
     w1, w2, w3 = (np.array(layer.weight.detach().cpu().numpy(), dtype=np.float32) for layer in (first, second, last))
     b1, b2, b3 = (np.array(layer.bias.detach().cpu().numpy(), dtype=np.float32) for layer in (first, second, last))
-    return K.Decoder(np.ascontiguousarray(w1.T), b1, np.ascontiguousarray(w2.T), b2, w3, b3)
+    w1 = np.pad(w1, ((0, 0), (0, decoder.channels + K.PADDED - w1.shape[1])))
+    return K.Decoder(np.ascontiguousarray(w1.T), w1, b1, np.ascontiguousarray(w2.T), w2, b2, w3, b3)
 
 
 @njit(**K.OPTIONS)
@@ -69,6 +70,9 @@ def make_space(field: Field) -> K.Space:
         int(field.fine),
         int(field.resolution),
         *(int(c) for c in field.topology.table_origin),
+        (0,) * field.feature_rows.shape[1],
+        (0,) * field.decoder.hidden,
+        (0,) * (field.feature_rows.shape[1] + K.PADDED),
     )
 
 
@@ -91,21 +95,21 @@ def render_pass(
     space: Any, volume: Any, decoder: Any, background: Any, origins: Any, directions: Any, stop: Any, threshold: Any, out: Any
 ) -> None:
     """Deferred rendering: origins, directions (B, 3) → out (B, 5) colour, distance, opacity."""
-    channels, hidden = volume.feature.shape[1], decoder.b1.shape[0]
+    channels, hidden = len(space.width), len(space.hidden)
     cells, values = np.empty(MOST_KEPT, np.int32), np.empty((MOST_KEPT, K.VALUES), np.float32)
-    rows, weights = np.empty(8, np.int64), np.empty(8, np.float32)
-    feature, given = np.empty(channels, np.float32), np.empty(channels + 9, np.float32)
+    rows, weights = np.empty((MOST_KEPT, 8), np.int32), np.empty(8, np.float32)
+    feature, given = np.empty(channels, np.float32), np.zeros(channels + K.PADDED, np.float32)
     h1, h2, colour, result = np.empty(hidden, np.float32), np.empty(hidden, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
     marks = np.empty(0, np.uint16)
     for ray in range(len(origins)):
         ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
         dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-        kept = K.march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, threshold, marks, cells, values, result)
+        kept = K.march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, threshold, marks, cells, rows, values, result)
         for c in range(channels):
             given[c] = K.ZERO
         opacity = K.ZERO
         for i in range(kept):
-            K.gather_feature(volume, cells[i], values[i, 0], values[i, 1], values[i, 2], rows, weights, feature)
+            K.gather_feature(space.width, volume.feature, rows[i], values[i, 0], values[i, 1], values[i, 2], weights, feature)
             weight = values[i, K.WEIGHT]
             opacity += weight
             for c in range(channels):
@@ -118,7 +122,7 @@ def render_pass(
         for c in range(channels):
             given[c] /= max(opacity, K.F(1e-6))
         K.encode_direction(dx, dy, dz, given[channels:])
-        K.decode(decoder, given, channels, h1, h2, colour)
+        K.decode(space, decoder, given, h1, h2, colour)
         for k in range(3):
             out[ray, k] = min(max(colour[k] * opacity + (K.ONE - opacity) * background[k], K.ZERO), K.ONE)
 

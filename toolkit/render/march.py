@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 import torch.nn.functional as F
@@ -69,23 +70,30 @@ class MarchGrid:
         self.space, self.resolution, self.topology, self.occupied = space, resolution, topology, occupied
         self.voxel = 2 * space.extent / resolution
         self._table = topology.table.reshape(-1)
-        side = resolution // BRICK
-        bricks = torch.zeros(side + 2, side + 2, side + 2, device=occupied.device)  # margin of one keeps border look-ups simple
-        per_block = occupied.view(-1, 2, BRICK, 2, BRICK, 2, BRICK).any(6).any(4).any(2)  # (M, 2, 2, 2) z, y, x
+        self._side = resolution // BRICK
+
+    @cached_property
+    def bricks(self) -> Tensor:
+        """(B, B, B) bool z, y, x: bricks that hold an occupied voxel, with a margin of one that keeps border look-ups simple."""
+        width = self._side + 2
+        out = torch.zeros(width, width, width, dtype=torch.bool, device=self.occupied.device)
+        per_block = self.occupied.view(-1, 2, BRICK, 2, BRICK, 2, BRICK).any(6).any(4).any(2)  # (M, 2, 2, 2) z, y, x
         filled = per_block.nonzero()
-        place = topology.keys[filled[:, 0]].long().flip(1) * 2 + filled[:, 1:] + 1  # z, y, x
-        place = place.clamp(0, side + 1)
-        bricks[place[:, 0], place[:, 1], place[:, 2]] = 1
-        self.bricks = bricks
-        # A coarse step is as long as a brick, so what it crosses lies in its own brick or next to it.
-        self._bricks = F.max_pool3d(bricks[None, None], 3, 1, 1)[0, 0].bool()
-        self._side = side
+        place = self.topology.keys[filled[:, 0]].long().flip(1) * 2 + filled[:, 1:] + 1  # z, y, x
+        place = place.clamp(0, self._side + 1)
+        out[place[:, 0], place[:, 1], place[:, 2]] = True
+        return out
+
+    @cached_property
+    def _near(self) -> Tensor:
+        """A coarse step is as long as a brick, so what it crosses lies in its own brick or next to it."""
+        return F.max_pool3d(self.bricks[None, None].float(), 3, 1, 1)[0, 0].bool()
 
     def near_bricks(self, contracted: Tensor) -> Tensor:
         """(..., 3) contracted points → (...) bool: something occupied lies within one brick."""
         index = ((contracted + self.space.extent) * (1 / (self.voxel * BRICK))).floor_().long().add_(1).clamp_(0, self._side + 1)
         width = self._side + 2
-        return self._bricks.view(-1)[(index[..., 2] * width + index[..., 1]) * width + index[..., 0]]
+        return self._near.view(-1)[(index[..., 2] * width + index[..., 1]) * width + index[..., 0]]
 
     def voxels(self, contracted: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 3) contracted points → (N,) row of the voxel around each, −1 where nothing is occupied, and (N, 3) place within it."""

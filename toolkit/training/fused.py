@@ -20,7 +20,6 @@ from toolkit.training.step import Rates
 Array = np.ndarray[Any, Any]
 GUESS_CELL = 8  # pixels a side of the tiles that remember how far a view sees
 BETAS, EPSILON = (0.9, 0.99), 1e-10
-GROWTH = 1.5  # of the Adam records, when they are full
 
 
 class FusedOptimiser:
@@ -38,7 +37,8 @@ class FusedOptimiser:
         shape = (len(pool.pose), int(heights) // GUESS_CELL + 1, int(widths) // GUESS_CELL + 1)
         self.guess = np.zeros(shape, np.float32)
         self.decoder = decoder_arrays(field.decoder)
-        self.moments = [(np.zeros_like(w), np.zeros_like(w)) for w in self.decoder]
+        d = self.decoder
+        self.moments = [(np.zeros_like(w), np.zeros_like(w)) for w in (d.w1, d.b1, d.w2, d.b2, d.w3, d.b3)]
         self.decoder_steps = 0
         steps = np.arange(1, 2049)
         self.scales = np.concatenate([[1], np.sqrt(1 - BETAS[1] ** steps) / (1 - BETAS[0] ** steps)]).astype(np.float32)
@@ -49,14 +49,15 @@ class FusedOptimiser:
         """Go on with another field of the same decoder: the rows' state starts afresh, the decoder's is kept."""
         self.field = field
         rows, channels = len(field.density_rows), field.feature_rows.shape[1]
-        self.state = np.full(rows, -1, np.int32)
-        self.records = np.zeros((min(rows, 1 << 14), 2 * channels + 4), np.float32)
-        self.next_record = 0
-        self.slots = np.full((self.threads, rows), -1, np.int32)
+        self.index = np.full((rows, self.threads + 1), -1, np.int32)
         # Sized for the worst case; the system gives memory only to the part that is written.
+        self.density_records = K.aligned((rows, 3), np.float32, zeroed=True)
+        self.feature_records = K.aligned((rows, 2 * channels), np.float32, zeroed=True)
+        self.next_record = 0
         self.touched = np.empty((self.threads, rows), np.int32)
-        self.sums = np.empty((self.threads, rows, channels + 1), np.float32)
-        self.partial = [[np.zeros_like(w) for w in self.decoder] for _ in range(self.threads)]
+        self.density_sums = np.empty((self.threads, rows), np.float32)
+        self.feature_sums = K.aligned((self.threads, rows, channels), np.float32)
+        self.tape: tuple[Array, ...] = ()
         self.go_on_with(field)
 
     def go_on_with(self, field: Field) -> None:
@@ -82,8 +83,8 @@ class FusedOptimiser:
         assert isinstance(self.field.decoder, Deferred)
         d = self.decoder
         with torch.no_grad():
-            for layer, weight, bias in ((net[0], d.w1.T, d.b1), (net[2], d.w2.T, d.b2), (net[4], d.w3, d.b3)):
-                layer.weight.copy_(torch.from_numpy(np.ascontiguousarray(weight)))
+            for layer, weight, bias in ((net[0], d.w1_out, d.b1), (net[2], d.w2_out, d.b2), (net[4], d.w3, d.b3)):
+                layer.weight.copy_(torch.from_numpy(np.ascontiguousarray(weight[:, : layer.in_features])))
                 layer.bias.copy_(torch.from_numpy(bias))
         return self.field
 
@@ -103,30 +104,33 @@ class FusedOptimiser:
         depths = np.empty(rays, np.float32)
         cuts = [rays * t // self.threads for t in range(self.threads + 1)]
 
+        if not self.tape or len(self.tape[0]) != rays:
+            hidden = self.decoder.b1.shape[0]
+            widths = (self.decoder.w1.shape[0], hidden, hidden, hidden, hidden, 3)
+            self.tape = tuple(np.zeros((rays, width), np.float32) for width in widths)
+
         def gradients(thread: int) -> tuple[int, float, int]:
             part = slice(cuts[thread], cuts[thread + 1])
-            sums = self.partial[thread]
-            for array in sums:
-                array.fill(0)
-            own = kernels.Gradients(self.slots[thread], self.touched[thread], self.sums[thread], *sums)
-            arguments = (self.pixels, picks[part], jitter[part], rays, losses, self.marks[thread], own, depths[part])
+            rows = (self.touched[thread], self.density_sums[thread], self.feature_sums[thread])
+            own = kernels.Gradients(*rows, *(array[part] for array in self.tape))
+            arguments = (self.pixels, picks[part], jitter[part], rays, losses, self.marks[thread], self.index, thread, own, depths[part])
             out: tuple[int, float, int] = kernels.gradient_pass(self.space, self.volume, self.decoder, self.background, *arguments)
             return out
 
         results = self._each(gradients)
         used = [result[0] for result in results]
-        self._reserve(sum(used))
         for thread, count in enumerate(used):
-            self.next_record = kernels.assign_records(self.state, self.touched[thread, :count], self.next_record)
+            self.next_record = kernels.assign_records(self.index, self.touched[thread, :count], self.next_record)
         step_sizes = np.array([rates.density, rates.feature], np.float32)
 
         def move(thread: int) -> None:
-            state = (self.volume, self.state, self.records, self.slots, self.touched, self.sums)
+            state = (self.space.width, self.volume, self.index, self.density_records, self.feature_records)
+            sums = (self.touched, self.density_sums, self.feature_sums)
             betas = (np.float32(BETAS[0]), np.float32(BETAS[1]), np.float32(EPSILON))
-            kernels.adam_pass(*state, thread, used[thread], self.scales, step_sizes, *betas)
+            kernels.adam_pass(*state, *sums, thread, used[thread], self.scales, step_sizes, *betas)
 
         self._each(move)
-        self._each(lambda thread: kernels.forget(self.slots[thread], self.touched[thread, : used[thread]]))
+        self._each(lambda thread: kernels.forget(self.index, thread, self.touched[thread, : used[thread]]))
         self._move_decoder(rates.decoder)
         kernels.remember_depths(self.pixels, picks, depths, self.guess, GUESS_CELL)
         return sum(result[1] for result in results) / (3 * rays), sum(result[2] for result in results)
@@ -141,23 +145,17 @@ class FusedOptimiser:
     def _each(self, work: Any) -> list[Any]:
         return [work(0)] if self.executor is None else list(self.executor.map(work, range(self.threads)))
 
-    def _reserve(self, more: int) -> None:
-        """Room for `more` Adam records."""
-        needed = self.next_record + more
-        if needed > len(self.records):
-            grown = np.zeros((min(int(needed * GROWTH), len(self.state)), self.records.shape[1]), np.float32)
-            grown[: self.next_record] = self.records[: self.next_record]
-            self.records = grown
-
     def _move_decoder(self, rate: float) -> None:
+        """Adam on the decoder; ∂L/∂W is a product of the layer's inputs with the gradients behind it, over all rays."""
+        given, h1, h2, g1, g2, g_logit = self.tape
+        d = self.decoder
         self.decoder_steps += 1
         n = self.decoder_steps
         scale = np.float32(rate * np.sqrt(1 - BETAS[1] ** n) / (1 - BETAS[0] ** n))
-        for index, weight in enumerate(self.decoder):
-            gradient = self.partial[0][index]
-            for other in self.partial[1:]:
-                gradient = gradient + other[index]
-            m, v = self.moments[index]
+        weights = (d.w1, d.b1, d.w2, d.b2, d.w3, d.b3)
+        gradients = (given.T @ g1, g1.sum(0), h1.T @ g2, g2.sum(0), g_logit.T @ h2, g_logit.sum(0))
+        for weight, gradient, (m, v) in zip(weights, gradients, self.moments, strict=True):
             m += np.float32(1 - BETAS[0]) * (gradient - m)
             v += np.float32(1 - BETAS[1]) * (gradient * gradient - v)
             weight -= scale * m / (np.sqrt(v) + np.float32(EPSILON))
+        d.w1_out[:], d.w2_out[:] = d.w1.T, d.w2.T

@@ -13,7 +13,8 @@ from numba import njit
 from toolkit.render import kernels as K
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
-COUNT, M_DENSITY, V_DENSITY, FIRST = 0, 1, 2, 4  # columns of a row's Adam record: steps, moments of the density, then of the features
+COUNT, FIRST, SECOND = 0, 1, 2  # columns of a row's density record: steps, both moments
+AHEAD = 8  # rows for which memory is asked before they are needed
 
 
 class Pixels(NamedTuple):
@@ -29,15 +30,15 @@ class Pixels(NamedTuple):
 class Gradients(NamedTuple):
     """What one thread gathers of a batch."""
 
-    slot: Any  # (M · 512 + 1,) int32 index into the arrays below, −1: not touched
     touched: Any  # (T,) int32 rows
-    values: Any  # (T, C + 1) float32: density, then features
-    w1: Any
-    b1: Any
-    w2: Any
-    b2: Any
-    w3: Any
-    b3: Any
+    density: Any  # (T,) float32 sums over the rays, in the order of `touched`
+    feature: Any  # (T, C) float32
+    given: Any  # (B, I) float32, a row a ray: what went into the decoder, its hidden layers, and their gradients
+    h1: Any  # (B, H)
+    h2: Any
+    g1: Any
+    g2: Any
+    g_logit: Any  # (B, 3)
 
 
 class Losses(NamedTuple):
@@ -68,41 +69,23 @@ def pixel_ray(pixels: Any, pick: Any, ray: Any) -> None:
 
 
 @njit(**K.OPTIONS)
-def _decoder_backward(
-    decoder: Any, gradients: Any, given: Any, channels: Any, h1: Any, h2: Any, g_logit: Any, g1: Any, g2: Any, g_given: Any
-) -> None:
-    """Back through `kernels.decode`: weights' gradients are added to `gradients`, the features' go to g_given[:C]."""
-    hidden = h1.shape[0]
+def _decoder_backward(space: Any, decoder: Any, h1: Any, h2: Any, g_logit: Any, g1: Any, g2: Any, g_given: Any) -> None:
+    """Back through `kernels.decode`, from logits (3,) to hidden layers and to the features g_given[:C].
+
+    The weights' own gradients are sums over rays of products of what lies on both sides of them: one matrix product a batch, later.
+    """
+    hidden = len(space.hidden)
+    a, b, c = g_logit[0], g_logit[1], g_logit[2]
     for j in range(hidden):
-        g2[j] = ZERO
-    for k in range(3):
-        g = g_logit[k]
-        gradients.b3[k] += g
-        for j in range(hidden):
-            gradients.w3[k, j] += g * h2[j]
-            g2[j] += g * decoder.w3[k, j]
-    for j in range(hidden):
-        g2[j] = g2[j] if h2[j] > ZERO else ZERO
-        gradients.b2[j] += g2[j]
+        total = a * decoder.w3[0, j] + b * decoder.w3[1, j] + c * decoder.w3[2, j]
+        g2[j] = total if h2[j] > ZERO else ZERO
+    K.multiply(space.hidden, space.hidden, decoder.w2, g2, g1)
     for i in range(hidden):
-        total, value = ZERO, h1[i]
-        for j in range(hidden):
-            total += g2[j] * decoder.w2[i, j]
-        g1[i] = total if value > ZERO else ZERO
-        if value > ZERO:
-            for j in range(hidden):
-                gradients.w2[i, j] += value * g2[j]
-    for j in range(hidden):
-        gradients.b1[j] += g1[j]
-    for i in range(channels + 9):
-        value = given[i]
-        for j in range(hidden):
-            gradients.w1[i, j] += value * g1[j]
-    for i in range(channels):
-        total = g_logit[i] if i < 3 else ZERO
-        for j in range(hidden):
-            total += g1[j] * decoder.w1[i, j]
-        g_given[i] = total
+        g1[i] = g1[i] if h1[i] > ZERO else ZERO
+    K.multiply(space.width, space.hidden, decoder.w1, g1, g_given)
+    g_given[0] += a
+    g_given[1] += b
+    g_given[2] += c
 
 
 @njit(**K.OPTIONS)
@@ -117,6 +100,8 @@ def gradient_pass(
     count: Any,
     losses: Any,
     marks: Any,
+    index: Any,
+    thread: Any,
     gradients: Any,
     depths: Any,
 ) -> Any:
@@ -125,31 +110,31 @@ def gradient_pass(
     Args:
         count: rays of the whole batch, of which these may be a part.
         marks: (M · 512,) uint16, this thread's own, or of length 0.
-        gradients: this thread's; `slot` all −1 on entry.
+        index: (M · 512 + 1, threads + 1) int32; column 1 + `thread` is where a row's sums are in `gradients`, −1: not touched, as all are
+            on entry.
         depths: (len(picks),) distance where half of the light was stopped, for those that ask; or of length 0.
 
     Returns:
         rows touched, sum of squared colour errors, samples looked up.
     """
-    channels, hidden = volume.feature.shape[1], decoder.b1.shape[0]
+    channels, hidden = len(space.width), len(space.hidden)
     most = 1024
     cells, values = np.empty(most, np.int32), np.empty((most, K.VALUES), np.float32)
-    rows, weights = np.empty((most, 8), np.int64), np.empty((most, 8), np.float32)
+    rows, weights = np.empty((most, 8), np.int32), np.empty((most, 8), np.float32)
     features = np.empty((most, channels), np.float32)
     g_weight = np.empty(most, np.float32)
-    given = np.empty(channels + 9, np.float32)
     g_given = np.empty(channels, np.float32)
-    h1, h2, g1, g2 = np.empty(hidden, np.float32), np.empty(hidden, np.float32), np.empty(hidden, np.float32), np.empty(hidden, np.float32)
-    colour, g_logit, result, ray = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(3, np.float32), np.empty(6, np.float32)
-    slot, touched, sums = gradients.slot, gradients.touched, gradients.values
+    colour, result, ray = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(6, np.float32)
+    touched, density_sums, feature_sums = gradients.touched, gradients.density, gradients.feature
+    column = thread + 1
     zero_row = volume.density.shape[0] - 1
     per_value = TWO / (F(3) * F(count))
     spread = F(4) / (F(space.fine) * F(space.resolution))
     distortion, opacity_loss = losses.distortion / F(count), TWO * losses.opacity / F(count)
     used, looked = 0, 0
     error = 0.0
-    for index in range(len(picks)):
-        pick = picks[index]
+    for number in range(len(picks)):
+        pick = picks[number]
         pixel_ray(pixels, pick, ray)
         kept = K.march_ray(
             space,
@@ -160,24 +145,29 @@ def gradient_pass(
             ray[3],
             ray[4],
             ray[5],
-            jitter[index],
+            jitter[number],
             losses.stop,
             losses.threshold,
             marks,
             cells,
+            rows,
             values,
             result,
         )
         looked += int(result[2])
         if depths.shape[0] > 0:
-            depths[index] = result[0]
+            depths[number] = result[0]
+        given, h1, h2 = gradients.given[number], gradients.h1[number], gradients.h2[number]
+        g1, g2, g_logit = gradients.g1[number], gradients.g2[number], gradients.g_logit[number]
         # composite the features
         for c in range(channels):
             given[c] = ZERO
         opacity = ZERO
         for i in range(kept):
             feature = features[i]
-            K.gather_feature(volume, cells[i], values[i, 0], values[i, 1], values[i, 2], rows[i], weights[i], feature)
+            K.gather_feature(space.width, volume.feature, rows[i], values[i, 0], values[i, 1], values[i, 2], weights[i], feature)
+            for corner in range(8):
+                K.prefetch(index, np.int64(rows[i, corner]))
             weight = values[i, K.WEIGHT]
             opacity += weight
             for c in range(channels):
@@ -186,7 +176,7 @@ def gradient_pass(
         for c in range(channels):
             given[c] *= scale
         K.encode_direction(ray[3], ray[4], ray[5], given[channels:])
-        K.decode(decoder, given, channels, h1, h2, colour)
+        K.decode(space, decoder, given, h1, h2, colour)
         # loss: mean over rays and channels of the squared error
         g_opacity = -(ONE - opacity) * opacity_loss
         for k in range(3):
@@ -195,9 +185,9 @@ def gradient_pass(
             g_mixed = residual * per_value
             g_opacity += g_mixed * (colour[k] - background[k])
             g_logit[k] = g_mixed * opacity * colour[k] * (ONE - colour[k])
+        _decoder_backward(space, decoder, h1, h2, g_logit, g1, g2, g_given)
         if kept == 0:
             continue
-        _decoder_backward(decoder, gradients, given, channels, h1, h2, g_logit, g1, g2, g_given)
         # ∂L/∂w: mean = Σ w f / A and A = Σ w
         dot = ZERO
         for c in range(channels):
@@ -232,32 +222,33 @@ def gradient_pass(
                 row = rows[i, corner]
                 if row == zero_row:
                     continue
-                at = slot[row]
+                at = index[row, column]
                 if at < 0:
                     at = used
-                    if used == len(touched):
-                        continue  # cannot happen: the caller sizes the arrays for the worst case
-                    slot[row] = at
+                    index[row, column] = at
                     touched[at] = row
-                    for c in range(channels + 1):
-                        sums[at, c] = ZERO
+                    density_sums[at] = ZERO
+                    for c in range(channels):
+                        feature_sums[at, c] = ZERO
                     used += 1
                 share = weights[i, corner]
-                sums[at, channels] += share * g_raw
+                density_sums[at] += share * g_raw
                 share *= weight
                 for c in range(channels):
-                    sums[at, c] += share * g_given[c]
+                    feature_sums[at, c] += share * g_given[c]
     return used, error, looked
 
 
 @njit(**K.OPTIONS)
 def adam_pass(
+    width: Any,
     volume: Any,
-    state: Any,
-    records: Any,
-    slots: Any,
+    index: Any,
+    density_records: Any,
+    feature_records: Any,
     touched: Any,
-    sums: Any,
+    density_sums: Any,
+    feature_sums: Any,
     thread: Any,
     used: Any,
     scales: Any,
@@ -270,65 +261,72 @@ def adam_pass(
     order, so that the result depends on the number of threads alone.
 
     Args:
-        state: (M · 512 + 1,) int32 record of a row, all of the touched assigned.
-        records: (K, 2 C + 4) float32.
-        slots, touched, sums: (threads, …) of all `Gradients`.
-        scales: (S,) float32 bias correction sqrt(1 - b2^n) / (1 - b1^n) for n steps; 1 beyond.
+        index: (M · 512 + 1, threads + 1) int32; column 0 is a row's Adam record, given to all that were touched.
+        density_records: (K, 3) float32; feature_records: (K, 2 C) float32, first moments, then second.
+        touched, density_sums, feature_sums: (threads, …) of all `Gradients`.
+        scales: (S,) float32 bias correction sqrt(1 - b2^n) / (1 - b1^n) for n steps; the last one beyond.
         rates: (2,) float32 of density and features.
     """
-    channels = volume.feature.shape[1]
+    channels = len(width)
     density, feature = volume.density, volume.feature
     c1, c2 = ONE - b1, ONE - b2
-    threads = slots.shape[0]
+    threads = index.shape[1] - 1
     for at in range(used):
+        if at + AHEAD < used:
+            later = np.int64(touched[thread, at + AHEAD])
+            record = np.int64(index[later, 0])
+            K.prefetch(feature_records, record)
+            K.prefetch_half(feature_records, record)
+            K.prefetch(density_records, record)
+            K.prefetch(feature, later)
         row = touched[thread, at]
-        own = sums[thread, at]
+        own = feature_sums[thread, at]
         mine = True
         for other in range(threads):
             if other == thread:
                 continue
-            twin = slots[other, row]
+            twin = index[row, other + 1]
             if twin >= 0:
                 if other < thread:
                     mine = False
                     break
-                for c in range(channels + 1):
-                    own[c] += sums[other, twin, c]
+                density_sums[thread, at] += density_sums[other, twin]
+                for c in range(channels):
+                    own[c] += feature_sums[other, twin, c]
         if not mine:
             continue
-        record = records[state[row]]
+        place = index[row, 0]
+        record, moments = density_records[place], feature_records[place]
         steps = record[COUNT] + ONE
-        record[COUNT] = steps
         scale = scales[min(int(steps), len(scales) - 1)]
-        g = own[channels]
-        m = b1 * record[M_DENSITY] + c1 * g
-        v = b2 * record[V_DENSITY] + c2 * g * g
-        record[M_DENSITY], record[V_DENSITY] = m, v
+        g = density_sums[thread, at]
+        m = b1 * record[FIRST] + c1 * g
+        v = b2 * record[SECOND] + c2 * g * g
+        record[COUNT], record[FIRST], record[SECOND] = steps, m, v
         density[row] -= rates[0] * scale * m / (np.sqrt(v) + epsilon)
         step = rates[1] * scale
         for c in range(channels):
-            g = own[c]
-            m = b1 * record[FIRST + c] + c1 * g
-            v = b2 * record[FIRST + channels + c] + c2 * g * g
-            record[FIRST + c], record[FIRST + channels + c] = m, v
+            m = b1 * moments[c] + c1 * own[c]
+            v = b2 * moments[channels + c] + c2 * own[c] * own[c]
+            moments[c], moments[channels + c] = m, v
             feature[row, c] -= step * m / (np.sqrt(v) + epsilon)
 
 
 @njit(**K.OPTIONS)
-def assign_records(state: Any, touched: Any, next_record: Any) -> Any:
+def assign_records(index: Any, touched: Any, next_record: Any) -> Any:
     """Give rows that are touched for the first time their Adam record; returns the next free one."""
     for at in range(len(touched)):
-        if state[touched[at]] < 0:
-            state[touched[at]] = next_record
+        if index[touched[at], 0] < 0:
+            index[touched[at], 0] = next_record
             next_record += 1
     return next_record
 
 
 @njit(**K.OPTIONS)
-def forget(slot: Any, touched: Any) -> None:
-    """Reset `slot` for the next batch."""
+def forget(index: Any, thread: Any, touched: Any) -> None:
+    """Make `index` good for the next batch."""
     for at in range(len(touched)):
-        slot[touched[at]] = -1
+        index[touched[at], thread + 1] = -1
 
 
 @njit(**K.OPTIONS)

@@ -94,7 +94,16 @@ def visible(field: Field, seen: Tensor, visits: Tensor, threshold: float) -> Ten
     strong = seen > threshold
     if not bool(strong.any()):
         return field.occupied
-    return (dilate(field.topology, strong, 1, grow=False)[1] | (visits < ENOUGH_VISITS)) & field.occupied
+    return (_beside(field.topology, strong) | (visits < ENOUGH_VISITS)) & field.occupied
+
+
+def _beside(topology: Topology, strong: Tensor) -> Tensor:
+    """(M · 512,) bool grown by one voxel."""
+    if strong.device.type == "cpu":
+        from toolkit.volume.compiled import dilated
+
+        return dilated(topology, strong)
+    return dilate(topology, strong, 1, grow=False)[1]
 
 
 def pruned(field: Field, keep: Tensor) -> Field:
@@ -105,6 +114,19 @@ def pruned(field: Field, keep: Tensor) -> Field:
 def finer(field: Field, keep: Tensor, resolution: int, host: Host) -> Field:
     """The same function, where `keep` says, on a lattice of `resolution` voxels a side; rows are new."""
     values = [field.density_rows, field.feature_rows]
+    if field.device.type == "cpu":
+        from toolkit.volume.compiled import refined
+
+        voxel_size = 2 * field.space.extent / resolution * field.space.half
+        hosted, occupied = refined(field.topology, field.occupied & keep, *values, resolution / field.resolution, host, voxel_size)
+        return replace(
+            field,
+            resolution=resolution,
+            topology=hosted.topology,
+            occupied=occupied,
+            density_rows=hosted.density,
+            feature_rows=hosted.feature,
+        )
     topology, occupied, rows = erase_empty_blocks(field.topology, field.occupied & keep, values)
     if resolution == 2 * field.resolution:
         topology, occupied, rows = split(topology, occupied, rows)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from toolkit.networks.decoder import Deferred
-from toolkit.render.composite import RAW_MAX, STOP, distortion, ray_sum, thickness_gradient, weights
+from toolkit.render.composite import RAW_MAX, SOLID, STOP, distortion, ray_sum, thickness_gradient, weights
 from toolkit.render.field import Field, density
 from toolkit.render.march import BRICK, Samples, march
 from toolkit.render.rays import OPACITY_FLOOR
@@ -54,10 +54,15 @@ class Optimiser:
         self.seen.zero_()
         self.visits.zero_()
 
-    def _mark(self, samples: Samples, weight: Tensor, alive: Tensor) -> None:
+    def _mark(self, samples: Samples, weight: Tensor, alive: Tensor, count: int) -> None:
         """Remember how strongly and how often voxels were seen, before the light was spent."""
         self.seen.scatter_reduce_(0, samples.cell, torch.where(alive, weight, 0.0), "amax")
         self.visits.index_add_(0, samples.cell, alive.float())
+        # Of a ray that ends somewhere the strongest sample counts as seen fully: on a fine lattice a surface is several voxels thick.
+        weight = torch.where(alive, weight, 0.0)
+        peak = torch.zeros(count, device=weight.device).scatter_reduce_(0, samples.ray, weight, "amax")
+        solid = 1 - ray_sum(weight, samples.ray, count) < SOLID
+        self.seen[samples.cell[(weight == peak[samples.ray]) & solid[samples.ray]]] = 1.0
 
     def _spread(self, weight: Tensor) -> Tensor:
         """Interval of every sample in the units of `Samples.place`."""
@@ -94,7 +99,7 @@ class Optimiser:
         thickness = density(raw) * samples.length
         weight, transmittance = weights(thickness, samples.first)
         alive = transmittance >= STOP
-        self._mark(samples, weight, alive)
+        self._mark(samples, weight, alive, count)
         chosen = (weight > rates.colour_threshold) & alive
         kept = samples.keep(chosen)
         rows, corner_weights, raw, thickness = rows[chosen], corner_weights[chosen], raw[chosen], thickness[chosen]
@@ -137,7 +142,7 @@ class Optimiser:
         # Weights and their gradient as in the deferred step; colours and raw densities hang on the decoder's graph.
         tau = thickness.detach()
         weight, transmittance = weights(tau, samples.first)
-        self._mark(samples, weight, transmittance >= STOP)
+        self._mark(samples, weight, transmittance >= STOP, count)
         opacity = ray_sum(weight, samples.ray, count)
         mixed = ray_sum(weight[:, None] * colour.detach(), samples.ray, count) + (1 - opacity)[:, None] * behind
         residual = mixed - batch.colour

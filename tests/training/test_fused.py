@@ -1,0 +1,163 @@
+"""The compiled engine against the torch reference: colours, gradients, the optimiser's step, and independence of threads."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.render.made import random_field, random_rays
+from toolkit.camera import Intrinsics
+from toolkit.capture.types import Views
+from toolkit.render.compiled import CompiledRenderer
+from toolkit.render.field import Field
+from toolkit.render.rays import render_rays
+from toolkit.training import step as step_module
+from toolkit.training.fused import FusedOptimiser
+from toolkit.training.rays import PixelPool
+from toolkit.training.step import Optimiser, Rates
+
+RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03)
+
+
+def looking(eye: np.ndarray) -> np.ndarray:
+    """(4, 4) camera at `eye` that looks at the origin."""
+    forward = -eye / np.linalg.norm(eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(forward, right), forward, eye], 1)
+    return pose
+
+
+def made_views(count: int = 5, side: int = 24) -> Views:
+    generator = np.random.default_rng(3)
+    eyes = generator.normal(size=(count, 3))
+    eyes = 3 * eyes / np.linalg.norm(eyes, axis=1, keepdims=True)
+    poses = np.stack([looking(eye) for eye in eyes])
+    images = [generator.integers(0, 256, (side, side, 3), dtype=np.uint8) for _ in range(count)]
+    lens = [Intrinsics(30, 31, side, side, 11.5, 12.5)] * count
+    return Views([f"{i}" for i in range(count)], images, lens, poses, np.zeros(count, bool))
+
+
+@pytest.mark.parametrize("shell", [0.0, 1.0])
+@pytest.mark.parametrize("keep", [1.0, 0.3, 0.02])
+def test_pictures_agree(shell: float, keep: float) -> None:
+    field = random_field(shell, 32, keep=keep, raw=-2.0)
+    origins, directions = random_rays(500)
+    if shell:
+        origins = origins * torch.linspace(0.02, 3, 500)[:, None]
+    expected = render_rays(field, origins, directions)
+    got = CompiledRenderer(field, 1).render(origins, directions)
+    assert float(expected.opacity.std()) > 0 and float(expected.colour.std()) > 0.05
+    torch.testing.assert_close(got[:, :3], expected.colour, atol=1e-4, rtol=0)
+    torch.testing.assert_close(got[:, 4], expected.opacity, atol=1e-4, rtol=0)
+    # The distance jumps where the light left passes one half within rounding of a sample's border.
+    close = (got[:, 3] - expected.distance).abs() < 1e-3 * (1 + expected.distance)
+    assert float(close.float().mean()) > 0.99
+
+
+def torch_gradients(
+    field: Field, pool: PixelPool, picks: torch.Tensor, rates: Rates, monkeypatch: pytest.MonkeyPatch
+) -> tuple[torch.Tensor, ...]:
+    """Dense gradients of the reference for densities and features, and the decoder's."""
+    density, feature = torch.zeros_like(field.density_rows), torch.zeros_like(field.feature_rows)
+    monkeypatch.setattr(
+        step_module.LazyAdam, "step", lambda self, rows, g, rate: (density if g.ndim == 1 else feature).index_add_(0, rows, g)
+    )
+    monkeypatch.setattr(torch, "rand", lambda *size, generator=None: torch.zeros(*size))
+    optimiser = Optimiser(field)
+    held: list[torch.Tensor] = []
+    monkeypatch.setattr(optimiser.decoder, "step", lambda: held.extend(p.grad.clone() for p in field.decoder.parameters()))  # type: ignore[misc]
+    optimiser.step(pool.take(picks), rates, torch.Generator())
+    monkeypatch.undo()
+    return density, feature, *held
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("shell", [0.0, 1.0])
+def test_gradients_agree(shell: float, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    field = random_field(shell, 32, keep=0.5, raw=-2.5)
+    pool = PixelPool(made_views())
+    picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(0))[:300]
+    expected = torch_gradients(field, pool, picks, RATES, monkeypatch)
+    engine = FusedOptimiser(field, pool, threads=threads)
+    dense = [torch.zeros_like(field.density_rows), torch.zeros_like(field.feature_rows)]
+
+    def keep_sums(width: object, volume: object, index: np.ndarray, *rest: object) -> None:
+        thread, used = rest[5:7]
+        counts[thread] = used  # type: ignore[index]
+
+    counts: dict[int, int] = {}
+    monkeypatch.setattr("toolkit.training.fused.kernels.adam_pass", keep_sums)
+    engine.step_on(picks.numpy(), np.zeros(300, np.float32), RATES)
+    for thread, used in counts.items():
+        rows = torch.from_numpy(engine.touched[thread, :used].astype(np.int64))
+        dense[0].index_add_(0, rows, torch.from_numpy(engine.density_sums[thread, :used]))
+        dense[1].index_add_(0, rows, torch.from_numpy(engine.feature_sums[thread, :used]))
+    assert len(counts) == threads
+    given, h1, h2, g1, g2, g_logit = engine.tape
+    weights = [(g1.T @ given)[:, : 8 + 9], g1.sum(0), g2.T @ h1, g2.sum(0), g_logit.T @ h2, g_logit.sum(0)]
+    for wanted, got in zip(expected, [*dense, *(torch.from_numpy(w) for w in weights)], strict=True):
+        scale = float(wanted.abs().max())
+        assert scale > 0
+        torch.testing.assert_close(got, wanted, atol=1e-4 * scale, rtol=1e-4)
+
+
+def test_a_step_moves_rows_as_the_reference_does() -> None:
+    """Three steps of both engines on the same pixels: the same field, within what a sign flip of a vanishing gradient may do."""
+    pool = PixelPool(made_views())
+    fields = [random_field(1.0, 32, keep=0.5, raw=-2.5) for _ in range(2)]
+    rates = replace(RATES, density=0.1, feature=0.05, decoder=1e-3)
+    reference, fused = Optimiser(fields[0]), FusedOptimiser(fields[1], pool, threads=2)
+    before = fields[0].feature_rows.clone()
+    for number in range(3):
+        picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(number))[:400]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(torch, "rand", lambda *size, generator=None: torch.zeros(*size))
+            a = reference.step(pool.take(picks), rates, torch.Generator())
+        b = fused.step_on(picks.numpy(), np.zeros(400, np.float32), rates)
+        assert b[0] == pytest.approx(a[0], rel=1e-4)
+    moved = (fields[0].feature_rows - before).abs() > 1e-3
+    assert float(moved.float().mean()) > 0.01
+    for name in ("feature_rows", "density_rows"):
+        difference = (getattr(fields[0], name) - getattr(fields[1], name)).abs()
+        assert float(difference.quantile(0.999) if difference.numel() < 1e6 else difference.flatten()[::7].quantile(0.999)) < 1e-3
+    fused.sync()
+    for a_weight, b_weight in zip(fields[0].decoder.parameters(), fields[1].decoder.parameters(), strict=True):
+        torch.testing.assert_close(a_weight, b_weight, atol=2e-4, rtol=1e-3)
+    seen = reference.seen > 0.01
+    assert bool(seen.any())
+    torch.testing.assert_close(fused.seen[seen], reference.seen[seen], atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_same_seed_gives_the_same_field(threads: int) -> None:
+    """Bit for bit, for a fixed number of threads."""
+    pool = PixelPool(made_views())
+    results = []
+    for _ in range(2):
+        field = random_field(1.0, 32, keep=0.5, raw=-2.5)
+        engine = FusedOptimiser(field, pool, seed=4, threads=threads)
+        for _ in range(5):
+            engine.step(256, replace(RATES, density=0.1, feature=0.05, decoder=1e-3))
+        results.append(engine.sync())
+    assert torch.equal(results[0].density_rows, results[1].density_rows)
+    assert torch.equal(results[0].feature_rows, results[1].feature_rows)
+
+
+def test_pruned_voxels_are_left_alone() -> None:
+    """After pruning rows stay where they are, so the optimiser state stays good and erased voxels get no gradient."""
+    pool = PixelPool(made_views())
+    field = random_field(1.0, 32, keep=1.0, raw=-2.5)
+    engine = FusedOptimiser(field, pool, seed=1, threads=1)
+    engine.step(256, replace(RATES, density=0.1, feature=0.05))
+    records = engine.next_record
+    empty = replace(field, occupied=torch.zeros_like(field.occupied))
+    engine.go_on_with(empty)
+    before = field.density_rows.clone()
+    error, looked = engine.step(256, replace(RATES, density=0.1, feature=0.05))
+    assert looked == 0 and np.isfinite(error) and engine.next_record == records
+    assert torch.equal(before, field.density_rows)
