@@ -82,7 +82,7 @@ class PoseResult:
                 seconds={str(key): float(value) for key, value in data["seconds"].items()},
                 metric=bool(data.get("metric", False)),
             )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             raise InputError(f"poses.json is not what the poses stage writes ({error}); remove it and run again") from error
 
     def apply(self, capture: Capture) -> Capture:

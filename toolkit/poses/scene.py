@@ -84,7 +84,7 @@ class Scene:
                 points=int(data["points"]),
                 warnings=[str(text) for text in data["warnings"]],
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InputError(f"scene.json is not what the poses stage writes ({error}); remove it and run again") from error
 
 

@@ -32,6 +32,7 @@ BLOCK = 8
 DEPTH_STEPS = 60000  # 16-bit depth: this value is depth_max, what saturates above it is out of range
 BYTES_PER_BLOCK = BLOCK**3 * (1 + 1 + 3) * 4
 MAX_BYTES = 4 * 2**30
+SMALLEST, LARGEST = 1e-9, 1e9  # of lengths: Open3D computes in float32, where products of two must stay finite and above zero
 SLACK = 1024  # blocks of room beyond those in use
 DEVICE = o3c.Device("CPU:0")
 
@@ -71,8 +72,8 @@ class TsdfVolume:
         self, voxel_size: float, depth_max: float, truncation: float = 4.0, expected_blocks: int = 4000, max_bytes: int = MAX_BYTES
     ) -> None:
         for name, value in (("voxel size", voxel_size), ("largest depth", depth_max), ("truncation", truncation)):
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"the {name} of the TSDF is {value:g}; it must be a positive number")
+            if not SMALLEST <= value <= LARGEST:
+                raise InputError(f"the {name} of the TSDF is {value:g}; it must be a positive number between {SMALLEST:g} and {LARGEST:g}")
         self.voxel_size, self.depth_max, self.truncation = float(voxel_size), float(depth_max), float(truncation)
         self.max_blocks = max(1, max_bytes // BYTES_PER_BLOCK)
         self.frames = 0
