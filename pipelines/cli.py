@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines import evaluate, export, finetune, info, poses, render, run, selftest, train, tsdf
+from pipelines import evaluate, export, finetune, info, poses, render, run, selftest, simulate, train, tsdf
 from pipelines.options import Json
 from toolkit import __version__
 from toolkit.errors import FieldfuseError, Interrupted
@@ -92,6 +92,7 @@ for _command in (
     info.info,
     train.train,
     selftest.selftest,
+    simulate.simulate,
 ):
     app.command()(_command)
 

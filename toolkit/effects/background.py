@@ -4,7 +4,7 @@ A colour for each direction d (unit, z up), the same from every place: with e = 
 
     ground  (e < 0):     haze · (1 − g) + earth · g,                         g = 1 − exp(e / 6°)
     sky     (e ≥ 0):     haze · exp(−e / 12°) + zenith · (1 − exp(−e / 12°)), and clouds over it
-    skyline (0 < e < h(a)): towers and hills, each azimuth step of its own height and shade, with rows of windows
+    skyline (0 < e < h(a)): towers, each step of azimuth of its own height and shade, with rows of windows
 
 `detail` in [0, 1] scales the contrast of clouds and the height of the skyline: 0 is a plain gradient.
 """
@@ -19,6 +19,7 @@ Tensor = torch.Tensor
 
 HAZE, ZENITH, EARTH = (0.66, 0.72, 0.78), (0.16, 0.32, 0.66), (0.20, 0.19, 0.16)  # linear
 TOWERS = 96  # steps of azimuth round the horizon
+SOFT = 0.15  # degrees over which roofs fade into the sky, about a pixel
 
 
 @dataclass(frozen=True)
@@ -50,10 +51,10 @@ def forward(effect: Background, directions: Tensor) -> Tensor:
     colour = torch.where(elevation >= 0, sky, haze * depth + earth * (1 - depth))
     if effect.detail > 0:
         top, shade = skyline(effect, azimuth)
-        windows = (torch.sin(azimuth * 900) > 0.2) & (torch.sin(elevation[:, 0] * 25) > 0.1)
-        face = shade[:, None] * torch.where(windows[:, None], haze * 1.15, haze * 0.75)
-        behind = (elevation[:, 0] > 0) & (elevation[:, 0] < top)
-        colour = torch.where(behind[:, None], face, colour)
+        windows = 0.95 + 0.2 * torch.sin(azimuth * 400) * torch.sin(elevation[:, 0] * 12)
+        face = (shade * windows)[:, None] * haze
+        behind = ((top - elevation[:, 0]) / SOFT).clamp(0, 1) * (elevation[:, 0] / SOFT + 1).clamp(0, 1)
+        colour = torch.lerp(colour, face, behind[:, None])
     return colour
 
 

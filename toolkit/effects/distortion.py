@@ -89,6 +89,7 @@ def lens(effect: Distortion, intrinsics: Intrinsics) -> Intrinsics:
     radius = float(ideal.norm(dim=1).max())
     if not (forward(effect, ideal) - place).abs().max() < 1e-9 or not lens_limit(out, radius) >= radius:
         raise InputError(
-            f"the lens distortion k1={effect.k1:g}, k2={effect.k2:g} turns back inside the picture; use smaller values or a narrower field of view"
+            f"the lens distortion k1={effect.k1:g}, k2={effect.k2:g} turns back inside the picture; "
+            "use smaller values or a narrower field of view"
         )
     return out

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
 from toolkit.camera import Array, Intrinsics
 from toolkit.errors import OutputError
@@ -20,6 +15,7 @@ from toolkit.progress import SILENT, Progress
 from toolkit.simulate import textures
 from toolkit.simulate.baked import BakedScene, Light
 from toolkit.simulate.trace import Rectangle, Sphere
+from toolkit.simulate.workers import drawing
 
 FRAMES_A_SECOND = 12
 WALL = 1.3  # metres from the middle of the floor to each wall
@@ -115,19 +111,6 @@ def hand_held(frames: int, seed: int = 0) -> Array:
     return poses
 
 
-@contextmanager
-def _drawing() -> Iterator[ThreadPoolExecutor]:
-    """Workers that draw one frame each on one thread: on a busy machine, threads that wait for each other are far slower."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    pool = ThreadPoolExecutor(min(os.cpu_count() or 1, 4))
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-        torch.set_num_threads(before)
-
-
 def write_demo_video(
     path: Path | str, frames: int = 48, size: tuple[int, int] = (480, 360), seed: int = 0, progress: Progress = SILENT
 ) -> Filmed:
@@ -139,13 +122,13 @@ def write_demo_video(
     width, height = size
     intrinsics = Intrinsics(width, height, 0.85 * width, 0.85 * width, width / 2, height / 2)
     poses = hand_held(frames, seed)
-    with _drawing() as pool, atomic_path(path) as temporary:
+    with drawing() as side_by_side, atomic_path(path) as temporary:
         scene = demo_scene(seed)
         writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_A_SECOND, (width, height))
         if not writer.isOpened():
             raise OutputError(f"cannot write {path}: OpenCV has no mp4 encoder or the folder is not writable; see `fieldfuse doctor`")
         try:
-            for number, picture in enumerate(pool.map(lambda pose: scene.picture(intrinsics, pose), poses)):
+            for number, picture in enumerate(side_by_side(lambda pose: scene.picture(intrinsics, pose), poses)):
                 progress.check()
                 writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
                 progress.update(number + 1, frames)

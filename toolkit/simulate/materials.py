@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 import torch
 
 from toolkit.camera import Array
 from toolkit.simulate import patterns, textures
+from toolkit.simulate.atlas import Atlas
 
 Tensor = torch.Tensor
 
 SIZE = 512  # texels of a texture's side
-LEVELS = 8  # mip levels: down to 4 × 4
 GAMMA = 2.2  # what the procedural pictures are stored in
 PLAIN = "plain"  # the texture that is white all over
 
@@ -37,70 +37,24 @@ MAKERS: dict[str, tuple[Callable[[np.random.Generator, int], Array], int]] = {  
 }
 
 
-class TextureBank:
-    """Square textures of one size, all mip levels in one list of texels.
+class TextureBank(Atlas):
+    """Square procedural pictures, sorted by what they can be on.
 
     Attributes:
-        texels: (total, 4) uint8, square root of linear colour (the fourth is padding: a texel is one 32-bit word).
         kinds: texture numbers by kind of surface.
     """
 
     def __init__(self, pictures: list[Array], kinds: dict[str, list[int]]) -> None:
-        """Args: pictures: (size, size, 3) sRGB float32 in [0, 1], one size, a power of two of at least 128."""
-        self.kinds, self.count, self.size = kinds, len(pictures), pictures[0].shape[0]
-        levels = []
-        linear: list[Array] = [np.clip(image, 0, 1).astype(np.float32) ** GAMMA for image in pictures]
-        for level in range(LEVELS):
-            side = self.size >> level
-            if level:
-                linear = [cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA) for image in linear]
-            levels += [np.round(np.sqrt(image) * 255).astype(np.uint8).reshape(-1, 3) for image in linear]
-        flat = np.concatenate(levels)
-        self.texels = torch.from_numpy(np.pad(flat, ((0, 0), (0, 1))))
-        first, sides = 0, []
-        for level in range(LEVELS):
-            sides.append((first, self.size >> level))
-            first += self.count * (self.size >> level) ** 2
-        self.starts = torch.tensor([start for start, _ in sides])  # (LEVELS,)
+        """Args: pictures: (size, size, 3) sRGB float32 in [0, 1]."""
+        super().__init__([np.clip(image, 0, 1).astype(np.float32) ** GAMMA for image in pictures])
+        self.kinds = kinds
 
     def to(self, device: torch.device | str) -> TextureBank:
         if self.texels.device == torch.device(device):
             return self
-        moved = object.__new__(TextureBank)
-        moved.kinds, moved.count, moved.size = self.kinds, self.count, self.size
-        moved.texels, moved.starts = self.texels.to(device), self.starts.to(device)
+        moved = copy(self)
+        moved._move(device)
         return moved
-
-    def sample(self, texture: Tensor, place: Tensor, footprint: Tensor) -> Tensor:
-        """(N, 3) linear colour of textures (N,) at places (N, 2) in texture widths, mirrored beyond [0, 1].
-
-        Args:
-            footprint: (N,) width of a pixel on the surface in texture widths; textures are blurred to it (trilinear).
-        """
-        level = torch.log2((footprint * self.size).clamp(min=1e-6)).clamp(0, LEVELS - 1 - 1e-3)
-        lower = level.floor()
-        between = level - lower
-        folded = 1 - (torch.remainder(place, 2) - 1).abs()  # (N, 2) in [0, 1]
-        rows, weights = [], []
-        for step, share in ((0, 1 - between), (1, between)):
-            number = lower.long() + step
-            side = torch.bitwise_right_shift(torch.full_like(number, self.size), number)
-            at = folded * side[:, None] - 0.5
-            corner = at.floor()
-            part = at - corner
-            first = self.starts[number] + texture * side * side
-            low = corner.long().clamp(min=0)
-            high = torch.minimum(corner.long() + 1, side[:, None] - 1)
-            for v, in_v in ((low[:, 1], 1 - part[:, 1]), (high[:, 1], part[:, 1])):
-                start = first + v * side
-                for u, in_u in ((low[:, 0], 1 - part[:, 0]), (high[:, 0], part[:, 0])):
-                    rows.append(start + u)
-                    weights.append(in_u * in_v * share)
-        total = torch.zeros(len(texture), 4, device=place.device)
-        for row, weight in zip(rows, weights, strict=True):
-            root = self.texels[row].float()
-            total.addcmul_(root.square_(), weight[:, None])
-        return total[:, :3] * (1 / 255**2)
 
 
 @lru_cache(maxsize=2)

@@ -1,0 +1,159 @@
+"""Filming: one frame of a scene after the other, through exactly the effects that are listed, with the truth behind each.
+
+Light takes this way: scene (background, highlights) → lens and rows (distortion, rolling shutter) → open shutter (motion blur) →
+vignetting → exposure → sensor noise → clipping, sRGB and 8 bits → compression. An effect that is not listed is not called.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from toolkit.camera import Array, Intrinsics
+from toolkit.effects import (
+    compression,
+    depth_noise,
+    distortion,
+    exposure,
+    motion_blur,
+    rolling_shutter,
+    sensor_noise,
+    transfer,
+    vignetting,
+)
+from toolkit.effects.listed import Effects, generator
+from toolkit.simulate.curve import Motion
+from toolkit.simulate.eye import Eye, Picture, eye_of, measure, take
+from toolkit.simulate.seen import Scenery
+
+Tensor = torch.Tensor
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One filmed frame with its truth."""
+
+    index: int
+    seconds: float
+    world_from_camera: Array  # (4, 4) float64: in the middle of the exposure, for the middle row
+    rgb: Array  # (H, W, 3) uint8 sRGB
+    jpeg: bytes | None  # the picture as it was compressed, when compression is listed
+    depth: Array  # (H, W) float32 metres along z: what a perfect camera at that pose sees; 0 = nothing
+    normals: Array  # (H, W, 3) float32 unit, world axes; 0 = nothing
+    sensor_depth: Array | None  # (H, W) float32 metres: what the depth sensor tells; None when the capture has no depth
+    facts: dict[str, Any] = field(default_factory=dict)  # parameters of the effects in this frame
+
+
+class Film:
+    """A scene, a camera on its way through it, and the effects.
+
+    Args:
+        intrinsics: pinhole; a listed lens distortion is put before it.
+        times: (N,) seconds of the frames.
+        depth: whether the capture has a depth sensor.
+        side: pixels that hold an edge are the mean of side × side rays.
+
+    Raises:
+        InputError: the lens distortion is not one-to-one over the picture.
+    """
+
+    def __init__(
+        self,
+        scene: Scenery,
+        intrinsics: Intrinsics,
+        motion: Motion,
+        times: Array,
+        effects: Effects,
+        seed: int = 0,
+        depth: bool = False,
+        side: int = 2,
+    ) -> None:
+        scene.background, scene.highlights = effects.background, effects.highlights
+        self.scene, self.motion, self.effects, self.seed, self.has_depth = scene, motion, effects, seed, depth
+        self.times = np.asarray(times, dtype=np.float64)
+        self.world_from_camera = motion.poses(self.times)
+        self.intrinsics = intrinsics if effects.distortion is None else distortion.lens(effects.distortion, intrinsics)
+        self.eye = eye_of(self.intrinsics, side, scene.device)
+        self._radius = None if effects.vignetting is None else vignetting.radii(self.intrinsics).to(scene.device)
+        self._gains = None if effects.exposure is None else exposure.draw(effects.exposure, len(self.times), generator(seed, "exposure"))
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def shot(self, index: int) -> Shot:
+        """Frame `index`; frames do not depend on each other, in whichever order or thread they are taken."""
+        effects, seconds, pose = self.effects, float(self.times[index]), self.world_from_camera[index]
+        facts: dict[str, Any] = {}
+        moving = effects.rolling_shutter is not None or effects.motion_blur is not None
+        picture = None if moving else take(self.scene, self.eye, pose[None])
+        linear = self._gathered(seconds, facts) if picture is None else picture.linear
+        rgb, jpeg = self._developed(linear, index, facts)
+        still, depth, normals = self._truth(picture, pose)
+        return Shot(
+            index=index,
+            seconds=seconds,
+            world_from_camera=pose,
+            rgb=rgb,
+            jpeg=jpeg,
+            depth=depth,
+            normals=normals,
+            sensor_depth=self._sensed(depth, still, index) if self.has_depth else None,
+            facts=facts,
+        )
+
+    def _gathered(self, seconds: float, facts: dict[str, Any]) -> Tensor:
+        """(H, W, 3) linear light of a frame during which the camera moves."""
+        effects = self.effects
+        rows = np.array([seconds])
+        if effects.rolling_shutter is not None:
+            rows = rolling_shutter.forward(effects.rolling_shutter, seconds, self.intrinsics.height)
+            facts["rolling_shutter"] = {"first_row_seconds": float(rows[0]), "last_row_seconds": float(rows[-1])}
+        if effects.motion_blur is None:
+            return take(self.scene, self.eye, self.motion.poses(rows)).linear
+        offsets = motion_blur.instants(effects.motion_blur)
+        half = effects.motion_blur.exposure / 2
+        facts["motion_blur"] = {
+            "exposure_seconds": effects.motion_blur.exposure,
+            "path": self.motion.poses(seconds + np.array([-half, 0.0, half])).tolist(),  # world_from_camera at start, middle and end
+        }
+        return motion_blur.forward([take(self.scene, self.eye, self.motion.poses(rows + offset)).linear for offset in offsets])
+
+    def _developed(self, linear: Tensor, index: int, facts: dict[str, Any]) -> tuple[Array, bytes | None]:
+        """Linear light on the lens → the stored picture."""
+        effects = self.effects
+        if effects.vignetting is not None and self._radius is not None:
+            linear = vignetting.forward(effects.vignetting, linear, self._radius)
+        if self._gains is not None:
+            gain = self._gains[index]
+            facts["exposure"] = {"gain": gain.tolist()}
+            linear = exposure.forward(linear, torch.tensor(gain, dtype=torch.float32, device=linear.device))
+        if effects.sensor_noise is not None:
+            noisy = sensor_noise.forward(effects.sensor_noise, linear.cpu().numpy(), generator(self.seed, "sensor_noise", index))
+            linear = torch.from_numpy(noisy)
+        rgb = transfer.to_bytes(transfer.encode(linear)).cpu().numpy()
+        if effects.compression is None:
+            return rgb, None
+        jpeg = compression.encode(effects.compression, rgb)
+        facts["compression"] = {"bytes": len(jpeg)}
+        return compression.decode(jpeg), jpeg
+
+    def _truth(self, picture: Picture | None, pose: Array) -> tuple[Picture | None, Array, Array]:
+        """What a perfect camera sees from the frame's pose: with materials only where the depth sensor asks for them."""
+        if picture is None and self.has_depth and self.effects.depth_noise is not None:
+            picture = take(self.scene, plain(self.eye), pose[None])
+        depth, normals = measure(self.scene, self.eye, pose[None]) if picture is None else (picture.depth, picture.normals)
+        return picture, depth.cpu().numpy(), normals.cpu().numpy()
+
+    def _sensed(self, depth: Array, still: Picture | None, index: int) -> Array:
+        if self.effects.depth_noise is None or still is None:
+            return depth
+        albedo, gloss = still.albedo.mean(2).cpu().numpy(), still.gloss.cpu().numpy()
+        return depth_noise.forward(self.effects.depth_noise, depth, albedo, gloss, generator(self.seed, "depth_noise", index))
+
+
+def plain(eye: Eye) -> Eye:
+    """The same camera with one ray a pixel."""
+    return eye_of(eye.intrinsics, 1, eye.directions.device)
