@@ -10,7 +10,7 @@ from toolkit.camera import Array
 from toolkit.errors import InputError
 
 KEYS = ("abs_err", "abs_rel", "rmse", "median_rel", "delta_1", "delta_2", "delta_3", "within_5_percent", "coverage")
-NEAREST, FARTHEST = 1e-12, 1e100
+NEAREST, FARTHEST = 1e-12, 1e30
 
 
 def has_depth(depth: Array) -> Array:
