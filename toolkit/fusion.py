@@ -25,7 +25,7 @@ from toolkit.networks.cameras import Cameras
 from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
 from toolkit.networks.lattice import LatentVolume, Lattice
 from toolkit.networks.model import NerfusionModel
-from toolkit.networks.refine import adopt, children, solid_cells, split_volume
+from toolkit.networks.refine import adopt, children, merged, part, solid_cells, split_volume
 from toolkit.networks.store import GlobalStore
 from toolkit.networks.unproject import EncodedView
 from toolkit.progress import SILENT, Progress
@@ -111,31 +111,20 @@ class Fusion:
         """Fuse one key frame (first) and its neighbours."""
         options = self.options
         keys = self._keys[visible_blocks(*self._balls, cameras, options.near, options.far)]
-        if len(keys) == 0:
-            return
-        part = self._fuse(0, views, cameras, self.stores[0].part(Topology(keys)), None)
-        for level in range(1, options.levels):
-            thickness = self.model.thickness(part)
-            finer = split_volume(part, solid_cells(part, thickness, options.gamma))
-            if finer.topology.blocks == 0:
-                return
-            before = adopt(self.stores[level].part(finer.topology), finer)
-            part = self._fuse(level, views, cameras, before, finer.known)
-
-    def _fuse(
-        self, level: int, views: Sequence[EncodedView], cameras: Cameras, before: LatentVolume, wanted: Tensor | None
-    ) -> LatentVolume:
-        """Local volume and GRU on the blocks of `before`, written to the store. Returns the global volume on these blocks."""
-        options = self.options
-        local = self.model.local_volume(views, cameras, before.lattice, before.topology, wanted, options.near, options.far)
-        after = self.model.fuse_part(before, local)
-        inside = local.known
-        self.stores[level].write(after, inside)
-        mask = torch.cat([inside, inside.new_zeros(1)])[:, None]
-        # What was known but is not seen now is needed to tell whole cells at the border of what is.
-        return LatentVolume(
-            before.lattice, before.topology, torch.where(mask, after.rows, before.rows), torch.where(inside, after.count, before.count)
-        )
+        topology, finer = Topology(keys), None
+        for level, store in enumerate(self.stores):
+            wanted = None if finer is None else finer.known
+            local = self.model.local_volume(views, cameras, store.lattice, topology, wanted, options.near, options.far)
+            before = store.part(local.topology)
+            if finer is not None:
+                before = adopt(before, part(finer, local.topology))
+            after = self.model.fuse_part(before, local)
+            store.write(after, local.known)
+            if level + 1 < options.levels:
+                # What was known before but is not seen now still makes cells whole.
+                here = merged(before, after, local.known)
+                finer = split_volume(here, solid_cells(here, self.model.thickness(here), options.gamma))
+                topology = finer.topology
 
     @property
     def volume(self) -> LatentVolume:

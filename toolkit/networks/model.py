@@ -115,29 +115,23 @@ class NerfusionModel(nn.Module):
         Args:
             views, cameras: K of each.
             topology: blocks to work on; None: every block that a view can see.
-            wanted: (M · 512,) bool, corners of these blocks to work on; None: all. Only what a view sees is ever filled.
+            wanted: (M · 512,) bool, corners of these blocks to work on; None: all.
             near, far: depths along z within which views are asked, working units.
+
+        Returns:
+            a volume of those of the blocks in which a view sees a corner.
         """
         if topology is None:
             keys = all_blocks(lattice, cameras.intrinsics.device)
             topology = Topology(keys[visible_blocks(*block_balls(lattice, keys), cameras, near, far)])
-        found, projected, colours, counts = [], [], [], []
         rows = torch.arange(topology.zero_row, device=topology.device) if wanted is None else wanted.nonzero().view(-1)
-        for part in rows.split(CHUNK):
-            seen, rows_projected, colour, count = self._observe(views, cameras, lattice, topology, part, near, far)
-            found.append(seen)
-            projected.append(rows_projected)
-            colours.append(colour)
-            counts.append(count)
+        parts = [self._observe(views, cameras, lattice, topology, part, near, far) for part in rows.split(CHUNK)]
+        where, projected, colours, counts = (torch.cat(values) for values in zip(*parts, strict=True))
+        topology, where = _without_empty_blocks(topology, where)
         config, size = self.config, topology.zero_row
-        where = torch.cat(found) if found else rows
-        count = torch.zeros(size, device=topology.device)
-        latent = torch.zeros((size + 1, config.hidden), device=topology.device)
-        colour = torch.zeros((size + 1, COLOURS), device=topology.device)
-        if len(where):
-            count = count.index_copy(0, where, torch.cat(counts))
-            latent = latent.index_copy(0, where, torch.cat(projected).to(latent.dtype))
-            colour = colour.index_copy(0, where, torch.cat(colours).to(colour.dtype))
+        count = torch.zeros(size, device=topology.device).index_copy(0, where, counts)
+        latent = projected.new_zeros((size + 1, config.hidden)).index_copy(0, where, projected)
+        colour = colours.new_zeros((size + 1, COLOURS)).index_copy(0, where, colours)
         raw = self.local(latent, colour, topology, count > 0)
         return LocalVolume(lattice, topology, torch.tanh(raw), count, raw)
 
@@ -206,3 +200,12 @@ class NerfusionModel(nn.Module):
             torch.zeros(size, device=known.device).index_copy(0, known, thickness.float()),
             torch.zeros((size, features.shape[1]), device=known.device).index_copy(0, known, features.float()),
         )
+
+
+def _without_empty_blocks(topology: Topology, rows: Tensor) -> tuple[Topology, Tensor]:
+    """The blocks that own at least one of the rows, in their order, and the same rows in them."""
+    slot = rows.div(VOXELS, rounding_mode="floor")
+    filled = torch.zeros(topology.blocks, dtype=torch.bool, device=rows.device).index_fill(0, slot, True)
+    if bool(filled.all()):
+        return topology, rows
+    return Topology(topology.keys[filled]), rows + ((torch.cumsum(filled, 0) - 1)[slot] - slot) * VOXELS

@@ -55,6 +55,24 @@ def adopt(state: LatentVolume, inherited: LatentVolume) -> LatentVolume:
     )
 
 
+def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
+    """A copy of some blocks of a volume; where it has no such block, nothing is known."""
+    slots = volume.topology.find(topology.keys)
+    place = (slots.clamp_min(0)[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
+    here = (slots >= 0).repeat_interleave(VOXELS)
+    if volume.topology.blocks == 0:
+        place = torch.zeros_like(place)
+    count = torch.cat([volume.count, volume.count.new_zeros(1)])[place] * here
+    rows = volume.rows[place] * here[:, None]
+    return LatentVolume(volume.lattice, topology, torch.cat([rows, rows.new_zeros((1, rows.shape[1]))]), count)
+
+
+def merged(before: LatentVolume, after: LatentVolume, changed: Tensor) -> LatentVolume:
+    """`after` where `changed` (M · 512,), else `before`; both have the same blocks."""
+    mask = torch.cat([changed, changed.new_zeros(1)])[:, None]
+    return replace(before, rows=torch.where(mask, after.rows, before.rows), count=torch.where(changed, after.count, before.count))
+
+
 def with_blocks(state: LatentVolume, keys: Tensor) -> tuple[LatentVolume, Tensor]:
     """The volume with at least these blocks — its own keep their slots, new ones follow, of which nothing is known — and their slots."""
     slots = state.topology.find(keys)

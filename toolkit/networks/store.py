@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from toolkit.networks.lattice import LatentVolume, Lattice
+from toolkit.networks.refine import part
 from toolkit.volume.topology import VOXELS, Topology
 
 GROWTH = 1.5  # a buffer that must grow gets at least this much more room
@@ -31,17 +32,15 @@ class GlobalStore:
 
     def part(self, topology: Topology) -> LatentVolume:
         """A copy of some blocks; where a block is not here, nothing is known."""
-        place, here = self._place(self.topology.find(topology.keys))
-        rows = self._rows[place] * here[:, None]
-        return LatentVolume(self.lattice, topology, torch.cat([rows, rows.new_zeros((1, rows.shape[1]))]), self._count[place] * here)
+        return part(self.volume(), topology)
 
-    def write(self, part: LatentVolume, changed: Tensor) -> None:
-        """Take over the corners `changed` (M · 512,) of a part."""
-        slots = self._slots(part.topology.keys)
+    def write(self, values: LatentVolume, changed: Tensor) -> None:
+        """Take over the corners `changed` (M · 512,) of some blocks."""
+        slots = self._slots(values.topology.keys)
         which = changed.nonzero().view(-1)
-        place = self._place(slots)[0][which]
-        self._rows[place] = part.rows[which]
-        self._count[place] = part.count[which]
+        place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)[which]
+        self._rows[place] = values.rows[which]
+        self._count[place] = values.count[which]
 
     def keep(self, blocks: Tensor) -> None:
         """Forget all blocks but those of the mask (M,)."""
@@ -52,11 +51,6 @@ class GlobalStore:
         self._count[: self.topology.zero_row] = 0
         self._rows[: len(rows)], self._count[: len(count)] = rows, count
         self.topology = Topology(self.topology.keys[kept])
-
-    def _place(self, slots: Tensor) -> tuple[Tensor, Tensor]:
-        """(M,) slots → (M · 512,) rows, and which of them are here (others point at row 0)."""
-        inner = torch.arange(VOXELS, device=slots.device)
-        return (slots.clamp_min(0)[:, None] * VOXELS + inner).view(-1), (slots >= 0).repeat_interleave(VOXELS)
 
     def _slots(self, keys: Tensor) -> Tensor:
         """(M,) slots of blocks, made where missing."""

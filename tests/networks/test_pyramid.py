@@ -1,0 +1,55 @@
+"""Lookups in pyramids against a slow definition, and their gradient."""
+
+from __future__ import annotations
+
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from toolkit.networks.pyramid import Pyramid
+
+
+def slow(levels: list[torch.Tensor], stride: int, u: float, v: float, footprint: float) -> torch.Tensor:
+    level = min(max(round(float(torch.log2(torch.tensor(footprint / stride)))), 0), len(levels) - 1)
+    image, cell = levels[level], stride * 2**level
+    x = min(max(u / cell - 0.5, 0.0), image.shape[2] - 1.0)
+    y = min(max(v / cell - 0.5, 0.0), image.shape[1] - 1.0)
+    x0, y0 = int(x), int(y)
+    x1, y1 = min(x0 + 1, image.shape[2] - 1), min(y0 + 1, image.shape[1] - 1)
+    fx, fy = x - x0, y - y0
+    top = (1 - fx) * image[:, y0, x0] + fx * image[:, y0, x1]
+    return (1 - fy) * top + fy * ((1 - fx) * image[:, y1, x0] + fx * image[:, y1, x1])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([1, 4]), st.integers(1, 3))
+def test_against_the_definition(seed: int, stride: int, levels: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    image = torch.rand((2, 8, 12), generator=generator, dtype=torch.float64)
+    maps = [image]
+    for _ in range(levels - 1):
+        maps.append(maps[-1].unflatten(2, (-1, 2)).mean(3).unflatten(1, (-1, 2)).mean(2))
+    pyramid = Pyramid.of(image, stride, levels)
+    assert pyramid.sizes == tuple((level.shape[1], level.shape[2]) for level in maps)
+    pixels = (torch.rand((20, 2), generator=generator, dtype=torch.float64) * 1.2 - 0.1) * stride * torch.tensor([12.0, 8.0])
+    footprint = torch.exp(3 * torch.randn(20, generator=generator, dtype=torch.float64))
+    found = pyramid.lookup(pixels, footprint)
+    for row, (u, v), size in zip(found, pixels.tolist(), footprint.tolist(), strict=True):
+        torch.testing.assert_close(row, slow(maps, stride, u, v, size), atol=1e-9, rtol=1e-9)
+
+
+def test_a_pixel_centre_gives_that_pixel() -> None:
+    image = torch.rand(3, 4, 6)
+    pyramid = Pyramid.of(image, 1, 5)
+    assert pyramid.sizes == ((4, 6), (2, 3))  # no further: a side is odd
+    found = pyramid.lookup(pyramid.pixels()[:24], torch.ones(24))
+    torch.testing.assert_close(found, image.flatten(1).T)
+    whole = pyramid.lookup(pyramid.pixels()[24:], torch.full((6,), 2.0))
+    torch.testing.assert_close(whole, pyramid.rows[24:])
+
+
+def test_gradient() -> None:
+    image = torch.rand(2, 4, 4, dtype=torch.float64, requires_grad=True)
+    pixels = torch.rand(7, 2, dtype=torch.float64) * 4
+    footprint = torch.tensor([1.0, 1.0, 2.0, 2.0, 8.0, 0.1, 1.0], dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda x: Pyramid.of(x, 1, 2).lookup(pixels, footprint), (image,))

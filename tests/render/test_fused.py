@@ -1,0 +1,118 @@
+"""From latent volumes to fields: units of density, pruning, saving, and a small volume that learns from its pictures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.networks.made import HEIGHT, INTRINSICS, WIDTH, lattice, small_model, wall_pictures
+from toolkit.camera import pixel_grid, rays
+from toolkit.networks.cameras import Cameras
+from toolkit.networks.cull import all_blocks
+from toolkit.networks.lattice import LatentVolume, Lattice
+from toolkit.networks.model import NerfusionModel
+from toolkit.render.differentiable import render_with_gradients
+from toolkit.render.field import Field
+from toolkit.render.fused import make_field, without_empty_blocks
+from toolkit.render.rays import render_rays
+from toolkit.volume.space import Space
+from toolkit.volume.topology import Topology
+
+
+def full_volume(model: NerfusionModel, shell: float = 0.0, resolution: int = 32) -> LatentVolume:
+    """Every corner of the space known, with one and the same latent."""
+    where = Lattice(Space((0.1, 0.2, -0.1), 0.8, shell), resolution)
+    topology = Topology(all_blocks(where))
+    rows = torch.zeros((topology.zero_row + 1, model.config.channels))
+    rows[:-1] = torch.linspace(-0.5, 0.5, model.config.channels)
+    return LatentVolume(where, topology, rows, torch.ones(topology.zero_row))
+
+
+@pytest.mark.parametrize("shell", [0.0, 1.0])
+@pytest.mark.parametrize("resolution", [16, 32])
+def test_thickness_is_counted_per_voxel(shell: float, resolution: int) -> None:
+    """A ray through n voxels of thickness τ along an axis leaves exp(−n·τ), whatever the resolution."""
+    model = small_model().eval()
+    volume = full_volume(model, shell, resolution)
+    with torch.no_grad():
+        thickness = float(torch.exp(model.thickness(volume)[0]))
+        field = make_field(model, volume, torch.zeros(3))
+        # From the middle to the lattice's face: half of its voxels.
+        origin = torch.tensor([[0.13, 0.21, -0.1]])
+        seen = render_rays(field, origin, torch.tensor([[0.0, 0.0, 1.0]]), threshold=0.0)
+    # The last voxel of a shell reaches to infinity and is not gone through to its end.
+    most, least = resolution / 2 + 0.2, resolution / 2 - (1.2 if shell else 0.2)
+    assert 1 - math.exp(-least * thickness) < float(seen.opacity) < 1 - math.exp(-most * thickness)
+
+
+def test_a_field_of_a_volume_can_be_saved_and_read(tmp_path: Path) -> None:
+    model = small_model().eval()
+    with torch.no_grad():
+        field = without_empty_blocks(make_field(model, full_volume(model, 1.0), torch.tensor([0.1, 0.2, 0.3]), near=0.2))
+    field.save(tmp_path / "field.safetensors")
+    again = Field.load(tmp_path / "field.safetensors")
+    origins, directions = torch.zeros(50, 3), torch.nn.functional.normalize(torch.randn(50, 3), dim=1)
+    one, two = render_rays(field, origins, directions), render_rays(again, origins, directions)
+    torch.testing.assert_close(one.colour, two.colour, atol=5e-3, rtol=0)
+
+
+def test_pruning_removes_see_through_cells_and_what_is_not_allowed() -> None:
+    model = small_model().eval()
+    volume = full_volume(model)
+    volume.rows[: len(volume.rows) // 2] *= -1
+    with torch.no_grad():
+        thickness = model.thickness(volume)
+        middle = float(torch.exp(torch.tensor([thickness[0], thickness[-2]]).mean()))
+        whole = make_field(model, volume, torch.zeros(3))
+        pruned = make_field(model, volume, torch.zeros(3), gamma=math.exp(-middle))
+        allowed = torch.rand(len(volume.count)) < 0.5
+        part = make_field(model, volume, torch.zeros(3), allowed=allowed)
+    assert 0 < pruned.voxels < whole.voxels
+    assert torch.equal(part.occupied, whole.occupied & allowed)
+    smaller = without_empty_blocks(pruned)
+    assert smaller.voxels == pruned.voxels and smaller.blocks < pruned.blocks
+
+
+def wall_rays(images: torch.Tensor, world: np.ndarray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """All pixels: origins, directions, cosines, colours."""
+    parts = [rays(INTRINSICS, pose, pixel_grid(WIDTH, HEIGHT)) for pose in world]
+    origins, directions, cosine = (torch.cat([part[k] for part in parts]) for k in range(3))
+    return origins, directions, cosine, images.permute(0, 2, 3, 1).reshape(-1, 3)
+
+
+def test_a_small_volume_learns_from_its_pictures() -> None:
+    """A wall seen by three cameras: from pictures alone the loss falls, and what is rendered moves to where it is."""
+    torch.manual_seed(0)
+    model = small_model(1)
+    depth = 2.1
+    images, world = wall_pictures(3, depth)
+    seen_by = Cameras.of([INTRINSICS] * 3, world)
+    where = replace(lattice(24), space=Space((0.0, 0.0, 0.0), 0.6, 0.0))
+    origins, directions, cosine, colour = wall_rays(images, world)
+    # Only rays that the volume holds from front to back have an answer.
+    ahead = origins + directions * (depth / cosine)[:, None]
+    held = (ahead[:, :2].abs() < 0.45).all(1)
+    origins, directions, cosine, colour = origins[held], directions[held], cosine[held], colour[held]
+    optimiser = torch.optim.Adam(model.parameters(), lr=5e-3)
+    generator = torch.Generator().manual_seed(2)
+    losses, errors = [], []
+    for _ in range(40):
+        pick = torch.randint(len(origins), (256,), generator=generator)
+        local = model.local_volume(model.encode(images, seen_by), seen_by, where, near=1.0, far=2.8)
+        field = make_field(model, local, torch.full((3,), 0.5))
+        jitter, behind = torch.rand(256, generator=generator), torch.rand((256, 3), generator=generator)
+        seen = render_with_gradients(field, origins[pick], directions[pick], jitter, behind)
+        loss = (seen.colour - colour[pick]).square().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+        errors.append(float(((seen.distance.detach() * cosine[pick]) / depth - 1).abs().median()))
+    first, last = np.mean(losses[:5]), np.mean(losses[-5:])
+    assert last < 0.35 * first, f"the loss fell from {first:.4f} to {last:.4f} only"
+    assert np.mean(errors[-5:]) < 0.85 * np.mean(errors[:5]), "what is rendered moves towards the wall"
