@@ -145,3 +145,15 @@ def test_points_with_floating_colours_far_away_and_none(tmp_path: Path) -> None:
     assert np.round(np.asarray(cloud.colors) * 255).tolist() == [[0, 128, 255], [255, 0, 0]]
     write_points(tmp_path / "none.ply", np.zeros((0, 3)))
     assert "element vertex 0" in (tmp_path / "none.ply").read_bytes().decode("ascii")
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_a_mesh_can_be_used_after_it_was_written(tmp_path: Path, suffix: str) -> None:
+    """trimesh marks the arrays it is given as read-only; the mesh that was written must not be touched by that."""
+    mesh = coloured_ball()
+    for _ in range(2):
+        write_mesh(tmp_path / f"mesh{suffix}", mesh)
+        assert mesh_facts(mesh)["watertight"] is True
+    for array in (mesh.vertices, mesh.triangles, mesh.colours, mesh.normals):
+        assert array is not None and array.flags.writeable
+    assert len(mesh.decimated(100).triangles) <= 100

@@ -11,7 +11,7 @@ from tests.tsdf.scenes import CAMERA, all_round, sphere_colour, sphere_depth, sp
 from toolkit.camera import Array, Intrinsics
 from toolkit.errors import InputError
 from toolkit.export.mesh import mesh_facts
-from toolkit.export.surface import field_mesh, field_points, field_volume, reliable_depth
+from toolkit.export.surface import field_volume, reliable_depth
 from toolkit.render.image import Rendered
 
 CENTRE = np.array([0.2, 0.1, -0.1])
@@ -39,7 +39,7 @@ def faulty(camera: Intrinsics, pose: Array) -> tuple[Array, Array, Array]:
 
 @pytest.mark.parametrize("render", [exact, faulty])
 def test_the_mesh_is_the_sphere_and_nothing_else(render: Callable[..., tuple[Array, Array, Array]]) -> None:
-    mesh = field_mesh(render, POSES, CAMERA, 0.02)
+    mesh = field_volume(render, POSES, CAMERA, 0.02).mesh().cleaned(min_area_share=2e-3)
     offset = mesh.vertices - CENTRE
     radius = np.linalg.norm(offset, axis=1)
     assert np.quantile(np.abs(radius - RADIUS), 0.98) < 0.01
@@ -52,7 +52,7 @@ def test_the_mesh_is_the_sphere_and_nothing_else(render: Callable[..., tuple[Arr
 
 
 def test_points_and_a_rendered_object() -> None:
-    cloud = field_points(lambda camera, pose: Rendered(*exact(camera, pose)), POSES, CAMERA, 0.02)
+    cloud = field_volume(lambda camera, pose: Rendered(*exact(camera, pose)), POSES, CAMERA, 0.02).points()
     offset = cloud.points - CENTRE
     assert len(cloud.points) > 3000
     assert np.quantile(np.abs(np.linalg.norm(offset, axis=1) - RADIUS), 0.97) < 0.01
@@ -68,13 +68,13 @@ def test_sizes_are_chosen_and_one_camera_a_pose_is_fine() -> None:
 
 def test_the_region_is_kept_and_the_rest_is_not() -> None:
     region = (CENTRE - 1.0, CENTRE + np.array([1, 1, 0]))  # the lower half
-    mesh = field_mesh(exact, POSES, CAMERA, 0.02, region=region)
+    mesh = field_volume(exact, POSES, CAMERA, 0.02, region=region).mesh()
     assert mesh.vertices[:, 2].max() < CENTRE[2] + 0.03
     assert mesh.vertices[:, 2].min() < CENTRE[2] - RADIUS + 0.03
 
 
 def test_thinned_when_asked() -> None:
-    mesh = field_mesh(exact, POSES, CAMERA, 0.02, max_triangles=1500)
+    mesh = field_volume(exact, POSES, CAMERA, 0.02).mesh().cleaned().decimated(1500)
     assert 1000 < len(mesh.triangles) <= 1500
     assert np.quantile(np.abs(np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS), 0.9) < 0.02
 
@@ -104,11 +104,11 @@ def test_what_has_no_surface_is_refused() -> None:
         return rgb, depth, np.zeros_like(depth)
 
     with pytest.raises(InputError, match="no rendered view shows a surface"):
-        field_mesh(nothing, POSES[:3], CAMERA, 0.02)
+        field_volume(nothing, POSES[:3], CAMERA, 0.02)
     with pytest.raises(InputError, match="2 cameras and 3 poses"):
-        field_mesh(exact, POSES[:3], [CAMERA] * 2, 0.02)
+        field_volume(exact, POSES[:3], [CAMERA] * 2, 0.02)
     with pytest.raises(InputError, match="nearer than"):
-        field_mesh(exact, POSES[:3], CAMERA, 0.02, depth_max=0.5)
+        field_volume(exact, POSES[:3], CAMERA, 0.02, depth_max=0.5)
     with pytest.raises(InputError, match="finer than the pixels"):
         field_volume(exact, POSES, CAMERA, 1e-4)
 

@@ -60,7 +60,9 @@ def to_trimesh(mesh: Mesh, offset: Array | None = None) -> trimesh.Trimesh:
     """As a trimesh mesh, nothing merged or removed; `offset` (3,) is taken off the positions."""
     vertices = mesh.vertices if offset is None else mesh.vertices - offset
     colours = np.concatenate([mesh.colours, np.full((len(mesh.colours), 1), 255, np.uint8)], axis=1)
-    return trimesh.Trimesh(vertices, mesh.triangles, vertex_normals=mesh.normals, vertex_colors=colours, process=False)
+    # A copy: trimesh marks the arrays that it is given as read-only, and Open3D cannot take such an array afterwards.
+    normals = None if mesh.normals is None else mesh.normals.copy()
+    return trimesh.Trimesh(vertices.copy(), mesh.triangles.copy(), vertex_normals=normals, vertex_colors=colours, process=False)
 
 
 def _write_obj(path: Path, mesh: Mesh) -> None:

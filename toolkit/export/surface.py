@@ -11,19 +11,16 @@ import numpy as np
 from toolkit.camera import Array, Intrinsics
 from toolkit.errors import InputError
 from toolkit.progress import SILENT, Progress
-from toolkit.tsdf.frames import DepthFrame, automatic_depth_max, automatic_voxel_size
-from toolkit.tsdf.fuse import estimate_blocks
-from toolkit.tsdf.mesh import Mesh, as_bytes
-from toolkit.tsdf.volume import Points, TsdfVolume
+from toolkit.tsdf.frames import DepthFrame
+from toolkit.tsdf.held import fuse_held
+from toolkit.tsdf.mesh import as_bytes
+from toolkit.tsdf.volume import TsdfVolume
 
 # (intrinsics, world_from_camera) → (rgb, depth, opacity), or an object with these names, as `render_view` gives.
 Render = Callable[[Intrinsics, Array], Any]
 
-CONFIRMED = 1.5  # surface that a single view shows is left out ...
-MANY_VIEWS = 10  # ... from so many views on
 STEEPEST = 4.0  # tangent of the angle between view and surface normal (76°) beyond which a depth step is taken as an edge
 SMALLEST_EDGE = 0.02  # share of depth: smaller steps are never an edge
-COARSER = 1.4
 
 
 def reliable_depth(depth: Array, opacity: Array, focal: float, min_opacity: float = 0.7) -> Array:
@@ -74,7 +71,7 @@ def field_volume(
     carve: bool = True,
     progress: Progress = SILENT,
 ) -> TsdfVolume:
-    """Render all (N, 4, 4) poses and fuse their reliable depth.
+    """Render all (N, 4, 4) poses and fuse their reliable depth; its `mesh()` and `points()` are the field's surface.
 
     Args:
         render: see `Render`.
@@ -91,76 +88,12 @@ def field_volume(
     cameras = [intrinsics] * len(poses) if isinstance(intrinsics, Intrinsics) else list(intrinsics)
     if len(cameras) != len(poses) or not cameras:
         raise InputError(f"a surface needs one camera a pose, there are {len(cameras)} cameras and {len(poses)} poses")
-    frames = []
-    for number, (camera, pose) in enumerate(zip(cameras, poses, strict=True), 1):
-        progress.check()
-        frames.append(rendered_frame(render, camera, pose, min_opacity, region))
-        progress.update(number, 1.1 * len(poses), "views rendered for the surface")
-    shown = [frame for frame in frames if (frame.depth > 0).any()]
-    if not shown:
-        raise InputError("no rendered view shows a surface (nothing is opaque) to make a mesh of; fit the field longer or check its poses")
-    depths = [frame.depth for frame in shown]
-    depth_max = depth_max or automatic_depth_max(depths)
-    size = voxel_size or automatic_voxel_size(depths, min(frame.depth_intrinsics.fx for frame in shown))
-    while True:
-        volume = TsdfVolume(size, depth_max, expected_blocks=64)
-        try:
-            expected = estimate_blocks(shown, volume, len(shown))
-            break
-        except InputError:
-            if voxel_size is not None:
-                raise
-            size *= COARSER
-    volume = TsdfVolume(size, depth_max, expected_blocks=2 * expected)
-    volume.min_weight = CONFIRMED if len(shown) >= MANY_VIEWS else None
-    if carve:
-        for frame in shown:
-            volume.reserve(volume.touched(frame))
-    for number, frame in enumerate(shown, 1):
-        progress.check()
-        volume.integrate(frame, carve)
-        progress.update(len(poses) * (1 + 0.1 * number / len(shown)), 1.1 * len(poses), "views fused")
-    if volume.frames == 0:
-        raise InputError(f"no rendered view shows a surface nearer than {depth_max:g}; raise the largest depth")
-    return volume
-
-
-def field_mesh(
-    render: Render,
-    poses: Array,
-    intrinsics: Intrinsics | Sequence[Intrinsics],
-    voxel_size: float | None = None,
-    depth_max: float | None = None,
-    *,
-    min_area_share: float = 2e-3,
-    max_triangles: int = 2_000_000,
-    min_opacity: float = 0.7,
-    region: tuple[Array, Array] | None = None,
-    carve: bool = True,
-    progress: Progress = SILENT,
-) -> Mesh:
-    """The field's surface in the working frame: `field_volume`, then components below `min_area_share` of the area removed, and thinned
-    out when there are more than `max_triangles`. Arguments and errors as there."""
-    volume = field_volume(
-        render, poses, intrinsics, voxel_size, depth_max, min_opacity=min_opacity, region=region, carve=carve, progress=progress
+    return fuse_held(
+        (rendered_frame(render, camera, pose, min_opacity, region) for camera, pose in zip(cameras, poses, strict=True)),
+        len(poses),
+        voxel_size,
+        depth_max,
+        carve=carve,
+        nothing="no rendered view shows a surface (nothing is opaque) to make a mesh of; fit the field longer or check its poses",
+        progress=progress,
     )
-    return volume.mesh().cleaned(min_area_share=min_area_share).decimated(max_triangles)
-
-
-def field_points(
-    render: Render,
-    poses: Array,
-    intrinsics: Intrinsics | Sequence[Intrinsics],
-    voxel_size: float | None = None,
-    depth_max: float | None = None,
-    *,
-    min_opacity: float = 0.7,
-    region: tuple[Array, Array] | None = None,
-    carve: bool = True,
-    progress: Progress = SILENT,
-) -> Points:
-    """The field's surface as coloured points with normals, in the working frame. Arguments and errors as `field_volume`."""
-    volume = field_volume(
-        render, poses, intrinsics, voxel_size, depth_max, min_opacity=min_opacity, region=region, carve=carve, progress=progress
-    )
-    return volume.points()

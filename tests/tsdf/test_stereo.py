@@ -1,0 +1,231 @@
+"""Depth by matching: on exact pictures of a textured corner, and its parts against slow, obvious references."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from tests.poses.textured import arc, look_at, render
+from toolkit.camera import Array, Intrinsics, pixel_grid, project, unproject
+from toolkit.capture.types import Views
+from toolkit.errors import InputError, Interrupted
+from toolkit.progress import Progress
+from toolkit.tsdf.stereo import StereoDepth, inverse_depths, stereo_depths, usable_neighbours
+from toolkit.tsdf.stereo_cost import OUTSIDE, Matcher, best_half, grey_view, plane_homography, sweep
+from toolkit.tsdf.stereo_refine import warped_by_depth
+from toolkit.tsdf.stereo_smooth import PATHS, SOFT_EDGE, smoothed_planes
+
+CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
+NEAR, FAR, MEDIAN = 1.0, 9.0, 3.4
+
+
+def views_of(poses: Array, pictures: list[Array], camera: Intrinsics = CAMERA) -> Views:
+    names = [f"{index:02d}" for index in range(len(poses))]
+    return Views(names, pictures, [camera] * len(poses), np.asarray(poses), np.zeros(len(poses), bool))
+
+
+@lru_cache(maxsize=1)
+def corner() -> tuple[Views, list[Array]]:
+    """Nine pictures and their exact depth."""
+    poses = arc(9, 44.0)
+    made = [render(pose, CAMERA) for pose in poses]
+    return views_of(poses, [picture for picture, _ in made]), [depth for _, depth in made]
+
+
+@lru_cache(maxsize=1)
+def found() -> list[StereoDepth]:
+    return stereo_depths(corner()[0], NEAR, FAR, MEDIAN)
+
+
+def relative_errors(depths: list[StereoDepth], truth: list[Array]) -> tuple[Array, float]:
+    """Errors over the truth where both are known, and the share of the true pixels that are."""
+    both = [(one.depth > 0) & (true > 0) for one, true in zip(depths, truth, strict=True)]
+    errors = [np.abs(one.depth - true)[known] / true[known] for one, true, known in zip(depths, truth, both, strict=True)]
+    return np.concatenate(errors), float(sum(known.sum() for known in both) / sum((true > 0).sum() for true in truth))
+
+
+def test_depth_is_found_on_textured_surface() -> None:
+    errors, coverage = relative_errors(found(), corner()[1])
+    assert np.median(errors) < 0.005
+    assert np.quantile(errors, 0.9) < 0.03
+    assert coverage > 0.7
+    assert all(one.depth.dtype == np.float32 and one.depth.shape == (120, 160) for one in found())
+
+
+def test_confidence_tells_good_depth_from_bad() -> None:
+    truth = corner()[1]
+    low, high = [], []
+    for one, true in zip(found(), truth, strict=True):
+        known = (one.depth > 0) & (true > 0)
+        error = np.abs(one.depth - true) / np.maximum(true, 1e-6)
+        low.append(error[known & (one.confidence < 0.7)])
+        high.append(error[known & (one.confidence >= 0.8)])
+        assert np.array_equal(one.confidence > 0, one.depth > 0)
+        assert one.confidence.max() < 1
+    assert np.concatenate(low).mean() > 2 * np.concatenate(high).mean()
+
+
+def test_larger_pictures_are_matched_small_and_keep_their_field_of_view() -> None:
+    poses = arc(9, 44.0)[2:6]
+    views = views_of(poses, [render(pose)[0] for pose in poses], Intrinsics(320, 240, 300.0, 300.0, 160.0, 120.0))
+    depths = stereo_depths(views, NEAR, FAR, MEDIAN, long_side=160)
+    assert depths[0].intrinsics == CAMERA
+    errors, _ = relative_errors(depths, corner()[1][2:6])
+    assert np.median(errors) < 0.008
+
+
+def test_masked_pixels_have_no_depth() -> None:
+    views, _ = corner()
+    part = views.subset(range(4))
+    part.valid = [np.arange(160)[None] < np.full((120, 1), 60), None, None, None]
+    part.alpha = [None, np.where(np.arange(120)[:, None] < 50, 0, 255) * np.ones((1, 160), np.uint8), None, None]
+    depths = stereo_depths(part, NEAR, FAR, MEDIAN)
+    assert not depths[0].depth[:, 60:].any() and (depths[0].depth[:, :60] > 0).mean() > 0.2
+    assert not depths[1].depth[:50].any() and (depths[1].depth[50:] > 0).mean() > 0.2
+
+
+def test_bare_walls_give_no_depth() -> None:
+    views, _ = corner()
+    bare = views_of(views.world_from_camera, [np.full_like(picture, 130) for picture in views.images])
+    kept = np.mean([(one.depth > 0).mean() for one in stereo_depths(bare.subset(range(5)), NEAR, FAR, MEDIAN)])
+    assert kept < 0.05
+
+
+def test_what_cannot_be_matched_is_refused() -> None:
+    views, _ = corner()
+    with pytest.raises(InputError, match="at least two pictures"):
+        stereo_depths(views.subset([0]), NEAR, FAR, MEDIAN)
+    with pytest.raises(InputError, match="cannot be looked for"):
+        stereo_depths(views, 2.0, 1.0, MEDIAN)
+    eye = np.array([0.5, -1.3, -2.0])
+    turning = np.array([look_at(eye, np.array([x, -0.7, 2.0])) for x in (-0.2, 0.0, 0.2)])
+    with pytest.raises(InputError, match="move sideways"):
+        stereo_depths(views_of(turning, views.images[:3]), NEAR, FAR, MEDIAN)
+
+
+def test_it_can_be_stopped() -> None:
+    class Stop(Progress):
+        def stopping(self) -> bool:
+            return True
+
+    with pytest.raises(Interrupted):
+        stereo_depths(corner()[0], NEAR, FAR, MEDIAN, progress=Stop())
+
+
+# --------------------------------------------------------------------------------------------------- parts
+
+
+def test_a_plane_maps_pixels_as_projection_does() -> None:
+    views, _ = corner()
+    first, second = (grey_view(views.images[i], CAMERA, views.world_from_camera[i]) for i in (0, 3))
+    pixels = pixel_grid(160, 120)[::97]
+    points = unproject(CAMERA, views.world_from_camera[0], pixels, np.full(len(pixels), 2.5))
+    expected, _ = project(CAMERA, views.world_from_camera[3], points)
+    mapped = np.c_[pixels - 0.5, np.ones(len(pixels))] @ plane_homography(first, second, 1 / 2.5).T
+    assert np.allclose(mapped[:, :2] / mapped[:, 2:] + 0.5, expected, atol=1e-8)
+
+
+def test_warping_by_an_even_depth_is_warping_by_a_plane() -> None:
+    views, _ = corner()
+    first, second = (grey_view(views.images[i], CAMERA, views.world_from_camera[i]) for i in (0, 2))
+    volume = sweep(first, [second], np.array([0.3]))
+    warped = warped_by_depth(first, second, np.full((120, 160), 0.3, np.float32))
+    cost = Matcher(first.grey).cost(warped)
+    known = (cost >= 0) & (volume[:, :, 0] != 0.5)
+    assert known.mean() > 0.5
+    assert np.abs(cost - volume[:, :, 0])[known].max() < 0.02  # the two warps round positions differently
+
+
+def test_cost_is_correlation() -> None:
+    rng = np.random.default_rng(0)
+    grey = rng.normal(0, 40, (30, 40)).astype(np.float32)
+    matcher = Matcher(grey, 5)
+    inner = slice(3, -3), slice(3, -3)
+    assert matcher.cost(0.5 * grey + 20)[inner].max() < 0.01  # brightness and contrast do not matter
+    assert matcher.cost(-grey)[inner].min() > 0.99
+    other = rng.normal(0, 40, (30, 40)).astype(np.float32)
+    expected = 0.5 - 0.5 * np.corrcoef(grey[8:13, 8:13].ravel(), other[8:13, 8:13].ravel())[0, 1]
+    assert matcher.cost(other.copy())[10, 10] == pytest.approx(expected, abs=0.005)
+    other[:, 20:] = OUTSIDE
+    assert (matcher.cost(other)[:, 20:] == -1).all()
+
+
+def test_the_better_half_counts() -> None:
+    rng = np.random.default_rng(1)
+    costs = rng.random((5, 6, 7)).astype(np.float32)
+    costs[rng.random(costs.shape) < 0.4] = -1
+    costs[:, 0, 0] = -1
+    out = np.empty((6, 7), np.float32)
+    best_half(costs, out)
+    for y, x in np.ndindex(6, 7):
+        known = np.sort(costs[:, y, x][costs[:, y, x] >= 0])
+        expected = known[: (len(known) + 1) // 2].mean() if len(known) else 0.5
+        assert out[y, x] == pytest.approx(expected, abs=1e-6)
+
+
+def slow_total(cost: Array, grey: Array, small: float, large: float) -> Array:
+    """Costs along all paths, pixel by pixel from the definition."""
+    height, width, planes = cost.shape
+    total = np.zeros(cost.shape)
+    for down, right in PATHS:
+        line = np.full(cost.shape, np.nan)
+        rows = range(height) if down >= 0 else range(height - 1, -1, -1)
+        columns = range(width) if right >= 0 else range(width - 1, -1, -1)
+        for y in rows:
+            for x in columns:
+                before = y - down, x - right
+                if not (0 <= before[0] < height and 0 <= before[1] < width):
+                    line[y, x] = cost[y, x]
+                    continue
+                past = line[before]
+                jump = max(large / (1 + abs(grey[y, x] - grey[before]) / SOFT_EDGE), 1.5 * small)
+                for d in range(planes):
+                    options = [past[d], past.min() + jump]
+                    options += [past[n] + small for n in (d - 1, d + 1) if 0 <= n < planes]
+                    line[y, x, d] = cost[y, x, d] + min(options) - past.min()
+        total += line
+    return total
+
+
+def test_semi_global_matching_against_its_definition() -> None:
+    rng = np.random.default_rng(2)
+    cost, grey = rng.random((7, 9, 6)).astype(np.float32), rng.uniform(0, 60, (7, 9)).astype(np.float32)
+    total = slow_total(cost, grey, 0.05, 0.8)
+    plane, margin = smoothed_planes(cost, grey, 0.05, 0.8)
+    assert np.array_equal(np.abs(plane - total.argmin(axis=2)) <= 0.5, np.ones((7, 9), bool))
+    best = total.argmin(axis=2)
+    for y, x in np.ndindex(7, 9):
+        apart = [total[y, x, d] for d in range(6) if abs(d - best[y, x]) > 1]
+        assert margin[y, x] == pytest.approx((min(apart) - total[y, x].min()) / min(apart), abs=1e-4)
+
+
+def test_fractions_of_a_plane() -> None:
+    planes = np.arange(12)
+    true = np.linspace(3.0, 8.0, 60).reshape(6, 10)
+    cost = ((planes - true[..., None]) ** 2 / 400).astype(np.float32)
+    plane, _ = smoothed_planes(cost, np.zeros((6, 10), np.float32), small=0.0, large=0.0)
+    assert np.abs(plane - true).max() < 0.02
+
+
+def test_planes_lie_a_pixel_apart() -> None:
+    views, _ = corner()
+    ready = [grey_view(picture, CAMERA, pose) for picture, pose in zip(views.images, views.world_from_camera, strict=True)]
+    planes = inverse_depths(ready[0], [ready[1], ready[2]], NEAR, FAR)
+    assert planes[0] == pytest.approx(1 / FAR) and planes[-1] == pytest.approx(1 / NEAR)
+    assert np.allclose(np.diff(planes), planes[1] - planes[0])
+    middle = np.array([80.0, 60.0, 1.0])
+    moves = [plane_homography(ready[0], ready[2], value) @ middle for value in planes]
+    steps = np.linalg.norm(np.diff([move[:2] / move[2] for move in moves], axis=0), axis=1)
+    assert 0.5 < np.median(steps) < 1.5
+
+
+def test_neighbours_from_the_same_place_are_left_out() -> None:
+    poses = arc(9, 44.0)
+    poses = np.concatenate([poses, poses[4:5]])  # a tenth camera where the fifth stands
+    near = usable_neighbours(poses, [CAMERA] * 10, MEDIAN, 8)
+    assert 9 not in near[4] and 4 not in near[9]
+    assert all(index not in row for index, row in enumerate(near))
+    away = np.concatenate([poses[:2], [look_at(np.array([0.0, -1, 0]), np.array([0.0, -1, -5]))]])  # the third looks the other way
+    assert usable_neighbours(away, [CAMERA] * 3, MEDIAN, 8) == [[1], [0], []]

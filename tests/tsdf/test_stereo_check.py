@@ -1,0 +1,137 @@
+"""Views that confirm each other's depth, the surface fused from it, and its file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.tsdf.scenes import CAMERA, all_round, plane_frame, ring, sphere_frame
+from toolkit.camera import Array
+from toolkit.capture.types import Views
+from toolkit.errors import InputError
+from toolkit.tsdf.stereo import StereoDepth
+from toolkit.tsdf.stereo_check import confirmed
+from toolkit.tsdf.stereo_frames import fuse_stereo, load_stereo, save_stereo, stereo_frames
+
+CENTRE, RADIUS = np.array([0.1, -0.2, 0.3]), 0.5
+POSES = ring(CENTRE, 1.6, 12)
+EXACT = [sphere_frame(pose, CENTRE, RADIUS).depth for pose in POSES]
+
+
+def check(index: int, others: list[int], depths: list[Array], **options: float) -> tuple[Array, Array]:
+    return confirmed(index, others, depths, [CAMERA] * len(depths), POSES[: len(depths)], **options)  # type: ignore[arg-type]
+
+
+def test_exact_depth_is_confirmed_and_stays() -> None:
+    depth, confidence = check(0, [1, 2, 10, 11], EXACT)
+    known = EXACT[0] > 0
+    assert (depth > 0)[known].mean() > 0.9
+    assert not depth[~known].any() and not confidence[~known].any()
+    assert np.quantile(np.abs(depth - EXACT[0])[depth > 0] / EXACT[0][depth > 0], 0.95) < 0.005
+    assert confidence[60, 80] == pytest.approx(4 / 5)
+
+
+def test_noise_becomes_smaller_by_averaging() -> None:
+    rng = np.random.default_rng(0)
+    noisy = [np.where(depth > 0, depth * (1 + 0.005 * rng.standard_normal(depth.shape)), 0).astype(np.float32) for depth in EXACT]
+    depth, _ = check(0, [1, 2, 3, 9, 10, 11], noisy)
+    kept = depth > 0
+    before, after = (np.std((one - EXACT[0])[kept] / EXACT[0][kept]) for one in (noisy[0], depth))
+    assert kept.mean() > 0.8 * (EXACT[0] > 0).mean()
+    assert after < 0.75 * before
+
+
+def test_what_others_do_not_see_is_dropped() -> None:
+    floating = EXACT[0].copy()
+    floating[50:70, 70:90] = 0.6  # in front of the sphere: others see through it
+    floating[5:15, 5:15] = 1.4  # beside it: others see nothing there
+    depth, _ = check(0, [1, 2, 10, 11], [floating, *EXACT[1:]])
+    assert not depth[50:70, 70:90].any() and not depth[5:15, 5:15].any()
+    assert depth[40, 80] > 0
+
+
+def test_as_many_as_needed_have_to_agree() -> None:
+    wrong = [np.where(depth > 0, depth * 0.9, 0).astype(np.float32) for depth in EXACT]
+    one_right = [EXACT[0], EXACT[1], *wrong[2:]]
+    assert (check(0, [1], one_right, needed=1)[0] > 0).mean() > 0.1
+    assert not check(0, [1], one_right, needed=2)[0].any()
+    # A second view that sees the surface elsewhere outvotes nothing, a third and fourth that see through it do.
+    through = [EXACT[0], EXACT[1], *(depth * 1.1 for depth in EXACT[2:])]
+    assert not check(0, [1, 2, 10, 11], through, needed=1)[0][50:70, 70:90].any()
+
+
+def test_specks_are_dropped_and_large_patches_are_not() -> None:
+    speck = [np.zeros_like(depth) for depth in EXACT]
+    patch = [np.zeros_like(depth) for depth in EXACT]
+    for index in (0, 1, 11):
+        speck[index][59:61, 79:81] = EXACT[index][59:61, 79:81]
+        patch[index][40:80, 60:100] = EXACT[index][40:80, 60:100]
+    assert not check(0, [1, 11], speck, needed=1)[0].any()
+    assert (check(0, [1, 11], patch, needed=1)[0] > 0).sum() > 400
+
+
+def test_nothing_known_is_nothing_kept() -> None:
+    depth, confidence = check(0, [1, 2], [np.zeros_like(one) for one in EXACT])
+    assert not depth.any() and not confidence.any()
+
+
+def sphere_views() -> tuple[Views, list[StereoDepth]]:
+    poses = all_round(CENTRE, 1.6, 24)
+    frames = [sphere_frame(pose, CENTRE, RADIUS) for pose in poses]
+    views = Views([f"{i}" for i in range(24)], [frame.colour for frame in frames], [CAMERA] * 24, poses, np.zeros(24, bool))
+    depths = [StereoDepth(frame.depth, np.where(frame.depth > 0, 0.8, 0).astype(np.float32), CAMERA) for frame in frames]
+    return views, depths
+
+
+def test_the_surface_of_confident_depth() -> None:
+    views, depths = sphere_views()
+    doubtful = depths[3].depth.copy()
+    doubtful[40:80, 60:100] = 0.7
+    low = np.full_like(doubtful, 0.8)
+    low[40:80, 60:100] = 0.3
+    depths[3] = StereoDepth(doubtful, low, CAMERA)
+    mesh = fuse_stereo(views, depths, 0.02).mesh()
+    radius = np.linalg.norm(mesh.vertices - CENTRE, axis=1)
+    assert len(mesh.triangles) > 3000
+    assert np.abs(radius - RADIUS).max() < 0.06 and np.quantile(np.abs(radius - RADIUS), 0.95) < 0.01
+    assert not next(iter(stereo_frames(views.subset([3]), depths[3:4]))).depth[40:80, 60:100].any()
+
+
+def test_no_depth_at_all_is_refused() -> None:
+    views, depths = sphere_views()
+    nothing = [StereoDepth(np.zeros_like(one.depth), np.zeros_like(one.depth), CAMERA) for one in depths]
+    with pytest.raises(InputError, match="--poses sfm"):
+        fuse_stereo(views, nothing)
+
+
+def test_depth_maps_come_back_from_their_file(tmp_path: Path) -> None:
+    _, depths = sphere_views()
+    path = tmp_path / "depths.safetensors"
+    save_stereo(path, ["a", "b"], depths[:2])
+    names, back = load_stereo(path)
+    assert names == ["a", "b"]
+    for one, other in zip(depths, back, strict=False):
+        assert np.array_equal(one.depth, other.depth) and np.allclose(one.confidence, other.confidence, atol=0.002)
+        assert one.intrinsics == other.intrinsics
+    damaged = path.read_bytes()[:-500]
+    path.write_bytes(damaged)
+    for bad in (path, tmp_path / "none.safetensors"):
+        with pytest.raises(InputError, match="cannot be read"):
+            load_stereo(bad)
+    other_shape = StereoDepth(depths[0].depth[:50], depths[0].confidence[:50], CAMERA)
+    save_stereo(path, ["a"], [other_shape])
+    with pytest.raises(InputError, match="does not fit its camera"):
+        load_stereo(path)
+
+
+def test_a_plane_far_from_zero_is_confirmed_too() -> None:
+    """Speckle removal works in shares of depth, whatever the unit."""
+    pose = np.eye(4)
+    shifted = [pose.copy() for _ in range(3)]
+    for index, one in enumerate(shifted):
+        one[0, 3] = 40.0 * index
+    depths = [plane_frame(one, np.array([0.0, 0, 1]), 99.0).depth * 1.0 for one in shifted]
+    kept, _ = confirmed(0, [1, 2], depths, [CAMERA] * 3, np.array(shifted), needed=1)
+    assert (kept > 0).mean() > 0.5 and kept.max() == pytest.approx(99, rel=1e-4)

@@ -1,0 +1,76 @@
+"""Fusing depth frames that are all in memory: sizes from their depth, room made once, empty space carved by every view."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from toolkit.errors import InputError
+from toolkit.progress import SILENT, Progress
+from toolkit.tsdf.frames import DepthFrame, automatic_depth_max, automatic_voxel_size
+from toolkit.tsdf.fuse import estimate_blocks
+from toolkit.tsdf.volume import TsdfVolume
+
+CONFIRMED = 1.5  # surface that a single view shows is left out ...
+MANY_VIEWS = 10  # ... from so many views on
+COARSER = 1.4
+FUSION = 0.1  # of the time that making the frames takes, for the progress
+
+
+def fuse_held(
+    frames: Iterable[DepthFrame],
+    total: int,
+    voxel_size: float | None = None,
+    depth_max: float | None = None,
+    *,
+    carve: bool = True,
+    nothing: str = "no view shows a surface",
+    progress: Progress = SILENT,
+) -> TsdfVolume:
+    """Take all `frames` (`total` of them; they may be made one by one as they are asked for), and fuse those that show depth.
+
+    Args:
+        voxel_size, depth_max: working units; None: from the frames' depth, the voxel size made coarser until it fits into memory.
+        carve: frames also empty what others put in front of their surface, which removes most floaters.
+        nothing: the refusal when no frame shows depth.
+
+    Raises:
+        InputError: no frame shows depth, or the voxel size that was asked for is too fine for the memory.
+        Interrupted: the user asked to stop.
+    """
+    held = []
+    for number, frame in enumerate(frames, 1):
+        progress.check()
+        held.append(frame)
+        progress.update(number, (1 + FUSION) * total, "views made for the surface")
+    shown = [frame for frame in held if (frame.depth > 0).any()]
+    if not shown:
+        raise InputError(nothing)
+    volume = _with_room(shown, voxel_size, depth_max)
+    if carve:
+        for frame in shown:
+            volume.reserve(volume.touched(frame))
+    for number, frame in enumerate(shown, 1):
+        progress.check()
+        volume.integrate(frame, carve)
+        progress.update(total * (1 + FUSION * number / len(shown)), (1 + FUSION) * total, "views fused")
+    if volume.frames == 0:
+        raise InputError(f"no view shows a surface nearer than {volume.depth_max:g}; raise the largest depth")
+    return volume
+
+
+def _with_room(frames: Sequence[DepthFrame], voxel_size: float | None, depth_max: float | None) -> TsdfVolume:
+    """An empty volume that the frames fit into."""
+    depths = [frame.depth for frame in frames]
+    depth_max = depth_max or automatic_depth_max(depths)
+    size = voxel_size or automatic_voxel_size(depths, min(frame.depth_intrinsics.fx for frame in frames))
+    while True:
+        try:
+            expected = estimate_blocks(frames, TsdfVolume(size, depth_max, expected_blocks=64), len(frames))
+            break
+        except InputError:
+            if voxel_size is not None:
+                raise
+            size *= COARSER
+    volume = TsdfVolume(size, depth_max, expected_blocks=2 * expected)
+    volume.min_weight = CONFIRMED if len(frames) >= MANY_VIEWS else None
+    return volume

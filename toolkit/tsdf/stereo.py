@@ -1,0 +1,162 @@
+"""Depth for captures that have none: each picture is matched with posed neighbours by a plane sweep, and views confirm each other.
+
+Steps: fronto-parallel planes at even steps of inverse depth (stereo_cost), semi-global matching over them (stereo_smooth), refinement
+between the planes (stereo_refine), agreement between views (stereo_check). Nothing is learned; what has no texture stays empty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from toolkit.camera import Array, Intrinsics
+from toolkit.capture.types import Views
+from toolkit.errors import InputError
+from toolkit.poses.overlap import best_neighbours, overlap, parallax
+from toolkit.progress import SILENT, Progress
+from toolkit.tsdf.stereo_check import confirmed
+from toolkit.tsdf.stereo_cost import GreyView, grey_view, plane_homography, sweep
+from toolkit.tsdf.stereo_refine import refined
+from toolkit.tsdf.stereo_smooth import smoothed_planes
+
+LONG_SIDE = 400  # pixels; cost grows with the third power of it
+MATCHED = 4  # neighbours that a picture is matched with
+CHECKED = 8  # neighbours that its depth is checked against
+SWEET = 8.0  # degrees of parallax that are looked for
+PARALLAX = (1.0, 45.0)  # degrees outside which a neighbour tells nothing, or looks too different
+LEAST_OVERLAP = 0.25
+MOST_COST = 0.4  # matching cost beyond which nothing was recognised: bare walls have 0.5 everywhere
+PLANES = (32, 160)  # fewest and most planes
+MOST_WORKERS = 8  # each holds two volumes of costs
+
+
+@dataclass(frozen=True)
+class StereoDepth:
+    """Depth of one view by matching."""
+
+    depth: Array  # (H, W) float32 along z, working units, 0 = unknown
+    confidence: Array  # (H, W) float32 in [0, 1), 0 where depth is unknown; see `stereo_check.confirmed`
+    intrinsics: Intrinsics  # pinhole, of the depth map's size
+
+
+@dataclass(frozen=True)
+class _View:
+    grey: GreyView
+    usable: Array | None  # (H, W) bool, None: all
+
+
+def stereo_depths(
+    views: Views,
+    near: float,
+    far: float,
+    median_depth: float,
+    *,
+    long_side: int = LONG_SIDE,
+    matched: int = MATCHED,
+    progress: Progress = SILENT,
+) -> list[StereoDepth]:
+    """One depth map for each of `views`, all of which are matched with each other (leave held-out views out before).
+
+    Args:
+        near, far: nearest and farthest depth that is looked for, working units.
+        median_depth: what parallax and overlap of pictures are judged at.
+        long_side: size of the depth maps; larger pictures are shrunk for matching.
+        matched: neighbours that each picture is matched with.
+
+    Raises:
+        InputError: fewer than two views, no two of them that see the same from different places, or a range that is none.
+        Interrupted: the user asked to stop.
+    """
+    if len(views) < 2:
+        raise InputError(f"depth from matching needs at least two pictures with poses, here is {len(views)}; give more pictures")
+    if not (np.isfinite([near, far]).all() and 0 < near < far):
+        raise InputError(f"depth between {near:g} and {far:g} cannot be looked for; check the poses of the capture")
+    ready = [_prepared(views, index, long_side) for index in range(len(views))]
+    poses = np.asarray(views.world_from_camera, dtype=np.float64)
+    cameras = [view.grey.camera for view in ready]
+    neighbours = usable_neighbours(poses, cameras, median_depth, max(matched, CHECKED))
+    if not any(neighbours):
+        raise InputError(
+            "no two pictures see the same things from places far enough apart to match them for depth; the camera has to move sideways"
+        )
+
+    def raw(index: int) -> Array:
+        progress.check()
+        return _matched(ready, index, neighbours[index][:matched], near, far)
+
+    def checked(index: int) -> StereoDepth:
+        progress.check()
+        known = [other for other in neighbours[index] if neighbours[other]]
+        # The first confirmation may come from a picture that was used for matching, so it alone proves little.
+        depth, confidence = confirmed(index, known, maps, cameras, poses, needed=min(2, max(1, len(known))))
+        return StereoDepth(depth, confidence, cameras[index])
+
+    workers = max(1, min(MOST_WORKERS, cv2.getNumThreads()))
+    maps: list[Array] = []
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            for depth in pool.map(raw, range(len(ready))):
+                maps.append(depth)
+                progress.update(len(maps), 1.1 * len(ready), "pictures matched")
+            out = list(pool.map(checked, range(len(ready))))
+        finally:
+            pool.shutdown(cancel_futures=True)
+    progress.update(1.1 * len(ready), 1.1 * len(ready), "depths checked")
+    return out
+
+
+def usable_neighbours(world_from_camera: Array, cameras: Sequence[Intrinsics], median_depth: float, count: int) -> list[list[int]]:
+    """For each view the neighbours that suit matching, best first; views that see too little in common or from one place are left out."""
+    shares = overlap(world_from_camera, cameras, median_depth)
+    angles = parallax(world_from_camera, median_depth)
+    best = best_neighbours(world_from_camera, shares, angles, count, SWEET)
+    fits = (np.minimum(shares, shares.T) >= LEAST_OVERLAP) & (angles >= PARALLAX[0]) & (angles <= PARALLAX[1])
+    return [[int(other) for other in row if fits[index, other]] for index, row in enumerate(best)]
+
+
+def inverse_depths(view: GreyView, others: Sequence[GreyView], near: float, far: float) -> Array:
+    """(D,) inverse depths of the planes, even, so close that the neighbour whose picture moves most moves by about a pixel from one to the
+    next."""
+    width, height = view.camera.width, view.camera.height
+    spots = np.array([[u * width, v * height, 1] for u in (0.1, 0.5, 0.9) for v in (0.1, 0.5, 0.9)]).T  # (3, 9)
+    moves = [1.0]
+    for other in others:
+        at_far, at_near = (plane_homography(view, other, 1 / depth) @ spots for depth in (far, near))
+        front = (at_far[2] > 0) & (at_near[2] > 0)
+        gap = np.linalg.norm(at_far[:2, front] / at_far[2, front] - at_near[:2, front] / at_near[2, front], axis=0)
+        moves.append(float(np.median(gap)) if len(gap) else 0.0)
+    return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(max(moves)) + 1, *PLANES)))
+
+
+def _prepared(views: Views, index: int, long_side: int) -> _View:
+    """Picture and mask of a view at the size of its depth map."""
+    camera = views.intrinsics[index].pinhole()
+    factor = min(1.0, long_side / max(camera.width, camera.height))
+    camera = camera.scaled(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+    valid = views.valid[index] if views.valid else None
+    alpha = views.alpha[index] if views.alpha else None
+    usable = valid
+    if alpha is not None:
+        usable = alpha >= 128 if usable is None else usable & (alpha >= 128)
+    if usable is not None:
+        usable = cv2.resize(usable.astype(np.uint8), (camera.width, camera.height), interpolation=cv2.INTER_NEAREST) > 0
+    return _View(grey_view(views.images[index], camera, views.world_from_camera[index]), usable)
+
+
+def _matched(ready: Sequence[_View], index: int, neighbours: Sequence[int], near: float, far: float) -> Array:
+    """(H, W) float32 depth of one view from matching alone; 0 where its mask excludes it, and everywhere without neighbours."""
+    view = ready[index].grey
+    if not neighbours:
+        return np.zeros(view.grey.shape, np.float32)
+    others = [ready[other].grey for other in neighbours]
+    planes = inverse_depths(view, others, near, far)
+    step = float(planes[1] - planes[0])
+    plane, _ = smoothed_planes(sweep(view, others, planes), view.grey)
+    inverse, cost = refined(view, others, planes[0] + plane * step, step)
+    depth = np.where(cost <= MOST_COST, 1 / np.clip(inverse, 1 / far, 1 / near), 0)
+    usable = ready[index].usable
+    return np.asarray(depth if usable is None else np.where(usable, depth, 0), dtype=np.float32)

@@ -1,0 +1,88 @@
+"""From depth by matching to a surface: frames for fusion, and the depth maps as a file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from toolkit.camera import Intrinsics
+from toolkit.capture.types import Views
+from toolkit.errors import InputError
+from toolkit.files import atomic_path
+from toolkit.progress import SILENT, Progress
+from toolkit.tsdf.frames import DepthFrame, cover
+from toolkit.tsdf.held import fuse_held
+from toolkit.tsdf.stereo import StereoDepth
+from toolkit.tsdf.volume import TsdfVolume
+
+LEAST_CONFIDENCE = 0.5  # two other views confirm a depth for each one that sees through it
+
+
+def stereo_frames(views: Views, depths: Sequence[StereoDepth], least_confidence: float = LEAST_CONFIDENCE) -> Iterator[DepthFrame]:
+    """One frame a view: its depth where it is confident enough, its picture in full size."""
+    for index, found in enumerate(depths):
+        depth = np.where(found.confidence >= least_confidence, found.depth, np.float32(0))
+        colour, camera = cover(views.images[index], views.intrinsics[index].pinhole(), found.intrinsics)
+        pose = np.asarray(views.world_from_camera[index], dtype=np.float64)
+        yield DepthFrame(depth, np.ascontiguousarray(colour), found.intrinsics, camera, pose)
+
+
+def fuse_stereo(
+    views: Views,
+    depths: Sequence[StereoDepth],
+    voxel_size: float | None = None,
+    depth_max: float | None = None,
+    least_confidence: float = LEAST_CONFIDENCE,
+    progress: Progress = SILENT,
+) -> TsdfVolume:
+    """Fuse the depth of `stereo_depths(views, …)`; errors as `fuse_held`, whose arguments these are."""
+    nothing = (
+        "no depth could be found by matching the pictures: they show too little texture, or their poses do not fit them; find the poses"
+        " again with --poses sfm, or set tsdf.enabled=off"
+    )
+    frames = stereo_frames(views, depths, least_confidence)
+    return fuse_held(frames, len(depths), voxel_size, depth_max, nothing=nothing, progress=progress)
+
+
+def save_stereo(path: Path | str, names: Sequence[str], depths: Sequence[StereoDepth]) -> None:
+    """Write the depth maps of the views `names` in full, their confidences in 8 bits.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    tensors = {}
+    for index, found in enumerate(depths):
+        tensors[f"depth.{index}"] = np.ascontiguousarray(found.depth, dtype=np.float32)
+        tensors[f"confidence.{index}"] = np.round(found.confidence * 255).astype(np.uint8)
+    about = {"names": list(names), "cameras": [found.intrinsics.to_dict() for found in depths]}
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, metadata={"stereo": json.dumps(about)})
+
+
+def load_stereo(path: Path | str) -> tuple[list[str], list[StereoDepth]]:
+    """What `save_stereo` wrote: names and depth maps.
+
+    Raises:
+        InputError: missing or damaged.
+    """
+    try:
+        with safe_open(str(path), framework="numpy") as file:
+            about = json.loads(file.metadata()["stereo"])
+            names, cameras = [str(name) for name in about["names"]], [Intrinsics.from_dict(camera) for camera in about["cameras"]]
+            out = []
+            for index, camera in enumerate(cameras):
+                depth, confidence = file.get_tensor(f"depth.{index}"), file.get_tensor(f"confidence.{index}")
+                shape = (camera.height, camera.width)
+                if depth.shape != shape or confidence.shape != shape or depth.dtype != np.float32 or not np.isfinite(depth).all():
+                    raise ValueError(f"the depth map {index} does not fit its camera")
+                out.append(StereoDepth(depth, confidence.astype(np.float32) / 255, camera))
+            if len(names) != len(out):
+                raise ValueError("there are not as many names as depth maps")
+            return names, out
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path} cannot be read ({str(error).splitlines()[0]}); remove it and run the command again") from error

@@ -1,0 +1,58 @@
+"""Depth between the planes: pictures are warped by the depth map itself, so a window follows the slope of the surface that it shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from toolkit.camera import Array
+from toolkit.tsdf.stereo_cost import OUTSIDE, WINDOW, GreyView, Matcher, best_half, plane_homography
+
+EVEN = 5  # pixels a side of the median that the depth map is evened out with before pictures are warped by it
+LEAST_BEND = 1e-4  # of the costs' parabola; flatter ones have no lowest point worth moving to
+
+
+def warped_by_depth(view: GreyView, other: GreyView, inverse_depth: Array) -> Array:
+    """(H, W) float32: the picture of `other` where it shows the points at `inverse_depth` (H, W) of `view`; `OUTSIDE` where it does not."""
+    far = plane_homography(view, other, 0.0)
+    move = plane_homography(view, other, 1.0) - far
+    height, width = inverse_depth.shape
+    u, v = np.arange(width, dtype=np.float32)[None], np.arange(height, dtype=np.float32)[:, None]
+    x, y, z = (
+        (far[r, 0] * u + far[r, 1] * v + far[r, 2] + inverse_depth * (move[r, 0] * u + move[r, 1] * v + move[r, 2])).astype(np.float32)
+        for r in range(3)
+    )
+    behind = z <= 1e-6
+    z[behind] = 1
+    x, y = x / z, y / z
+    x[behind] = -1e3
+    return np.asarray(cv2.remap(other.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=OUTSIDE))
+
+
+def refined(
+    view: GreyView, others: Sequence[GreyView], inverse_depth: Array, step: float, rounds: int = 2, window: int = WINDOW
+) -> tuple[Array, Array]:
+    """Each pixel moved to the lowest point of a parabola through three costs; the first round reaches half a `step` (the planes' distance)
+    to either side, each next one half as far.
+
+    Returns:
+        (H, W) float32 inverse depth, and (H, W) float32 the lowest of the last round's costs.
+    """
+    matcher = Matcher(view.grey, window)
+    now = inverse_depth.astype(np.float32)
+    costs = np.empty((len(others), *now.shape), np.float32)
+    three = np.empty((3, *now.shape), np.float32)
+    for number in range(rounds):
+        reach = np.float32(0.5 * step / 2**number)
+        even = cv2.medianBlur(now, EVEN)
+        for place, side in enumerate((-1, 0, 1)):
+            for k, other in enumerate(others):
+                costs[k] = matcher.cost(warped_by_depth(view, other, even + side * reach))
+            best_half(costs, three[place])
+        low, mid, high = three
+        bend = low - 2 * mid + high
+        shift = np.clip(0.5 * (low - high) / np.maximum(bend, LEAST_BEND), -1, 1)
+        now = even + np.where(bend > LEAST_BEND, shift, 0).astype(np.float32) * reach
+    return np.asarray(cv2.medianBlur(now, 3)), three.min(axis=0)
