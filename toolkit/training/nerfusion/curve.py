@@ -15,7 +15,12 @@ from toolkit.files import atomic_path
 
 # Panels of the picture: title, columns drawn in it (a column that no row has is left out), and whether the axis is logarithmic.
 PANELS: tuple[tuple[str, tuple[str, ...], bool], ...] = (
-    ("PSNR (dB)", ("psnr_local", "psnr_fused", "val_psnr_local", "val_psnr_fused", "val_psnr_nearest"), False),
+    ("PSNR (dB)", ("psnr_local", "psnr_fused", "psnr_fused_1"), False),
+    (
+        "PSNR on held-out pictures of real captures (dB)",
+        ("val_psnr_local", "val_psnr_fused", "val_psnr_fused_1", "val_psnr_nearest"),
+        False,
+    ),
     ("log likelihood of the true depth", ("depth_likelihood", "val_depth_likelihood"), False),
     ("relative depth error (median)", ("depth_error", "val_depth_error"), False),
     ("spatial deviation of encoder features", ("feature_deviation",), False),

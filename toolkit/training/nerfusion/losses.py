@@ -54,21 +54,21 @@ class Traced:
             return torch.where(torch.isfinite(found) & (self.opacity > 1e-3), found, 0.0)
 
 
-def depth_likelihood(traced: Traced, distance: Tensor, width: float = WIDTH) -> tuple[Tensor, Tensor]:
+def depth_likelihood(traced: Traced, distance: Tensor, voxel_size: float = 0.0) -> tuple[Tensor, Tensor]:
     """How much of each ray's weight lies where the surface truly is.
 
     Args:
         distance: (R,) true distances, 0 = unknown.
-        width: standard deviation of the window around them, relative to the distance.
+        voxel_size: what is nearer than half of it cannot be told apart.
 
     Returns:
-        (R',) natural logarithm of Σ_i w_i exp(−½ ((t_i − t*) / (width · t*))²), not below log `FLOOR`, for the rays with a known
-        distance; and (R,) bool, which those are.
+        (R',) natural logarithm of Σ_i w_i exp(−½ ((t_i − t*) / s)²) with s = max(`WIDTH` · t*, voxel_size / 2), not below log `FLOOR`,
+        for the rays with a known distance; and (R,) bool, which those are.
     """
     known = distance > 0
     safe = torch.where(known, distance, torch.ones_like(distance))
     true = safe[traced.ray]
-    window = torch.exp(-0.5 * ((traced.distance - true) / (width * true)).square())
+    window = torch.exp(-0.5 * ((traced.distance - true) / (WIDTH * true).clamp_min(0.5 * voxel_size)).square())
     mass = ray_sum(traced.weight * window, traced.ray, len(distance))
     return torch.log(mass[known].clamp(0, 1) + FLOOR), known
 
@@ -83,15 +83,18 @@ class LossParts:
     depth: Tensor
 
 
-def rendering_loss(traced: Traced, rays: TargetRays, opacity_weight: float, depth_weight: float) -> LossParts:
-    """colour: mean squared error over rays and channels. opacity: mean of (1 − A)² over solid rays. depth: mean −log likelihood."""
+def rendering_loss(traced: Traced, rays: TargetRays, opacity_weight: float, depth_weight: float, voxel_size: float = 0.0) -> LossParts:
+    """colour: mean squared error over rays and channels. opacity: mean of (1 − A)² over solid rays. depth: mean −log likelihood.
+
+    `voxel_size`: see `depth_likelihood`.
+    """
     colour = (traced.colour - rays.colour).square().mean()
     zero = colour.new_zeros(())
     solid = rays.solid
     opacity = (1 - traced.opacity[solid]).square().mean() if bool(solid.any()) else zero
     depth = zero
     if depth_weight > 0:
-        likelihood, _ = depth_likelihood(traced, rays.distance)
+        likelihood, _ = depth_likelihood(traced, rays.distance, voxel_size)
         depth = -likelihood.mean() if len(likelihood) else zero
     return LossParts(colour + opacity_weight * opacity + depth_weight * depth, colour, opacity, depth)
 

@@ -9,9 +9,12 @@ import numpy as np
 import torch
 
 from toolkit.camera import Array, Intrinsics
+from toolkit.effects import transfer
 from toolkit.errors import InputError
+from toolkit.simulate.eye import eye_of, take
 from toolkit.simulate.materials import TextureBank, texture_bank
 from toolkit.simulate.procedural import random_scene
+from toolkit.simulate.scene import EDGE_SIDE
 from toolkit.training.nerfusion.paths import around, hand_held
 from toolkit.training.nerfusion.samples import Pictures
 
@@ -67,6 +70,7 @@ class ProceduralScene:
         self.world_from_camera = poses.copy()
         self.world_from_camera[:, :3, 3] *= self._scale
         self._camera = _camera(rng, long_side)
+        self._eye = eye_of(self._camera, EDGE_SIDE, torch.device("cpu"))  # kept: scenes take turns, and rays are dear to make
         # Exposure and white balance differ between captures, not within one.
         self._gain = torch.from_numpy(np.exp(rng.normal(0, 0.12) + rng.normal(0, 0.04, 3))).float()
         self._noise = float(rng.choice([0.0, rng.uniform(0.0, 0.02)]))
@@ -81,8 +85,8 @@ class ProceduralScene:
 
     def _frame(self, index: int) -> tuple[torch.Tensor, torch.Tensor]:
         if index not in self._drawn:
-            seen = self._scene.render(self._camera, self._poses[index])
-            picture = seen.rgb.permute(2, 0, 1) * self._gain[:, None, None]
+            seen = take(self._scene, self._eye, self._poses[index][None])
+            picture = transfer.encode(seen.linear).permute(2, 0, 1) * self._gain[:, None, None]
             if self._noise > 0:
                 generator = torch.Generator().manual_seed(self._seed + index)
                 picture = picture + self._noise * torch.randn(picture.shape, generator=generator)

@@ -14,7 +14,7 @@ from toolkit.errors import InputError
 from toolkit.volume.space import Space
 
 Tensor = torch.Tensor
-BY_TIME, BY_PLACE = "time", "place"
+SWEET = (0.2, 0.7)  # how different neighbours of a key frame are (see `view_distance`); around an object that is 6° to 20° of parallax
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,8 @@ def choose_views(
     """Key frames, their references and the pictures to predict (NeRFusion, section 4).
 
     Videos of rooms: key frames are 2–5% of the frames, one after the other in time, at least a few frames apart; references are
-    neighbours in time. Otherwise: 16 frames are drawn, key frames among them, and references are near in place and direction.
+    neighbours in time. Otherwise: 16 frames are drawn, key frames among them, and references are near in place and direction, at a
+    difference that suits matching.
     Targets are frames close to the key frame (videos: between its references or just beyond) that it does not refer to.
 
     Raises:
@@ -138,15 +139,17 @@ def _by_place(poses: Array, rng: np.random.Generator, views: int, key_frames: in
         left[order] = np.inf
         order.append(int(np.argmin(left)) if np.isfinite(left).any() else order[-1])
     references, wanted = [], []
+    sweet = float(np.exp(rng.uniform(np.log(SWEET[0]), np.log(SWEET[1]))))
     for key in order:
-        near = [int(i) for i in np.argsort(apart[key], kind="stable")]
-        near.remove(key)
-        # Sometimes the very nearest, sometimes one further: parallax varies.
-        skip = int(rng.integers(0, 2)) if len(near) > views + targets else 0
-        refer = [key, *near[skip : skip + views - 1]]
-        close = [i for i in near if i not in refer][: 2 * targets]
+        # Neighbours at about one difference, on different sides of the key frame: parallax varies between samples, not within one.
+        refer, cost = [key], np.abs(apart[key] - sweet)
+        while len(refer) < views:
+            cost[refer[-1]] = np.inf
+            refer.append(int(np.argmin(cost)))
+            cost = cost - 0.25 * np.minimum(apart[refer[-1]], 2 * sweet)
+        near = [int(i) for i in np.argsort(apart[key], kind="stable") if int(i) not in refer]
         references.append([int(pool[i]) for i in refer])
-        wanted.append([int(pool[i]) for i in _draw(rng, close, targets)])
+        wanted.append([int(pool[i]) for i in _draw(rng, near[: 2 * targets], targets)])
     return Choice(np.array(references), np.array(wanted))
 
 

@@ -61,6 +61,9 @@ class StageSettings:
     steps: int = 4000  # of stage 1, then of stage 2
     fused_steps: int = 2000
     truncate: int = 3  # stage 2: key frames between two cuts of the gradient through the recurrent state
+    levels: int = 2  # stage 2: lattices, each of half the voxel size of the one before (1: the paper's single one)
+    gamma: float = 0.95  # coarse cells in which exp(−optical thickness) exceeds this are not looked at finer
+    most_split: int = 6000  # coarse cells that are looked at finer, a key frame at most
     prune_from: float = 0.5  # share of stage 2 after which the fused volume is pruned
 
 
@@ -96,7 +99,6 @@ class TrainSettings:
     reuse: int = 4  # steps that one scene serves
     window: int = 8  # scenes that take turns
     start_from: str | None = None  # weights (safetensors) to start from
-    pretrained: bool = False  # ImageNet start of the encoder, where the optional package is installed
     model: dict[str, Any] = default(default_factory=dict)  # what differs from the networks' own defaults
     sources: list[SourceSettings] = default(default_factory=lambda: [SourceSettings()])
     pictures: PictureSettings = default(default_factory=PictureSettings)
@@ -158,6 +160,8 @@ def _check(settings: TrainSettings) -> None:
         "pictures.targets": settings.pictures.targets,
         "loss.rays": settings.loss.rays,
         "stage.truncate": settings.stage.truncate,
+        "stage.levels": settings.stage.levels,
+        "stage.most_split": settings.stage.most_split,
         "reuse": settings.reuse,
         "window": settings.window,
         "total steps": settings.total_steps,

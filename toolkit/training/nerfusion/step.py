@@ -13,6 +13,7 @@ from toolkit.render.fused import GAMMA, make_field
 from toolkit.training.nerfusion.health import feature_deviation, rendering_health
 from toolkit.training.nerfusion.losses import Traced, annealed, rendering_loss
 from toolkit.training.nerfusion.rays import TargetRays, random_rays
+from toolkit.training.nerfusion.recurrence import Recurrence
 from toolkit.training.nerfusion.samples import Pictures, Sample
 from toolkit.training.nerfusion.settings import TrainSettings
 from toolkit.training.nerfusion.tracing import trace
@@ -81,9 +82,10 @@ def render_volume(
     near: float,
     generator: torch.Generator | None,
     prune: bool,
+    allowed: Tensor | None = None,
 ) -> Traced:
     """Render a local or global volume along rays, with gradients where they are enabled."""
-    made = make_field(model, volume, behind if behind.ndim == 1 else behind[0], gamma=GAMMA if prune else None, near=near)
+    made = make_field(model, volume, behind if behind.ndim == 1 else behind[0], gamma=GAMMA if prune else None, near=near, allowed=allowed)
     return trace(made, rays, behind, generator)
 
 
@@ -113,16 +115,16 @@ class Stepper:
         step: int,
         generator: torch.Generator,
         log: Outcome,
+        allowed: Tensor | None = None,
     ) -> Tensor:
         rays = random_rays(sample.pictures, targets, count, generator)
         behind = background_of(sample.pictures, len(rays), generator)
-        prune = which == FUSED and self.prunes(step)
-        traced = render_volume(self.model, volume, rays, behind, 0.5 * sample.near, generator, prune)
-        parts = rendering_loss(traced, rays, self.settings.loss.opacity, self.depth_weight(step))
+        prune = which != LOCAL and self.prunes(step)
+        traced = render_volume(self.model, volume, rays, behind, 0.5 * sample.near, generator, prune, allowed)
+        parts = rendering_loss(traced, rays, self.settings.loss.opacity, self.depth_weight(step), volume.lattice.voxel_size)
         health = rendering_health(traced, rays)
         log.note({f"psnr_{which}": health.pop("psnr")})
-        if which == LOCAL or self.settings.stage.steps <= step:
-            log.note(health)
+        log.note(health)
         log.depth_loss += float(parts.depth.detach())
         return parts.total
 
@@ -137,25 +139,38 @@ class Stepper:
 
     def stage_two(self, sample: Sample, step: int, generator: torch.Generator) -> Outcome:
         """Local and global loss at every key frame; the gradient through the state is cut every `stage.truncate` key frames."""
-        log, settings = Outcome(), self.settings
-        frames = len(sample.references)
-        rays = max(1, settings.loss.rays // (2 * frames))
-        state = self.model.start(Lattice(sample.space, sample.resolution))
+        log, settings, model = Outcome(), self.settings, self.model
+        stage, weights, frames = settings.stage, settings.loss, len(sample.references)
+        rays = max(1, weights.rays // ((1 + stage.levels) * frames))
+        state = begin(model, sample, stage.levels, stage.gamma, stage.most_split)
         pending: list[Tensor] = []
         for frame in range(frames):
-            local = local_of(self.model, sample, frame, log if self.watched and frame == 0 else None)
-            state = self.model.fuse(state, local)
-            near = self._loss(local, sample, sample.targets[frame], rays, LOCAL, step, generator, log)
-            # The global volume answers for every place it has seen, not only for the newest.
-            fused = self._loss(state, sample, sample.targets[: frame + 1], rays, FUSED, step, generator, log)
-            pending.append((settings.loss.local * near + settings.loss.fused * fused) / frames)
-            if (frame + 1) % settings.stage.truncate == 0 or frame + 1 == frames:
+            indices = sample.references[frame]
+            cameras = cameras_of(sample.pictures, indices)
+            views = model.encode(sample.pictures.images[indices], cameras)
+            if self.watched and frame == 0:
+                log.note({"feature_deviation": encoder_deviation(model, sample.pictures.images[indices[:1]])})
+            state, local = state.add(model, views, cameras)
+            pending.append(weights.local / frames * self._loss(local, sample, sample.targets[frame], rays, LOCAL, step, generator, log))
+            # The global volumes answer for every place they have seen, not only for the newest.
+            seen = sample.targets[: frame + 1]
+            for level, volume in enumerate(state.volumes):
+                name = FUSED if level == 0 else f"{FUSED}_{level}"
+                allowed = state.allowed(model, level)
+                loss = self._loss(volume, sample, seen, rays, name, step, generator, log, allowed)
+                pending.append(weights.fused / frames * loss)
+            if (frame + 1) % stage.truncate == 0 or frame + 1 == frames:
                 total = torch.stack(pending).sum()
                 total.backward()
                 log.loss += float(total.detach())
                 pending, state = [], state.detached()
-        log.depth_loss /= 2 * frames
+        log.depth_loss /= (1 + stage.levels) * frames
         return log
+
+
+def begin(model: NerfusionModel, sample: Sample, levels: int, gamma: float = 0.95, most: int = 6000) -> Recurrence:
+    """The recurrence before a sample's first key frame."""
+    return Recurrence.start(model, Lattice(sample.space, sample.resolution), levels, sample.near, sample.far, gamma, most)
 
 
 def seeded(seed: int, rank: int, step: int) -> torch.Generator:

@@ -14,13 +14,13 @@ import torch
 from toolkit.camera import Array
 from toolkit.errors import OutputError
 from toolkit.files import atomic_path
-from toolkit.networks.lattice import LatentVolume, Lattice
+from toolkit.networks.lattice import LatentVolume
 from toolkit.networks.model import NerfusionModel
 from toolkit.training.nerfusion.health import relative_depth_error
 from toolkit.training.nerfusion.losses import Traced, depth_likelihood, psnr
 from toolkit.training.nerfusion.rays import TargetRays, picture_rays
 from toolkit.training.nerfusion.real import Case
-from toolkit.training.nerfusion.step import background_of, local_of, render_volume
+from toolkit.training.nerfusion.step import background_of, begin, cameras_of, render_volume
 
 Tensor = torch.Tensor
 CHUNK = 4096  # rays at a time
@@ -38,43 +38,45 @@ class Predicted:
 
 
 @torch.no_grad()
-def predict(model: NerfusionModel, case: Case, device: torch.device, prune: bool) -> Predicted:
-    """Direct inference of one case: the local volume of the nearest key frame, and the volume of all key frames fused.
+def predict(model: NerfusionModel, case: Case, device: torch.device, prune: bool, levels: int = 1) -> Predicted:
+    """Direct inference of one case: the local volume of the nearest key frame, and the volumes of all key frames fused.
 
-    Returns numbers `psnr_local`, `psnr_fused`, `psnr_nearest` (the nearest training picture shown unchanged), and with true depth
-    `depth_error` (median, relative) and `depth_likelihood`, of the fused volume.
+    Returns numbers `psnr_local`, `psnr_fused` (coarsest level), `psnr_fused_1` (half its voxel size), `psnr_nearest` (the nearest
+    training picture shown unchanged), and with true depth `depth_error` (median, relative) and `depth_likelihood` of the finest one.
     """
     sample = case.sample.to(device)
     target = int(sample.targets[0, 0])
     rays = picture_rays(sample.pictures, target)
-    state = model.start(Lattice(sample.space, sample.resolution))
-    local: LatentVolume = state
-    for frame in range(len(sample.references)):
-        local = local_of(model, sample, frame)
-        state = model.fuse(state, local)
+    state = begin(model, sample, levels)
+    local: LatentVolume = state.volumes[0]
+    for indices in sample.references:
+        cameras = cameras_of(sample.pictures, indices)
+        state, local = state.add(model, model.encode(sample.pictures.images[indices], cameras), cameras)
     behind = background_of(sample.pictures, 1, None)
     truth = sample.pictures.images[target].permute(1, 2, 0)
     numbers = {"psnr_nearest": psnr((sample.pictures.images[case.nearest].permute(1, 2, 0) - truth).square().mean())}
     height, width = truth.shape[:2]
     colour = distance = torch.zeros(0)
-    for name, volume in (("local", local), ("fused", state)):
-        colour, distance, likelihood = _render(model, volume, rays, behind, 0.5 * sample.near, prune and name == "fused")
+    fused = [("fused" if level == 0 else f"fused_{level}", volume, level) for level, volume in enumerate(state.volumes)]
+    for name, volume, level in [("local", local, 0), *fused]:
+        allowed = state.allowed(model, level) if name != "local" else None
+        colour, distance, likelihood = _render(model, volume, rays, behind, 0.5 * sample.near, prune and name != "local", allowed)
         numbers[f"psnr_{name}"] = psnr((colour.clamp(0, 1).view(height, width, 3) - truth).square().mean())
         error = relative_depth_error(distance, rays.distance)
-        if error is not None and name == "fused":
+        if error is not None:  # of the last one, the finest
             numbers["depth_error"], numbers["depth_likelihood"] = error, likelihood
     depth = (distance * rays.cosine).view(height, width)
     return Predicted(case, colour.clamp(0, 1).view(height, width, 3).cpu(), depth.cpu(), numbers)
 
 
 def _render(
-    model: NerfusionModel, volume: LatentVolume, rays: TargetRays, behind: Tensor, near: float, prune: bool
+    model: NerfusionModel, volume: LatentVolume, rays: TargetRays, behind: Tensor, near: float, prune: bool, allowed: Tensor | None
 ) -> tuple[Tensor, Tensor, float]:
     colours, distances, likelihoods = [], [], []
     for start in range(0, len(rays), CHUNK):
         part = slice(start, start + CHUNK)
         some = TargetRays(*(getattr(rays, name)[part] for name in rays.__dataclass_fields__))
-        traced: Traced = render_volume(model, volume, some, behind, near, None, prune)
+        traced: Traced = render_volume(model, volume, some, behind, near, None, prune, allowed)
         colours.append(traced.colour)
         distances.append(traced.median_distance())
         likelihoods.append(depth_likelihood(traced, some.distance)[0])
@@ -83,7 +85,7 @@ def _render(
 
 
 def validate(
-    model: NerfusionModel, cases: Sequence[Case], device: torch.device, sheet: Path | None = None, prune: bool = False
+    model: NerfusionModel, cases: Sequence[Case], device: torch.device, sheet: Path | None = None, prune: bool = False, levels: int = 1
 ) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
     """Means over the captures (each counts the same) with names `val_…`, and means of each capture.
 
@@ -97,7 +99,7 @@ def validate(
     model.eval()
     by_capture: dict[str, list[Predicted]] = defaultdict(list)
     for case in cases:
-        by_capture[case.capture].append(predict(model, case, device, prune))
+        by_capture[case.capture].append(predict(model, case, device, prune, levels))
     model.train(was)
     each = {name: _means([one.numbers for one in found]) for name, found in by_capture.items()}
     if sheet is not None:

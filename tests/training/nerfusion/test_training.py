@@ -1,0 +1,236 @@
+"""Whole training runs, small: health, both stages, resuming bit for bit, many processes, refusals."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.training.nerfusion.tiny import SMALL, merged, tiny_settings
+from toolkit.errors import InputError
+from toolkit.networks.weights import load_model
+from toolkit.progress import Progress
+from toolkit.training.nerfusion.checkpoint import checkpoint_settings, checkpoints
+from toolkit.training.nerfusion.curve import Curve
+from toolkit.training.nerfusion.distributed import Crew, join_crew
+from toolkit.training.nerfusion.health import ALIVE
+from toolkit.training.nerfusion.train import WEIGHTS, Trainer, learning_rate
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def state(trainer: Trainer) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in trainer.model.state_dict().items()}
+
+
+def same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bool:
+    return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_a_run_leaves_weights_curve_and_checkpoint(tmp_path: Path) -> None:
+    trainer = Trainer(tiny_settings(), tmp_path, Crew())
+    before = state(trainer)
+    assert trainer.run() == 6
+    assert [path.name for path in checkpoints(tmp_path)] == ["checkpoint-0000006.safetensors"]
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+    curve = Curve(tmp_path)
+    curve.load(100)
+    assert [row["step"] for row in curve.rows] == [1, 2, 3, 4, 5, 6]
+    assert [row["stage"] for row in curve.rows] == [1, 1, 1, 2, 2, 2]
+    assert all({"psnr_local", "loss", "depth_likelihood", "depth_error", "opacity_high", "feature_deviation"} <= set(r) for r in curve.rows)
+    assert all({"psnr_fused", "psnr_fused_1", "gate_update_saturated"} <= set(row) for row in curve.rows[3:])
+    assert [row["depth_weight"] > 0 for row in curve.rows] == [True, True, True, False, False, False]
+    loaded = load_model(tmp_path / WEIGHTS)
+    assert same(loaded.state_dict(), state(trainer))
+    # Every part learns: the fusion in stage 2 only, all others from the first step.
+    moved = {name.split(".")[0] for name, value in state(trainer).items() if not torch.equal(value, before[name])}
+    assert moved == {name.split(".")[0] for name in before}
+    assert checkpoint_settings(checkpoints(tmp_path)[-1])["loss"]["rays"] == SMALL["loss"]["rays"]
+
+
+@pytest.mark.parametrize("stop", [2, 5])
+def test_resuming_repeats_every_bit(tmp_path: Path, stop: int) -> None:
+    whole = Trainer(tiny_settings(), tmp_path / "whole", Crew())
+    whole.run()
+    first = Trainer(tiny_settings(), tmp_path / "parts", Crew())
+    assert first.run(until=stop) == stop
+    second = Trainer(tiny_settings(), tmp_path / "parts", Crew(), resume=True)
+    assert second.step == stop and same(state(first), state(second))
+    second.run()
+    assert same(state(whole), state(second))
+    for a, b in zip(whole.model.parameters(), second.model.parameters(), strict=True):
+        assert torch.equal(whole.adam.state[a]["exp_avg_sq"], second.adam.state[b]["exp_avg_sq"])
+    once, twice = (
+        [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in trainer.curve.rows] for trainer in (whole, second)
+    )
+    assert [row["step"] for row in once] == [row["step"] for row in twice]
+    assert once[-1] == twice[-1]
+
+
+def test_a_request_to_stop_keeps_what_there_is(tmp_path: Path) -> None:
+    class StopAtTwo(Progress):
+        done = 0.0
+
+        def update(self, done: float, total: float, note: str = "") -> None:
+            self.done = done
+
+        def stopping(self) -> bool:
+            return self.done >= 1
+
+    assert Trainer(tiny_settings(), tmp_path, Crew()).run(progress=StopAtTwo()) == 2
+    assert checkpoints(tmp_path)[-1].name == "checkpoint-0000002.safetensors"
+
+
+def test_a_second_run_does_not_overwrite_the_first(tmp_path: Path) -> None:
+    Trainer(tiny_settings(), tmp_path, Crew()).run(until=1)
+    with pytest.raises(InputError, match="--resume"):
+        Trainer(tiny_settings(), tmp_path, Crew())
+
+
+def test_only_the_newest_checkpoints_are_kept(tmp_path: Path) -> None:
+    Trainer(tiny_settings(record={"checkpoint_every": 1, "keep": 2}), tmp_path, Crew()).run(until=4)
+    assert [path.name for path in checkpoints(tmp_path)] == ["checkpoint-0000003.safetensors", "checkpoint-0000004.safetensors"]
+
+
+def test_a_broken_or_foreign_checkpoint_is_refused(tmp_path: Path) -> None:
+    Trainer(tiny_settings(), tmp_path, Crew()).run(until=1)
+    with pytest.raises(InputError, match="not a checkpoint of these networks"):
+        Trainer(tiny_settings(model=merged(SMALL["model"], {"channels": 12})), tmp_path, Crew(), resume=True)
+    path = checkpoints(tmp_path)[-1]
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(InputError, match="cannot read"):
+        Trainer(tiny_settings(), tmp_path, Crew(), resume=True)
+
+
+def test_training_starts_from_given_weights(tmp_path: Path) -> None:
+    first = Trainer(tiny_settings(), tmp_path / "first", Crew())
+    first.run(until=2)
+    second = Trainer(tiny_settings(start_from=str(tmp_path / "first" / WEIGHTS)), tmp_path / "second", Crew())
+    assert second.step == 0 and same(state(first), state(second))
+
+
+def test_the_learning_rate_warms_up_and_falls() -> None:
+    settings = tiny_settings(stage={"steps": 50, "fused_steps": 50}, optimiser={"warmup": 10, "rate": 3e-3, "final": 0.1})
+    rates = [learning_rate(settings, step) for step in range(100)]
+    assert rates[0] == pytest.approx(3e-4) and max(rates) == pytest.approx(3e-3) and int(np.argmax(rates)) in (9, 10)
+    assert all(a >= b for a, b in pairwise(rates[10:])) and rates[-1] == pytest.approx(3e-4, rel=0.1)
+
+
+def test_reduced_precision_stays_close(tmp_path: Path) -> None:
+    full = Trainer(tiny_settings(), tmp_path / "full", Crew()).one_step()
+    reduced = Trainer(tiny_settings(optimiser={"reduced": True}), tmp_path / "reduced", Crew()).one_step()
+    assert np.isfinite(reduced["gradient_norm"]) and reduced["gradient_norm"] > 0
+    assert reduced["loss"] == pytest.approx(full["loss"], rel=0.1)
+
+
+def test_bad_gradients_do_not_reach_the_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = Trainer(tiny_settings(), tmp_path, Crew())
+    before = state(trainer)
+    whole = trainer.stepper.stage_one
+
+    def poisoned(*arguments):  # type: ignore[no-untyped-def]
+        outcome = whole(*arguments)
+        next(trainer.model.parameters()).grad[:] = float("nan")  # type: ignore[index]
+        return outcome
+
+    monkeypatch.setattr(trainer.stepper, "stage_one", poisoned)
+    trainer.one_step()
+    assert same(before, state(trainer))
+    trainer._bad = 19
+    with pytest.raises(InputError, match="no finite gradient"):
+        trainer.one_step()
+
+
+WORKER = """
+import json, sys, torch
+from pathlib import Path
+sys.path.insert(0, {root!r})
+from tests.training.nerfusion.tiny import tiny_settings
+from toolkit.training.nerfusion.distributed import join_crew
+from toolkit.training.nerfusion.train import Trainer
+torch.set_num_threads(1)
+with join_crew("cpu") as crew:
+    trainer = Trainer(tiny_settings(), Path({out!r}), crew)
+    first = trainer.mixture.sample(0, 1).pictures.images.double().sum().item()
+    trainer.run(until=4)
+    total = sum(p.double().abs().sum().item() for p in trainer.model.parameters())
+    Path({out!r}, f"rank{{crew.rank}}.json").write_text(json.dumps([crew.size, first, total]))
+"""
+
+
+def test_two_processes_stay_equal_and_see_different_samples(tmp_path: Path) -> None:
+    import json
+
+    script = tmp_path / "worker.py"
+    script.write_text(WORKER.format(root=str(ROOT), out=str(tmp_path)), encoding="utf-8")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", str(script)]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=170)
+    assert done.returncode == 0, done.stderr[-2000:]
+    (size, first_a, total_a), (_, first_b, total_b) = (json.loads((tmp_path / f"rank{r}.json").read_text()) for r in (0, 1))
+    assert size == 2 and first_a != first_b and total_a == total_b
+    assert len(checkpoints(tmp_path)) == 1  # the leader alone writes
+
+
+def test_averaging_alone_changes_nothing_and_a_crew_of_one_needs_no_group() -> None:
+    with join_crew("cpu") as crew:
+        assert (crew.rank, crew.size, crew.leads) == (0, 1, True)
+        parameter = torch.nn.Parameter(torch.ones(3))
+        parameter.grad = torch.tensor([1.0, 2.0, 3.0])
+        crew.average_gradients([parameter])
+        assert parameter.grad.tolist() == [1.0, 2.0, 3.0] and crew.any(True) and crew.mean({"a": 2.0}) == {"a": 2.0}
+
+
+@pytest.mark.parametrize("device", ["tpu", "cuda"])
+def test_a_device_that_is_not_there_is_refused(device: str) -> None:
+    if device == "cuda" and torch.cuda.is_available():
+        pytest.skip("this machine has a CUDA device")
+    with pytest.raises(InputError), join_crew(device):
+        pass
+
+
+def health_run(out: Path, steps: int) -> tuple[list[dict[str, float]], Trainer]:
+    settings = tiny_settings(
+        seed=1,
+        window=4,
+        reuse=12,
+        model={"image_channels": 32, "hidden": 8, "channels": 8, "gru_hidden": 8, "features": 8, "sampled": 8, "direction": 4},
+        loss={"rays": 256, "depth": 0.1, "depth_steps": 10 * steps},
+        stage={"steps": steps, "fused_steps": 1},
+        optimiser={"warmup": 10},
+        record={"log_every": 5, "health_every": 5000, "checkpoint_every": 10**6},
+    )
+    trainer = Trainer(settings, out, Crew())
+    trainer.run(until=steps)
+    return trainer.curve.rows, trainer
+
+
+def check_health(rows: list[dict[str, float]]) -> None:
+    """Features tell places apart all the time, weight moves to where surfaces are, and not by everything becoming opaque."""
+    part = max(1, len(rows) // 4)
+
+    def mean(name: str, some: list[dict[str, float]]) -> float:
+        return float(np.mean([row[name] for row in some]))
+
+    assert min(row["feature_deviation"] for row in rows) > ALIVE
+    assert mean("depth_likelihood", rows[-part:]) > mean("depth_likelihood", rows[:part]) + 0.1
+    assert mean("psnr_local", rows[-part:]) > mean("psnr_local", rows[:part]) + 1
+    assert all(np.isfinite(row["gradient_norm"]) and row["gradient_norm"] > 0 for row in rows)
+
+
+def test_training_briefly_keeps_features_alive_and_finds_depth(tmp_path: Path) -> None:
+    rows, _ = health_run(tmp_path, 120)
+    check_health(rows)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not os.environ.get("FIELDFUSE_SLOW"), reason="two minutes of training: set FIELDFUSE_SLOW=1")
+def test_training_for_two_minutes_keeps_features_alive_and_finds_depth(tmp_path: Path) -> None:
+    rows, _ = health_run(tmp_path, 900)
+    check_health(rows)
