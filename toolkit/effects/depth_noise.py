@@ -4,7 +4,7 @@
     1/z'' = step · round(1 / (z' · step))                 disparity comes in whole steps, so depth in steps of about step · z²
     0 where there is no measurement:
         outside [nearest, farthest]
-        next to a jump: within `edge` pixels of a neighbour whose depth differs by more than 5%, with probability `edge_loss`
+        next to a jump: the `edge` pixels on both sides of neighbours that differ by more than 5%, with probability `edge_loss`
         on dark surfaces:   probability dark_loss · clamp(1 − albedo / dark, 0, 1)
         on glossy surfaces: probability gloss_loss · gloss
 
@@ -77,10 +77,15 @@ def quantise(effect: DepthNoise, depth: Array) -> Array:
 
 def loss(effect: DepthNoise, depth: Array, albedo: Array, gloss: Array) -> Array:
     """(H, W) float64 probability that a pixel has no measurement, for its surroundings, darkness or gloss."""
-    kernel = np.ones((2 * effect.edge + 1,) * 2, np.uint8)
-    depth32 = np.ascontiguousarray(depth, dtype=np.float32)
-    jump = cv2.dilate(depth32, kernel) - cv2.erode(depth32, kernel) > JUMP * depth32
-    at_edge = effect.edge_loss * (jump & (effect.edge > 0))
+    near = np.zeros(depth.shape, dtype=np.uint8)
+    for axis in (0, 1):
+        before, after = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),)
+        jump = np.abs(depth[after] - depth[before]) > JUMP * np.minimum(depth[after], depth[before])
+        near[before] |= jump
+        near[after] |= jump
+    if effect.edge > 1:
+        near = np.asarray(cv2.dilate(near, np.ones((2 * effect.edge - 1,) * 2, np.uint8)))
+    at_edge = effect.edge_loss * (near > 0) * (effect.edge > 0)
     dark = effect.dark_loss * np.clip(1 - albedo / effect.dark, 0, 1)
     shiny = effect.gloss_loss * np.clip(gloss, 0, 1)
     return np.asarray(1 - (1 - at_edge) * (1 - dark) * (1 - shiny), dtype=np.float64)

@@ -197,7 +197,8 @@ def _surface(part: Any, pictures: list[Array], known: dict[int, int]) -> tuple[i
         if share < 1:
             pixels = cv2.resize(pixels, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
         pictures.append(_linear(np.arange(256) / 255.0)[pixels])
-    return known[id(image)], white * (_linear(shade) if factor is not None else 1.0), gloss
+    # Only glTF defines that the factor multiplies the texture; in OBJ files it is often a grey that nobody meant.
+    return known[id(image)], white * (_linear(shade) if hasattr(material, "baseColorFactor") else 1.0), gloss
 
 
 def _linear(stored: Array) -> Array:

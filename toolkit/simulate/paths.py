@@ -20,7 +20,7 @@ DENSE = 1500  # samples of a curve
 LONG = 2.5  # a free space this many times longer than wide is walked along, not round
 
 
-@dataclass(frozen=True)
+@dataclass
 class PathSettings:
     """How the camera moves.
 
