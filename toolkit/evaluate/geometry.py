@@ -1,0 +1,149 @@
+"""How well a mesh fits the true one: accuracy, completeness and F-score (Knapitsch et al. 2017) over points spread on both surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d.core as o3c
+import trimesh
+
+from toolkit.camera import Array, Intrinsics
+from toolkit.errors import InputError
+from toolkit.evaluate.coverage import ray_scene, seen_points
+from toolkit.tsdf.mesh import Mesh
+
+SAMPLES = 200_000  # on each surface: F-scores of the same meshes then repeat within some thousandths
+VOXELS = (1, 2, 4)  # distances at which F-scores are given, in voxels
+MARGIN = 0.25  # voxels before a true point where the true surface itself does not hide it
+MOST_BYTES = 2 * 2**30
+
+Region = tuple[Array, Array]  # lowest and highest corner (3,)
+
+
+def read_mesh(path: Path | str) -> Mesh:
+    """The triangles of a .ply, .obj or .glb file, with vertex colours where there are any.
+
+    Raises:
+        InputError: missing, too large, damaged, or without triangles.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"the mesh {path} is larger than the {MOST_BYTES / 2**30:.0f} GB that are read; thin it out")
+        loaded = trimesh.load_mesh(path, process=False)
+        vertices, triangles = np.asarray(loaded.vertices), np.asarray(loaded.faces)
+        visual: Any = loaded.visual
+        colours = np.asarray(visual.vertex_colors)[:, :3] if visual.kind == "vertex" else None
+        mesh = Mesh.create(vertices, triangles, colours)
+    except OSError as error:
+        raise InputError(f"cannot read the mesh {path}: {error.strerror or error}") from error
+    except InputError:
+        raise
+    except Exception as error:  # trimesh's readers raise whatever they stumble over
+        raise InputError(f"{path} is not a mesh that can be read ({type(error).__name__}); write it again as .ply") from error
+    if len(mesh.triangles) == 0:
+        raise InputError(f"the mesh {path} has no triangles; write it with its faces")
+    return mesh
+
+
+def surface_points(mesh: Mesh, count: int, seed: int = 0) -> Array:
+    """(count, 3) points spread evenly by area over a mesh, always the same ones for a seed; none for a mesh without area."""
+    areas = mesh.areas()
+    total = float(areas.sum())
+    if not total > 0:
+        return np.zeros((0, 3))
+    rng = np.random.default_rng(seed)
+    # One sample in each of `count` equal shares of the area: less uneven than independent draws.
+    at = (np.arange(count) + rng.random(count)) / count * total
+    triangle = np.minimum(np.searchsorted(np.cumsum(areas), at, side="right"), len(areas) - 1)
+    first, second = rng.random((2, count, 1))
+    root = np.sqrt(first)
+    a, b, c = (mesh.vertices[mesh.triangles[triangle, corner]] for corner in range(3))
+    return np.asarray((1 - root) * a + root * (1 - second) * b + root * second * c)
+
+
+def distances(points: Array, mesh: Mesh) -> Array:
+    """(N,) distance of (N, 3) points to the nearest point of a mesh's surface, infinite when it has none."""
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    if len(mesh.triangles) == 0:
+        return np.full(len(points), np.inf)
+    origin = mesh.bounds().mean(axis=0)
+    found = ray_scene(mesh, origin).compute_distance(o3c.Tensor.from_numpy((points - origin).astype(np.float32)))
+    return np.asarray(found.numpy(), dtype=np.float64)
+
+
+def inside(points: Array, region: Region | None) -> Array:
+    """(N,) bool: which (N, 3) points lie in a box; None: all."""
+    if region is None:
+        return np.ones(len(points), bool)
+    return np.asarray(np.all((points >= region[0]) & (points <= region[1]), axis=1))
+
+
+def seen_surface(
+    truth: Mesh,
+    cameras: Sequence[Intrinsics],
+    world_from_camera: Array,
+    voxel_size: float,
+    region: Region | None = None,
+    samples: int = SAMPLES,
+    seed: int = 0,
+) -> tuple[Array, float]:
+    """Points of the true surface that a reconstruction is asked for: those that some camera saw, in the region.
+
+    Returns:
+        (N, 3) points, and their share of the whole true surface.
+
+    Raises:
+        InputError: the cameras saw nothing of it, so mesh and poses do not belong together.
+    """
+    points = surface_points(truth, samples, seed)
+    kept = inside(points, region)
+    kept[kept] = seen_points(points[kept], truth, cameras, world_from_camera, MARGIN * voxel_size)
+    if not kept.any():
+        raise InputError("no camera sees anything of the ground-truth mesh; mesh and poses must be in the same frame")
+    return points[kept], float(kept.mean())
+
+
+def geometry_metrics(
+    mesh: Mesh,
+    truth: Mesh,
+    wanted: Array,
+    voxel_size: float,
+    region: Region | None = None,
+    samples: int = SAMPLES,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Compare a mesh with the true one; all lengths in the meshes' unit.
+
+    Args:
+        wanted: (N, 3) points of the true surface that it has to cover, from `seen_surface`.
+        voxel_size: unit of the distances at which F-scores are given.
+        region: box outside which neither surface counts.
+
+    Returns:
+        plain data: `accuracy` and `accuracy_median`, distance of the mesh's points from the true surface; `completeness` and
+        `completeness_median`, distance of the wanted points from the mesh; for 1, 2 and 4 voxels `precision_n` and `recall_n`, the shares
+        of both within that distance, and `f_score_n`, their harmonic mean; `voxel_size`. Without a surface: accuracy None, scores 0.
+    """
+    own = surface_points(mesh, samples, seed + 1)
+    own = own[inside(own, region)]
+    to_truth, to_mesh = distances(own, truth), distances(wanted, mesh)
+    out: dict[str, Any] = {
+        "accuracy": _number(to_truth, np.mean),
+        "accuracy_median": _number(to_truth, np.median),
+        "completeness": _number(to_mesh, np.mean),
+        "completeness_median": _number(to_mesh, np.median),
+        "voxel_size": float(voxel_size),
+    }
+    for n in VOXELS:
+        precision, recall = (float((gap <= n * voxel_size).mean()) if len(gap) else 0.0 for gap in (to_truth, to_mesh))
+        out[f"precision_{n}"], out[f"recall_{n}"] = precision, recall
+        out[f"f_score_{n}"] = 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0
+    return out
+
+
+def _number(gaps: Array, of: Any) -> float | None:
+    return float(of(gaps)) if len(gaps) and np.isfinite(gaps).all() else None
