@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 import torch
@@ -122,16 +124,60 @@ def test_edges_are_smooth_with_more_rays_and_flat_parts_do_not_change(bank: Text
 
 
 def test_lamps_throw_shadows(bank: TextureBank) -> None:
-    scene = random_scene("sphere", np.random.default_rng(0), bank)
-    scene.lamps = [Lamp((0.0, 0.0, 2.5), (0.9, 0.9, 0.9))]
-    below, beside = torch.tensor([[0.0, 0.0, -1.0]]), torch.tensor([[0.6, 0.0, -1.0]])
-    origin = torch.tensor([[0.9, 0.9, 0.4]])  # beside the stand: its lower part is what shadows the floor beneath it
-    under = torch.nn.functional.normalize(torch.tensor([[0.0, 0.0, 0.002]]) + below, dim=1)
-    seen = scene.see(Rays(origin, torch.cat([below, torch.nn.functional.normalize(beside, dim=1)]), 1e-3))
-    assert (seen.distance < FAR).all() and under.shape == (1, 3)
-    without = scene.see(Rays(origin, below, 1e-3)).linear
+    """Under a table, below a lamp that hangs over it: what the lamp adds beside the table, it does not add beneath."""
+    scene = random_scene("table", np.random.default_rng(2), bank)
+    eye = torch.tensor([[1.3, 0.0, 0.3]])
+    ways = torch.tensor([[0.0, 0.0, 0.0], [1.25, 0.3, 0.0]]) - eye
+    rays = Rays(eye, torch.nn.functional.normalize(ways, dim=1), 1e-3)
     scene.lamps = []
-    assert (scene.see(Rays(origin, below, 1e-3)).linear < without).all()
+    without = scene.see(rays)
+    torch.testing.assert_close(without.distance, ways.norm(dim=1), atol=0.02, rtol=0)  # both rays reach the floor
+    scene.lamps = [Lamp((0.0, 0.0, 2.5), (0.9, 0.9, 0.9))]
+    added = (scene.see(rays).linear - without.linear).mean(1)
+    assert added[0] == 0 and added[1] > 0.02
+
+
+def test_rays_that_hit_nothing(bank: TextureBank) -> None:
+    scene = random_scene("street", np.random.default_rng(0), bank)
+    up = torch.nn.functional.normalize(
+        torch.randn(300, 3, generator=torch.Generator().manual_seed(0)) * 0.1 + torch.tensor([0, 0, 1.0]), dim=1
+    )
+    start = torch.tensor([[0.0, 0.0, 40.0]])
+    for lit in (True, False):
+        seen = scene.see(Rays(start, up, 1e-3), lit)
+        assert (seen.distance == FAR).all() and (seen.normals == 0).all() and (seen.part == 0).all()
+        assert (seen.linear > 0).all() == lit
+    scene.background = None
+    assert (scene.see(Rays(start, up, 1e-3)).linear == 0).all()
+    assert len(scene.see(Rays(start, up[:0], 1e-3)).distance) == 0
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here")
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_same_on_a_gpu(kind: str, bank: TextureBank) -> None:
+    scene = random_scene(kind, np.random.default_rng(3), bank)
+    pose = looking(standing(scene), scene.focus)
+    here, there = scene.render(CAMERA, pose), scene.to("cuda").render(CAMERA, pose)
+    assert there.rgb.is_cuda
+    assert ((here.depth - there.depth.cpu()).abs() < 1e-3).float().mean() > 0.99
+    assert (here.rgb - there.rgb.cpu()).abs().mean() < 0.01
+
+
+def test_five_frames_a_second() -> None:
+    """At 320×240 with one ray more at edges, by processor time of one thread: a busy machine does not count against it."""
+    scene = random_scene("room", np.random.default_rng(0))
+    camera = Intrinsics(320, 240, 250.0, 250.0, 160.0, 120.0)
+    poses = [looking(standing(scene, seed), scene.focus) for seed in range(5)]
+    before, spent = torch.get_num_threads(), []
+    torch.set_num_threads(1)
+    try:
+        for pose in poses:
+            began = time.process_time()
+            scene.render(camera, pose)
+            spent.append(time.process_time() - began)
+    finally:
+        torch.set_num_threads(before)
+    assert np.median(spent) < 0.2
 
 
 def test_unknown_kinds_are_refused() -> None:

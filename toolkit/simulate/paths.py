@@ -83,7 +83,9 @@ def plan(scene: Scenery, settings: PathSettings, rng: np.random.Generator) -> Mo
 
 
 def _clear(scene: Scenery, places: Array, margin: float) -> bool:
-    step = max(1, len(places) // 200)
+    """Whether a curve keeps `margin` from surfaces: looked at so densely that no wall fits between two looks."""
+    longest = float(np.linalg.norm(np.diff(places, axis=0), axis=1).max())
+    step = min(max(1, int(margin / max(longest, 1e-9))), max(1, len(places) // 60))
     return bool((scene.clearance(torch.from_numpy(places[::step].astype(np.float32))) > margin).all())
 
 

@@ -74,7 +74,10 @@ class Solids:
         self.centre = stack([solid.centre for solid in self.items], 3)  # (P, 3)
         self.half = stack([np.maximum(solid.half, THINNEST) for solid in self.items], 3)  # (P, 3)
         self.rotation = stack([solid.rotation for solid in self.items], 3, 3)  # (P, 3, 3)
-        self.materials = torch.tensor([_faces(solid.materials) for solid in self.items], device=device).reshape(-1, 6)  # (P, 6)
+        faces = [_faces(solid.materials) for solid in self.items]
+        self.materials = torch.tensor(faces, dtype=torch.int64, device=device).reshape(-1, 6)  # (P, 6)
+            -1, 6
+        )  # (P, 6)
 
     def __len__(self) -> int:
         return len(self.items)
