@@ -76,8 +76,6 @@ class Solids:
         self.rotation = stack([solid.rotation for solid in self.items], 3, 3)  # (P, 3, 3)
         faces = [_faces(solid.materials) for solid in self.items]
         self.materials = torch.tensor(faces, dtype=torch.int64, device=device).reshape(-1, 6)  # (P, 6)
-            -1, 6
-        )  # (P, 6)
 
     def __len__(self) -> int:
         return len(self.items)
