@@ -52,10 +52,11 @@ class FitSettings:
     budget: float | None = None  # seconds; None: by preset
     max_rays: int = 2048  # rays a step at the finest level; many small steps beat few large ones
     rate_density: float = 0.15
-    rate_feature: float = 0.1
+    rate_feature: float = 0.05
     rate_decoder: float = 3e-3
-    distortion: float = 0.005  # weight of the distortion loss
+    distortion: float = 0.01  # weight of the distortion loss
     opacity: float = 0.05  # weight of (1 - opacity)² where every ray must end somewhere (captures without alpha)
+    patience: bool = False  # end before the budget when the validation views stop improving
     prune_weight: float = 0.05  # voxels whose largest seen weight stays below are removed
 
 

@@ -26,6 +26,13 @@ class Deferred(nn.Module):
         nn.init.zeros_(last.bias)
         self.net = nn.Sequential(nn.Linear(channels + 9, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), last)
 
+    @property
+    def layers(self) -> tuple[nn.Linear, nn.Linear, nn.Linear]:
+        """The three linear layers, first to last."""
+        first, second, last = self.net[0], self.net[2], self.net[4]
+        assert isinstance(first, nn.Linear) and isinstance(second, nn.Linear) and isinstance(last, nn.Linear)
+        return first, second, last
+
     def forward(self, features: Tensor, directions: Tensor) -> Tensor:
         """Colour of an opaque ray with these mean features."""
         view = spherical_harmonics(directions)

@@ -23,7 +23,7 @@ PIECE = 4096  # rays that a thread takes at a time
 
 def decoder_arrays(decoder: Deferred) -> K.Decoder:
     """Copies of the weights."""
-    first, second, last = (decoder.net[i] for i in (0, 2, 4))
+    first, second, last = decoder.layers
     w1, w2, w3 = (np.array(layer.weight.detach().cpu().numpy(), dtype=np.float32) for layer in (first, second, last))
     b1, b2, b3 = (np.array(layer.bias.detach().cpu().numpy(), dtype=np.float32) for layer in (first, second, last))
     w1 = np.pad(w1, ((0, 0), (0, decoder.channels + K.PADDED - w1.shape[1])))
@@ -59,20 +59,22 @@ def chessboard_distance(bricks: Any, most: Any) -> None:
 def make_space(field: Field) -> K.Space:
     """The field's scalars."""
     space, f = field.space, np.float32
+    cx, cy, cz = (f(c) for c in space.centre)
+    bx, by, bz = (f(b) for b in space.box)
+    ox, oy, oz = (int(c) for c in field.topology.table_origin)
+    channels = field.feature_rows.shape[1]
     return K.Space(
-        *(f(c) for c in space.centre),
-        f(space.half),
-        f(space.shell),
-        f(space.extent),
-        *(f(b) for b in space.box),
-        f(field.grid.voxel),
-        f(field.near),
-        int(field.fine),
-        int(field.resolution),
-        *(int(c) for c in field.topology.table_origin),
-        (0,) * field.feature_rows.shape[1],
-        (0,) * field.decoder.hidden,
-        (0,) * (field.feature_rows.shape[1] + K.PADDED),
+        *(cx, cy, cz, f(space.half), f(space.shell), f(space.extent), bx, by, bz),
+        voxel=f(field.grid.voxel),
+        near=f(field.near),
+        fine=int(field.fine),
+        resolution=int(field.resolution),
+        ox=ox,
+        oy=oy,
+        oz=oz,
+        width=(0,) * channels,
+        hidden=(0,) * field.decoder.hidden,
+        inputs=(0,) * (channels + K.PADDED),
     )
 
 

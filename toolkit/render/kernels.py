@@ -7,7 +7,7 @@ functions are cached on disk. Numba turns an `int * float32` and every Python li
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from llvmlite import ir
@@ -54,13 +54,13 @@ def _prefetch(context: Any, array: Any, index: Any, half: bool) -> Any:
     return types.void(array, types.int64), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@cast(Any, intrinsic)
 def prefetch(context: Any, array: Any, index: Any) -> Any:
     """Ask for the cache line of array[index] or array[index, 0] without waiting for it: memory latency is most of what a ray costs."""
     return _prefetch(context, array, index, False)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@cast(Any, intrinsic)
 def prefetch_half(context: Any, array: Any, index: Any) -> Any:
     """The same for the middle of row `index`: a row of 2 C floats is two lines long."""
     return _prefetch(context, array, index, True)
@@ -283,7 +283,8 @@ def march_ray(
     strongest, strongest_cell = ZERO, 0
     known = False  # whether p holds the contracted place at s
     p0x, p0y, p0z = ZERO, ZERO, ZERO
-    while True:
+    longest = int(F(14) * extent / step) + 32  # steps: a direction that is zero or no number leads nowhere
+    while step_index < longest:
         if shell == ZERO:
             if s >= leave:
                 break
@@ -352,7 +353,7 @@ def march_ray(
                 tau = math.exp(min(raw, _RAW_MAX)) * _UNITS * length
                 looked += 1
                 depth += tau
-                after = math.exp(-depth)
+                after = F(math.exp(-depth))
                 # w = T (1 - exp(-τ)): from the difference where it holds the digits, else from the series
                 weight = transmittance - after
                 if tau < _THIN:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import numpy as np
 import torch
 
+from toolkit.config import Settings
+from toolkit.networks.decoder import Deferred
+from toolkit.progress import Progress
 from toolkit.render.field import Field
 from toolkit.render.rays import render_rays
 from toolkit.training.rays import PixelPool
@@ -75,11 +77,27 @@ class TorchEngine(Optimiser):
         return self.field
 
 
-def make_engine(name: str, field: Field, pool: PixelPool, seed: int) -> Engine:
-    """`name`: auto | numba | torch."""
-    on_cpu = field.device.type == "cpu"
-    if name == "torch" or not on_cpu:
-        return TorchEngine(field, pool, seed)
+def chosen_engine(settings: Settings, device: torch.device) -> str:
+    """numba or torch. The compiled engine knows the deferred decoder on the CPU."""
+    able = device.type == "cpu" and settings.field.decoder == "deferred"
+    return "numba" if able and settings.engine != "torch" else "torch"
+
+
+def make_engine(settings: Settings, field: Field, pool: PixelPool) -> Engine:
+    """The engine that the settings ask for, or `auto`: compiled on the CPU, torch elsewhere."""
+    if chosen_engine(settings, field.device) == "torch" or not isinstance(field.decoder, Deferred):
+        return TorchEngine(field, pool, settings.seed)
     from toolkit.training.fused import FusedOptimiser
 
-    return FusedOptimiser(field, pool, seed)
+    return FusedOptimiser(field, pool, settings.seed)
+
+
+def warm_up(settings: Settings, progress: Progress) -> None:
+    """Have the kernels compiled (once a machine: they are kept on disk) or loaded, before any clock runs."""
+    if chosen_engine(settings, torch.device("cpu")) == "torch":
+        return
+    from toolkit.training import warm
+
+    if not warm.ready(settings.field.channels, settings.field.hidden):
+        progress.update(0, 1, "compiling the fast engine, once on this machine, about a minute")
+        warm.run(settings.field.channels, settings.field.hidden)

@@ -14,6 +14,7 @@ from dataclasses import field as default
 import numpy as np
 import torch
 
+from toolkit.camera import Array
 from toolkit.capture.types import Views
 from toolkit.config import Settings
 from toolkit.errors import InputError
@@ -21,22 +22,21 @@ from toolkit.networks.decoder import make_decoder
 from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
+from toolkit.training.engine import Engine, make_engine, warm_up
 from toolkit.training.levels import all_places, finer, first_field, pruned, visible
 from toolkit.training.rays import PixelPool
-from toolkit.training.start import finest_resolution, levels, make_space, possible
-from toolkit.training.engine import Engine, make_engine
-from toolkit.training.step import Rates
+from toolkit.training.schedule import LAST_PRUNE, Schedule
+from toolkit.training.start import MARGIN, ROOM_MARGIN, finest_resolution, levels, make_space, possible
 from toolkit.volume.host import Host, TorchHost
 
 DEFAULT_BUDGET = 120.0
 START_RAW = -4.5  # of the first density: thin enough that every voxel along a ray is tried, thick enough that none is ignored
 TIMELINE_POINTS = 12
 TIMELINE_PIXELS = 8192
-PRUNE_EVERY = 150  # steps
-LEVEL_STEPS = 100  # a level is not left, nor pruned, before so many: what has not had time to grow is not empty
-LAST_PRUNE = 0.8  # of the budget
+VALIDATION_PIXELS = 4096
+VALIDATION_SHARE = 12  # every so manieth training view steers the schedule …
+LEAST_VIEWS = 24  # … when there are enough: with few views each of them is worth more than what it would decide
 MANY_VOXELS = 2_000_000  # beyond this a finer level is made only where rays came
-FIRST_BATCH = 256  # rays a step at the coarsest level, doubled at each level: early on the number of steps counts
 
 
 @dataclass
@@ -67,15 +67,14 @@ class _Clock:
         self._since = time.perf_counter()
 
 
-class _HeldOut:
-    """PSNR over a fixed random sample of the held-out views' pixels."""
+class _Sample:
+    """PSNR over a fixed random sample of some views' pixels."""
 
-    def __init__(self, views: Views, device: torch.device) -> None:
+    def __init__(self, views: Views, indices: Array, pixels: int, device: torch.device) -> None:
         self.batch = None
-        indices = np.flatnonzero(views.test)
         if len(indices):
             pool = PixelPool(views.subset(indices), device)
-            pick = torch.randperm(len(pool), generator=torch.Generator().manual_seed(0))[:TIMELINE_PIXELS]
+            pick = torch.randperm(len(pool), generator=torch.Generator().manual_seed(0))[:pixels]
             self.batch = pool.take(pick.to(device))
 
     def psnr(self, engine: Engine) -> float | None:
@@ -105,41 +104,48 @@ def fit_field(
     train = views.subset(np.flatnonzero(~views.test))
     if len(train) == 0:
         raise InputError("no training view is left; lower --holdout or give more pictures")
-    clock = _Clock()
     host = host or TorchHost(device)
     generator = torch.Generator().manual_seed(settings.seed)
     torch.manual_seed(settings.seed)
-    pool = PixelPool(train, device)
-    held_out = _HeldOut(views, device)
+    held_out = _Sample(views, np.flatnonzero(views.test), TIMELINE_PIXELS, device)
+    aside = np.arange(len(train)) % VALIDATION_SHARE == VALIDATION_SHARE // 2 if len(train) >= LEAST_VIEWS else np.zeros(len(train), bool)
+    validation = _Sample(train, np.flatnonzero(aside), VALIDATION_PIXELS, device)
+    # Views that are kept aside come last, so that joining them is a matter of a limit.
+    pool = PixelPool(train.subset(np.argsort(aside, kind="stable")), device)
+    pool.limit = int((pool.view < np.count_nonzero(~aside)).sum())
     budget = settings.fit.budget or DEFAULT_BUDGET
+    warm_up(settings, progress)
+    clock = _Clock()
     if start is None:
         current, ladder = _first(views, train, scene, settings, device, host, generator)
     else:
         keep = torch.ones_like(start.occupied)
         current, ladder = finer(start, keep, start.resolution, host), [start.resolution]
-    engine = make_engine(settings.engine, current, pool, settings.seed)
+    engine = make_engine(settings, current, pool)
+    plan = Schedule(ladder, budget, settings.fit, views.background is None, settings.fit.patience)
     result = FitResult(current)
-    rungs = _rungs(len(ladder))
-    level, steps_here = 0, 0
     marks = [budget * 0.02 * 50 ** (i / (TIMELINE_POINTS - 1)) for i in range(TIMELINE_POINTS - 1)]
-    opaque = views.background is None
 
-    while (now := clock.seconds()) < budget and not progress.stopping():
-        done = now / budget
-        if level < len(ladder) - 1 and done > rungs[level] and steps_here >= LEVEL_STEPS:
-            level += 1
+    while (done := plan.position(now := clock.seconds())) < 1 and not progress.stopping():
+        if plan.wants_finer(done):
             keep = visible(current, engine.seen, engine.visits, settings.fit.prune_weight)
-            if int(keep.sum()) * (ladder[level] / current.resolution) ** 3 > MANY_VOXELS:
+            growth = (ladder[plan.level + 1] / current.resolution) ** 3
+            if int(keep.sum()) * growth > MANY_VOXELS:
                 keep &= engine.visits > 0  # memory is bounded: what no ray came to is the first to go
-            current = finer(current, keep, ladder[level], host)
-            engine.renew_rows(current)
-            steps_here = 0
-        elif steps_here and steps_here % PRUNE_EVERY == 0 and done < LAST_PRUNE:
+            if plan.worth(int(keep.sum()) * growth, (budget - now) * result.rays / max(now, 1e-3)):
+                plan.climb()
+                current = finer(current, keep, plan.resolution, host)
+                engine.renew_rows(current)
+        elif plan.wants_pruning(done):
             current = pruned(current, visible(current, engine.seen, engine.visits, settings.fit.prune_weight))
             engine.go_on_with(current)
-        rays = min(FIRST_BATCH << level, settings.fit.max_rays)
-        engine.step(rays, _rates(settings, done, opaque))
-        steps_here += 1
+        if done > LAST_PRUNE:
+            pool.limit = len(pool)
+        elif plan.wants_look(done) and (psnr := validation.psnr(engine)) is not None:
+            plan.look(psnr, done)
+        rays = plan.rays
+        engine.step(rays, plan.rates(done, result.rays))
+        plan.steps_here += 1
         result.steps += 1
         result.rays += rays
         if marks and now > marks[0]:
@@ -148,8 +154,8 @@ def fit_field(
             _measure(result, held_out, engine, now)
             clock.go_on()
         if result.steps % 5 == 0:
-            note = f"{ladder[level]}³, {result.timeline[-1]['psnr']:.1f} dB" if result.timeline else f"{ladder[level]}³"
-            progress.update(now, budget, note)
+            note = f"{plan.resolution}³, {result.timeline[-1]['psnr']:.1f} dB" if result.timeline else f"{plan.resolution}³"
+            progress.update(done * budget, budget, note)
     clock.pause()
     result.interrupted = progress.stopping()
     result.seconds = clock._spent
@@ -165,7 +171,7 @@ def _first(
     """The classical start at the coarsest level, and the resolutions to climb."""
     wanted = settings.field.background
     background = scene.has_background if wanted == "auto" else wanted == "on"
-    space = make_space(scene, background and views.background is None)
+    space = make_space(scene, background and views.background is None, MARGIN if views.background is not None else ROOM_MARGIN)
     ladder = levels(settings.field.resolution or finest_resolution(space, train, scene))
     places = possible(space, ladder[0], all_places(space, ladder[0]), views)
     decoder = make_decoder(settings.field.decoder, settings.field.channels, settings.field.hidden).to(device)
@@ -180,19 +186,7 @@ def _first(
     ), ladder
 
 
-def _rungs(count: int) -> list[float]:
-    """Share of the budget at which each level ends (at most five levels below the finest: 32 … 512)."""
-    return [0.06, 0.18, 0.4, 0.65, 0.8][: count - 1]
-
-
-def _rates(settings: Settings, done: float, opaque: bool) -> Rates:
-    """Step sizes that fall to a tenth over the budget."""
-    fall = 0.1**done
-    fit = settings.fit
-    return Rates(fit.rate_density * fall, fit.rate_feature * fall, fit.rate_decoder * fall, fit.distortion, fit.opacity if opaque else 0.0)
-
-
-def _measure(result: FitResult, held_out: _HeldOut, engine: Engine, seconds: float) -> None:
+def _measure(result: FitResult, held_out: _Sample, engine: Engine, seconds: float) -> None:
     value = held_out.psnr(engine)
     if value is not None and math.isfinite(value):
         result.timeline.append({"seconds": round(seconds, 3), "psnr": round(value, 4)})

@@ -10,9 +10,9 @@ import torch
 
 from toolkit.networks.decoder import Deferred
 from toolkit.render import kernels as K
+from toolkit.render.compiled import decoder_arrays, make_space, make_volume, render_pass
 from toolkit.render.composite import STOP, THRESHOLD
 from toolkit.render.field import Field
-from toolkit.render.compiled import decoder_arrays, make_space, make_volume, render_pass
 from toolkit.training import fused_kernels as kernels
 from toolkit.training.rays import PixelPool
 from toolkit.training.step import Rates
@@ -58,14 +58,15 @@ class FusedOptimiser:
         self.density_sums = np.empty((self.threads, rows), np.float32)
         self.feature_sums = K.aligned((self.threads, rows, channels), np.float32)
         self.tape: tuple[Array, ...] = ()
+        self.marks = np.zeros((self.threads, len(field.occupied)), np.uint16)
         self.go_on_with(field)
 
     def go_on_with(self, field: Field) -> None:
-        """Go on with the same rows after pruning; what was seen is counted afresh."""
+        """Go on with the same rows after pruning; what was seen counts half from now on, so that it is forgotten within a few prunings."""
         self.field = field
         self.space, self.volume = make_space(field), make_volume(field)
         self.background = field.background.numpy().astype(np.float32)
-        self.marks = np.zeros((self.threads, len(field.occupied)), np.uint16)
+        kernels.fade(self.marks)
 
     @property
     def seen(self) -> torch.Tensor:
@@ -79,18 +80,17 @@ class FusedOptimiser:
 
     def sync(self) -> Field:
         """The field with the decoder's weights written back."""
-        net = self.field.decoder.net
         assert isinstance(self.field.decoder, Deferred)
         d = self.decoder
         with torch.no_grad():
-            for layer, weight, bias in ((net[0], d.w1_out, d.b1), (net[2], d.w2_out, d.b2), (net[4], d.w3, d.b3)):
-                layer.weight.copy_(torch.from_numpy(np.ascontiguousarray(weight[:, : layer.in_features])))
+            for layer, weight, bias in zip(self.field.decoder.layers, (d.w1_out, d.w2_out, d.w3), (d.b1, d.b2, d.b3), strict=True):
+                layer.weight.copy_(torch.from_numpy(weight[:, : layer.in_features]))
                 layer.bias.copy_(torch.from_numpy(bias))
         return self.field
 
     def step(self, rays: int, rates: Rates) -> tuple[float, int]:
         """One step on `rays` random pixels. Returns the mean squared colour error and the number of samples that were looked up."""
-        picks = self.generator.integers(0, len(self.pool), rays)
+        picks = self.generator.integers(0, self.pool.limit, rays)
         return self.step_on(picks, self.generator.random(rays, np.float32), rates)
 
     def step_on(self, picks: Array, jitter: Array, rates: Rates) -> tuple[float, int]:

@@ -117,7 +117,7 @@ def gradient_pass(
     Returns:
         rows touched, sum of squared colour errors, samples looked up.
     """
-    channels, hidden = len(space.width), len(space.hidden)
+    channels = len(space.width)
     most = 1024
     cells, values = np.empty(most, np.int32), np.empty((most, K.VALUES), np.float32)
     rows, weights = np.empty((most, 8), np.int32), np.empty((most, 8), np.float32)
@@ -327,6 +327,15 @@ def forget(index: Any, thread: Any, touched: Any) -> None:
     """Make `index` good for the next batch."""
     for at in range(len(touched)):
         index[touched[at], thread + 1] = -1
+
+
+@njit(**K.OPTIONS)
+def fade(marks: Any) -> None:
+    """Halve weights and visits of all marks (threads, M · 512)."""
+    for thread in range(marks.shape[0]):
+        own = marks[thread]
+        for row in range(len(own)):
+            own[row] = (own[row] >> np.uint16(1)) & np.uint16(0xFFF7) & np.uint16(0x7FFF)
 
 
 @njit(**K.OPTIONS)

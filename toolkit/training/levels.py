@@ -118,7 +118,9 @@ def finer(field: Field, keep: Tensor, resolution: int, host: Host) -> Field:
         from toolkit.volume.compiled import refined
 
         voxel_size = 2 * field.space.extent / resolution * field.space.half
-        hosted, occupied = refined(field.topology, field.occupied & keep, *values, resolution / field.resolution, host, voxel_size)
+        kept = field.occupied & keep
+        ratio = resolution / field.resolution
+        hosted, occupied = refined(field.topology, kept, field.density_rows, field.feature_rows, ratio, host, voxel_size)
         return replace(
             field,
             resolution=resolution,

@@ -38,14 +38,15 @@ class PixelPool:
         self.height = max((c.height for c in views.intrinsics), default=0)
         k = [(c.fx, c.fy, c.cx, c.cy, c.width) for c in views.intrinsics]
         self.camera = torch.tensor(k, dtype=torch.float32, device=device)
+        self.limit = len(self.colour)  # batches are drawn from the pixels before this one
         self.pose = torch.from_numpy(views.world_from_camera.astype(np.float32)).to(device)
 
     def __len__(self) -> int:
         return len(self.colour)
 
     def batch(self, count: int, generator: torch.Generator) -> Batch:
-        """`count` rays, uniformly over all pixels, with replacement."""
-        pick = torch.randint(len(self), (count,), generator=generator).to(self.colour.device)
+        """`count` rays, uniformly over the pixels before `limit`, with replacement."""
+        pick = torch.randint(self.limit, (count,), generator=generator).to(self.colour.device)
         return self.take(pick)
 
     def take(self, pick: Tensor) -> Batch:

@@ -28,7 +28,7 @@ class Rates:
     distortion: float
     opacity: float = 0.0  # weight of the mean of (1 - opacity)², for captures in which every ray ends somewhere
     random_background: bool = False  # what is behind everything is another colour for every ray, so that it cannot stand in for a surface
-    colour_threshold: float = 1e-3  # samples of smaller weight are neither decoded nor given a gradient
+    colour_threshold: float = 3e-3  # samples of smaller weight are neither decoded nor given a gradient
 
 
 class Optimiser:
@@ -49,10 +49,10 @@ class Optimiser:
         self.decoder = decoder
 
     def go_on_with(self, field: Field) -> None:
-        """Go on with the same rows after pruning; what was seen is counted afresh."""
+        """Go on with the same rows after pruning; what was seen counts half from now on, so that it is forgotten within a few prunings."""
         self.field = field
-        self.seen.zero_()
-        self.visits.zero_()
+        self.seen.mul_(0.5)
+        self.visits.mul_(0.5)
 
     def _mark(self, samples: Samples, weight: Tensor, alive: Tensor, count: int) -> None:
         """Remember how strongly and how often voxels were seen, before the light was spent."""

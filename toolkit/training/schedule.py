@@ -1,0 +1,124 @@
+"""When a fit goes to a finer lattice, how its step sizes fall, and when it is done: shares of the budget, and a validation split.
+
+Validation views are training views that are kept aside for most of the fit; held-out views are never asked. Once nothing is left to
+decide the validation views are fitted like all others, so that no picture is wasted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from dataclasses import field as default
+
+from toolkit.config import FitSettings
+from toolkit.training.step import Rates
+
+RUNGS = (0.1, 0.3, 0.6, 0.8, 0.9)  # share of the budget at which each level ends at the latest (32 … 512)
+LEVEL_STEPS = 100  # a level is not left, nor pruned, before so many: what has not had time to grow is not empty
+PRUNE_EVERY = 150  # steps
+LAST_PRUNE = 0.8  # of the budget; from here on the field is only polished, on all views
+SLOWING = 1.5e6  # rays after which step sizes begin to fall
+LAST_RATE = 0.3  # of the step sizes, at the very end
+FIRST_BATCH = 256  # rays a step at the coarsest level, doubled at each level: early on the number of steps counts
+WORTH = 0.2  # rays that must be left for every voxel of a finer level: with fewer it ends blurred, and worse than the coarser one
+CHECKS = 50  # looks at the validation views in a budget
+WINDOW = 4  # looks that a plateau is judged by
+GAIN = 0.04  # decibels over a window that still count as progress
+DROPS = 2  # halvings of the step sizes on plateaus of the finest level, before the end
+
+
+@dataclass
+class Schedule:
+    """The plan of one fit.
+
+    Attributes:
+        ladder: resolutions from coarse to fine.
+        budget: seconds.
+        patient: end when the validation views stop improving, before the budget does.
+    """
+
+    ladder: list[int]
+    budget: float
+    settings: FitSettings
+    opaque: bool
+    patient: bool = False
+    level: int = 0
+    steps_here: int = 0
+    slower: float = 1.0
+    drops: int = 0
+    ended: float | None = None  # share of the budget at which patience ended the search; what follows is polish
+    looks: list[float] = default(default_factory=list)  # validation PSNR at this level and rate
+    next_look: float = 0.0
+
+    @property
+    def resolution(self) -> int:
+        return self.ladder[self.level]
+
+    @property
+    def finest(self) -> bool:
+        return self.level == len(self.ladder) - 1
+
+    @property
+    def rays(self) -> int:
+        """Rays of the next step."""
+        return min(FIRST_BATCH << self.level, self.settings.max_rays)
+
+    def position(self, seconds: float) -> float:
+        """0 … 1: how far the fit is. After patience has ended the search, a fifth of the time spent is left for polish."""
+        done = seconds / self.budget
+        if self.ended is None:
+            return done
+        return LAST_PRUNE + (done - self.ended) / max(self.ended * (1 / LAST_PRUNE - 1), 1e-9) * (1 - LAST_PRUNE)
+
+    def wants_look(self, done: float) -> bool:
+        """Whether the validation views should be looked at now."""
+        if done < self.next_look or done >= LAST_PRUNE:
+            return False
+        self.next_look = done + 1 / CHECKS
+        return True
+
+    def look(self, psnr: float, done: float) -> None:
+        """Note the validation views' PSNR; on a plateau of the finest level slow down, or stop searching."""
+        self.looks.append(psnr)
+        if self.finest and self.plateau():
+            self.looks.clear()
+            if self.drops < DROPS:
+                self.drops += 1
+                self.slower *= 0.5
+            elif self.patient:
+                self.ended = done
+
+    def plateau(self) -> bool:
+        """The last looks were hardly better than those before."""
+        if len(self.looks) < 2 * WINDOW:
+            return False
+        before, after = self.looks[-2 * WINDOW : -WINDOW], self.looks[-WINDOW:]
+        return sum(after) / WINDOW - sum(before) / WINDOW < GAIN
+
+    def wants_finer(self, done: float) -> bool:
+        """Time for the next level: its share is spent, or the validation views gain nothing more here."""
+        if self.finest or self.steps_here < LEVEL_STEPS or done >= RUNGS[-1]:
+            return False
+        return done > RUNGS[min(self.level, len(RUNGS) - 1)] or self.plateau()
+
+    def worth(self, voxels: float, rays_left: float) -> bool:
+        """Whether a finer level of so many voxels would see enough rays; if not, this level is the last."""
+        if rays_left >= WORTH * voxels:
+            return True
+        del self.ladder[self.level + 1 :]
+        return False
+
+    def climb(self) -> None:
+        """The next level has begun."""
+        self.level += 1
+        self.steps_here = 0
+        self.looks.clear()
+
+    def wants_pruning(self, done: float) -> bool:
+        return self.steps_here > 0 and self.steps_here % PRUNE_EVERY == 0 and done < LAST_PRUNE
+
+    def rates(self, done: float, rays: int) -> Rates:
+        """Step sizes: they fall with the rays that were fitted, whatever the machine took for them, on plateaus, and at the end."""
+        fall = (1 + rays / SLOWING) ** -0.85 * self.slower * LAST_RATE ** max(0.0, (done - LAST_PRUNE) / (1 - LAST_PRUNE))
+        fit = self.settings
+        opacity = fit.opacity if self.opaque else 0.0
+        return Rates(fit.rate_density * fall, fit.rate_feature * fall, fit.rate_decoder * fall, fit.distortion, opacity)
