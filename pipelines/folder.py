@@ -22,7 +22,7 @@ LOCK = ".lock"
 RUN = "run.json"
 STAGES = "stages"
 ERROR_LOG = "error.log"
-SUBFOLDERS = (STAGES, "frames", "sparse", "renders", "tsdf", "exports")
+SUBFOLDERS = (STAGES, "frames", "sparse", "renders", "tsdf", "stereo", "tsdf_stereo", "compare", "exports")
 FILES = (
     "capture.json",
     "poses.json",
@@ -35,6 +35,8 @@ FILES = (
     "evaluation.json",
     "report.json",
     "report.html",
+    "compare.json",
+    "compare.html",
 )
 BUSY = "another fieldfuse command is working in {}; wait for it to end or choose another --out folder"
 FOREIGN = "{} holds {!r} but no fieldfuse run; choose a new or empty --out folder so that nothing of yours is replaced"

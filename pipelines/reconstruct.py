@@ -11,6 +11,7 @@ from pipelines.console import ConsoleProgress
 from pipelines.job import Job, open_job
 from pipelines.steps_capture import choose_frames, choose_keyframes, find_camera_poses, find_capture, make_views, measure_scene
 from pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views, score_pictures, wants_tsdf
+from pipelines.steps_stereo import reuse_matched
 from pipelines.summary import put_report, summarise_poses
 
 if TYPE_CHECKING:
@@ -38,11 +39,9 @@ def run_job(
         return reconstruct(job, wanted, go_on) if wanted else reconstruct_poses(job)
 
 
-def stand(job: Job, goals: frozenset[str] = frozenset()) -> tuple[Capture, PoseResult, Capture, Scene, Views]:
+def stand(job: Job) -> tuple[Capture, PoseResult, Capture, Scene, Views]:
     """What every result stands on: capture, poses, the posed capture, the scene, and the views made ready."""
     capture = choose_frames(job, find_capture(job))
-    if "tsdf" in goals:
-        wants_tsdf(job, capture)  # a surface that cannot be made is refused before the long work
     poses = find_camera_poses(job, capture)
     posed = poses.apply(capture)
     scene = measure_scene(job, posed)
@@ -66,11 +65,12 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
     start = time.monotonic()
     stages = job.stages
     stages.trust(set(RESULTS) - goals)
-    capture, poses, posed, scene, views = stand(job, goals)
+    capture, poses, posed, scene, views = stand(job)
 
     timeline: list[dict[str, Any]] = []
     field, exported = None, None
     pictures = {}
+    reuse_matched(job, scene, views)
     if ("tsdf" in goals and wants_tsdf(job, posed)) or stages.usable("tsdf"):
         pictures["tsdf"] = fuse_tsdf(job, posed, scene, views)
     if goals & {"field", "render", "export"} or stages.usable("field"):

@@ -12,7 +12,6 @@ import numpy as np
 from pipelines.job import Job, set_seeds
 from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture, write_pngs
 from pipelines.steps_capture import last_of, pixel_state
-from toolkit.errors import InputError
 from toolkit.files import read_json, write_json
 
 if TYPE_CHECKING:
@@ -23,43 +22,43 @@ if TYPE_CHECKING:
 
 
 def wants_tsdf(job: Job, capture: Capture) -> bool:
-    """Whether this run makes the TSDF surface.
-
-    Raises:
-        InputError: it is asked for and the capture has no depth.
-    """
+    """Whether this run makes the TSDF surface: when the capture has depth or it is asked for; then pictures alone are matched for depth."""
     wanted = job.settings.tsdf.enabled
-    if wanted == "on" and not capture.has_depth:
-        raise InputError(
-            f"{job.source} holds no depth pictures, which a TSDF surface is made of; leave out tsdf.enabled=on or give an RGB-D capture"
-        )
-    return wanted != "off" and capture.has_depth
+    return wanted == "on" or (wanted == "auto" and capture.has_depth)
 
 
-def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views) -> Pictures:
-    """Fuse the training frames' depth into a surface; its pictures at the held-out views are the result."""
-    folder = job.folder / "tsdf"
-    kept = job.folder / "renders" / "tsdf.safetensors"
+def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = "tsdf", matched: bool | None = None) -> Pictures:
+    """Fuse the training frames' depth into a surface; its pictures at the held-out views are the result.
+
+    Args:
+        name: of the stage, its folder and its pictures.
+        matched: take depth by matching pictures instead of the capture's own (None: when it has none).
+    """
+    from pipelines.steps_stereo import match_pictures
+
+    folder = job.folder / name
+    kept = job.folder / "renders" / f"{name}.safetensors"
     made: list[Path] = []
+    stereo = match_pictures(job, scene, views) if (not posed.has_depth if matched is None else matched) else None
 
     def make() -> Pictures:
         from pipelines.surface import fuse_training_frames
 
-        pictures, paths = fuse_training_frames(job, folder, posed, scene, views)
+        pictures, paths = fuse_training_frames(job, folder, posed, scene, views, stereo)
         made.extend(paths)
         return pictures
 
     def save(pictures: Pictures) -> list[Path]:
         save_pictures(kept, pictures)
-        return [kept, *made, *write_pngs(kept.parent, "tsdf", pictures)]
+        return [kept, *made, *write_pngs(kept.parent, name, pictures)]
 
     return job.stages.run(
-        "tsdf",
+        name,
         make=make,
         save=save,
         load=lambda: load_pictures(kept),
         uses=[asdict(job.settings.tsdf), pixel_state(posed)],
-        after=["scene", "views"],
+        after=["scene", "views", *(["stereo"] if stereo is not None else [])],
     )
 
 

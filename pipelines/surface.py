@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from toolkit.render.field import Field
     from toolkit.tsdf.fuse import Points
     from toolkit.tsdf.mesh import Mesh
+    from toolkit.tsdf.stereo import StereoDepth
 
 SMALL_PART = 0.002  # components of a mesh with less than this share of its area are specks
 MOST_TRIANGLES = 2_000_000
@@ -36,18 +37,29 @@ def spread(count: int, most: int) -> list[int]:
     return sorted({round(i) for i in np.linspace(0, count - 1, min(count, most))}) if count and most else []
 
 
-def fuse_training_frames(job: Job, folder: Path, posed: Capture, scene: Scene, views: Views) -> tuple[Pictures, list[Path]]:
+def fuse_training_frames(
+    job: Job, folder: Path, posed: Capture, scene: Scene, views: Views, stereo: list[StereoDepth] | None = None
+) -> tuple[Pictures, list[Path]]:
     """The TSDF surface of the training frames: mesh and points in `folder`, pictures at the held-out views.
+
+    Args:
+        stereo: depth of the training views by matching, to be used instead of the capture's own.
 
     Returns:
         pictures, and the files written. `pictures.facts`: voxel size and range (working units), frames, blocks, seconds with decoding.
     """
     from toolkit.export.mesh import mesh_facts
     from toolkit.tsdf.fuse import fuse_capture
+    from toolkit.tsdf.stereo_frames import fuse_stereo
 
-    train = [index for index, test in enumerate(views.test) if not test and posed.frames[index].depth is not None]
+    settings = job.settings.tsdf
     start = time.monotonic()
-    volume = fuse_capture(posed, scene.working_from_input, train, job.settings.tsdf, job.progress)
+    if stereo is None:
+        train = [index for index, test in enumerate(views.test) if not test and posed.frames[index].depth is not None]
+        volume = fuse_capture(posed, scene.working_from_input, train, settings, job.progress)
+    else:
+        shown = views.subset(np.flatnonzero(~views.test))
+        volume = fuse_stereo(shown, stereo, settings.voxel_size, settings.depth_max, progress=job.progress)
     fused = time.monotonic() - start
     mesh = volume.mesh().cleaned(min_area_share=SMALL_PART)
     write_surface(folder, scene, mesh, volume.points())
@@ -58,6 +70,7 @@ def fuse_training_frames(job: Job, folder: Path, posed: Capture, scene: Scene, v
         picture = to_picture(volume.render(views.intrinsics[index], views.world_from_camera[index]))
         found.add(views.names[index], picture, time.monotonic() - start)
     found.facts = {
+        "depth_from": "sensor" if stereo is None else "matching",
         "voxel_size": volume.voxel_size,
         "depth_max": volume.depth_max,
         "frames": volume.frames,

@@ -215,7 +215,7 @@ def run_made(capsys: Capsys, tmp_path: Path, *arguments: object) -> Answer:
         (["--image-size", "4"], "16 pixels"),
         (["--threads", "0"], "positive"),
         (["--config", "nowhere.yaml"], "nowhere.yaml"),
-        (["--set", "tsdf.enabled=on"], "depth"),
+        (["--set", "tsdf.enabled=maybe"], "auto, on, off"),
     ],
 )
 def test_wrong_settings(arguments: list[str], words: str, tmp_path: Path, capsys: Capsys) -> None:

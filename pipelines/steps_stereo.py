@@ -1,0 +1,54 @@
+"""The stage `stereo`: depth of the training pictures by matching them with each other, for captures that have none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines.job import Job
+from toolkit.errors import InputError
+
+if TYPE_CHECKING:
+    from toolkit.capture.types import Views
+    from toolkit.poses.scene import Scene
+    from toolkit.tsdf.stereo import StereoDepth
+
+
+def match_pictures(job: Job, scene: Scene, views: Views) -> list[StereoDepth]:
+    """Depth of every training view; held-out pictures are not looked at.
+
+    Raises:
+        InputError: the pictures cannot be matched.
+        Interrupted: the user asked to stop.
+    """
+    from toolkit.tsdf.stereo import stereo_depths
+    from toolkit.tsdf.stereo_frames import load_stereo, save_stereo
+
+    path = job.folder / "stereo" / "depths.safetensors"
+    training = views.subset(np.flatnonzero(~views.test))
+
+    def load() -> list[StereoDepth]:
+        names, depths = load_stereo(path)
+        if names != training.names:
+            raise InputError(f"{path} is of other pictures; remove it and run the command again")
+        return depths
+
+    def save(depths: list[StereoDepth]) -> list[Path]:
+        save_stereo(path, training.names, depths)
+        return [path]
+
+    return job.stages.run(
+        "stereo",
+        make=lambda: stereo_depths(training, scene.near, scene.far, scene.median_depth, progress=job.progress),
+        save=save,
+        load=load,
+        after=["scene", "views"],
+    )
+
+
+def reuse_matched(job: Job, scene: Scene, views: Views) -> None:
+    """Take up depth by matching that the folder has, so that a surface made of it counts as standing on what is there."""
+    if job.stages.usable("stereo"):
+        match_pictures(job, scene, views)

@@ -1,0 +1,64 @@
+"""Surfaces of captures without depth: pictures are matched with each other first."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.pipelines.made import call, save_picture, write_transforms
+from tests.poses.textured import arc, render
+from toolkit.camera import Intrinsics, opengl_from_world
+from toolkit.files import read_json
+
+Capsys = pytest.CaptureFixture[str]
+CAMERA = Intrinsics(128, 96, 120.0, 120.0, 64.0, 48.0)
+
+
+def make_corner(folder: Path, count: int = 9, depth: bool = False) -> None:
+    """The textured corner as transforms.json with pictures, with its depth in millimetres when asked for."""
+    frames: list[dict[str, Any]] = []
+    for index, pose in enumerate(arc(count, 44.0)):
+        picture, metres = render(pose, CAMERA)
+        frame: dict[str, Any] = {"file_path": f"images/{index:03d}.png", "transform_matrix": opengl_from_world(pose).tolist()}
+        save_picture(folder / frame["file_path"], picture)
+        if depth:
+            frame["depth_file_path"] = f"depth/{index:03d}.png"
+            (folder / "depth").mkdir(exist_ok=True)
+            cv2.imwrite(str(folder / frame["depth_file_path"]), (metres * 1000 + 0.5).astype(np.uint16))
+        frames.append(frame)
+    about = {"w": CAMERA.width, "h": CAMERA.height, "fl_x": CAMERA.fx, "fl_y": CAMERA.fy, "cx": CAMERA.cx, "cy": CAMERA.cy}
+    write_transforms(folder, {**about, "frames": frames})
+
+
+def test_a_surface_from_pictures_alone(tmp_path: Path, capsys: Capsys) -> None:
+    make_corner(tmp_path / "corner")
+    out = tmp_path / "out"
+    answer = call(capsys, "tsdf", tmp_path / "corner", "--out", out, "--holdout", "4", "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    data = json.loads(answer.out)
+    score = data["evaluation"]["tsdf"]
+    assert score["depth_from"] == "matching"
+    assert score["psnr_masked"] > 18 and score["coverage"] > 0.6
+    assert (out / "tsdf" / "mesh.ply").stat().st_size > 10_000
+    stages = {stage["name"]: stage["cached"] for stage in data["stages"]}
+    assert stages["stereo"] is False
+
+    again = json.loads(call(capsys, "tsdf", out, "--quiet", "--json").out)
+    assert {stage["name"]: stage["cached"] for stage in again["stages"]} == {**dict.fromkeys(stages, True)}
+    # Another command keeps the surface in its report.
+    kept = json.loads(call(capsys, "evaluate", out, "--quiet", "--json", "--set", "fit.budget=2", "--set", "field.resolution=32").out)
+    assert kept["evaluation"]["tsdf"]["psnr"] == score["psnr"]
+    assert kept["evaluation"]["field"]["psnr"] > 8
+
+
+def test_without_being_asked_nothing_is_matched(tmp_path: Path, capsys: Capsys) -> None:
+    make_corner(tmp_path / "corner", 6)
+    out = tmp_path / "out"
+    options = ["--holdout", "3", "--quiet", "--set", "fit.budget=1", "--set", "field.resolution=32"]
+    assert call(capsys, "run", tmp_path / "corner", "--out", out, *options, "--set", "export.formats=[]").code == 0
+    assert not (out / "stereo").exists() and read_json(out / "report.json")["evaluation"]["tsdf"] is None
