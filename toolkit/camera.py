@@ -22,6 +22,7 @@ PINHOLE = "pinhole"
 OPENCV = "opencv"  # k1, k2, p1, p2[, k3[, k4, k5, k6]] as in OpenCV
 FISHEYE = "fisheye"  # k1, k2, k3, k4 of OpenCV's equidistant model
 LENSES = (PINHOLE, OPENCV, FISHEYE)
+RIGID = 1e-14  # how far RᵀR of a rotation in float64 is from the identity by rounding alone
 
 
 @dataclass(frozen=True)
@@ -198,7 +199,9 @@ def invert(pose: Array) -> Array:
 
 
 def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
-    """A rigid float64 (4, 4) pose, re-orthonormalised, or a clear refusal.
+    """A rigid float64 (4, 4) pose, re-orthonormalised where it is off, or a clear refusal.
+
+    What is rigid to the last digits stays as it is: a pose that was written and read back is the same pose.
 
     Raises:
         InputError: wrong shape, not finite, singular, mirrored or not rigid (beyond `tolerance`).
@@ -220,11 +223,14 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
         raise InputError(
             f"{where}: the pose mirrors space (its rotation has determinant < 0); its axis convention is not what this kind of capture uses"
         )
-    if np.abs(rotation.T @ rotation - np.eye(3)).max() > tolerance:
+    off = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if off > tolerance:
         raise InputError(f"{where}: the pose is not rigid (its rotation is scaled or sheared by more than {tolerance:g}); correct it")
-    u, _, vt = np.linalg.svd(rotation)
     out = np.eye(4)
-    out[:3, :3] = u @ vt
+    if off > RIGID:
+        u, _, vt = np.linalg.svd(rotation)
+        rotation = u @ vt
+    out[:3, :3] = rotation
     out[:3, 3] = pose[:3, 3]
     return out
 
