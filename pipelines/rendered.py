@@ -88,8 +88,9 @@ def load_pictures(path: Path) -> Pictures:
                 for index in range(len(about["names"]))
             ]
             return Pictures(about["names"], pictures, about["seconds"], about["facts"])
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} cannot be read ({str(error).splitlines()[0]}); remove it and run the command again") from error
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, MemoryError, RecursionError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{path} cannot be read ({reason}); remove it and run the command again") from error
 
 
 def file_name(name: str) -> str:

@@ -56,7 +56,7 @@ def load_volume(path: Path | str) -> TsdfVolume:
         voxel_size, depth_max, truncation = (float(facts[name]) for name in ("voxel_size", "depth_max", "truncation"))
         volume = TsdfVolume(voxel_size, depth_max, truncation, expected_blocks=2 * len(keys))
         volume.frames, volume.empty_frames, volume.touches = int(facts["frames"]), int(facts["empty_frames"]), int(facts["touches"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path} is no TSDF volume of this program (its description lacks or misstates {error}); fuse again") from error
     if len(keys) > volume.max_blocks or len(np.unique(keys, axis=0)) != len(keys):
         raise InputError(f"{path} holds {len(keys)} blocks, too many or repeated ones; fuse again with a larger tsdf.voxel_size")
@@ -79,8 +79,9 @@ def _read(path: Path) -> tuple[dict[str, float], dict[str, Array]]:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
     except FileNotFoundError as error:
         raise InputError(f"{path} does not exist; fuse the capture's depth first") from error
-    except (SafetensorError, OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not a TSDF volume or is damaged ({str(error).splitlines()[0]}); fuse again") from error
+    except (SafetensorError, OSError, ValueError, TypeError, MemoryError, RecursionError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{path} is not a TSDF volume or is damaged ({reason}); fuse again") from error
     if not isinstance(facts, dict) or facts.get("version") != VERSION:
         raise InputError(f"{path} is not a TSDF volume of version {VERSION}; fuse again with this program")
     count = len(arrays["keys"]) if "keys" in arrays and arrays["keys"].ndim == 2 else -1
