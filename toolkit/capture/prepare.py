@@ -7,6 +7,7 @@ import math
 import cv2
 import numpy as np
 
+from toolkit import memory
 from toolkit.camera import Array, Intrinsics, Similarity, resample_maps, undistort_maps
 from toolkit.capture.images import load_depth, load_image, load_mask, turns_by_exif
 from toolkit.capture.listing import fitted, natural_key
@@ -43,12 +44,16 @@ def prepare_views(capture: Capture, working_from_input: Similarity, settings: Ca
     One frame is decoded at a time.
 
     Raises:
-        InputError: a frame without pose or intrinsics, a file that cannot be read, a picture of another shape than its camera.
+        InputError: a frame without pose or intrinsics, a file that cannot be read, a picture of another shape than its camera, or more
+            than there is memory for.
     """
     count = len(capture.frames)
     poses: list[Array] = []
     views = Views([], [], [], np.zeros((0, 4, 4)), held_out(capture, settings.holdout), background=WHITE if capture.alpha else None)
-    shrink = _Shrinker(settings.image_size or DEFAULT_LONG_SIDE)
+    long_side = settings.image_size or DEFAULT_LONG_SIDE
+    size = expected_bytes(capture, long_side)
+    memory.require(size, f"{count} pictures of {capture.root} at {long_side} pixels", "lower --image-size, or give fewer frames")
+    shrink = _Shrinker(long_side)
     exif = turns_by_exif(capture)
     for index, frame in enumerate(capture.frames):
         progress.check()
@@ -72,6 +77,17 @@ def prepare_views(capture: Capture, working_from_input: Similarity, settings: Ca
     views.world_from_camera = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
     progress.update(count, count)
     return views
+
+
+def expected_bytes(capture: Capture, long_side: int) -> int:
+    """Memory that the prepared views of a capture take while they are written: colour, alpha, mask and depth, and one copy of them."""
+    total = 0
+    for frame in capture.frames:
+        if frame.intrinsics is not None:
+            width, height = target_size(frame.intrinsics.width, frame.intrinsics.height, long_side)
+            partial = frame.mask is not None or frame.intrinsics.distorted
+            total += width * height * (3 + capture.alpha + partial + 4 * (frame.depth is not None))
+    return 2 * total
 
 
 def target_size(width: int, height: int, long_side: int) -> tuple[int, int]:

@@ -19,6 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from toolkit import memory
 from toolkit.camera import Similarity
 from toolkit.errors import FieldfuseError, InputError, OutputError
 from toolkit.files import atomic_path
@@ -125,7 +126,8 @@ def read_field(path: Path | str) -> FieldFile:
     """Read and check a field file that may come from anybody.
 
     Raises:
-        InputError: missing, truncated, not a field, of another version, or any value that could not have been written.
+        InputError: missing, truncated, not a field, of another version, any value that could not have been written, or more than there
+            is memory for.
     """
     path = Path(path)
     if not path.is_file():
@@ -142,7 +144,11 @@ def read_field(path: Path | str) -> FieldFile:
                     raise _Unusable(f"it holds an unknown tensor {name[:40]!r}")
             # Copies, because the originals are windows into the file, which may change under them.
             tensors = {name: source.get_tensor(name).clone() for name in names}
-        return _checked(tensors, metadata[METADATA_KEY])
+        data = _checked(tensors, metadata[METADATA_KEY])
+        # A few bytes of keys stand for kilobytes of rows: what a small file unpacks to is looked at before anybody unpacks it.
+        unpacked = len(data.keys) * VOXELS * (4 * (data.features.shape[1] + 1) + 1)
+        memory.require(unpacked, f"the field {path}", "fit it at a lower resolution, or use a machine with more memory")
+        return data
     except FieldfuseError:
         raise
     except (_Unusable, SafetensorError, OSError, ValueError, TypeError, KeyError, RuntimeError, OverflowError, MemoryError) as error:

@@ -1,0 +1,47 @@
+"""How much memory this process may still take, and the refusal, with numbers, of work that needs more. Only the standard library."""
+
+from __future__ import annotations
+
+import resource
+from contextlib import suppress
+from pathlib import Path
+
+from toolkit.errors import InputError
+
+GIB = 2**30
+SPARE = 128 * 2**20  # left to everything else
+_MEMINFO, _STATUS = Path("/proc/meminfo"), Path("/proc/self/status")
+_CGROUP = Path("/sys/fs/cgroup")
+
+
+def available() -> int | None:
+    """Bytes that can still be had: what the machine has free, what a container allows, what RLIMIT_AS leaves; None where nobody tells."""
+    limits = []
+    with suppress(OSError, KeyError, ValueError):
+        limits.append(_kilobytes(_MEMINFO, "MemAvailable"))
+    with suppress(OSError, ValueError):  # "max" where there is no limit
+        limits.append(int((_CGROUP / "memory.max").read_text()) - int((_CGROUP / "memory.current").read_text()))
+    with suppress(OSError, KeyError, ValueError):
+        most = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if most != resource.RLIM_INFINITY:
+            limits.append(most - _kilobytes(_STATUS, "VmSize"))
+    return max(0, min(limits)) if limits else None
+
+
+def require(size: int, what: str, advice: str) -> None:
+    """Refuse what would need `size` bytes when there are fewer.
+
+    Args:
+        what: what needs them, the start of a sentence. advice: what to do, its end.
+
+    Raises:
+        InputError: naming both numbers.
+    """
+    there = available()
+    if there is not None and size > there - SPARE:
+        raise InputError(f"{what} needs about {size / GIB:.1f} GB of memory and {max(there, 0) / GIB:.1f} GB is free; {advice}")
+
+
+def _kilobytes(path: Path, name: str) -> int:
+    entries = dict(line.split(":", 1) for line in path.read_text(encoding="ascii").splitlines() if ":" in line)
+    return int(entries[name].split()[0]) * 1024
