@@ -19,6 +19,8 @@ from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".wmv")
+MOST_FRAMES = 2_000_000  # eighteen hours at 30 a second
+SMALLEST_FRAME = 8  # bytes
 _PLAYLISTS = (b"#EXTM3U", b"ffconcat")  # text that makes FFmpeg open other files or addresses
 
 
@@ -44,7 +46,9 @@ def read_video(path: Path) -> Capture:
         announced = stream.get(cv2.CAP_PROP_FRAME_COUNT)
         fps = stream.get(cv2.CAP_PROP_FPS)
         rotation = stream.get(cv2.CAP_PROP_ORIENTATION_META)
-        count = int(announced) if math.isfinite(announced) and 0 < announced < 1e8 else _count(stream) + 1
+        # A header may announce anything; what a file of this size cannot hold, or nobody would film, is counted instead.
+        believable = min(path.stat().st_size // SMALLEST_FRAME, MOST_FRAMES)
+        count = int(announced) if math.isfinite(announced) and 0 < announced <= believable else _count(stream) + 1
     finally:
         stream.release()
     fps = float(fps) if math.isfinite(fps) and 0 < fps < 1e4 else 0.0
