@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.networks.made import pictures
-from toolkit.networks.encoder import STRIDE, ImageEncoder
+from toolkit.networks.encoder import STRIDE, ImageEncoder, Sampled
 
 
 def test_features_are_alive_at_the_start() -> None:
@@ -48,4 +48,8 @@ def test_cells_are_centred_where_unprojection_looks_for_them() -> None:
             parameter.data = (parameter.data + parameter.data.flip(3)) / 2
     image = torch.rand(1, 3, 64, 96, dtype=torch.float64)
     torch.testing.assert_close(encoder(image.flip(3)), encoder(image).flip(3), atol=1e-9, rtol=1e-9)
-    assert encoder(image).shape[3] == 96 // STRIDE
+    sampled = Sampled(16, 16, 4).double()
+    sampled.fine.weight.data = (sampled.fine.weight.data + sampled.fine.weight.data.flip(3)) / 2
+    one, two = sampled(*encoder.maps(image)), sampled(*encoder.maps(image.flip(3)))
+    torch.testing.assert_close(two, one.flip(3), atol=1e-9, rtol=1e-9)
+    assert one.shape == (1, 4, 64 // STRIDE, 96 // STRIDE) and float(one.detach().flatten(2).std(2).mean()) > 0.1

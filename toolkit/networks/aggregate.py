@@ -33,23 +33,23 @@ def aggregate(values: Tensor, visible: Tensor, with_variance: bool = True) -> tu
     return mean, variance.masked_fill(one, 0.0), count
 
 
-def evidence(mean: Tensor, variance: Tensor, count: Tensor, footprint: Tensor, spread: Tensor) -> Tensor:
+def evidence(mean: Tensor, variance: Tensor, count: Tensor, footprint: Tensor, step: Tensor) -> Tensor:
     """The input of the local network.
 
     Args:
         mean, variance: (N, C) from `aggregate`.
         count: (N,) views.
         footprint: (N,) pixels that the voxel covers (geometric mean over the views).
-        spread: (N,) standard deviation of the viewing directions, radians.
+        step: (N,) pixels by which views disagree about the voxel's neighbour in depth.
 
     Returns:
         (N, 3 · C + FLAGS): mean, deviation-like variance, its logarithm about [−1, 1]; a flag for two and more views, 1 / views, the
-        logarithm of the footprint, and that of the pixels by which views disagree about a voxel's neighbour. Nothing has a unit.
+        logarithms of the footprint and of the step. Nothing has a unit.
     """
     several = (count >= 2)[:, None].to(mean.dtype)
     squashed = variance / (1 + variance)
     logarithm = (torch.log(variance + LOG_FLOOR) / 4 + 1) * several
-    disparity = torch.log2(spread * footprint + 0.05) * several[:, 0]
+    disparity = torch.log2(step + 0.05) * several[:, 0]
     flags = torch.stack([several[:, 0], 1 / count.to(mean.dtype), torch.log2(footprint) / 4, disparity / 4], 1)
     return torch.cat([mean, squashed * several, logarithm, flags], 1)
 

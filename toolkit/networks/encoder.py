@@ -1,4 +1,5 @@
-"""The image encoder: one map of 64 channels at a quarter of the picture's size, a feature pyramid fused top down.
+"""The image encoder: one map of 64 channels at a quarter of the picture's size, a feature pyramid fused top down, and what of it voxels
+look up at half the size.
 
 Every stride-2 convolution has an even kernel, so cell j of a map of stride s is centred at s · (j + ½) pixels exactly; unprojection
 relies on it. Normalisation by groups keeps the features alive from the first step on (plain deep stacks die without notice).
@@ -9,7 +10,7 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-STRIDE = 4  # pixels a cell of the map
+STRIDE = 2  # pixels a cell of what voxels look up
 DEEPEST = 16  # pixels a cell of the deepest level; pictures are padded to multiples of it
 GROUP = 8  # channels normalised together
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's pictures, RGB
@@ -36,7 +37,7 @@ class _Residual(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """(V, 3, H, W) RGB in [0, 1] → (V, channels, ⌈H/16⌉·4, ⌈W/16⌉·4), of unit deviation.
+    """(V, 3, H, W) RGB in [0, 1] → (V, channels, ⌈H/16⌉·4, ⌈W/16⌉·4), of about unit deviation.
 
     Args:
         channels: of the result.
@@ -45,10 +46,12 @@ class ImageEncoder(nn.Module):
 
     def __init__(self, channels: int = 64, widths: tuple[int, int, int, int] = (16, 32, 48, 96)) -> None:
         super().__init__()
+        self.widths = widths
         half, quarter, eighth, sixteenth = widths
+        self.stem = _Conv(3, half, 4, 2)
         self.stages = nn.ModuleList(
             [
-                nn.Sequential(_Conv(3, half, 4, 2), _Conv(half, quarter, 4, 2), _Residual(quarter)),
+                nn.Sequential(_Conv(half, quarter, 4, 2), _Residual(quarter)),
                 nn.Sequential(_Conv(quarter, eighth, 4, 2), _Residual(eighth)),
                 nn.Sequential(_Conv(eighth, sixteenth, 4, 2), _Residual(sixteenth)),
             ]
@@ -58,7 +61,12 @@ class ImageEncoder(nn.Module):
         self.norm = nn.GroupNorm(channels // GROUP, channels)
 
     def forward(self, images: Tensor) -> Tensor:
+        return self.maps(images)[1]
+
+    def maps(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """The stem's map at half the size, (V, widths[0], ⌈H/16⌉·8, ⌈W/16⌉·8), and the fused one."""
         x = (padded(images) - images.new_tensor(MEAN).view(3, 1, 1)) / images.new_tensor(DEVIATION).view(3, 1, 1)
+        half = x = self.stem(x)
         levels = []
         for stage in self.stages:
             x = stage(x)
@@ -67,6 +75,24 @@ class ImageEncoder(nn.Module):
         for level in (1, 0):
             fused = self.laterals[level](levels[level]) + F.interpolate(fused, scale_factor=2, mode="bilinear", align_corners=False)
         features: Tensor = self.norm(self.smooth(fused))
+        return half, features
+
+
+class Sampled(nn.Module):
+    """What voxels look up: few channels of the fused map, enlarged, plus detail from the stem, at half the picture's size.
+
+    A voxel's step in depth moves its pixel by about one pixel only, so a map of a quarter of the size cannot tell neighbouring voxels
+    apart.
+    """
+
+    def __init__(self, fused: int, half: int, channels: int) -> None:
+        super().__init__()
+        self.coarse, self.fine = _linear(fused, channels, 1), _linear(half, channels, 3)
+        self.norm = nn.GroupNorm(1, channels)
+
+    def forward(self, half: Tensor, fused: Tensor) -> Tensor:
+        enlarged = F.interpolate(self.coarse(fused), scale_factor=2, mode="bilinear", align_corners=False)
+        features: Tensor = self.norm(enlarged + self.fine(half))
         return features
 
 

@@ -24,7 +24,7 @@ from toolkit.networks.cameras import Cameras
 from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
 from toolkit.networks.decoder import make_decoder
 from toolkit.networks.direction import DirectionCode
-from toolkit.networks.encoder import STRIDE, ImageEncoder, padded
+from toolkit.networks.encoder import STRIDE, ImageEncoder, Sampled, padded
 from toolkit.networks.gru import FusionGRU, RunningMean
 from toolkit.networks.head import FieldHead
 from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume, empty_volume
@@ -66,10 +66,9 @@ class NerfusionModel(nn.Module):
         super().__init__()
         self.config = config = config or ModelConfig()
         self.encoder = ImageEncoder(config.image_channels)
-        self.sample = nn.Conv2d(config.image_channels, config.sampled, 1)
-        nn.init.kaiming_normal_(self.sample.weight, nonlinearity="linear")
+        self.sample = Sampled(config.image_channels, self.encoder.widths[0], config.sampled)
         self.direction = DirectionCode(config.direction) if config.direction else None
-        inputs = 3 * (config.sampled + config.direction + COLOURS) + FLAGS
+        inputs = 3 * (config.sampled + config.direction + 2 * COLOURS) + FLAGS
         self.local = LocalReconstruction(inputs, config.hidden, config.channels)
         self.fusion: FusionGRU | RunningMean = FusionGRU(config.channels, config.gru_hidden) if config.fusion == "gru" else RunningMean()
         self.to_field = FieldHead(config.channels, config.head_hidden, config.features)
@@ -77,7 +76,7 @@ class NerfusionModel(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        return self.sample.weight.device
+        return next(self.parameters()).device
 
     def encode(self, images: Tensor, cameras: Cameras) -> list[EncodedView]:
         """Everything that voxels look up in pictures.
@@ -89,7 +88,7 @@ class NerfusionModel(nn.Module):
             images: (V, 3, H, W) RGB in [0, 1], undistorted; of one size.
             cameras: V cameras for exactly these pictures.
         """
-        maps = self.sample(self.encoder(images))
+        maps = self.sample(*self.encoder.maps(images))
         whole = padded((images - 0.5) * COLOUR_GAIN)
         views = []
         for index in range(len(images)):
@@ -148,10 +147,10 @@ class NerfusionModel(nn.Module):
         kept = seen.nonzero().view(-1)
         rows, points, projection = rows[kept], points[kept], projection[kept]
         visible = projection.visible
-        mean, variance, count = aggregate(look_up(views, projection), visible, self.config.variance)
-        footprint = torch.exp((torch.log(projection.footprint) * visible).sum(0) / count.clamp_min(1))
-        spread = direction_spread(points, cameras.positions, visible)
-        projected = torch.relu(self.local.project(evidence(mean, variance, count, footprint, spread)))
+        footprint = torch.exp((torch.log(projection.footprint) * visible).sum(0) / visible.sum(0).clamp_min(1))
+        step = footprint * direction_spread(points, cameras.positions, visible)
+        mean, variance, count = aggregate(look_up(views, projection, step), visible, self.config.variance)
+        projected = torch.relu(self.local.project(evidence(mean, variance, count, footprint, step)))
         colour = colour_latent((mean[:, -COLOURS:] / COLOUR_GAIN + 0.5).clamp(0, 1))
         return rows, projected, colour, count.to(torch.float32)
 

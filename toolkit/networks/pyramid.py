@@ -60,7 +60,7 @@ class Pyramid:
         Returns:
             (N, C); differentiable in `rows`.
         """
-        level = torch.log2(footprint / self.stride).round_().clamp_(0, len(self.sizes) - 1).long()
+        level = torch.log2((footprint / self.stride).clamp_min(1)).round_().clamp_max_(len(self.sizes) - 1).long()
         table = torch.tensor(self.sizes, device=pixels.device)
         starts = torch.cat([table.new_zeros(1), table.prod(1).cumsum(0)[:-1]])
         height, width = table[level].unbind(1)

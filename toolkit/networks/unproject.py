@@ -19,10 +19,6 @@ class EncodedView:
     features: Pyramid
     colours: Pyramid
 
-    @property
-    def channels(self) -> int:
-        return self.features.rows.shape[1] + self.colours.rows.shape[1]
-
 
 @dataclass(frozen=True)
 class Projection:
@@ -64,9 +60,21 @@ def project(points: Tensor, size: Tensor, cameras: Cameras, near: float, far: fl
     return Projection(torch.where(visible[..., None], pixels, torch.zeros_like(pixels)), visible, footprint)
 
 
-def look_up(views: Sequence[EncodedView], projection: Projection) -> Tensor:
-    """(K, N, C) what each view shows at the voxels: features, direction code, colour. Where it does not see one: anything finite."""
+def look_up(views: Sequence[EncodedView], projection: Projection, step: Tensor) -> Tensor:
+    """What each view shows at the voxels. Where it does not see one: anything finite.
+
+    Two sizes matter. To tell depths apart, views are compared at the size of `step`: larger cells look the same from voxel to voxel (and a
+    voxel is often many pixels wide while its neighbour in depth is less than a pixel away), smaller ones differ by chance. To colour the
+    voxel, they are averaged over all that it covers.
+
+    Args:
+        step: (N,) pixels by which views disagree about the voxel's neighbour in depth.
+
+    Returns:
+        (K, N, C): features and direction code (F), colour at the size of the step (3), colour at the size of the voxel (3).
+    """
     parts = []
     for view, pixels, footprint in zip(views, projection.pixels, projection.footprint, strict=True):
-        parts.append(torch.cat([view.features.lookup(pixels, footprint), view.colours.lookup(pixels, footprint)], 1))
+        fine = [view.features.lookup(pixels, step), view.colours.lookup(pixels, step)]
+        parts.append(torch.cat([*fine, view.colours.lookup(pixels, footprint)], 1))
     return torch.stack(parts)
