@@ -41,7 +41,7 @@ class PosesSettings:
 class FieldSettings:
     channels: int = 16  # features a voxel
     decoder: str = "deferred"  # deferred | per_sample (the paper's)
-    hidden: int = 32  # width of the decoder
+    hidden: int = 64  # width of the decoder
     background: str = "auto"  # auto | on | off: contract what lies outside the region of interest
     resolution: int | None = None  # voxels along the longest side of the volume; None: by preset and picture size
     init: str = "classical"
@@ -53,8 +53,8 @@ class FitSettings:
     max_rays: int = 2048  # rays a step at the finest level; many small steps beat few large ones
     rate_density: float = 0.15
     rate_feature: float = 0.05
-    rate_decoder: float = 3e-3
-    distortion: float = 0.01  # weight of the distortion loss
+    rate_decoder: float = 5e-3
+    distortion: float = 0.015  # weight of the distortion loss
     opacity: float = 0.05  # weight of (1 - opacity)² where every ray must end somewhere (captures without alpha)
     patience: bool = False  # end before the budget when the validation views stop improving
     prune_weight: float = 0.05  # voxels whose largest seen weight stays below are removed

@@ -123,7 +123,7 @@ def test_the_start_is_the_visual_hull() -> None:
 
 
 @pytest.mark.parametrize(
-    ("finest", "expected"), [(64, [32, 64]), (256, [32, 64, 128, 256]), (320, [32, 64, 128, 256, 320]), (288, [32, 64, 128, 288])]
+    ("finest", "expected"), [(64, [32, 64]), (256, [32, 64, 128, 256]), (320, [32, 64, 128, 320]), (288, [32, 64, 128, 288])]
 )
 def test_levels_end_at_the_finest(finest: int, expected: list[int]) -> None:
     assert levels(finest) == expected

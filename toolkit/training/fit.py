@@ -25,7 +25,7 @@ from toolkit.render.field import Field
 from toolkit.training.engine import Engine, make_engine, warm_up
 from toolkit.training.levels import all_places, finer, first_field, pruned, visible
 from toolkit.training.rays import PixelPool
-from toolkit.training.schedule import LAST_PRUNE, Schedule
+from toolkit.training.schedule import Schedule
 from toolkit.training.start import MARGIN, ROOM_MARGIN, finest_resolution, levels, make_space, possible
 from toolkit.volume.host import Host, TorchHost
 
@@ -33,8 +33,8 @@ DEFAULT_BUDGET = 120.0
 START_RAW = -4.5  # of the first density: thin enough that every voxel along a ray is tried, thick enough that none is ignored
 TIMELINE_POINTS = 12
 TIMELINE_PIXELS = 8192
-VALIDATION_PIXELS = 4096
-VALIDATION_SHARE = 12  # every so manieth training view steers the schedule …
+VALIDATION_PIXELS = 2048
+VALIDATION_SHARE = 20  # every so manieth training view steers the schedule …
 LEAST_VIEWS = 24  # … when there are enough: with few views each of them is worth more than what it would decide
 MANY_VOXELS = 2_000_000  # beyond this a finer level is made only where rays came
 
@@ -139,7 +139,7 @@ def fit_field(
         elif plan.wants_pruning(done):
             current = pruned(current, visible(current, engine.seen, engine.visits, settings.fit.prune_weight))
             engine.go_on_with(current)
-        if done > LAST_PRUNE:
+        if plan.decided(done):
             pool.limit = len(pool)
         elif plan.wants_look(done) and (psnr := validation.psnr(engine)) is not None:
             plan.look(psnr, done)

@@ -29,16 +29,14 @@ class FusedOptimiser:
     """
 
     def __init__(self, field: Field, pool: PixelPool, seed: int = 0, threads: int | None = None) -> None:
-        assert isinstance(field.decoder, Deferred)
         self.pool, self.threads = pool, threads or torch.get_num_threads()
         self.generator = np.random.default_rng(seed)
         self.pixels = kernels.Pixels(pool.colour.numpy(), pool.place.numpy(), pool.view.numpy(), pool.camera.numpy(), pool.pose.numpy())
         widths, heights = pool.camera[:, 4].max(), pool.height
         shape = (len(pool.pose), int(heights) // GUESS_CELL + 1, int(widths) // GUESS_CELL + 1)
         self.guess = np.zeros(shape, np.float32)
-        self.decoder = decoder_arrays(field.decoder)
-        d = self.decoder
-        self.moments = [(np.zeros_like(w), np.zeros_like(w)) for w in (d.w1, d.b1, d.w2, d.b2, d.w3, d.b3)]
+        self._take_decoder(field)
+        self.moments = [(np.zeros_like(weight), np.zeros_like(weight)) for weight in self._weights()]
         self.decoder_steps = 0
         steps = np.arange(1, 2049)
         self.scales = np.concatenate([[1], np.sqrt(1 - BETAS[1] ** steps) / (1 - BETAS[0] ** steps)]).astype(np.float32)
@@ -57,7 +55,6 @@ class FusedOptimiser:
         self.touched = np.empty((self.threads, rows), np.int32)
         self.density_sums = np.empty((self.threads, rows), np.float32)
         self.feature_sums = K.aligned((self.threads, rows, channels), np.float32)
-        self.tape: tuple[Array, ...] = ()
         self.marks = np.zeros((self.threads, len(field.occupied)), np.uint16)
         self.go_on_with(field)
 
@@ -103,19 +100,10 @@ class FusedOptimiser:
         losses = kernels.Losses(*(np.float32(v) for v in (rates.distortion, rates.opacity, rates.colour_threshold, STOP)))
         depths = np.empty(rays, np.float32)
         cuts = [rays * t // self.threads for t in range(self.threads + 1)]
-
-        if not self.tape or len(self.tape[0]) != rays:
-            hidden = self.decoder.b1.shape[0]
-            widths = (self.decoder.w1.shape[0], hidden, hidden, hidden, hidden, 3)
-            self.tape = tuple(np.zeros((rays, width), np.float32) for width in widths)
+        self._make_room(rays)
 
         def gradients(thread: int) -> tuple[int, float, int]:
-            part = slice(cuts[thread], cuts[thread + 1])
-            rows = (self.touched[thread], self.density_sums[thread], self.feature_sums[thread])
-            own = kernels.Gradients(*rows, *(array[part] for array in self.tape))
-            arguments = (self.pixels, picks[part], jitter[part], rays, losses, self.marks[thread], self.index, thread, own, depths[part])
-            out: tuple[int, float, int] = kernels.gradient_pass(self.space, self.volume, self.decoder, self.background, *arguments)
-            return out
+            return self._gradients(thread, slice(cuts[thread], cuts[thread + 1]), picks, jitter, losses, depths)
 
         results = self._each(gradients)
         used = [result[0] for result in results]
@@ -145,17 +133,51 @@ class FusedOptimiser:
     def _each(self, work: Any) -> list[Any]:
         return [work(0)] if self.executor is None else list(self.executor.map(work, range(self.threads)))
 
-    def _move_decoder(self, rate: float) -> None:
-        """Adam on the decoder; ∂L/∂W is a product of the layer's inputs with the gradients behind it, over all rays."""
-        given, h1, h2, g1, g2, g_logit = self.tape
+    def _take_decoder(self, field: Field) -> None:
+        """Copy the decoder's weights."""
+        assert isinstance(field.decoder, Deferred)
+        self.decoder = decoder_arrays(field.decoder)
+        self.tape: tuple[Array, ...] = ()
+
+    def _weights(self) -> tuple[Array, ...]:
+        """What Adam moves of the decoder."""
         d = self.decoder
+        return d.w1, d.b1, d.w2, d.b2, d.w3, d.b3
+
+    def _make_room(self, rays: int) -> None:
+        """For a batch of so many rays."""
+        if not self.tape or len(self.tape[0]) != rays:
+            hidden = self.decoder.b1.shape[0]
+            widths = (self.decoder.w1.shape[0], hidden, hidden, hidden, hidden, 3)
+            self.tape = tuple(np.zeros((rays, width), np.float32) for width in widths)
+
+    def _gradients(
+        self, thread: int, part: slice, picks: Array, jitter: Array, losses: kernels.Losses, depths: Array
+    ) -> tuple[int, float, int]:
+        """The part of a batch that is `thread`'s → rows touched, sum of squared errors, samples looked up."""
+        rows = (self.touched[thread], self.density_sums[thread], self.feature_sums[thread])
+        own = kernels.Gradients(*rows, *(array[part] for array in self.tape))
+        arguments = (self.pixels, picks[part], jitter[part], len(picks), losses, self.marks[thread], self.index, thread, own, depths[part])
+        out: tuple[int, float, int] = kernels.gradient_pass(self.space, self.volume, self.decoder, self.background, *arguments)
+        return out
+
+    def _weight_gradients(self) -> tuple[Array, ...]:
+        """In the order of `_weights`. ∂L/∂W is a product of the layer's inputs with the gradients behind it, over all rays."""
+        given, h1, h2, g1, g2, g_logit = self.tape
+        return given.T @ g1, g1.sum(0), h1.T @ g2, g2.sum(0), g_logit.T @ h2, g_logit.sum(0)
+
+    def _turn_decoder(self) -> None:
+        """Renew what is kept of the weights a second time."""
+        d = self.decoder
+        d.w1_out[:], d.w2_out[:] = d.w1.T, d.w2.T
+
+    def _move_decoder(self, rate: float) -> None:
+        """Adam on the decoder."""
         self.decoder_steps += 1
         n = self.decoder_steps
         scale = np.float32(rate * np.sqrt(1 - BETAS[1] ** n) / (1 - BETAS[0] ** n))
-        weights = (d.w1, d.b1, d.w2, d.b2, d.w3, d.b3)
-        gradients = (given.T @ g1, g1.sum(0), h1.T @ g2, g2.sum(0), g_logit.T @ h2, g_logit.sum(0))
-        for weight, gradient, (m, v) in zip(weights, gradients, self.moments, strict=True):
+        for weight, gradient, (m, v) in zip(self._weights(), self._weight_gradients(), self.moments, strict=True):
             m += np.float32(1 - BETAS[0]) * (gradient - m)
             v += np.float32(1 - BETAS[1]) * (gradient * gradient - v)
             weight -= scale * m / (np.sqrt(v) + np.float32(EPSILON))
-        d.w1_out[:], d.w2_out[:] = d.w1.T, d.w2.T
+        self._turn_decoder()

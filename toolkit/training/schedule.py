@@ -19,10 +19,12 @@ LAST_PRUNE = 0.8  # of the budget; from here on the field is only polished, on a
 SLOWING = 1.5e6  # rays after which step sizes begin to fall
 LAST_RATE = 0.3  # of the step sizes, at the very end
 FIRST_BATCH = 256  # rays a step at the coarsest level, doubled at each level: early on the number of steps counts
-WORTH = 0.2  # rays that must be left for every voxel of a finer level: with fewer it ends blurred, and worse than the coarser one
-CHECKS = 50  # looks at the validation views in a budget
+WORTH = 0.5  # rays that must be left for every voxel of a finer level: with fewer it ends blurred, and worse than the coarser one
+CHECKS = 150  # looks at the validation views in a budget, at most …
+LOOK_STEPS = 40  # … and so many steps from one to the next
 WINDOW = 4  # looks that a plateau is judged by
-GAIN = 0.04  # decibels over a window that still count as progress
+GAIN = 0.04  # decibels over a window that still count as progress at the finest level …
+COARSE_GAIN = 0.25  # … and before it, where the next level gains more in the same time
 DROPS = 2  # halvings of the step sizes on plateaus of the finest level, before the end
 
 
@@ -69,9 +71,13 @@ class Schedule:
             return done
         return LAST_PRUNE + (done - self.ended) / max(self.ended * (1 / LAST_PRUNE - 1), 1e-9) * (1 - LAST_PRUNE)
 
+    def decided(self, done: float) -> bool:
+        """Whether the validation views have nothing more to say, so that they can be fitted too."""
+        return done >= LAST_PRUNE or (self.finest and not self.patient)
+
     def wants_look(self, done: float) -> bool:
         """Whether the validation views should be looked at now."""
-        if done < self.next_look or done >= LAST_PRUNE:
+        if done < self.next_look or done >= LAST_PRUNE or self.steps_here % LOOK_STEPS:
             return False
         self.next_look = done + 1 / CHECKS
         return True
@@ -92,7 +98,7 @@ class Schedule:
         if len(self.looks) < 2 * WINDOW:
             return False
         before, after = self.looks[-2 * WINDOW : -WINDOW], self.looks[-WINDOW:]
-        return sum(after) / WINDOW - sum(before) / WINDOW < GAIN
+        return sum(after) / WINDOW - sum(before) / WINDOW < (GAIN if self.finest else COARSE_GAIN)
 
     def wants_finer(self, done: float) -> bool:
         """Time for the next level: its share is spent, or the validation views gain nothing more here."""

@@ -24,7 +24,7 @@ ROOM_MARGIN = 1.4  # the same where nothing exists outside and no alpha says whe
 LEAST_REACH = 0.9
 COARSEST = 32
 FINEST = 512
-PIXELS = 1.8
+PIXELS = 2.0
 SEEN_BY = 3  # training views that must see a voxel: fewer cannot tell its depth
 
 
@@ -54,7 +54,7 @@ def levels(finest: int) -> list[int]:
     while out[-1] * 2 <= finest:
         out.append(out[-1] * 2)
     if out[-1] < finest:
-        if finest / out[-1] < 1.25:
+        if finest / out[-1] <= 1.3:
             out[-1] = finest
         else:
             out.append(finest)

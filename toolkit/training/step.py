@@ -35,18 +35,16 @@ class Optimiser:
     """A field with the optimiser state of its rows, and the largest weight that each voxel was seen with."""
 
     def __init__(self, field: Field) -> None:
-        self.field = field
-        self.density = LazyAdam(field.density_rows)
-        self.feature = LazyAdam(field.feature_rows)
         self.decoder = torch.optim.Adam(field.decoder.parameters(), lr=1e-3, betas=(0.9, 0.99), eps=1e-10)
-        self.seen = torch.zeros(len(field.occupied), device=field.device)
-        self.visits = torch.zeros(len(field.occupied), device=field.device)
+        self.renew_rows(field)
 
     def renew_rows(self, field: Field) -> None:
         """Go on with another field of the same decoder: the rows' state starts afresh, the decoder's is kept."""
-        decoder = self.decoder
-        self.__init__(field)  # type: ignore[misc]
-        self.decoder = decoder
+        self.field = field
+        self.density = LazyAdam(field.density_rows)
+        self.feature = LazyAdam(field.feature_rows)
+        self.seen = torch.zeros(len(field.occupied), device=field.device)
+        self.visits = torch.zeros(len(field.occupied), device=field.device)
 
     def go_on_with(self, field: Field) -> None:
         """Go on with the same rows after pruning; what was seen counts half from now on, so that it is forgotten within a few prunings."""
