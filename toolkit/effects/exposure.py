@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from toolkit.camera import Array
+from toolkit.effects.evidence import ROUNDS, Evidence, Tracks, robust, without_points_and_frames
 
 Tensor = torch.Tensor
 
@@ -53,3 +54,35 @@ def forward(linear: Tensor, gain: Tensor) -> Tensor:
 def invert(linear: Tensor, gain: Tensor) -> Tensor:
     """What `forward` was given; exact where nothing was clipped afterwards."""
     return linear / gain
+
+
+THRESHOLD = 0.04  # stops
+FEWEST = 30  # observations without which nothing can be told
+
+
+def evidence(tracks: Tracks, frames: int) -> Evidence:
+    """Whether frames differ in exposure or white balance: the deviation over the frames of the gains that shared points ask for.
+
+    The gains' own uncertainty is taken off the deviation. `parameters["gain"]` are (frames, 3) gains with geometric mean 1.
+    """
+    used = tracks.usable()
+    if len(used.frame) < FEWEST:
+        return Evidence("exposure", 0.0, THRESHOLD, "too few points are shared between pictures to compare their exposure")
+    light, weight = np.log2(used.linear), np.ones(len(used.frame))
+    constants = np.zeros((frames, 3))
+    for _ in range(ROUNDS):
+        left, constants = without_points_and_frames(light, used, weight, frames)
+        weight, _ = robust(left)
+    seen = np.bincount(used.frame, weight, frames)
+    noise = (weight[:, None] * left**2).sum(0) / max(float(weight.sum()), 1e-9)  # (3,) variance of one observation
+    told = seen > 0
+    chance = (noise / np.maximum(seen[told, None], 1)).mean(0)
+    deviation = np.sqrt(np.maximum((constants[told] ** 2).mean(0) - chance, 0))
+    number = float(deviation.max())
+    return Evidence(
+        "exposure",
+        number,
+        THRESHOLD,
+        f"the same points differ by {number:.3f} stops (deviation over frames) between pictures; {THRESHOLD:g} or more speak for drift",
+        {"gain": np.exp2(constants).tolist()},
+    )

@@ -6,6 +6,7 @@ vignetting → exposure → sensor noise → clipping, sRGB and 8 bits → compr
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -71,6 +72,7 @@ class Film:
         depth: bool = False,
         side: int = 2,
     ) -> None:
+        scene = copy(scene)  # the caller's scene keeps its own background and highlights
         scene.background, scene.highlights = effects.background, effects.highlights
         self.scene, self.motion, self.effects, self.seed, self.has_depth = scene, motion, effects, seed, depth
         self.times = np.asarray(times, dtype=np.float64)

@@ -113,8 +113,8 @@ def _check_keys(data: dict[str, Any], known: DictConfig, where: str, prefix: str
 def _check(settings: SceneFile, where: str) -> None:
     ranges: dict[str, tuple[float, float, float]] = {
         "seed": (settings.seed, 0, 2**32 - 1),
-        "camera.width": (settings.camera.width, 16, 8192),
-        "camera.height": (settings.camera.height, 16, 8192),
+        "camera.width": (settings.camera.width, 16, 4096),
+        "camera.height": (settings.camera.height, 16, 4096),
         "camera.fov": (settings.camera.fov, 5, 140),
         "path.frames": (settings.path.frames, 1, 100_000),
         "path.fps": (settings.path.fps, 1e-3, 1e4),

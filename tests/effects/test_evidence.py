@@ -1,0 +1,124 @@
+"""Evidence from simulated captures with known effects: found when it is there, not found when it is not, and of the right size."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.effects.tracks import CAMERA, FRAMES, Filmed, film_tracks
+from toolkit.effects import exposure, rolling_shutter, vignetting
+from toolkit.effects.evidence import Tracks, without_points_and_frames
+from toolkit.simulate.materials import TextureBank, texture_bank
+
+SEEDS = (11, 12)
+
+
+@pytest.fixture(scope="module")
+def bank() -> TextureBank:
+    return texture_bank(size=256)
+
+
+@pytest.fixture(scope="module")
+def clean(bank: TextureBank) -> list[Filmed]:
+    return [film_tracks(bank, seed, []) for seed in SEEDS]
+
+
+def test_constants_are_taken_out_exactly() -> None:
+    """Made-up values of points plus frames leave nothing, and give the frames' constants back."""
+    rng = np.random.default_rng(0)
+    frame, point = rng.integers(0, 7, 900), rng.integers(0, 5000, 900) // 10
+    frames, points = rng.normal(0, 1, (7, 2)), rng.normal(0, 3, (500, 2))
+    frames -= frames.mean(0)
+    tracks = Tracks(np.full((900, 3), 0.5), frame, point, np.zeros(900))
+    left, constants = without_points_and_frames(frames[frame] + points[point], tracks, rng.uniform(0.5, 1, 900), 7)
+    np.testing.assert_allclose(left, 0, atol=2e-4)
+    np.testing.assert_allclose(constants, frames, atol=2e-4)
+
+
+def test_dark_clipped_and_single_observations_are_not_used() -> None:
+    linear = np.full((6, 3), 0.4)
+    linear[1, 2], linear[2, 0] = 0.95, 0.001
+    used = Tracks(linear, np.arange(6), np.array([0, 0, 0, 5, 5, 7]), np.zeros(6)).usable()
+    assert used.frame.tolist() == [3, 4] and used.point.tolist() == [0, 0]
+
+
+def test_a_clean_capture_gives_no_evidence(clean: list[Filmed]) -> None:
+    for filmed in clean:
+        for found in (exposure.evidence(filmed.tracks, FRAMES), vignetting.evidence(filmed.tracks, FRAMES)):
+            assert not found.found, found.reason
+
+
+@pytest.mark.parametrize(("seed", "strength"), [(12, "weak"), (11, "medium"), (12, "strong")])
+def test_exposure_drift_is_found_and_measured(bank: TextureBank, seed: int, strength: str) -> None:
+    filmed = film_tracks(bank, seed, [f"exposure:{strength}"])
+    found = exposure.evidence(filmed.tracks, FRAMES)
+    assert found.found, found.reason
+    truth = np.log2([filmed.film.shot(index).facts["exposure"]["gain"] for index in range(0, FRAMES, 4)])
+    got = np.log2(found.parameters["gain"])[::4]
+    off = (got - got.mean(0)) - (truth - truth.mean(0))
+    assert np.abs(off).max() < 0.12 * exposure.PRESETS[strength].stops + 0.05
+    assert not vignetting.evidence(filmed.tracks, FRAMES).found
+
+
+@pytest.mark.parametrize(("seed", "strength"), [(11, "weak"), (12, "medium"), (11, "strong")])
+def test_vignetting_is_found_and_measured(bank: TextureBank, seed: int, strength: str) -> None:
+    filmed = film_tracks(bank, seed, [f"vignetting:{strength}"])
+    found = vignetting.evidence(filmed.tracks, FRAMES)
+    assert found.found, found.reason
+    assert found.parameters["corner"] == pytest.approx(vignetting.PRESETS[strength].corner, abs=0.06)
+
+
+def test_both_together(bank: TextureBank) -> None:
+    filmed = film_tracks(bank, SEEDS[0], ["exposure:strong", "vignetting:medium", "sensor_noise:medium"])
+    assert exposure.evidence(filmed.tracks, FRAMES).found
+    found = vignetting.evidence(filmed.tracks, FRAMES)
+    assert found.found and found.parameters["corner"] == pytest.approx(0.62, abs=0.08)
+
+
+def shifts(filmed: Filmed, readout: float, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Residuals, rows and velocities of the tracks as a rolling shutter of this readout makes them."""
+    rng = np.random.default_rng(seed)
+    residuals, rows, velocity = [], [], []
+    step = filmed.film.times[1] - filmed.film.times[0]
+    for index in range(1, FRAMES - 1):
+        mine = filmed.tracks.frame == index
+        points, predicted = filmed.points[filmed.tracks.point[mine]], filmed.pixels[mine]
+        seen = predicted.copy()
+        for _ in range(3):  # the row decides the time, the time the row
+            times = filmed.film.times[index] + readout * (seen[:, 1] / CAMERA.height - 0.5)
+            poses = filmed.film.motion.poses(times)
+            camera = np.einsum("nji,nj->ni", poses[:, :3, :3], points - poses[:, :3, 3])
+            seen = camera[:, :2] / camera[:, 2:] * CAMERA.fx + [CAMERA.cx, CAMERA.cy]
+        seen = seen + rng.normal(0, noise, seen.shape)
+        near = filmed.film.motion.poses(filmed.film.times[index] + np.array([-0.02, 0.02]))
+        residuals.append(seen - predicted)
+        rows.append(seen[:, 1])
+        velocity.append(rolling_shutter.image_velocity(CAMERA, near, 0.04, points))
+    assert step > 0
+    return np.concatenate(residuals), np.concatenate(rows), np.concatenate(velocity)
+
+
+@pytest.mark.parametrize("readout", [0.008, 0.018, 0.033, -0.02])
+def test_a_rolling_shutter_is_found_and_measured(clean: list[Filmed], readout: float) -> None:
+    for filmed in clean:
+        found = rolling_shutter.evidence(*shifts(filmed, readout, noise=0.15), CAMERA.height)
+        assert found.found, found.reason
+        assert found.parameters["readout"] == pytest.approx(readout, rel=0.1, abs=0.001)
+
+
+def test_a_global_shutter_gives_no_evidence(clean: list[Filmed]) -> None:
+    for filmed in clean:
+        for noise in (0.0, 0.3, 1.0):
+            found = rolling_shutter.evidence(*shifts(filmed, 0.0, noise), CAMERA.height)
+            assert not found.found, found.reason
+            assert abs(found.parameters["readout"]) < 0.006
+
+
+def test_too_little_to_tell_is_said(clean: list[Filmed]) -> None:
+    tracks = clean[0].tracks
+    few = Tracks(tracks.linear[:5], tracks.frame[:5], tracks.point[:5], tracks.radius[:5])
+    for found in (exposure.evidence(few, FRAMES), vignetting.evidence(few, FRAMES)):
+        assert not found.found and "too few" in found.reason
+    assert "too few" in rolling_shutter.evidence(np.zeros((3, 2)), np.zeros(3), np.zeros((3, 2)), 10).reason
+    still = rolling_shutter.evidence(np.random.default_rng(0).normal(0, 1, (100, 2)), np.linspace(0, 96, 100), np.zeros((100, 2)), 96)
+    assert not still.found and still.number == 0
