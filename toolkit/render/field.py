@@ -20,6 +20,7 @@ from toolkit.volume.topology import BLOCK, VOXELS, Topology
 
 Tensor = torch.Tensor
 
+
 def density(raw: Tensor) -> Tensor:
     """Raw density → σ ≥ 0 per normalised unit: exp, clamped in its forward value (a zero-length interval must not meet an infinite σ)."""
     return torch.exp(raw.clamp_max(RAW_MAX)) * UNITS
@@ -95,7 +96,7 @@ class Field:
         topology, occupied, (density_rows, feature_rows) = erase_empty_blocks(
             self.topology, self.occupied, [self.density_rows, self.feature_rows]
         )
-        return replace(self, topology=topology, occupied=occupied, density_rows=density_rows.clone(), feature_rows=feature_rows.clone())
+        return replace(self, topology=topology, occupied=occupied, density_rows=density_rows, feature_rows=feature_rows)
 
     def save(self, path: Path | str, working_from_input: Similarity | None = None, meta: dict[str, Any] | None = None) -> None:
         """Write `field.safetensors`, atomically; corners that no occupied voxel uses are left out.

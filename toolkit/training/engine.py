@@ -15,6 +15,7 @@ from toolkit.networks.decoder import Deferred
 from toolkit.progress import Progress
 from toolkit.render.field import Field
 from toolkit.render.rays import render_rays
+from toolkit.training.adam import LazyAdam
 from toolkit.training.rays import PixelPool
 from toolkit.training.step import Optimiser, Rates
 
@@ -47,6 +48,10 @@ class Engine(Protocol):
         """Go on with another field of the same decoder; the rows' state starts afresh."""
         ...
 
+    def let_go(self) -> None:
+        """Free what belongs to the rows, before finer ones are made beside them; `renew_rows` must follow."""
+        ...
+
     def go_on_with(self, field: Field) -> None:
         """Go on with the same rows after pruning."""
         ...
@@ -72,6 +77,11 @@ class TorchEngine(Optimiser):
 
     def colours(self, origins: Tensor, directions: Tensor) -> Tensor:
         return render_rays(self.field, origins, directions).colour
+
+    def let_go(self) -> None:
+        nothing = torch.zeros(0)
+        self.density, self.feature = LazyAdam(nothing), LazyAdam(nothing)
+        self.seen = self.visits = nothing
 
     def sync(self) -> Field:
         return self.field

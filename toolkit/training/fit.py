@@ -134,6 +134,7 @@ def fit_field(
                 keep &= engine.visits > 0  # memory is bounded: what no ray came to is the first to go
             if plan.worth(int(keep.sum()) * growth, (budget - now) * result.rays / max(now, 1e-3)):
                 plan.climb()
+                engine.let_go()
                 current = finer(current, keep, plan.resolution, host)
                 engine.renew_rows(current)
         elif plan.wants_pruning(done):
@@ -160,7 +161,9 @@ def fit_field(
     result.interrupted = progress.stopping()
     result.seconds = clock._spent
     _measure(result, held_out, engine, result.seconds)
-    result.field = engine.sync().settled()
+    current = engine.sync()
+    engine.let_go()
+    result.field = current.settled()
     host.close()
     return result
 

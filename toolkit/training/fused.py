@@ -58,6 +58,12 @@ class FusedOptimiser:
         self.marks = np.zeros((self.threads, len(field.occupied)), np.uint16)
         self.go_on_with(field)
 
+    def let_go(self) -> None:
+        """Free what belongs to the rows, before finer ones are made beside them; `renew_rows` must follow."""
+        nothing = np.empty(0, np.int32)
+        self.index = self.density_records = self.feature_records = self.touched = self.density_sums = self.feature_sums = nothing
+        self.marks = nothing
+
     def go_on_with(self, field: Field) -> None:
         """Go on with the same rows after pruning; what was seen counts half from now on, so that it is forgotten within a few prunings."""
         self.field = field
