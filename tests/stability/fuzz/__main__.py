@@ -1,0 +1,36 @@
+"""`python -m tests.stability.fuzz --inputs 100000 [--seed 1] [--jobs 2] [--only field] [--page docs/stability.md]`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from tests.stability.fuzz.drive import fuzz
+from tests.stability.page import replace_part
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="fuzz", description="Damaged and hostile files for every reader.")
+    parser.add_argument("--inputs", type=int, default=100_000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--only", action="append", default=[], help="a target's name; may be repeated")
+    parser.add_argument("--page", type=Path, help="a page whose part `fuzz` is replaced by the result")
+    chosen = parser.parse_args()
+
+    def told(inputs: int, problems: int) -> None:
+        sys.stderr.write(f"{inputs} inputs, {problems} problems\n")
+
+    result = fuzz(chosen.inputs, chosen.seed, chosen.jobs, chosen.only, told)
+    for problem in result.problems:
+        sys.stdout.write(json.dumps(problem) + "\n")
+    if chosen.page is not None:
+        replace_part(chosen.page, "fuzz", result.lines())
+    sys.stderr.write("\n".join(result.lines()) + "\n")
+    return 1 if result.problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,253 @@
+"""What is fed: small real samples of every format that is read, and what reads them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from tests.capture.layouts import LAYOUTS
+from tests.capture.made import eyes, render, save_picture
+from toolkit.camera import Intrinsics, Similarity
+from toolkit.capture import open_capture
+from toolkit.capture.checks import check_capture
+from toolkit.capture.images import load_image, load_mask
+from toolkit.capture.ply_points import read_ply_points
+from toolkit.capture.prepare import prepare_views
+from toolkit.capture.storage import capture_from_dict, capture_to_dict
+from toolkit.capture.types import Capture, Views
+from toolkit.capture.video import iterate_video, read_video
+from toolkit.capture.views_file import load_views, save_views
+from toolkit.config import CaptureSettings, load_settings
+from toolkit.evaluate.selftest.edit import aimed_rays, small_field
+from toolkit.files import read_json, write_json
+from toolkit.poses.given import given_poses
+from toolkit.render.field import Field
+from toolkit.render.rays import render_rays
+
+Act = Callable[[Path, int], object]
+
+
+@dataclass(frozen=True)
+class Target:
+    """Files below `root`, one of which is damaged at a time, and `act(root, number)` which reads them."""
+
+    name: str
+    files: tuple[str, ...]
+    make: Callable[[Path], object]
+    act: Act
+    weight: float = 1.0
+
+
+class Escape(Exception):
+    """A reader answered with a file outside the capture."""
+
+
+def contained(capture: Capture, root: Path) -> Capture:
+    """The capture, when all its files lie inside its folder."""
+    for frame in capture.frames:
+        for path in (frame.image, frame.depth, frame.mask):
+            if path is not None and not path.resolve().is_relative_to(root.resolve()):
+                raise Escape(str(path))
+    return capture
+
+
+def read_capture(root: Path, number: int) -> None:
+    """Read a capture; every fourth time look at its pictures and prepare them as well."""
+    capture = contained(open_capture(root), root)
+    if number % 4 == 0:
+        capture = check_capture(capture)
+        posed = given_poses(capture).apply(capture)
+        prepare_views(posed, Similarity.identity(), CaptureSettings(image_size=32))
+
+
+# ------------------------------------------------------------------------------------------------ samples
+
+FILES = {
+    "transforms": ("transforms.json", "transforms.json", "images/0001.png", "depth/0002.png"),
+    "blender": ("transforms_test.json", "transforms_train.json", "train/r_0.png"),
+    "colmap bin": ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"),
+    "colmap txt": ("sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"),
+    "7scenes": ("frame-000002.pose.txt", "frame-000002.depth.png"),
+    "tum": ("rgb.txt", "depth.txt", "groundtruth.txt"),
+    "scannet": ("pose/10.txt", "intrinsic/intrinsic_color.txt", "color/5.jpg"),
+    "llff": ("poses_bounds.npy",),
+    "dtu": ("cameras.npz",),
+    "redwood": ("trajectory.log", "camera_intrinsics.json"),
+}
+
+
+def make_extras(root: Path) -> None:
+    """`transforms.json` with everything optional: masks, float depth, a point cloud, splits."""
+    LAYOUTS["transforms"][1](root)
+    data = json.loads((root / "transforms.json").read_text())
+    for index, frame in enumerate(data["frames"]):
+        mask = np.full((60, 80), 255, np.uint8)
+        mask[:10] = 0
+        cv2.imwrite(str(root / f"mask{index}.png"), mask)
+        np.save(root / f"depth{index}.npy", render(eyes()[index], LAYOUTS_CAMERA)[1].astype(np.float32))
+        frame.update(mask_path=f"mask{index}.png", depth_file_path=f"depth{index}.npy", k1=0.01)
+    header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    (root / "points.ply").write_text(header + "0 0 0\n1 0.5 2\n-1 3 1e-3\n")
+    data.update(ply_file_path="points.ply", depth_unit_scale_factor=1.0, train_filenames=["images/0001.png"], applied_scale=1.0)
+    (root / "transforms.json").write_text(json.dumps(data))
+
+
+LAYOUTS_CAMERA = LAYOUTS["transforms"][1].__globals__["OFF_CENTRE"]
+PHOTOS = ("a.jpg", "b.png", "c.webp", "d.bmp", "e.tif", "f.png", "g.jpg")
+
+
+def make_photos(root: Path) -> None:
+    """Photos in every format that is read, with EXIF, alpha and 16 bits."""
+    from PIL import Image
+
+    pictures = [render(eye, LAYOUTS_CAMERA)[0] for eye in eyes()]
+    root.mkdir(parents=True, exist_ok=True)
+    tags = Image.Exif()
+    tags[0x0112], tags[0x010F] = 6, "maker"
+    tags.get_ifd(0x8769)[0xA405] = 28
+    Image.fromarray(pictures[0]).save(root / "a.jpg", exif=tags, quality=85)
+    save_picture(root / "b.png", np.dstack([pictures[1], np.full((60, 80), 200, np.uint8)]))
+    Image.fromarray(pictures[2]).save(root / "c.webp")
+    Image.fromarray(pictures[3]).save(root / "d.bmp")
+    Image.fromarray(pictures[4]).save(root / "e.tif", compression="tiff_deflate")
+    cv2.imwrite(str(root / "f.png"), pictures[0].astype(np.uint16) * 257)
+    Image.fromarray(pictures[1]).save(root / "g.jpg", progressive=True)
+
+
+def read_photo_folder(root: Path, number: int) -> None:
+    capture = contained(open_capture(root), root)
+    for frame in capture.frames:
+        load_image(frame, exif=True)
+        load_mask(frame)
+    if number % 4 == 0:
+        check_capture(capture)
+
+
+def make_videos(root: Path) -> None:
+    root.mkdir(parents=True, exist_ok=True)
+    for name, codec in (("a.avi", "MJPG"), ("b.mp4", "mp4v"), ("c.webm", "VP80")):
+        writer = cv2.VideoWriter(str(root / name), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), 10, (80, 60))
+        for eye in eyes():
+            writer.write(np.ascontiguousarray(render(eye, LAYOUTS_CAMERA)[0][..., ::-1]))
+        writer.release()
+
+
+def read_one_video(root: Path, number: int) -> None:
+    path = sorted(root.iterdir())[number % 3]
+    capture = contained(read_video(path), root)
+    for _ in iterate_video(path, range(min(3, len(capture.frames)))):
+        pass
+
+
+def make_runs(root: Path) -> None:
+    """The files of a run's folder that later commands read."""
+    from pipelines.folder import RunFolder
+    from pipelines.rendered import Picture, Pictures, save_pictures
+    from toolkit.config import Settings
+    from toolkit.poses.scene import Scene
+    from toolkit.tsdf.store import save_volume
+    from toolkit.tsdf.volume import TsdfVolume
+
+    source = root / "source"
+    LAYOUTS["transforms"][1](source)
+    capture = open_capture(source)
+    folder = RunFolder(root)
+    folder.start(source, Settings())
+    write_json(root / "capture.json", capture_to_dict(capture))
+    write_json(root / "poses.json", given_poses(capture).to_dict())
+    scene = Scene(Similarity.identity(), np.zeros(3), np.ones(3), 1.5, 0.1, 9.0, 0.1, True, False)
+    write_json(root / "scene.json", scene.to_dict())
+    record = {
+        "name": "views",
+        "key": "a",
+        "made": "b",
+        "seconds": 1.0,
+        "peak_memory_mb": 2.0,
+        "outputs": {"run.json": 5},
+        "after": {"poses": "c"},
+    }
+    write_json(root / "stages" / "views.json", record)
+    camera = Intrinsics(16, 12, 15.0, 15.0, 8.0, 6.0)
+    pixels = np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8)
+    depth = np.ones((12, 16), np.float32)
+    views = Views(["a", "b"], [pixels] * 2, [camera] * 2, np.tile(np.eye(4), (2, 1, 1)), np.array([True, False]), depths=[depth, None])
+    save_views(root / "views.safetensors", views)
+    save_pictures(root / "field.pictures.safetensors", Pictures(["a"], [Picture(pixels, depth)], [0.1], {"x": 1}))
+    small_field(1, 0.2).save(root / "field.safetensors")
+    small_field(1, 0.2, decoder="per_sample", shell=1.0).save(root / "other.safetensors")
+    volume = TsdfVolume(0.1, 3.0, expected_blocks=16)
+    save_volume(root / "tsdf.safetensors", volume)
+    (root / "settings.yaml").write_text("preset: fast\nfit: {budget: 5.0}\nexport:\n  formats: [ply, obj]\ntsdf: {enabled: off}\n")
+
+
+def read_json_files(root: Path, number: int) -> None:
+    """Every JSON file of a run's folder, as the commands read it."""
+    from pipelines.folder import RunFolder
+    from pipelines.render_path import read_cameras
+    from pipelines.stages import finished_stages
+    from toolkit.poses.result import PoseResult
+    from toolkit.poses.scene import Scene
+
+    folder = RunFolder(root)
+    finished_stages(folder)
+    readers: tuple[Callable[[], Any], ...] = (
+        lambda: load_settings("balanced", stored=folder.about()["settings"]),
+        lambda: capture_from_dict(read_json(root / "capture.json")),
+        lambda: PoseResult.from_dict(read_json(root / "poses.json")),
+        lambda: Scene.from_dict(read_json(root / "scene.json")),
+        lambda: read_cameras(root / "source" / "transforms.json"),
+        lambda: load_settings("balanced", file=root / "settings.yaml"),
+    )
+    first: Exception | None = None
+    for reader in readers:
+        try:
+            reader()
+        except Exception as error:  # the others are read all the same; the worker judges the first
+            first = first or error
+    if first is not None:
+        raise first
+
+
+RAYS = aimed_rays(8)
+
+
+def read_fields(root: Path, number: int) -> None:
+    """Load a field and look along eight rays."""
+    for name in ("field.safetensors", "other.safetensors"):
+        field = Field.load(root / name)
+        values = render_rays(field, *RAYS)
+        if not bool(torch.isfinite(values.colour).all()):
+            raise ValueError("a colour that is not finite")
+
+
+def read_tensors(root: Path, number: int) -> None:
+    from pipelines.rendered import load_pictures
+    from toolkit.tsdf.store import load_volume
+
+    reader = (
+        lambda: load_views(root / "views.safetensors"),
+        lambda: load_pictures(root / "field.pictures.safetensors"),
+        lambda: load_volume(root / "tsdf.safetensors"),
+    )
+    for read in reader:
+        read()
+
+
+RUN_FILES = ("run.json", "capture.json", "poses.json", "scene.json", "stages/views.json", "settings.yaml", "source/transforms.json")
+TARGETS: tuple[Target, ...] = (
+    *(Target(layout, files, LAYOUTS[layout][1], read_capture, 1.0) for layout, files in FILES.items()),
+    Target("extras", ("transforms.json", "mask1.png", "depth2.npy", "points.ply"), make_extras, read_capture, 2.0),
+    Target("photos", PHOTOS, make_photos, read_photo_folder, 3.0),
+    Target("videos", ("a.avi", "b.mp4", "c.webm"), make_videos, read_one_video, 1.5),
+    Target("run json", RUN_FILES, make_runs, read_json_files, 2.0),
+    Target("field", ("field.safetensors", "other.safetensors"), make_runs, read_fields, 3.0),
+    Target("tensors", ("views.safetensors", "field.pictures.safetensors", "tsdf.safetensors"), make_runs, read_tensors, 1.5),
+    Target("points", ("points.ply",), make_extras, lambda root, number: read_ply_points(root / "points.ply"), 0.5),
+)  # fmt: skip

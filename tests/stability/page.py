@@ -1,0 +1,70 @@
+"""`docs/stability.md`: the parts between `<!-- NAME -->` and `<!-- /NAME -->` are written by programs, the rest by people.
+
+`python -m tests.stability.page docs/stability.md` runs every case of the self-test and replaces the part `cases`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from toolkit.evaluate.selftest.case import Outcome, all_cases, run_cases
+
+
+def replace_part(page: Path, name: str, lines: list[str]) -> None:
+    """Write `lines` between the marks of the part `name`.
+
+    Raises:
+        ValueError: the page has no such part.
+    """
+    text = page.read_text(encoding="utf-8")
+    pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
+    if not pattern.search(text):
+        raise ValueError(f"{page} has no part between <!-- {name} --> and <!-- /{name} -->")
+    body = "\n".join(lines) + "\n"
+    page.write_text(pattern.sub(lambda match: match[1] + body + match[2], text), encoding="utf-8")
+
+
+def number(value: float) -> str:
+    return "0" if value == 0 else f"{value:.1e}" if math.isfinite(value) and not 0.01 <= abs(value) < 1000 else f"{value:.3g}"
+
+
+def case_lines(outcomes: list[Outcome]) -> list[str]:
+    """A table: each case's measure that comes nearest to its bound."""
+    numbers = sum(len(outcome.measures) for outcome in outcomes)
+    bad = [outcome for outcome in outcomes if not outcome.good]
+    silent = sum(not math.isfinite(measure.error) for outcome in outcomes for measure in outcome.measures)
+    out = [
+        f"{len(outcomes)} cases, {numbers} numbers; {len(bad)} cases missed a bound; {silent} errors were NaN or infinite.",
+        "",
+        "| case | numbers | worst quantity | error | bound |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for outcome in outcomes:
+        if outcome.failure or not outcome.measures:
+            out.append(f"| {outcome.case.title} | | failed: {outcome.failure} | | |")
+            continue
+        worst = max(outcome.measures, key=lambda measure: (not measure.good, _share(measure.error, measure.bound)))
+        quantity = worst.quantity.replace("|", "·")
+        out.append(f"| {outcome.case.title} | {len(outcome.measures)} | {quantity} | {number(worst.error)} | {number(worst.bound)} |")
+    return out
+
+
+def _share(error: float, bound: float) -> float:
+    return error / bound if bound > 0 else error
+
+
+def main() -> int:
+    page = Path(sys.argv[1])
+    with np.errstate(all="ignore"):
+        outcomes = run_cases(all_cases(), lambda outcome: sys.stderr.write(f"{outcome.seconds:6.1f} s  {outcome.case.title}\n"))
+    replace_part(page, "cases", case_lines(outcomes))
+    return 0 if all(outcome.good for outcome in outcomes) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

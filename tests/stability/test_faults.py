@@ -1,0 +1,185 @@
+"""Faults in the middle of a run: kill -9, signals at each stage, a full disk at each writer, clocks that jump, two runs, little memory."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pipelines.console import ConsoleProgress
+from pipelines.folder import RunFolder
+from tests.pipelines.made import Answer, call, environment
+from tests.stability.kills import kill_runs
+from tests.stability.runs import OPTIONS, PATIENCE, ROOT, STAGES, corrupt, differences, launch, leftovers, make_source
+from toolkit.config import Settings
+from toolkit.files import read_json
+
+Capsys = pytest.CaptureFixture[str]
+LONG = pytest.mark.timeout(900)  # what takes half a minute alone takes minutes on a busy machine
+
+
+@LONG
+def test_killed_three_times_at_random_the_run_goes_on_to_the_same_files(tmp_path: Path) -> None:
+    survey = kill_runs(tmp_path, kills=3, seed=int(os.environ.get("FIELDFUSE_SEED", "7")), each=3)
+    assert survey.kills == 3 and not survey.wrong
+
+
+def test_the_check_of_a_folder_notices_damage(tmp_path: Path) -> None:
+    (tmp_path / "stages").mkdir()
+    (tmp_path / "a.json").write_text("{")
+    (tmp_path / "b.png").write_bytes(b"\x89PNG")
+    (tmp_path / "field.safetensors").write_bytes(b"x" * 20)
+    (tmp_path / "c.txt").touch()
+    (tmp_path / ".tmp-12-d.json").write_text("{")
+    (tmp_path / "stages" / "views.json").write_text(json.dumps({"outputs": {"views.safetensors": 5}}))
+    found = corrupt(tmp_path)
+    assert [
+        name for name in ("a.json", "b.png", "field.safetensors", "c.txt", "views.safetensors") if not any(name in text for text in found)
+    ] == []
+    assert not any(".tmp" in text for text in found) and leftovers(tmp_path) == [".tmp-12-d.json"]
+
+
+def test_the_comparison_of_folders_notices_changes(tmp_path: Path) -> None:
+    for name, value in (("first", 1.0), ("second", 2.0)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "scene.json").write_text(json.dumps({"far": value, "seconds": value}))
+        (tmp_path / name / "only.json").write_text(json.dumps({"seconds": value, "made": value}))
+    assert differences(tmp_path / "first", tmp_path / "second") == ["scene.json differs"]
+    (tmp_path / "first" / "more.txt").touch()
+    assert "more.txt is only in one of them" in differences(tmp_path / "first", tmp_path / "second")
+
+
+# ------------------------------------------------------------------------------------------------ signals
+
+
+def struck(monkeypatch: pytest.MonkeyPatch, stage: str, number: int, times: int) -> None:
+    """Send a signal to this process as soon as `stage` begins."""
+
+    def begin(self: ConsoleProgress, name: str) -> None:
+        self.stage = name
+        if name == stage:
+            for _ in range(times):
+                os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(ConsoleProgress, "begin", begin)
+
+
+@LONG
+@pytest.mark.parametrize("times", [1, 2], ids=["once", "twice"])
+def test_signals_at_each_stage(times: int, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One folder is stopped at one stage after the other: each time in a sentence, with whole files, and it goes on from there."""
+    source, out = make_source(tmp_path / "room"), tmp_path / "out"
+    handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    for index, stage in enumerate(STAGES):
+        with monkeypatch.context() as patch:
+            struck(patch, stage, (signal.SIGINT, signal.SIGTERM)[index % 2], times)
+            answer = call(capsys, "run", source, "--out", out, *OPTIONS)
+        assert "Traceback" not in answer.err
+        if times == 2 or (stage != "field" and stage != STAGES[-1]):
+            assert answer.code == 130, (stage, answer)
+            assert ("same command again" in answer.err) == (times == 1), (stage, answer)
+        else:  # the fit keeps what it has and the report follows; behind the last stage there is nothing to stop
+            assert answer.code == 0, (stage, answer)
+        assert corrupt(out) == [], stage
+        done = {path.stem for path in (out / "stages").glob("[!.]*.json")} if (out / "stages").exists() else set()
+        assert done >= set(STAGES[:index]) - {"field", "render", "export"}, stage
+    answer = call(capsys, "run", source, "--out", out, *OPTIONS)
+    assert answer.code == 0, answer
+    assert corrupt(out) == [] and leftovers(out) == []
+    assert {path.stem for path in (out / "stages").glob("*.json")} == set(STAGES)
+    assert not any("stopped early" in text for text in read_json(out / "report.json")["warnings"])
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
+
+
+# ------------------------------------------------------------------------------------------------ disks
+
+
+@LONG
+def test_every_writer_says_that_the_disk_is_full_or_the_folder_closed(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.stability.writers", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        env=environment(),
+        cwd=ROOT,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    result = json.loads(done.stdout)
+    assert len(result) >= 60
+    assert {case: what for case, what in result.items() if what != "ok"} == {}
+    assert not list(tmp_path.rglob(".tmp*"))
+
+
+def test_leftovers_of_every_kind_are_removed_and_nothing_else(tmp_path: Path) -> None:
+    with RunFolder(tmp_path) as folder:
+        folder.start(Path("source"), Settings())
+    (tmp_path / "renders").mkdir()
+    gone = [".tmp-12-field.safetensors", ".tmpaB3xYz", "renders/.tmp-7-a.png", "renders/.tmpQQ12zz"]
+    kept = [".tmp-mine", ".tmpfiles", ".tmp", "renders/.tmpaB3xYz.keep", "notes.txt"]
+    for name in gone + kept:
+        (tmp_path / name).write_text("x")
+    with RunFolder(tmp_path):
+        assert [name for name in gone if (tmp_path / name).exists()] == []
+        assert [name for name in kept if not (tmp_path / name).exists()] == []
+
+
+# ------------------------------------------------------------------------------------------------ clocks, memory, company
+
+
+@LONG
+def test_a_wall_clock_that_jumps_by_a_year_changes_nothing(tmp_path: Path) -> None:
+    source = make_source(tmp_path / "room")
+    for index, path in enumerate(sorted(source.rglob("*.png"))):  # files of 1970, of the year 2100 and from before 1970
+        os.utime(path, (4.1e9 if index % 3 else 0.0, (0.0, 4.1e9, -1e6)[index % 3]))
+    began = time.monotonic()
+    done = launch({"jumps": True}, source, tmp_path / "out", "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert all(0 <= stage["seconds"] < time.monotonic() - began for stage in report["stages"])
+    assert 0 < report["seconds_total"] < time.monotonic() - began
+    again = launch({"jumps": True}, source, tmp_path / "out", "--json")
+    assert again.returncode == 0 and all(stage["cached"] for stage in json.loads(again.stdout)["stages"])
+
+
+@LONG
+def test_a_stage_that_does_not_fit_into_memory_is_refused_with_numbers(tmp_path: Path) -> None:
+    done = launch({"stage": "views", "memory": 100 * 2**20}, make_source(tmp_path / "room"), tmp_path / "out")
+    assert done.returncode == 2, done.stderr
+    sentence = Answer(done.returncode, done.stdout, done.stderr).sentence()
+    assert "GB of memory" in sentence and "is free" in sentence and "--image-size" in sentence
+    assert corrupt(tmp_path / "out") == []
+
+
+RACE = """
+import sys, time
+from pathlib import Path
+from pipelines.folder import RunFolder
+from toolkit.errors import OutputError
+folder, start = Path(sys.argv[1]), float(sys.argv[2])
+while time.time() < start:
+    time.sleep(0.001)
+try:
+    with RunFolder(folder):
+        print("mine", flush=True)
+        sys.stdin.read()
+except OutputError as error:
+    print("busy" if "another fieldfuse command" in str(error) else error, flush=True)
+"""
+
+
+def test_of_six_commands_that_start_at_once_one_gets_the_folder(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", RACE, str(tmp_path / "out"), str(time.time() + 4)]
+    racers = [subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment()) for _ in range(6)]
+    said = [racer.stdout.readline().strip() for racer in racers if racer.stdout is not None]
+    for racer in racers:
+        racer.communicate(timeout=PATIENCE)
+    assert sorted(said) == ["busy"] * 5 + ["mine"]
+    with RunFolder(tmp_path / "out"):
+        pass
