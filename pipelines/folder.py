@@ -40,7 +40,7 @@ FILES = (
 )
 BUSY = "another fieldfuse command is working in {}; wait for it to end or choose another --out folder"
 FOREIGN = "{} holds {!r} but no fieldfuse run; choose a new or empty --out folder so that nothing of yours is replaced"
-TEMPORARY = re.compile(r"\.tmp-\d+-")  # as toolkit.files.atomic_path names them
+TEMPORARY = re.compile(r"\.tmp-\d+-|\.tmp[A-Za-z0-9]{6}$")  # as toolkit.files.atomic_path names them, and safetensors its own
 WRITE_ERRORS = {errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EIO}
 WRITE_PHRASES = ("no space left", "file too large", "disk quota", "read-only file system", "disk i/o error", "database or disk is full")
 
@@ -110,7 +110,7 @@ class RunFolder:
         """Half-written files of a run that was killed; only below our own folders."""
         places = [self.path, *(place for name in SUBFOLDERS for place in [self.path / name, *(self.path / name).glob("**/")])]
         for place in places:
-            for leftover in place.glob(".tmp-*"):
+            for leftover in place.glob(".tmp*"):
                 if TEMPORARY.match(leftover.name):
                     remove(leftover)
 

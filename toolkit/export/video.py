@@ -16,6 +16,7 @@ from toolkit.tsdf.mesh import as_bytes
 # In order of preference. The pip wheels of OpenCV carry no H.264 encoder; VP9 in mp4 is what browsers play, at some tenths of a second a
 # picture; MPEG-4 part 2 is everywhere, a hundred times as fast, and plays in desktop players only.
 CODECS = ("vp09", "mp4v")
+PROBE = 2**16  # bytes
 
 
 def write_video(path: Path | str, frames: Iterable[Array], fps: float = 30.0, codec: str = "auto") -> str:
@@ -67,6 +68,7 @@ def _open(path: Path, shape: tuple[int, ...], fps: float, codecs: Iterable[str])
         if writer.isOpened():
             return writer, codec
         writer.release()
+    path.write_bytes(bytes(PROBE))  # a full disk is no fault of the codec, and this says what it is
     raise OutputError("this OpenCV writes no mp4 videos; `pip install --force-reinstall opencv-contrib-python-headless` helps")
 
 

@@ -11,7 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from toolkit.camera import Array
-from toolkit.errors import InputError
+from toolkit.errors import InputError, OutputError
 from toolkit.files import atomic_path
 from toolkit.tsdf.volume import BLOCK, TsdfVolume
 
@@ -41,7 +41,10 @@ def save_volume(path: Path | str, volume: TsdfVolume) -> None:
         "touches": volume.touches,
     }
     with atomic_path(path) as temporary:
-        save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, temporary, metadata={"tsdf": json.dumps(facts)})
+        try:
+            save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, temporary, metadata={"tsdf": json.dumps(facts)})
+        except SafetensorError as error:  # a full disk arrives as this, not as an OSError
+            raise OutputError(f"cannot write {path}: {error}; free space or choose another --out folder") from error
 
 
 def load_volume(path: Path | str) -> TsdfVolume:
