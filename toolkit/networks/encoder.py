@@ -2,7 +2,9 @@
 look up at half the size.
 
 Every stride-2 convolution has an even kernel, so cell j of a map of stride s is centred at s · (j + ½) pixels exactly; unprojection
-relies on it. Normalisation by groups keeps the features alive from the first step on (plain deep stacks die without notice).
+relies on it. Normalisation by groups keeps the layers alive from the first step on (plain deep stacks die without notice), and the last
+one, of each channel over the picture, keeps what comes out different from place to place: with groups there, training let it sink to a
+deviation of 0.15 and learned more slowly.
 """
 
 from __future__ import annotations
@@ -58,7 +60,7 @@ class ImageEncoder(nn.Module):
         )
         self.laterals = nn.ModuleList(_linear(width, channels, 1) for width in (quarter, eighth, sixteenth))
         self.smooth = _linear(channels, channels, 3)
-        self.norm = nn.GroupNorm(channels // GROUP, channels)
+        self.norm = nn.GroupNorm(channels, channels)
 
     def forward(self, images: Tensor) -> Tensor:
         return self.maps(images)[1]
@@ -88,7 +90,7 @@ class Sampled(nn.Module):
     def __init__(self, fused: int, half: int, channels: int) -> None:
         super().__init__()
         self.coarse, self.fine = _linear(fused, channels, 1), _linear(half, channels, 3)
-        self.norm = nn.GroupNorm(1, channels)
+        self.norm = nn.GroupNorm(channels, channels)
 
     def forward(self, half: Tensor, fused: Tensor) -> Tensor:
         enlarged = F.interpolate(self.coarse(fused), scale_factor=2, mode="bilinear", align_corners=False)
