@@ -75,6 +75,17 @@ def test_both_together(bank: TextureBank) -> None:
     assert found.found and found.parameters["corner"] == pytest.approx(0.62, abs=0.08)
 
 
+def test_vignetting_is_not_taken_for_drift(bank: TextureBank) -> None:
+    """Along a corridor points move outwards in every frame; with the vignetting that was found taken out, no drift is left."""
+    filmed = film_tracks(bank, 32, ["vignetting:medium"], kind="corridor")
+    found = vignetting.evidence(filmed.tracks, FRAMES)
+    left = vignetting.corrected(filmed.tracks, found.parameters["corner"])
+    before, after = exposure.evidence(filmed.tracks, FRAMES), exposure.evidence(left, FRAMES)
+    assert found.found and before.number > 0.06
+    assert not after.found, after.reason
+    assert not vignetting.evidence(left, FRAMES).found
+
+
 def shifts(filmed: Filmed, readout: float, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Residuals, rows and velocities of the tracks as a rolling shutter of this readout makes them."""
     rng = np.random.default_rng(seed)

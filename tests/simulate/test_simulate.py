@@ -180,6 +180,8 @@ def test_stopping_or_failing_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="already holds something"):
         simulate(scene_file(SMALL, "test"), tmp_path / "full")
     assert (tmp_path / "full" / "file").read_text() == "mine"
+    (tmp_path / "empty").mkdir()
+    assert len(open_capture(made(tmp_path / "empty")).frames) == 4
 
 
 def test_depth_noise_without_depth_is_refused(tmp_path: Path) -> None:

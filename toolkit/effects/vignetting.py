@@ -8,7 +8,7 @@ With tan θ = √a · r this is cos⁴ θ.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -92,3 +92,11 @@ def evidence(tracks: Tracks, frames: int) -> Evidence:
         f"{100 * THRESHOLD:g}% or more speak for vignetting",
         {"corner": corner},
     )
+
+
+def corrected(tracks: Tracks, corner: float) -> Tracks:
+    """The tracks without a vignetting of this corner: `exposure.evidence` wants them so, because points that move towards the corners
+    of one frame get darker in it as if it were exposed less. (The other way round there is nothing to do: frames' gains are taken out.)
+    """
+    share = falloff(Vignetting(corner), torch.from_numpy(tracks.radius)).numpy()
+    return replace(tracks, linear=tracks.linear / share[:, None])

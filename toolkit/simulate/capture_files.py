@@ -9,7 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from toolkit.camera import Array, Intrinsics, opengl_from_world
 from toolkit.errors import OutputError
@@ -61,7 +61,8 @@ class CaptureWriter:
             self._png(entry["depth_file_path"], millimetres(shot.sensor_depth))
         entry["transform_matrix"] = opengl_from_world(shot.world_from_camera).tolist()
         self.entries.append(entry)
-        save_file({"depth": np.ascontiguousarray(shot.depth), "normals": shot.normals.astype(np.float16)}, str(self.folder / truth))
+        exact = {"depth": np.ascontiguousarray(shot.depth), "normals": shot.normals.astype(np.float16)}
+        (self.folder / truth).write_bytes(save(exact))
         picture = {"video_index": shot.index} if self.output == "video" else {"picture": entry["file_path"]}
         self.poses.append({**picture, "truth": truth, "seconds": shot.seconds, "world_from_camera": shot.world_from_camera.tolist()})
         self.facts.append({**picture, **shot.facts})
@@ -84,8 +85,8 @@ class CaptureWriter:
             self._video.release()
 
     def _png(self, name: str, picture: Array) -> None:
-        if not cv2.imwrite(str(self.folder / name), picture, [cv2.IMWRITE_PNG_COMPRESSION, 3]):
-            raise OutputError(f"cannot write {self.folder / name}; free space or choose another --out folder")
+        _, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+        (self.folder / name).write_bytes(data.tobytes())
 
 
 @contextmanager
