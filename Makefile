@@ -23,11 +23,13 @@ RUFF_RULES := E,F,W,I,B,UP,PTH,RUF,PERF,SIM,C4,PIE,RET,T20,S102,S301,S307,S506,S
 RUFF := $(BIN)/ruff check --isolated --line-length 140 --target-version py311 --select $(RUFF_RULES) --ignore RUF001,RUF002,RUF003,PERF203
 SOURCES := toolkit pipelines configs tests
 
-.PHONY: help demo test lint venv system lpips
+.PHONY: help demo test lint stability fuzz venv system lpips
 
 help:
 	@echo "make demo    film a small made-up scene, reconstruct it, and print where the results are (in demo/)"
 	@echo "make test    lint, type check, import layers and all tests"
+	@echo "make stability  the hard cases for the numbers and 50 kills of a small run (some minutes); renews docs/stability.md"
+	@echo "make fuzz    100,000 damaged files for every reader (half an hour); renews docs/stability.md"
 	@echo "make venv    only make the environment in $(VENV)"
 	@echo "make lpips   add the weights of the LPIPS measure"
 
@@ -36,6 +38,13 @@ demo: $(VENV)/.installed
 
 test: lint
 	$(BIN)/python -m pytest
+
+stability: $(VENV)/.installed-test
+	$(BIN)/python -m tests.stability.page docs/stability.md
+	$(BIN)/python -m tests.stability.kills --kills 50 --page docs/stability.md
+
+fuzz: $(VENV)/.installed-test
+	$(BIN)/python -m tests.stability.fuzz --inputs 100000 --page docs/stability.md
 
 lint: $(VENV)/.installed-test
 	$(RUFF) $(SOURCES)
