@@ -20,11 +20,11 @@ SLOWING = 1e7  # rays after which step sizes begin to fall
 LAST_RATE = 0.08  # of the step sizes, at the very end
 FIRST_BATCH = 256  # rays a step at the coarsest level, doubled at each level: early on the number of steps counts
 WORTH = 0.5  # rays that must be left for every voxel of a finer level: with fewer it ends blurred, and worse than the coarser one
-CHECKS = 150  # looks at the validation views in a budget, at most …
-LOOK_STEPS = 40  # … and so many steps from one to the next
+LOOK_STEPS = 60  # from one look at the validation views to the next …
+FINEST_LOOK_STEPS = 250  # … and at the finest level
 WINDOW = 4  # looks that a plateau is judged by
 GAIN = 0.04  # decibels over a window that still count as progress at the finest level …
-COARSE_GAIN = 0.25  # … and before it, where the next level gains more in the same time
+COARSE_GAIN = 0.1  # … and before it, where the next level gains more in the same time
 DROPS = 2  # halvings of the step sizes on plateaus of the finest level, before the end
 
 
@@ -49,7 +49,6 @@ class Schedule:
     drops: int = 0
     ended: float | None = None  # share of the budget at which patience ended the search; what follows is polish
     looks: list[float] = default(default_factory=list)  # validation PSNR at this level and rate
-    next_look: float = 0.0
 
     @property
     def resolution(self) -> int:
@@ -77,10 +76,8 @@ class Schedule:
 
     def wants_look(self, done: float) -> bool:
         """Whether the validation views should be looked at now."""
-        if done < self.next_look or done >= LAST_PRUNE or self.steps_here % LOOK_STEPS:
-            return False
-        self.next_look = done + 1 / CHECKS
-        return True
+        every = FINEST_LOOK_STEPS if self.finest else LOOK_STEPS
+        return done < LAST_PRUNE and self.steps_here > 0 and self.steps_here % every == 0
 
     def look(self, psnr: float, done: float) -> None:
         """Note the validation views' PSNR; on a plateau of the finest level slow down, or stop searching."""
