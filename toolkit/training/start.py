@@ -24,7 +24,8 @@ ROOM_MARGIN = 1.4  # the same where nothing exists outside and no alpha says whe
 LEAST_REACH = 0.9
 COARSEST = 32
 FINEST = 512
-PIXELS = 2.0
+PIXELS = 2.0  # of the training views, a voxel in the middle of the scene
+OBJECT_PIXELS = 1.3  # the same where alpha cuts the object out: fewer voxels are in play, so they may be finer
 SEEN_BY = 3  # training views that must see a voxel: fewer cannot tell its depth
 
 
@@ -44,7 +45,8 @@ def finest_resolution(space: Space, views: Views, scene: Scene) -> int:
     Finer lattices fitted worse at equal seconds (more unknowns than the pixels can tell apart).
     """
     focal = float(np.median([camera.fx for camera in views.intrinsics]))
-    wanted = 2 * space.extent * space.half / (PIXELS * scene.median_depth / focal)
+    pixels = PIXELS if views.background is None else OBJECT_PIXELS
+    wanted = 2 * space.extent * space.half / (pixels * scene.median_depth / focal)
     return int(np.clip(round(wanted / 32) * 32, 64, FINEST))
 
 
