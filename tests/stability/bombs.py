@@ -164,7 +164,7 @@ def main() -> None:
     bound_memory()
     result = {}
     for name, act in every.items():
-        began = time.monotonic()
+        began = time.process_time()
         try:
             answer = act()
             outcome = f"read: {answer if isinstance(answer, int) else type(answer).__name__}"
@@ -172,8 +172,8 @@ def main() -> None:
             outcome = "refused" if "\n" not in str(error) else f"says {error}"
         except BaseException as error:  # everything else is what this looks for
             outcome = f"raises {type(error).__name__}: {str(error)[:200]}"
-        took = time.monotonic() - began
-        result[name] = outcome if took < SECONDS * max(1.0, os.getloadavg()[0]) else f"took {took:.1f} s"
+        took = time.process_time() - began
+        result[name] = outcome if took < SECONDS else f"took {took:.1f} s of computing"
     sys.stdout.write(json.dumps(result) + "\n")
     sys.stdout.flush()
     os._exit(0)

@@ -39,16 +39,16 @@ root = place / "captures" / "planted"
 root.mkdir(parents=True)
 (root / "a.bin").write_bytes(b"abc")
 (place / "secret.txt").write_text("secret")
-watching.SECONDS = 0.3
+watching.SECONDS, watching.WAITING = 0.3, 1.0
 
 def refuse(text):
     raise InputError(text)
 
-def stubborn():
-    end = time.time() + 2
+def stubborn(act):
+    end = time.time() + 20
     while time.time() < end:
         try:
-            time.sleep(0.1)
+            act()
         except Exception:
             pass
 
@@ -57,7 +57,8 @@ PLANTS = {
     "sentence": lambda: refuse("this is a good sentence"),
     "not a sentence": lambda: refuse("two\\nlines of it"),
     "IndexError": lambda: [][1],
-    "hang": stubborn,
+    "busy": lambda: stubborn(lambda: sum(range(1000))),
+    "waiting": lambda: stubborn(lambda: time.sleep(0.1)),
     "read outside": lambda: (place / "secret.txt").read_text(),
     "write": lambda: (root / "new.txt").write_text("x"),
     "write outside": lambda: (place / "new.txt").write_text("x"),
@@ -88,7 +89,13 @@ def test_what_is_planted_is_found(tmp_path: Path) -> None:
     escapes = {name for name, kind in told.items() if kind == "escape"}
     assert escapes == {"read outside", "write", "write outside", "shell", "process", "eval", "pickle"}
     rest = {name: kind for name, kind in told.items() if name not in escapes}
-    assert rest == {"not a sentence": "not a sentence", "IndexError": "IndexError", "hang": "hang", "memory": "MemoryError"}
+    assert rest == {
+        "not a sentence": "not a sentence",
+        "IndexError": "IndexError",
+        "busy": "hang",
+        "waiting": "hang",
+        "memory": "MemoryError",
+    }
 
 
 def test_a_worker_that_dies_is_reported_and_the_next_goes_on(tmp_path: Path) -> None:

@@ -16,7 +16,12 @@ from tests.stability.runs import ROOT
 @pytest.mark.timeout(600)
 def test_bombs(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "tests.stability.bombs", str(tmp_path)], capture_output=True, text=True, env=environment(), cwd=ROOT, check=False
+        [sys.executable, "-m", "tests.stability.bombs", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        env=environment(),
+        cwd=ROOT,
+        check=False,
     )
     assert done.returncode == 0, done.stderr[-3000:]
     result = json.loads(done.stdout)

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 SYSTEM = ("/proc/self", "/proc/meminfo", "/proc/cpuinfo", "/sys/fs/cgroup", "/dev/null", "/dev/urandom")
-SECONDS = 5.0
-DEAD = 20.0  # seconds after which even code that never returns to Python is ended
+SECONDS = 5.0  # of computing: on a busy machine the wall clock says nothing about an input
+WAITING = 120.0  # seconds of the wall clock, for what waits instead of computing
+DEAD = 300.0  # seconds after which even code that never returns to Python is ended
 MEMORY = 2**30
 RUNS = ("os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "subprocess.Popen", "pickle.find_class", "socket.connect",
         "socket.bind", "socket.getaddrinfo", "ctypes.dlopen", "pty.spawn", "code.__new__", "webbrowser.open")  # fmt: skip
@@ -64,21 +65,24 @@ class Watch:
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """One input: `Hang` after five seconds; the process ends when not even that can be raised."""
+        """One input: `Hang` after five seconds of computing; the process ends when not even that can be raised."""
         self.escapes.clear()
         faulthandler.dump_traceback_later(DEAD, exit=True)
-        signal.signal(signal.SIGALRM, self._late)
-        signal.setitimer(signal.ITIMER_REAL, SECONDS)
+        for number in (signal.SIGPROF, signal.SIGALRM):
+            signal.signal(number, self._late)
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
+        signal.setitimer(signal.ITIMER_REAL, WAITING)
         self.on = True
         try:
             yield
         finally:
             self.on = False
+            signal.setitimer(signal.ITIMER_PROF, 0)
             signal.setitimer(signal.ITIMER_REAL, 0)
             faulthandler.cancel_dump_traceback_later()
 
     def _late(self, number: int, frame: Any) -> None:
-        raise Hang(f"more than {SECONDS:.0f} seconds")
+        raise Hang(f"more than {SECONDS:g} seconds of computing" if number == signal.SIGPROF else f"more than {WAITING:g} seconds")
 
 
 def bound_memory(more: int = MEMORY) -> None:
