@@ -24,7 +24,7 @@ Holdout = Annotated[
 Device = Annotated[str | None, typer.Option(help="auto (default), cpu or cuda.", show_default=False)]
 Threads = Annotated[int | None, typer.Option(help="Threads to use; default: all cores.", show_default=False)]
 Seed = Annotated[int | None, typer.Option(help="Seed of all random numbers; default 0.", show_default=False)]
-Engine = Annotated[str | None, typer.Option(help="What optimises and renders: torch.", show_default=False)]
+Engine = Annotated[str | None, typer.Option(help="auto (default): numba on the CPU, torch on CUDA; numba or torch.", show_default=False)]
 Decoder = Annotated[str | None, typer.Option(help="deferred (default) or per_sample (the paper's).", show_default=False)]
 PosesFrom = Annotated[str | None, typer.Option("--poses", help="auto (default), given, or sfm: ignore given poses.", show_default=False)]
 Config = Annotated[Path | None, typer.Option(help="YAML file with settings.", show_default=False)]
