@@ -1,0 +1,160 @@
+"""Pictures of a field with the paper's decoder through compiled kernels."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+
+from toolkit.networks.decoder import FREQUENCIES, PerSample
+from toolkit.render import kernels as K
+from toolkit.render.compiled import PIECE, make_space, make_volume
+from toolkit.render.composite import STOP
+from toolkit.render.field import Field
+from toolkit.render.kernels_matrix import LANES
+from toolkit.render.kernels_net import BATCH, Net, Tape, decode_colours, make_tape
+from toolkit.render.kernels_per_sample import NEGLIGIBLE, march_ray
+
+Tensor = torch.Tensor
+Array = np.ndarray[Any, Any]
+LAYERS = ("body.0", "body.2", "density", "colour.0", "colour.2")
+RAYS = 64  # rays whose colours are decoded together, when they have few samples
+
+
+def _padded(values: Array, rows: int, columns: int) -> Array:
+    """`values` (r, c) in the corner of zeros (rows, columns), at the start of a cache line."""
+    out = K.aligned((rows, columns), np.float32, zeroed=True)
+    out[: values.shape[0], : values.shape[1]] = values
+    return out
+
+
+def whole(width: int) -> int:
+    """`width` rounded up to whole LANES."""
+    return -(-width // LANES) * LANES
+
+
+def net_arrays(decoder: PerSample) -> Net:
+    """Copies of the weights, padded."""
+    state = {name: value.detach().cpu().numpy() for name, value in decoder.state_dict().items()}
+    w1, w2, wd, w3, w4 = (state[f"{name}.weight"] for name in LAYERS)
+    b1, b2, bd, b3, b4 = (state[f"{name}.bias"][None] for name in LAYERS)
+    hidden, inputs = whole(decoder.hidden), whole(decoder.channels * (1 + 2 * FREQUENCIES))
+    third = _padded(w3[:, : decoder.hidden].T, hidden + K.PADDED, hidden)
+    third[hidden : hidden + 9, : decoder.hidden] = w3[:, decoder.hidden :].T
+    net = Net(
+        w1=_padded(w1.T, inputs, hidden),
+        w1_back=K.aligned((hidden, inputs), np.float32),
+        b1=_padded(b1, 1, hidden)[0],
+        w2=_padded(w2.T, hidden, hidden),
+        w2_back=K.aligned((hidden, hidden), np.float32),
+        b2=_padded(b2, 1, hidden)[0],
+        density=_padded(wd, 1, hidden)[0],
+        density_bias=_padded(bd, 1, 1)[0],
+        w3=third,
+        w3_back=K.aligned((hidden, hidden), np.float32),
+        b3=_padded(b3, 1, hidden)[0],
+        w4=_padded(w4, 3, hidden),
+        b4=_padded(b4, 1, 3)[0],
+    )
+    turn(net)
+    return net
+
+
+def turn(net: Net) -> None:
+    """Renew what is kept transposed too."""
+    net.w1_back[:], net.w2_back[:], net.w3_back[:] = net.w1.T, net.w2.T, net.w3[: len(net.b3)].T
+
+
+def write_back(net: Net, decoder: PerSample) -> None:
+    """The weights into the decoder."""
+    h = decoder.hidden
+    third = np.concatenate([net.w3[:h], net.w3[len(net.b3) : len(net.b3) + 9]])
+    values = {
+        "body.0.weight": net.w1[: decoder.channels * (1 + 2 * FREQUENCIES), :h].T,
+        "body.0.bias": net.b1[:h],
+        "body.2.weight": net.w2[:h, :h].T,
+        "body.2.bias": net.b2[:h],
+        "density.weight": net.density[None, :h],
+        "density.bias": net.density_bias,
+        "colour.0.weight": third[:, :h].T,
+        "colour.0.bias": net.b3[:h],
+        "colour.2.weight": net.w4[:, :h],
+        "colour.2.bias": net.b4,
+    }
+    decoder.load_state_dict({name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in values.items()})
+
+
+@njit(**K.OPTIONS)
+def render_pass(
+    space: Any,
+    volume: Any,
+    net: Net,
+    tape: Tape,
+    background: Any,
+    origins: Any,
+    directions: Any,
+    stop: Any,
+    threshold: Any,
+    out: Any,
+) -> None:
+    """Origins, directions (B, 3) → out (B, 5) colour, distance, opacity."""
+    marks, ray, light = np.empty(0, np.uint16), np.empty(6, np.float32), np.empty(5, np.float32)
+    starts = np.empty(RAYS + 1, np.int64)
+    number = 0
+    while number < len(origins):
+        begun, used, rays = number, 0, 0
+        while number < len(origins) and rays < RAYS and used < BATCH:
+            for k in range(3):
+                ray[k], ray[3 + k] = origins[number, k], directions[number, k]
+            starts[rays] = used
+            used += march_ray(space, volume, net, tape, used, ray, K.ZERO, stop, threshold, marks, light)
+            out[number, 3] = light[2]
+            rays += 1
+            number += 1
+        starts[rays] = used
+        decode_colours(net, tape, used)
+        for r in range(rays):
+            own = out[begun + r]
+            opacity, a, b, c = K.ZERO, K.ZERO, K.ZERO, K.ZERO
+            for i in range(starts[r], starts[r + 1]):
+                weight = tape.values[i, K.WEIGHT]
+                opacity += weight
+                a += weight * tape.colour[i, 0]
+                b += weight * tape.colour[i, 1]
+                c += weight * tape.colour[i, 2]
+            own[0], own[1], own[2], own[4] = a, b, c, opacity
+            for k in range(3):
+                own[k] = min(max(own[k] + (K.ONE - opacity) * background[k], K.ZERO), K.ONE)
+
+
+class PerSampleRenderer:
+    """Renders rays of one field (CPU, the paper's decoder); makes the kernels' arrays once."""
+
+    def __init__(self, field: Field, threads: int | None = None) -> None:
+        assert isinstance(field.decoder, PerSample)
+        self.space, self.volume, self.net = make_space(field), make_volume(field), net_arrays(field.decoder)
+        self.background = field.background.numpy().astype(np.float32)
+        self.threads = threads or torch.get_num_threads()
+
+    def render(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """(B, 3), (B, 3) → (B, 5): colour, distance, opacity. The same whatever the number of threads."""
+        out = np.empty((len(origins), 5), np.float32)
+        given = origins.float().contiguous().numpy(), directions.float().contiguous().numpy()
+
+        def part(piece: slice) -> None:
+            limits = (np.float32(STOP), np.float32(NEGLIGIBLE))
+            arguments = (make_tape(self.net), self.background, given[0][piece], given[1][piece], *limits, out[piece])
+            render_pass(self.space, self.volume, self.net, *arguments)
+
+        size = max(min(PIECE, len(out) // self.threads), 1)
+        pieces = [slice(start, start + size) for start in range(0, len(out), size)]
+        if self.threads == 1 or len(pieces) == 1:
+            for piece in pieces:
+                part(piece)
+        else:
+            with ThreadPoolExecutor(self.threads) as pool:
+                list(pool.map(part, pieces))
+        return torch.from_numpy(out)

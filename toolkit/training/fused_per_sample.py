@@ -1,0 +1,72 @@
+"""The CPU's fast engine for the paper's decoder: the step of `step.Optimiser._per_sample` through compiled kernels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from toolkit.networks.decoder import PerSample
+from toolkit.render.compiled_per_sample import net_arrays, render_pass, turn, write_back
+from toolkit.render.composite import STOP
+from toolkit.render.field import Field
+from toolkit.render.kernels_net import Net, make_tape
+from toolkit.render.kernels_per_sample import NEGLIGIBLE
+from toolkit.training import fused_per_sample_kernels as kernels
+from toolkit.training.fused import FusedOptimiser
+from toolkit.training.fused_kernels import Losses
+
+Array = np.ndarray[Any, Any]
+
+
+class FusedPerSampleOptimiser(FusedOptimiser):
+    """`FusedOptimiser` with another decoder: rows, their lazy Adam, marks and threads are the same.
+
+    `Rates.colour_threshold` is not used, as in the reference: this decoder gives a density too, and every sample needs it. Only what
+    weighs less than NEGLIGIBLE is left out.
+    """
+
+    def _take_decoder(self, field: Field) -> None:
+        assert isinstance(field.decoder, PerSample)
+        self.net = net_arrays(field.decoder)
+        self.scratch = [kernels.make_scratch(self.net) for _ in range(self.threads)]
+
+    def _weights(self) -> tuple[Array, ...]:
+        return _moved(self.net)
+
+    def _weight_gradients(self) -> tuple[Array, ...]:
+        totals = [_moved(scratch.total) for scratch in self.scratch]
+        return tuple(sum(parts[1:], parts[0]) for parts in zip(*totals, strict=True))
+
+    def _turn_decoder(self) -> None:
+        turn(self.net)
+
+    def _make_room(self, rays: int) -> None:
+        """What a thread needs does not depend on the size of a batch."""
+
+    def _gradients(self, thread: int, part: slice, picks: Array, jitter: Array, losses: Losses, depths: Array) -> tuple[int, float, int]:
+        rows = (self.touched[thread], self.density_sums[thread], self.feature_sums[thread])
+        losses = losses._replace(threshold=np.float32(NEGLIGIBLE))
+        arguments = (self.pixels, picks[part], jitter[part], len(picks), losses, self.marks[thread], self.index, thread, rows)
+        given = (self.space, self.volume, self.net, self.background)
+        out: tuple[int, float, int] = kernels.gradient_pass(*given, *arguments, self.scratch[thread], depths[part])
+        return out
+
+    def sync(self) -> Field:
+        """The field with the decoder's weights written back."""
+        assert isinstance(self.field.decoder, PerSample)
+        write_back(self.net, self.field.decoder)
+        return self.field
+
+    def colours(self, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+        """(B, 3) colours that the field has now."""
+        out = np.empty((len(origins), 5), np.float32)
+        limits = (np.float32(STOP), np.float32(NEGLIGIBLE))
+        given = (self.space, self.volume, self.net, make_tape(self.net), self.background)
+        render_pass(*given, origins.numpy(), directions.numpy(), *limits, out)
+        return torch.from_numpy(out[:, :3])
+
+
+def _moved(net: Net) -> tuple[Array, ...]:
+    return net.w1, net.b1, net.w2, net.b2, net.density, net.density_bias, net.w3, net.b3, net.w4, net.b4
