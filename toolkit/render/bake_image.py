@@ -1,0 +1,76 @@
+"""Pictures of a baked field."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from toolkit.camera import Array, Intrinsics
+from toolkit.errors import InputError
+from toolkit.render.bake import BakedField
+from toolkit.render.bake_tiles import TILE, render_tiles
+from toolkit.render.image import SOLID, Rendered
+
+STOP = 1e-2  # a ray ends where less than this part of the light is left, and what it saw stands for all of it
+THRESHOLD = 5e-3  # samples of smaller weight lend no colour
+SMALL = 0.04  # samples of smaller weight take the features of the nearest corner
+PIECES = 8  # parts of a picture for each thread, so that none waits long for another
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a picture took: operations, not seconds."""
+
+    rays: int
+    looked_up: int  # samples in occupied voxels
+    coloured: int  # of these, with features
+    walked: int  # fine steps, occupied or not
+
+
+class BakedRenderer:
+    """Renders pictures of one baked field on the CPU."""
+
+    def __init__(
+        self, field: BakedField, threads: int | None = None, stop: float = STOP, threshold: float = THRESHOLD, small: float = SMALL
+    ) -> None:
+        self.field, self.space = field, field.kernel_space()
+        self.threads = threads or torch.get_num_threads()
+        self.limits = np.float32(stop), np.float32(threshold), np.float32(small)
+
+    def render(self, intrinsics: Intrinsics, world_from_camera: Array) -> Rendered:
+        """The field as a pinhole camera at `world_from_camera` (4, 4), working frame, sees it."""
+        return self.render_counted(intrinsics, world_from_camera)[0]
+
+    def render_counted(self, intrinsics: Intrinsics, world_from_camera: Array) -> tuple[Rendered, Work]:
+        """The same with the work it took. The same whatever the number of threads.
+
+        Raises:
+            InputError: the camera's lens bends light.
+        """
+        if intrinsics.distorted:
+            raise InputError("a baked field is rendered by pinhole cameras only; undistort the camera first")
+        width, height = intrinsics.width, intrinsics.height
+        out = np.empty((height * width, 5), np.float32)
+        camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy], np.float32)
+        pose = np.ascontiguousarray(world_from_camera[:3], np.float32)
+        tiles = -(-width // TILE) * -(-height // TILE)
+        pieces = min(PIECES * self.threads, tiles) if self.threads > 1 else 1
+        cuts = [tiles * i // pieces for i in range(pieces + 1)]
+        fixed = (self.space, self.field.arrays, self.field.decoder, self.field.background, camera, pose, (width, height))
+
+        def part(piece: int) -> Any:
+            return render_tiles(*fixed, (cuts[piece], cuts[piece + 1]), self.limits, out)
+
+        if self.threads == 1:
+            counts = [part(0)]
+        else:
+            with ThreadPoolExecutor(self.threads) as pool:
+                counts = list(pool.map(part, range(pieces)))
+        looked, coloured, walked = (sum(count[i] for count in counts) for i in range(3))
+        depth = np.where(out[:, 4] >= SOLID, out[:, 3], np.float32(0)).reshape(height, width)
+        picture = Rendered(np.ascontiguousarray(out[:, :3]).reshape(height, width, 3), depth, out[:, 4].reshape(height, width).copy())
+        return picture, Work(width * height, looked, coloured, walked)

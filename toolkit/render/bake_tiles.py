@@ -1,0 +1,99 @@
+"""Pictures of a baked field, compiled: rays made where they are used, tile by tile, marched, coloured and decoded."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from toolkit.render import kernels as K
+from toolkit.render.bake_kernels import VW, VX, VY, VZ, baked_march
+
+F, ZERO, HALF, ONE = K.F, K.ZERO, K.HALF, K.ONE
+MOST_KEPT = 512  # samples of one ray that are coloured
+TILE = 16  # pixels a side: rays of a tile share what they read while it is still in the cache
+
+
+@njit(**K.OPTIONS)
+def add_feature(width: Any, feature: Any, starts: Any, kept_at: Any, i: Any, total: Any) -> None:
+    """Add the feature of kept sample `i`, in steps and times its weight, to total[:C]."""
+    x, y, z, weight = kept_at[i, VX], kept_at[i, VY], kept_at[i, VZ], kept_at[i, VW]
+    r0, r1 = starts[i, 0], starts[i, 1]
+    if r1 < 0:
+        for k in range(len(width)):
+            total[k] += weight * F(feature[r0, k])
+        return
+    a, b, c = ONE - x, ONE - y, (ONE - z) * weight
+    z *= weight
+    w0, w1, w2, w3 = a * b * c, x * b * c, a * y * c, x * y * c
+    w4, w5, w6, w7 = a * b * z, x * b * z, a * y * z, x * y * z
+    r2, r3 = starts[i, 2], starts[i, 3]
+    for k in range(len(width)):
+        low = w0 * F(feature[r0, k]) + w1 * F(feature[r0 + 1, k]) + w2 * F(feature[r1, k]) + w3 * F(feature[r1 + 1, k])
+        high = w4 * F(feature[r2, k]) + w5 * F(feature[r2 + 1, k]) + w6 * F(feature[r3, k]) + w7 * F(feature[r3 + 1, k])
+        total[k] += low + high
+
+
+@njit(**K.OPTIONS)
+def render_tiles(
+    space: Any, baked: Any, decoder: Any, background: Any, camera: Any, pose: Any, size: Any, tiles: Any, limits: Any, out: Any
+) -> Any:
+    """Pixels of some tiles of a pinhole picture.
+
+    Args:
+        camera: (4,) float32 fx, fy, cx, cy; pose: (3, 4) float32 world_from_camera; size: (width, height), ints.
+        tiles: range of tiles, row by row, as (first, last + 1).
+        limits: float32 stop, threshold, small: see `baked_march`.
+        out: (H · W, 5) float32 colour, depth along z, opacity.
+
+    Returns:
+        samples looked up, samples coloured, fine steps.
+    """
+    channels, hidden = len(space.width), len(space.hidden)
+    starts, kept_at = np.empty((MOST_KEPT, 4), np.int32), np.empty((MOST_KEPT, 4), np.float32)
+    given = np.zeros(channels + K.PADDED, np.float32)
+    h1, h2, colour, result = np.empty(hidden, np.float32), np.empty(hidden, np.float32), np.empty(3, np.float32), np.empty(4, np.float32)
+    width, height = size
+    stop, threshold, small = limits
+    across = (width + TILE - 1) // TILE
+    ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
+    looked, coloured, walked = 0, 0, 0
+    for tile in range(tiles[0], tiles[1]):
+        top, left = tile // across * TILE, tile % across * TILE
+        for row in range(top, min(top + TILE, height)):
+            for column in range(left, min(left + TILE, width)):
+                x, y = (F(column) + HALF - camera[2]) / camera[0], (F(row) + HALF - camera[3]) / camera[1]
+                dx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]
+                dy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]
+                dz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]
+                cosine = ONE / math.sqrt(x * x + y * y + ONE)
+                dx, dy, dz = dx * cosine, dy * cosine, dz * cosine
+                kept = baked_march(space, baked, ox, oy, oz, dx, dy, dz, stop, threshold, small, starts, kept_at, result)
+                looked += int(result[2])
+                walked += int(result[3])
+                coloured += kept
+                pixel = row * width + column
+                opacity = ONE - result[1]
+                if result[1] < stop:
+                    opacity = ONE
+                out[pixel, 3], out[pixel, 4] = result[0] * cosine, opacity
+                if kept == 0:
+                    for k in range(3):
+                        out[pixel, k] = background[k]
+                    continue
+                for k in range(channels):
+                    given[k] = ZERO
+                total = ZERO
+                for sample in range(kept):
+                    add_feature(space.width, baked.feature, starts, kept_at, sample, given)
+                    total += kept_at[sample, VW]
+                share = ONE / total
+                for k in range(channels):
+                    given[k] = baked.low[k] + baked.scale[k] * (given[k] * share)
+                K.encode_direction(dx, dy, dz, given[channels:])
+                K.decode(space, decoder, given, h1, h2, colour)
+                for k in range(3):
+                    out[pixel, k] = min(max(colour[k] * opacity + (ONE - opacity) * background[k], ZERO), ONE)
+    return looked, coloured, walked
