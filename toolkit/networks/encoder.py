@@ -9,13 +9,22 @@ deviation of 0.15 and learned more slowly.
 
 from __future__ import annotations
 
+from itertools import pairwise
+from pathlib import Path
+
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from toolkit.errors import InputError
+from toolkit.networks import lite
 
 STRIDE = 2  # pixels a cell of what voxels look up
 DEEPEST = 16  # pixels a cell of the deepest level; pictures are padded to multiples of it
 GROUP = 8  # channels normalised together
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's pictures, RGB
+WIDTHS = (16, 32, 48, 96)  # channels at 1/2, 1/4, 1/8 and 1/16
+SMALL, LITE0 = "small", "lite0"
+TRUNKS = (SMALL, LITE0)
 
 
 class _Conv(nn.Sequential):
@@ -43,24 +52,36 @@ class ImageEncoder(nn.Module):
 
     Args:
         channels: of the result.
+        trunk: "small", plain convolutions, made for the CPU; or "lite0", which can start from ImageNet weights.
+
+    Attributes:
         widths: channels of the levels at 1/2, 1/4, 1/8 and 1/16.
     """
 
-    def __init__(self, channels: int = 64, widths: tuple[int, int, int, int] = (16, 32, 48, 96)) -> None:
+    def __init__(self, channels: int = 64, trunk: str = SMALL) -> None:
         super().__init__()
-        self.widths = widths
-        half, quarter, eighth, sixteenth = widths
-        self.stem = _Conv(3, half, 4, 2)
-        self.stages = nn.ModuleList(
-            [
-                nn.Sequential(_Conv(half, quarter, 4, 2), _Residual(quarter)),
-                nn.Sequential(_Conv(quarter, eighth, 4, 2), _Residual(eighth)),
-                nn.Sequential(_Conv(eighth, sixteenth, 4, 2), _Residual(sixteenth)),
-            ]
-        )
-        self.laterals = nn.ModuleList(_linear(width, channels, 1) for width in (quarter, eighth, sixteenth))
+        self.trunk = trunk
+        self.stem: nn.Sequential
+        if trunk == LITE0:
+            self.widths, (self.stem, self.stages) = lite.WIDTHS, lite.lite_trunk()
+        else:
+            self.widths, self.stem = WIDTHS, _Conv(3, WIDTHS[0], 4, 2)
+            steps = pairwise(WIDTHS)
+            self.stages = nn.ModuleList(nn.Sequential(_Conv(inside, outside, 4, 2), _Residual(outside)) for inside, outside in steps)
+        self.laterals = nn.ModuleList(_linear(width, channels, 1) for width in self.widths[1:])
         self.smooth = _linear(channels, channels, 3)
         self.norm = nn.GroupNorm(channels, channels)
+
+    def load_imagenet(self, path: Path | str | None = None) -> None:
+        """Fill the trunk with ImageNet weights; see `lite.load_imagenet`.
+
+        Raises:
+            InputError: the trunk is not "lite0", or there are no such weights.
+        """
+        if self.trunk != LITE0:
+            raise InputError(f"only the encoder {LITE0!r} can start from ImageNet, this one is {self.trunk!r}; set model.encoder={LITE0}")
+        assert isinstance(self.stem, nn.Sequential)
+        lite.load_imagenet(self.stem, self.stages, path)
 
     def forward(self, images: Tensor) -> Tensor:
         return self.maps(images)[1]

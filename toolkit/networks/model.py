@@ -45,6 +45,7 @@ COLOUR_LEVELS = 5
 class ModelConfig:
     """Sizes and switches of the networks. The defaults are what the shipped weights were trained with."""
 
+    encoder: str = "small"  # small | lite0 (can start from ImageNet)
     image_channels: int = 64  # of the encoder's map
     sampled: int = 16  # of them kept where voxels look
     direction: int = 16  # of the direction code; 0: off (ablation)
@@ -65,7 +66,7 @@ class NerfusionModel(nn.Module):
     def __init__(self, config: ModelConfig | None = None) -> None:
         super().__init__()
         self.config = config = config or ModelConfig()
-        self.encoder = ImageEncoder(config.image_channels)
+        self.encoder = ImageEncoder(config.image_channels, config.encoder)
         self.sample = Sampled(config.image_channels, self.encoder.widths[0], config.sampled)
         self.direction = DirectionCode(config.direction) if config.direction else None
         inputs = 3 * (config.sampled + config.direction + 2 * COLOURS) + FLAGS

@@ -13,13 +13,14 @@ from safetensors.torch import save_file
 
 from toolkit.errors import InputError, OutputError
 from toolkit.files import atomic_path
+from toolkit.networks.encoder import TRUNKS
 from toolkit.networks.model import ModelConfig, NerfusionModel
 
 METADATA_KEY = "fieldfuse.networks"
 VERSION = 1
 MAX_BYTES = 10 * 2**20
 LIMITS = {"direction": 0}  # least values; every other number is at least 1
-CHOICES = {"decoder": ("deferred", "per_sample"), "fusion": ("gru", "mean")}
+CHOICES = {"encoder": TRUNKS, "decoder": ("deferred", "per_sample"), "fusion": ("gru", "mean")}
 
 
 def save_model(path: Path | str, model: NerfusionModel, meta: dict[str, Any] | None = None) -> None:
