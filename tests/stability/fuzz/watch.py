@@ -34,7 +34,7 @@ class Watch:
         """`inside` holds the captures; everything else but the program's own files is off limits."""
         self.inside = str(inside.resolve())
         own = (sys.prefix, sys.base_prefix, str(Path(__file__).resolve().parents[3]))
-        self.allowed = (*(os.path.realpath(place) for place in own), *SYSTEM)
+        self.allowed = (*(os.path.realpath(place) for place in own), *SYSTEM, f"/proc/{os.getpid()}/")
         self.escapes: list[str] = []
         self.on = False
         sys.addaudithook(self._hear)

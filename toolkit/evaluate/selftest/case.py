@@ -24,6 +24,7 @@ MODULES = (
     "volume",
     "edit",
     "network",
+    "engines",
     "place",
     "place_files",
     "cameras",
