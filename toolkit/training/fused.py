@@ -60,9 +60,10 @@ class FusedOptimiser:
 
     def let_go(self) -> None:
         """Free what belongs to the rows, before finer ones are made beside them; `renew_rows` must follow."""
-        nothing = np.empty(0, np.int32)
-        self.index = self.density_records = self.feature_records = self.touched = self.density_sums = self.feature_sums = nothing
-        self.marks = nothing
+        self.index = self.touched = np.empty((0, 0), np.int32)
+        self.density_records = self.feature_records = self.density_sums = np.empty((0, 0), np.float32)
+        self.feature_sums = np.empty((0, 0, 0), np.float32)
+        self.marks = np.empty((0, 0), np.uint16)
 
     def go_on_with(self, field: Field) -> None:
         """Go on with the same rows after pruning; what was seen counts half from now on, so that it is forgotten within a few prunings."""
