@@ -38,13 +38,14 @@ def make_renderer(field: Field, engine: str = "auto") -> View:
     """What renders rays of `field`, for many pictures: compiled on the CPU, torch elsewhere.
 
     Args:
-        engine: auto | numba | torch. The compiled one knows the deferred decoder on the CPU; everything else is rendered by torch.
+        engine: auto | numba | torch. The compiled one runs on the CPU alone.
     """
-    if engine == "torch" or field.device.type != "cpu" or not isinstance(field.decoder, Deferred):
+    if engine == "torch" or field.device.type != "cpu":
         return partial(_in_chunks, field)
     from toolkit.render.compiled import CompiledRenderer
+    from toolkit.render.compiled_per_sample import PerSampleRenderer
 
-    compiled = CompiledRenderer(field)
+    compiled = CompiledRenderer(field) if isinstance(field.decoder, Deferred) else PerSampleRenderer(field)
 
     def render(origins: torch.Tensor, directions: torch.Tensor) -> RayValues:
         values = compiled.render(origins, directions)

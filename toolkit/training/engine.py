@@ -88,18 +88,21 @@ class TorchEngine(Optimiser):
 
 
 def chosen_engine(settings: Settings, device: torch.device) -> str:
-    """numba or torch. The compiled engine knows the deferred decoder on the CPU."""
-    able = device.type == "cpu" and settings.field.decoder == "deferred"
-    return "numba" if able and settings.engine != "torch" else "torch"
+    """numba or torch: the compiled engine runs on the CPU."""
+    return "numba" if device.type == "cpu" and settings.engine != "torch" else "torch"
 
 
 def make_engine(settings: Settings, field: Field, pool: PixelPool) -> Engine:
     """The engine that the settings ask for, or `auto`: compiled on the CPU, torch elsewhere."""
-    if chosen_engine(settings, field.device) == "torch" or not isinstance(field.decoder, Deferred):
+    if chosen_engine(settings, field.device) == "torch":
         return TorchEngine(field, pool, settings.seed)
-    from toolkit.training.fused import FusedOptimiser
+    if isinstance(field.decoder, Deferred):
+        from toolkit.training.fused import FusedOptimiser
 
-    return FusedOptimiser(field, pool, settings.seed)
+        return FusedOptimiser(field, pool, settings.seed)
+    from toolkit.training.fused_per_sample import FusedPerSampleOptimiser
+
+    return FusedPerSampleOptimiser(field, pool, settings.seed)
 
 
 def warm_up(settings: Settings, progress: Progress) -> None:
@@ -108,6 +111,7 @@ def warm_up(settings: Settings, progress: Progress) -> None:
         return
     from toolkit.training import warm
 
-    if not warm.ready(settings.field.channels, settings.field.hidden):
+    kind = (settings.field.decoder, settings.field.channels, settings.field.hidden)
+    if not warm.ready(*kind):
         progress.update(0, 1, "compiling the fast engine, once on this machine, about a minute")
-        warm.run(settings.field.channels, settings.field.hidden)
+        warm.run(*kind)

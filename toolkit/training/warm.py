@@ -9,28 +9,30 @@ from toolkit.camera import Intrinsics
 from toolkit.capture.types import Views
 from toolkit.networks.decoder import make_decoder
 from toolkit.render.compiled import CompiledRenderer
+from toolkit.render.compiled_per_sample import PerSampleRenderer
 from toolkit.training.fused import FusedOptimiser
+from toolkit.training.fused_per_sample import FusedPerSampleOptimiser
 from toolkit.training.levels import finer, first_field, visible
 from toolkit.training.rays import PixelPool
 from toolkit.training.step import Rates
 from toolkit.volume.host import TorchHost
 from toolkit.volume.space import Space
 
-_ready: set[tuple[int, int]] = set()
+_ready: set[tuple[str, int, int]] = set()
 RATES = Rates(0.01, 0.01, 0.001, 0.01, 0.01)
 
 
-def ready(channels: int, hidden: int) -> bool:
-    """Whether `run` was done in this process for fields with so many channels and so wide a decoder."""
-    return (channels, hidden) in _ready
+def ready(decoder: str, channels: int, hidden: int) -> bool:
+    """Whether `run` was done in this process for fields with this decoder, so many channels and so wide hidden layers."""
+    return (decoder, channels, hidden) in _ready
 
 
-def run(channels: int, hidden: int) -> None:
-    """Use every kernel once. Random number generators of the process are left as they were."""
+def run(kind: str, channels: int, hidden: int) -> None:
+    """Use every kernel once, for the decoder `kind` (deferred | per_sample). The process's random numbers are left as they were."""
     state = torch.get_rng_state()
     line = torch.arange(8)
     places = torch.cartesian_prod(line, line, line)
-    decoder = make_decoder("deferred", channels, hidden)
+    decoder = make_decoder(kind, channels, hidden)
     background, generator = torch.zeros(3), torch.Generator().manual_seed(0)
     space = Space((0.0, 0.0, 0.0), 1.0, 1.0)
     field = first_field(space, 8, places, channels, 0.0, decoder, background, 0.0, 4, TorchHost(), generator)
@@ -38,7 +40,7 @@ def run(channels: int, hidden: int) -> None:
     pose[2, 3] = -3
     picture = np.zeros((4, 4, 3), np.uint8)
     pool = PixelPool(Views(["one"], [picture], [Intrinsics(4, 4, 4, 4, 2, 2)], pose[None], np.zeros(1, bool)))
-    engine = FusedOptimiser(field, pool)
+    engine = FusedOptimiser(field, pool) if kind == "deferred" else FusedPerSampleOptimiser(field, pool)
     engine.step(8, RATES)
     field = finer(field, visible(field, engine.seen, engine.visits, 0.05), 16, TorchHost())
     engine.renew_rows(field)
@@ -46,6 +48,7 @@ def run(channels: int, hidden: int) -> None:
     engine.go_on_with(field)
     origins, directions = torch.zeros(3, 3), torch.eye(3)
     engine.colours(origins, directions)
-    CompiledRenderer(engine.sync()).render(origins, directions)
+    renderer = CompiledRenderer if kind == "deferred" else PerSampleRenderer
+    renderer(engine.sync()).render(origins, directions)
     torch.set_rng_state(state)
-    _ready.add((channels, hidden))
+    _ready.add((kind, channels, hidden))
