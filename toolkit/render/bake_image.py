@@ -17,7 +17,6 @@ from toolkit.render.image import SOLID, Rendered
 
 STOP = 1e-2  # a ray ends where less than this part of the light is left, and what it saw stands for all of it
 THRESHOLD = 5e-3  # samples of smaller weight lend no colour
-SMALL = 0.04  # samples of smaller weight take the features of the nearest corner
 PIECES = 8  # parts of a picture for each thread, so that none waits long for another
 
 
@@ -34,12 +33,10 @@ class Work:
 class BakedRenderer:
     """Renders pictures of one baked field on the CPU."""
 
-    def __init__(
-        self, field: BakedField, threads: int | None = None, stop: float = STOP, threshold: float = THRESHOLD, small: float = SMALL
-    ) -> None:
+    def __init__(self, field: BakedField, threads: int | None = None, stop: float = STOP, threshold: float = THRESHOLD) -> None:
         self.field, self.space = field, field.kernel_space()
         self.threads = threads or torch.get_num_threads()
-        self.limits = np.float32(stop), np.float32(threshold), np.float32(small)
+        self.limits = np.float32(stop), np.float32(threshold)
 
     def render(self, intrinsics: Intrinsics, world_from_camera: Array) -> Rendered:
         """The field as a pinhole camera at `world_from_camera` (4, 4), working frame, sees it."""

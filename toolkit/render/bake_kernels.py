@@ -62,13 +62,6 @@ def corner_starts(baked: Any, slot: Any, x: Any, y: Any, z: Any, starts: Any, ke
 
 
 @njit(**K.OPTIONS)
-def nearest_corner(baked: Any, slot: Any, x: Any, y: Any, z: Any) -> Any:
-    """Stored corner (x, y, z) of a block."""
-    row = int(baked.rows[slot, z * CORNERS + y])
-    return np.int32(baked.base[slot] + (row >> CORNERS) + int(ones(np.uint64(row & ((1 << x) - 1)))))
-
-
-@njit(**K.OPTIONS)
 def packed_density(packed: Any, x: Any, y: Any, z: Any) -> Any:
     """Trilinear quantised raw density of a voxel, in steps."""
     low, high = np.uint32(packed & np.uint64(0xFFFFFFFF)), np.uint32(packed >> np.uint64(32))
@@ -98,7 +91,6 @@ def baked_march(
     dz: Any,
     stop: Any,
     threshold: Any,
-    small: Any,
     starts: Any,
     kept_at: Any,
     result: Any,
@@ -106,7 +98,6 @@ def baked_march(
     """March one ray (working frame, unit direction); the counterpart of `kernels.march_ray`, whose arguments it shares.
 
     Args:
-        small: samples of smaller weight take the features of the nearest corner instead of all eight: an eighth of the reads.
         starts: (S, 4) int32 and kept_at: (S, 4) float32: corners, places and weights of the samples that are to be coloured.
         result: (4,) float32 distance at which half of the light is stopped (0: never), transmittance left, samples looked up, fine steps.
 
@@ -222,14 +213,9 @@ def baked_march(
                     part = math.log(TWO * transmittance) / max(tau, F(1e-12))
                     median = (s + (s1 - s) * (F(index) + part) * per_fine) * half
                 if weight > threshold and kept < starts.shape[0]:
-                    if weight < small:
-                        starts[kept, 0] = nearest_corner(baked, slot, i8 + int(fx + HALF), j8 + int(fy + HALF), k8 + int(fz + HALF))
-                        starts[kept, 1] = -1
-                        K.prefetch(baked.feature, np.int64(starts[kept, 0]))
-                    else:
-                        corner_starts(baked, slot, i8, j8, k8, starts, kept)
-                        for pair in range(4):
-                            K.prefetch(baked.feature, np.int64(starts[kept, pair]))
+                    corner_starts(baked, slot, i8, j8, k8, starts, kept)
+                    for pair in range(4):
+                        K.prefetch(baked.feature, np.int64(starts[kept, pair]))
                     kept_at[kept, VX], kept_at[kept, VY], kept_at[kept, VZ], kept_at[kept, VW] = fx, fy, fz, weight
                     kept += 1
                 transmittance = after

@@ -18,13 +18,9 @@ TILE = 16  # pixels a side: rays of a tile share what they read while it is stil
 
 @njit(**K.OPTIONS)
 def add_feature(width: Any, feature: Any, starts: Any, kept_at: Any, i: Any, total: Any) -> None:
-    """Add the feature of kept sample `i`, in steps and times its weight, to total[:C]."""
+    """Add the trilinear feature of kept sample `i`, in steps and times its weight, to total[:C]."""
     x, y, z, weight = kept_at[i, VX], kept_at[i, VY], kept_at[i, VZ], kept_at[i, VW]
     r0, r1 = starts[i, 0], starts[i, 1]
-    if r1 < 0:
-        for k in range(len(width)):
-            total[k] += weight * F(feature[r0, k])
-        return
     a, b, c = ONE - x, ONE - y, (ONE - z) * weight
     z *= weight
     w0, w1, w2, w3 = a * b * c, x * b * c, a * y * c, x * y * c
@@ -45,7 +41,7 @@ def render_tiles(
     Args:
         camera: (4,) float32 fx, fy, cx, cy; pose: (3, 4) float32 world_from_camera; size: (width, height), ints.
         tiles: range of tiles, row by row, as (first, last + 1).
-        limits: float32 stop, threshold, small: see `baked_march`.
+        limits: float32 stop, threshold: see `baked_march`.
         out: (H · W, 5) float32 colour, depth along z, opacity.
 
     Returns:
@@ -56,7 +52,7 @@ def render_tiles(
     given = np.zeros(channels + K.PADDED, np.float32)
     h1, h2, colour, result = np.empty(hidden, np.float32), np.empty(hidden, np.float32), np.empty(3, np.float32), np.empty(4, np.float32)
     width, height = size
-    stop, threshold, small = limits
+    stop, threshold = limits
     across = (width + TILE - 1) // TILE
     ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
     looked, coloured, walked = 0, 0, 0
@@ -70,7 +66,7 @@ def render_tiles(
                 dz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]
                 cosine = ONE / math.sqrt(x * x + y * y + ONE)
                 dx, dy, dz = dx * cosine, dy * cosine, dz * cosine
-                kept = baked_march(space, baked, ox, oy, oz, dx, dy, dz, stop, threshold, small, starts, kept_at, result)
+                kept = baked_march(space, baked, ox, oy, oz, dx, dy, dz, stop, threshold, starts, kept_at, result)
                 looked += int(result[2])
                 walked += int(result[3])
                 coloured += kept

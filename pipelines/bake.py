@@ -1,0 +1,104 @@
+"""`fieldfuse bake DIR`: a run's field as a small file that is rendered straight from disk."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
+
+
+def bake(
+    target: Target,
+    out: OptionalOut = None,
+    seen: Annotated[
+        float, typer.Option(min=0, max=1, help="Voxels in which no training pixel has more of its light are left out; 0 keeps all.")
+    ] = 0.01,
+    to: Annotated[Path | None, typer.Option(help="The file. Default: DIR/exports/baked.safetensors.", show_default=False)] = None,
+    threads: Threads = None,
+    config: Config = None,
+    pairs: Pairs = None,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Quantise the field of a run to bytes and say what that costs at the held-out views."""
+    from pipelines.job import bound_threads
+
+    options = gather(None, config, pairs, threads=threads)
+    bound_threads(options)
+    data = bake_run(target, out, options, seen, to, quiet)
+    if json:
+        import json as writer
+
+        typer.echo(writer.dumps(data, indent=1))
+    elif not quiet:
+        loss = "" if data["loss"] is None else f", {data['loss']:.2f} dB below the field ({data['psnr']:.2f}) at the held-out views"
+        size, before = data["bytes"] / 1e6, data["field_bytes"] / 1e6
+        typer.echo(f"{data['voxels']:,} voxels in {size:.1f} MB (field: {before:.1f} MB){loss}: {data['to']}")
+
+
+def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: float, to: Path | None, quiet: bool) -> dict[str, Any]:
+    """Bake the field of a run, write it, read it back, and compare both at the held-out views.
+
+    Returns:
+        `to`, `bytes` and `field_bytes`, `voxels` and `field_voxels`, and the mean `psnr` of the field and the `loss` of the baked one at
+        the held-out views (null when there are none).
+
+    Raises:
+        InputError: a folder without a field and without its source, or a decoder that cannot be baked.
+        OutputError: the file cannot be written.
+    """
+    import numpy as np
+    import torch
+
+    from pipelines.console import make_progress
+    from pipelines.job import open_job
+    from pipelines.reconstruct import BEFORE, stand
+    from pipelines.steps_results import fit_radiance_field
+    from toolkit.evaluate.images import psnr
+    from toolkit.render.bake import bake as quantise
+    from toolkit.render.bake_file import read_baked, write_baked
+    from toolkit.render.bake_image import BakedRenderer
+    from toolkit.render.bake_views import seen_voxels
+    from toolkit.render.image import make_renderer, render_view
+
+    with open_job(target, out, options, make_progress(quiet), (*BEFORE, "field")) as job:
+        _, _, _, scene, views = stand(job)
+        field, _ = fit_radiance_field(job, views, scene)
+        field = field.to("cpu")
+        job.progress.begin("bake")
+        start = time.monotonic()
+        threads = torch.get_num_threads()
+        train, test = np.flatnonzero(~views.test), np.flatnonzero(views.test)
+        keep = None
+        if seen > 0:
+            lenses = [views.intrinsics[i] for i in train]
+            keep = seen_voxels(field, lenses, views.world_from_camera[train], seen, threads, job.progress)
+        place = to or job.folder / "exports" / "baked.safetensors"
+        write_baked(place, quantise(field, keep), scene.working_from_input)
+        baked = read_baked(place)
+        renderer, view = BakedRenderer(baked, threads), make_renderer(field)
+        scores = []
+        for index in test:
+            job.progress.check()
+            lens, pose = views.intrinsics[index], views.world_from_camera[index]
+            truth = views.images[index].astype(np.float32) / 255
+            valid = views.valid[index] if views.valid else None
+            pictures = render_view(field, lens, pose, view).rgb, renderer.render(lens, pose).rgb
+            pair = [psnr(picture, truth, valid) for picture in pictures]
+            if None not in pair:
+                scores.append(pair)
+        job.progress.finish("bake", time.monotonic() - start, False)
+    mean = np.mean(np.array(scores, np.float64), 0) if scores else None
+    return {
+        "to": str(place),
+        "bytes": place.stat().st_size,
+        "field_bytes": field.bytes,
+        "voxels": baked.voxels,
+        "field_voxels": field.voxels,
+        "psnr": None if mean is None else round(float(mean[0]), 3),
+        "loss": None if mean is None else round(float(mean[0] - mean[1]), 3),
+    }

@@ -1,0 +1,171 @@
+"""Baked fields: the same picture from bytes, on disk and back, and files that are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file, save_file
+
+from tests.render.made import random_field
+from toolkit.camera import Intrinsics
+from toolkit.errors import InputError
+from toolkit.evaluate.speed_state import around, lens, sphere_field
+from toolkit.networks.decoder import make_decoder
+from toolkit.render.bake import BakedField, bake
+from toolkit.render.bake_file import METADATA_KEY, read_baked, write_baked
+from toolkit.render.bake_image import BakedRenderer
+from toolkit.render.bake_views import seen_voxels
+from toolkit.render.field import Field
+from toolkit.render.image import render_view
+
+CAMERA, POSE = lens(40, 30), around()[1]
+
+
+def coloured_field(shell: float = 0.0) -> Field:
+    """A sphere of features that change over a few voxels, as fitted ones do, with a decoder that uses direction."""
+    field = sphere_field(32)
+    row = torch.arange(len(field.feature_rows) - 1)
+    place = field.topology.keys[row // 512] * 8 + torch.stack([row & 7, (row >> 3) & 7, (row >> 6) & 7], 1)
+    wave = torch.linspace(0.05, 0.4, 16)
+    field.feature_rows[:-1] = 2 * torch.sin(place.float().sum(1, keepdim=True) * wave + torch.arange(16))
+    generator = torch.Generator().manual_seed(1)
+    for parameter in field.decoder.parameters():
+        parameter.data.add_(0.1 * torch.randn(parameter.shape, generator=generator))
+    return replace(field, space=replace(field.space, shell=shell), background=torch.tensor([0.9, 0.2, 0.4]))
+
+
+@pytest.fixture(scope="module")
+def field() -> Field:
+    return coloured_field()
+
+
+@pytest.fixture(scope="module")
+def baked(field: Field) -> BakedField:
+    return bake(field)
+
+
+def picture(field: BakedField, **options: Any) -> np.ndarray:
+    return BakedRenderer(field, 1, **options).render(CAMERA, POSE).rgb
+
+
+@pytest.mark.parametrize("shell", [0.0, 1.0])
+def test_the_picture_is_the_fields_own(shell: float) -> None:
+    """Quantisation alone moves colours by less than two of 255 steps on average, and depth hardly."""
+    given = coloured_field(shell)
+    expected = render_view(given, CAMERA, POSE)
+    got = BakedRenderer(bake(given), 1, stop=1e-4, threshold=0.0).render(CAMERA, POSE)
+    assert expected.rgb.std() > 0.1 and 0.1 < expected.opacity.mean() < 0.999
+    assert np.abs(got.rgb - expected.rgb).mean() < 2 / 255
+    assert np.abs(got.opacity - expected.opacity).max() < 0.03
+    both = (got.depth > 0) & (expected.depth > 0)
+    assert both.mean() > 0.1 and np.median(np.abs(got.depth - expected.depth)[both] / expected.depth[both]) < 2e-3
+
+
+def test_cutting_corners_costs_little(baked: BakedField) -> None:
+    """The default limits against none: above 38 dB between the pictures."""
+    error = np.mean((picture(baked) - picture(baked, stop=1e-4, threshold=0.0)) ** 2)
+    assert error < 10**-3.8
+
+
+def test_threads_change_nothing(baked: BakedField) -> None:
+    one, three = (BakedRenderer(baked, threads).render_counted(CAMERA, POSE) for threads in (1, 3))
+    assert np.array_equal(one[0].rgb, three[0].rgb) and one[1] == three[1]
+
+
+def test_only_corners_beside_voxels_are_stored(field: Field, baked: BakedField) -> None:
+    from toolkit.volume.edit import corner_nodes
+
+    beside = int(corner_nodes(field.topology, field.occupied).sum())
+    assert beside <= baked.corners < 1.5 * beside  # those on faces between blocks are stored with each
+    assert baked.voxels == field.voxels
+    assert baked.bytes < field.bytes / 3
+
+
+def test_a_file_is_rendered_from_where_it_lies(baked: BakedField, tmp_path: Path) -> None:
+    path = tmp_path / "baked.safetensors"
+    write_baked(path, baked)
+    again = read_baked(path)
+    assert np.array_equal(picture(again), picture(baked))
+    # Features are a window into the file: what changes there changes here.
+    before = again.arrays.feature.tobytes()
+    data = path.read_bytes()
+    at = data.index(before)
+    with path.open("r+b") as file:
+        file.seek(at)
+        file.write(bytes(255 - value for value in before[:64]))
+    assert again.arrays.feature.tobytes()[:64] != before[:64]
+
+
+DAMAGE: dict[str, Any] = {
+    "table": lambda a: np.where(a >= 0, a + 10_000, a),
+    "first": lambda a: a + 5,
+    "rows": lambda a: a + (1 << 9),
+    "base": lambda a: a + 1,
+    "bits": lambda a: np.full_like(a, 255),
+    "feature": lambda a: a[:-1],
+    "packed": lambda a: a[:-1],
+    "bricks": lambda a: a[:-1],
+    "thickness": lambda a: np.where(np.arange(len(a)) == 3, np.float32("nan"), a),
+    "scale": lambda a: a.astype(np.float64),
+    "decoder.w1": lambda a: a[:-1],
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damaged_files_are_refused(baked: BakedField, tmp_path: Path, name: str) -> None:
+    """Compiled code follows indices without asking, so none may lead outside."""
+    from safetensors import safe_open
+
+    path = tmp_path / "baked.safetensors"
+    write_baked(path, baked)
+    with safe_open(str(path), framework="np") as source:
+        metadata = source.metadata()
+    tensors = load_file(str(path))
+    tensors[name] = np.ascontiguousarray(DAMAGE[name](tensors[name]))
+    save_file(tensors, str(path), metadata=metadata)
+    with pytest.raises(InputError, match="cannot be used"):
+        read_baked(path)
+
+
+def test_other_files_are_refused(baked: BakedField, tmp_path: Path) -> None:
+    path = tmp_path / "baked.safetensors"
+    with pytest.raises(InputError, match="there is no baked field"):
+        read_baked(path)
+    path.write_bytes(b"nothing")
+    with pytest.raises(InputError, match="cannot be used"):
+        read_baked(path)
+    write_baked(path, baked)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match="cannot be used"):
+        read_baked(path)
+    save_file({"a": np.zeros(1, np.float32)}, str(path), metadata={METADATA_KEY: "{}"})
+    with pytest.raises(InputError, match="cannot be used"):
+        read_baked(path)
+
+
+def test_what_no_view_sees_is_left_out(field: Field) -> None:
+    """A camera before an opaque sphere sees one side of it."""
+    solid = replace(field, density_rows=field.density_rows + 4)
+    keep = seen_voxels(solid, [CAMERA], POSE[None])
+    assert 0.02 < float(keep.sum()) / solid.voxels < 0.2  # the near half of the outermost of eight layers
+    assert not bool((keep & ~solid.occupied).any())
+    small = bake(solid, keep)
+    whole, part = (BakedRenderer(f, 1).render(CAMERA, POSE) for f in (bake(solid), small))
+    assert small.bytes < bake(solid).bytes and np.abs(whole.rgb - part.rgb).mean() < 0.01
+    behind = POSE.copy()
+    behind[:3, :3] = behind[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
+    with pytest.raises(InputError, match="nothing to bake"):
+        bake(solid, seen_voxels(solid, [CAMERA], behind[None]))
+
+
+def test_what_cannot_be_baked_or_rendered_is_told(baked: BakedField) -> None:
+    with pytest.raises(InputError, match="deferred"):
+        bake(replace(random_field(), decoder=make_decoder("per_sample", 8, 16)))
+    bent = Intrinsics(8, 8, 8, 8, 4, 4, "opencv", (0.1, 0, 0, 0))
+    with pytest.raises(InputError, match="undistort"):
+        BakedRenderer(baked, 1).render(bent, POSE)
