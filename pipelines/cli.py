@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines import evaluate, export, finetune, info, poses, render, run, selftest, simulate, train, tsdf
+from pipelines import bake, bench, evaluate, export, finetune, info, poses, render, run, selftest, simulate, train, tsdf
 from pipelines.options import Json
 from toolkit import __version__
 from toolkit.errors import FieldfuseError, Interrupted
@@ -88,6 +88,7 @@ for _command in (
     finetune.finetune,
     render.render,
     export.export,
+    bake.bake,
     evaluate.evaluate,
     info.info,
     train.train,
@@ -95,6 +96,7 @@ for _command in (
     simulate.simulate,
 ):
     app.command()(_command)
+app.add_typer(bench.app, name="bench")
 
 
 if __name__ == "__main__":
