@@ -27,24 +27,28 @@ def wants_tsdf(job: Job, capture: Capture) -> bool:
     return wanted == "on" or (wanted == "auto" and capture.has_depth)
 
 
-def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = "tsdf", matched: bool | None = None) -> Pictures:
+def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = "tsdf", depth_from: str | None = None) -> Pictures:
     """Fuse the training frames' depth into a surface; its pictures at the held-out views are the result.
 
     Args:
         name: of the stage, its folder and its pictures.
-        matched: take depth by matching pictures instead of the capture's own (None: when it has none).
+        depth_from: "sensor", "matching" (pictures with each other) or "exact" (the truth that a simulated capture brings); None: the
+            sensor's when the capture has depth, else by matching.
     """
-    from pipelines.steps_stereo import match_pictures
+    from pipelines.steps_stereo import exact_depths, match_pictures
 
     folder = job.folder / name
     kept = job.folder / "renders" / f"{name}.safetensors"
     made: list[Path] = []
-    stereo = match_pictures(job, scene, views) if (not posed.has_depth if matched is None else matched) else None
+    depth_from = depth_from or ("sensor" if posed.has_depth else "matching")
+    matched = match_pictures(job, scene, views) if depth_from == "matching" else None
 
     def make() -> Pictures:
         from pipelines.surface import fuse_training_frames
 
-        pictures, paths = fuse_training_frames(job, folder, posed, scene, views, stereo)
+        depths = exact_depths(posed, scene, views) if depth_from == "exact" else matched
+        pictures, paths = fuse_training_frames(job, folder, posed, scene, views, depths, depth_from == "exact")
+        pictures.facts["depth_from"] = depth_from
         made.extend(paths)
         return pictures
 
@@ -57,8 +61,8 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
         make=make,
         save=save,
         load=lambda: load_pictures(kept),
-        uses=[asdict(job.settings.tsdf), pixel_state(posed)],
-        after=["scene", "views", *(["stereo"] if stereo is not None else [])],
+        uses=[asdict(job.settings.tsdf), pixel_state(posed), depth_from],
+        after=["scene", "views", *(["stereo"] if matched is not None else [])],
     )
 
 

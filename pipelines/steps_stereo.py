@@ -1,4 +1,4 @@
-"""The stage `stereo`: depth of the training pictures by matching them with each other, for captures that have none."""
+"""Depth of the training pictures that no sensor measured: by matching them with each other (the stage `stereo`), or a simulation's own."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipelines.job import Job
 from toolkit.errors import InputError
 
 if TYPE_CHECKING:
-    from toolkit.capture.types import Views
+    from toolkit.capture.types import Capture, Views
     from toolkit.poses.scene import Scene
     from toolkit.tsdf.stereo import StereoDepth
 
@@ -52,3 +52,23 @@ def reuse_matched(job: Job, scene: Scene, views: Views) -> None:
     """Take up depth by matching that the folder has, so that a surface made of it counts as standing on what is there."""
     if job.stages.usable("stereo"):
         match_pictures(job, scene, views)
+
+
+def exact_depths(posed: Capture, scene: Scene, views: Views) -> list[StereoDepth]:
+    """The true depth of every training view, for captures that bring it.
+
+    Raises:
+        InputError: a training picture has none.
+    """
+    from toolkit.evaluate.compare_truth import find_truth, true_depths
+    from toolkit.tsdf.stereo import StereoDepth
+
+    truth = find_truth(posed)
+    training = np.flatnonzero(~views.test)
+    depths = [] if truth is None else true_depths(truth, posed, views, training, scene.working_from_input.scale)
+    known = [depth for depth in depths if depth is not None]
+    if not known or len(known) < len(training):
+        raise InputError(f"{posed.root} brings no exact depth for {len(training) - len(known)} of its pictures; choose another depth")
+    return [
+        StereoDepth(depth, (depth > 0).astype(np.float32), views.intrinsics[index]) for depth, index in zip(known, training, strict=True)
+    ]

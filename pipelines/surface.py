@@ -38,12 +38,13 @@ def spread(count: int, most: int) -> list[int]:
 
 
 def fuse_training_frames(
-    job: Job, folder: Path, posed: Capture, scene: Scene, views: Views, stereo: list[StereoDepth] | None = None
+    job: Job, folder: Path, posed: Capture, scene: Scene, views: Views, depths: list[StereoDepth] | None = None, exact: bool = False
 ) -> tuple[Pictures, list[Path]]:
     """The TSDF surface of the training frames: mesh and points in `folder`, pictures at the held-out views.
 
     Args:
-        stereo: depth of the training views by matching, to be used instead of the capture's own.
+        depths: of the training views, to be used instead of the capture's own.
+        exact: these depths are beyond doubt.
 
     Returns:
         pictures, and the files written. `pictures.facts`: voxel size and range (working units), frames, blocks, seconds with decoding.
@@ -54,12 +55,12 @@ def fuse_training_frames(
 
     settings = job.settings.tsdf
     start = time.monotonic()
-    if stereo is None:
+    if depths is None:
         train = [index for index, test in enumerate(views.test) if not test and posed.frames[index].depth is not None]
         volume = fuse_capture(posed, scene.working_from_input, train, settings, job.progress)
     else:
         shown = views.subset(np.flatnonzero(~views.test))
-        volume = fuse_stereo(shown, stereo, settings.voxel_size, settings.depth_max, progress=job.progress)
+        volume = fuse_stereo(shown, depths, settings.voxel_size, settings.depth_max, carve=not exact, progress=job.progress)
     fused = time.monotonic() - start
     mesh = volume.mesh().cleaned(min_area_share=SMALL_PART)
     write_surface(folder, scene, mesh, volume.points())
@@ -70,7 +71,6 @@ def fuse_training_frames(
         picture = to_picture(volume.render(views.intrinsics[index], views.world_from_camera[index]))
         found.add(views.names[index], picture, time.monotonic() - start)
     found.facts = {
-        "depth_from": "sensor" if stereo is None else "matching",
         "voxel_size": volume.voxel_size,
         "depth_max": volume.depth_max,
         "frames": volume.frames,

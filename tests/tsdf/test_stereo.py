@@ -28,8 +28,8 @@ def views_of(poses: Array, pictures: list[Array], camera: Intrinsics = CAMERA) -
 
 @lru_cache(maxsize=1)
 def corner() -> tuple[Views, list[Array]]:
-    """Nine pictures and their exact depth."""
-    poses = arc(9, 44.0)
+    """Seven pictures and their exact depth."""
+    poses = arc(7, 36.0)
     made = [render(pose, CAMERA) for pose in poses]
     return views_of(poses, [picture for picture, _ in made]), [depth for _, depth in made]
 
@@ -68,19 +68,19 @@ def test_confidence_tells_good_depth_from_bad() -> None:
 
 
 def test_larger_pictures_are_matched_small_and_keep_their_field_of_view() -> None:
-    poses = arc(9, 44.0)[2:6]
+    poses = arc(7, 36.0)[2:5]
     views = views_of(poses, [render(pose)[0] for pose in poses], Intrinsics(320, 240, 300.0, 300.0, 160.0, 120.0))
     depths = stereo_depths(views, NEAR, FAR, MEDIAN, long_side=160)
     assert depths[0].intrinsics == CAMERA
-    errors, _ = relative_errors(depths, corner()[1][2:6])
+    errors, _ = relative_errors(depths, corner()[1][2:5])
     assert np.median(errors) < 0.008
 
 
 def test_masked_pixels_have_no_depth() -> None:
     views, _ = corner()
-    part = views.subset(range(4))
-    part.valid = [np.arange(160)[None] < np.full((120, 1), 60), None, None, None]
-    part.alpha = [None, np.where(np.arange(120)[:, None] < 50, 0, 255) * np.ones((1, 160), np.uint8), None, None]
+    part = views.subset([0, 1, 2])
+    part.valid = [np.arange(160)[None] < np.full((120, 1), 60), None, None]
+    part.alpha = [None, np.where(np.arange(120)[:, None] < 50, 0, 255) * np.ones((1, 160), np.uint8), None]
     depths = stereo_depths(part, NEAR, FAR, MEDIAN)
     assert not depths[0].depth[:, 60:].any() and (depths[0].depth[:, :60] > 0).mean() > 0.2
     assert not depths[1].depth[:50].any() and (depths[1].depth[50:] > 0).mean() > 0.2
@@ -89,7 +89,7 @@ def test_masked_pixels_have_no_depth() -> None:
 def test_bare_walls_give_no_depth() -> None:
     views, _ = corner()
     bare = views_of(views.world_from_camera, [np.full_like(picture, 130) for picture in views.images])
-    kept = np.mean([(one.depth > 0).mean() for one in stereo_depths(bare.subset(range(5)), NEAR, FAR, MEDIAN)])
+    kept = np.mean([(one.depth > 0).mean() for one in stereo_depths(bare.subset([0, 1, 2]), NEAR, FAR, MEDIAN)])
     assert kept < 0.05
 
 
@@ -209,7 +209,7 @@ def test_fractions_of_a_plane() -> None:
     assert np.abs(plane - true).max() < 0.02
 
 
-def test_planes_lie_a_pixel_apart() -> None:
+def test_planes_lie_one_to_two_pixels_apart() -> None:
     views, _ = corner()
     ready = [grey_view(picture, CAMERA, pose) for picture, pose in zip(views.images, views.world_from_camera, strict=True)]
     planes = inverse_depths(ready[0], [ready[1], ready[2]], NEAR, FAR)
@@ -218,7 +218,7 @@ def test_planes_lie_a_pixel_apart() -> None:
     middle = np.array([80.0, 60.0, 1.0])
     moves = [plane_homography(ready[0], ready[2], value) @ middle for value in planes]
     steps = np.linalg.norm(np.diff([move[:2] / move[2] for move in moves], axis=0), axis=1)
-    assert 0.5 < np.median(steps) < 1.5
+    assert 1 < np.median(steps) < 2
 
 
 def test_neighbours_from_the_same_place_are_left_out() -> None:

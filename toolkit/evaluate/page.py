@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import base64
 from datetime import datetime
-from importlib import resources
 from typing import Any
 from urllib.parse import quote
 
 import cv2
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from toolkit.camera import Array
@@ -19,7 +17,9 @@ from toolkit.evaluate import words
 from toolkit.evaluate.pictures import DEPTH_COLOURS, ERROR_COLOURS, ERROR_TOP, Pictures, colour_bar
 from toolkit.evaluate.plots import psnr_over_time, stage_bars
 from toolkit.evaluate.report import SCORE
+from toolkit.evaluate.templates import template
 
+TEMPLATE = "report.html.j2"
 LONGEST = 480  # pixels of an embedded tile's long side: sharp at the size it is shown, small in bytes
 QUALITY = 86
 TILE_HEIGHT = 380  # CSS pixels at most, so that upright pictures do not fill the screen
@@ -164,10 +164,6 @@ def _fact(name: str, value: Any) -> str:
 
 def render_page(data: dict[str, Any], pictures: Pictures) -> str:
     """The page as text. `data` as `report_data` answers it."""
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    for show in (words.decimal, words.significant, words.whole, words.size, words.memory, words.duration, words.share):
-        environment.filters[show.__name__] = show
-    template = environment.from_string(resources.files("toolkit.evaluate").joinpath("report.html.j2").read_text(encoding="utf-8"))
     evaluation = data["evaluation"]
     levels = {
         "TSDF": (evaluation["tsdf"] or {}).get("psnr"),
@@ -176,7 +172,7 @@ def render_page(data: dict[str, Any], pictures: Pictures) -> str:
     # The plots are our own text but for stage names, which matplotlib escapes.
     time_plot, stage_plot = psnr_over_time(data["timeline"], levels), stage_bars(data["stages"])
     near, far = pictures.depth_range or (None, None)
-    return template.render(
+    return template(TEMPLATE).render(
         data=data,
         title=short_name(data["source"]) or "Report",
         subtitle=subtitle(data),

@@ -6,7 +6,7 @@ Error maps have one fixed scale everywhere; depth maps have one range a run, so 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -40,6 +40,7 @@ class Tiles:
     render: Array
     error: Array
     depth: Array
+    depth_error: Array | None = None  # where there is a true depth
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class ViewPictures:
 
     name: str
     truth: Array  # (H, W, 3) uint8
-    methods: dict[str, Tiles]  # "field", "tsdf"
+    methods: dict[str, Tiles]  # "field", "tsdf", …
     measured: Array | None = None
 
 
@@ -103,6 +104,15 @@ def spread(count: int, most: int) -> list[int]:
     return sorted({round(i) for i in np.linspace(0, count - 1, most)})
 
 
+def depth_error_picture(depth: Array, truth: Array, top: float) -> Array:
+    """|d − d*| on a scale of 0 … `top`, (H, W, 3) uint8; grey where either depth is missing."""
+    known = has_depth(depth) & has_depth(truth)
+    gap = np.abs(np.where(known, depth, 0) - np.where(known, truth, 0))
+    picture = coloured(gap / max(top, 1e-12), ERROR_COLOURS)
+    picture[~known] = MISSING
+    return picture
+
+
 def make_pictures(
     views: Views,
     indices: Sequence[int] | Array,
@@ -111,12 +121,24 @@ def make_pictures(
     unit: str = "units",
     most: int = 24,
 ) -> Pictures:
-    """Tiles of the views at `indices`; `field` and `tsdf` hold one rendering for each of them, in that order (None: not made).
+    """Tiles of the views at `indices` for the two methods of a run; see `method_pictures`."""
+    return method_pictures(views, indices, {name: of for name, of in (("field", field), ("tsdf", tsdf)) if of is not None}, unit, most)
 
-    At most `most` views are shown, evenly spread.
+
+def method_pictures(
+    views: Views,
+    indices: Sequence[int] | Array,
+    methods: Mapping[str, Sequence[RenderedView]],
+    unit: str = "units",
+    most: int = 24,
+    depth_error_top: float | None = None,
+) -> Pictures:
+    """Tiles of the views at `indices`; each of `methods` holds one rendering for each of them, in that order.
+
+    At most `most` views are shown, evenly spread. With `depth_error_top` (working units) errors of depth are shown up to that.
     """
     chosen = spread(len(indices), most)
-    rendered = {name: [list(of)[i] for i in chosen] for name, of in (("field", field), ("tsdf", tsdf)) if of is not None}
+    rendered = {name: [list(of)[i] for i in chosen] for name, of in methods.items()}
     shown = [int(indices[i]) for i in chosen]
     measured = [entry(views.depths, index) for index in shown]
     limits = depth_range(
@@ -124,14 +146,14 @@ def make_pictures(
     )
     out = []
     for place, index in enumerate(shown):
-        truth, valid = views.images[index], entry(views.valid, index)
-        methods = {}
+        truth, valid, sensor = views.images[index], entry(views.valid, index), measured[place]
+        tiles = {}
         for name, of in rendered.items():
-            rgb = on_background(of[place], views)
+            rgb, depth = on_background(of[place], views), of[place].depth
+            off = None if sensor is None or depth_error_top is None else depth_error_picture(depth, sensor, depth_error_top)
             render = np.round(rgb * 255).astype(np.uint8)
-            methods[name] = Tiles(render, error_picture(rgb, truth, valid), depth_picture(of[place].depth, limits))
-        sensor = measured[place]
-        out.append(ViewPictures(views.names[index], truth, methods, None if sensor is None else depth_picture(sensor, limits)))
+            tiles[name] = Tiles(render, error_picture(rgb, truth, valid), depth_picture(depth, limits), off)
+        out.append(ViewPictures(views.names[index], truth, tiles, None if sensor is None else depth_picture(sensor, limits)))
     return Pictures(out, limits, unit, len(indices) - len(chosen))
 
 

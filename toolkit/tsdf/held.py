@@ -30,7 +30,7 @@ def fuse_held(
 
     Args:
         voxel_size, depth_max: working units; None: from the frames' depth, the voxel size made coarser until it fits into memory.
-        carve: frames also empty what others put in front of their surface, which removes most floaters.
+        carve: take no frame's word alone: each empties what others put in front of its surface, and what a single one shows is left out.
         nothing: the refusal when no frame shows depth.
 
     Raises:
@@ -47,6 +47,7 @@ def fuse_held(
         raise InputError(nothing)
     volume = _with_room(shown, voxel_size, depth_max)
     if carve:
+        volume.min_weight = CONFIRMED if len(shown) >= MANY_VIEWS else None
         for frame in shown:
             volume.reserve(volume.touched(frame))
     for number, frame in enumerate(shown, 1):
@@ -71,6 +72,4 @@ def _with_room(frames: Sequence[DepthFrame], voxel_size: float | None, depth_max
             if voxel_size is not None:
                 raise
             size *= COARSER
-    volume = TsdfVolume(size, depth_max, expected_blocks=2 * expected)
-    volume.min_weight = CONFIRMED if len(frames) >= MANY_VIEWS else None
-    return volume
+    return TsdfVolume(size, depth_max, expected_blocks=2 * expected)

@@ -30,7 +30,10 @@ SWEET = 8.0  # degrees of parallax that are looked for
 PARALLAX = (1.0, 45.0)  # degrees outside which a neighbour tells nothing, or looks too different
 LEAST_OVERLAP = 0.25
 MOST_COST = 0.4  # matching cost beyond which nothing was recognised: bare walls have 0.5 everywhere
-PLANES = (32, 160)  # fewest and most planes
+STEP = (
+    1.5  # pixels that the picture of the neighbour that moves most moves by from one plane to the next; refinement finds what lies between
+)
+PLANES = (32, 128)  # fewest and most planes
 MOST_WORKERS = 8  # each holds two volumes of costs
 
 
@@ -119,8 +122,7 @@ def usable_neighbours(world_from_camera: Array, cameras: Sequence[Intrinsics], m
 
 
 def inverse_depths(view: GreyView, others: Sequence[GreyView], near: float, far: float) -> Array:
-    """(D,) inverse depths of the planes, even, so close that the neighbour whose picture moves most moves by about a pixel from one to the
-    next."""
+    """(D,) inverse depths of the planes, even, about `STEP` apart."""
     width, height = view.camera.width, view.camera.height
     spots = np.array([[u * width, v * height, 1] for u in (0.1, 0.5, 0.9) for v in (0.1, 0.5, 0.9)]).T  # (3, 9)
     moves = [1.0]
@@ -129,7 +131,7 @@ def inverse_depths(view: GreyView, others: Sequence[GreyView], near: float, far:
         front = (at_far[2] > 0) & (at_near[2] > 0)
         gap = np.linalg.norm(at_far[:2, front] / at_far[2, front] - at_near[:2, front] / at_near[2, front], axis=0)
         moves.append(float(np.median(gap)) if len(gap) else 0.0)
-    return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(max(moves)) + 1, *PLANES)))
+    return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(max(moves) / STEP) + 1, *PLANES)))
 
 
 def _prepared(views: Views, index: int, long_side: int) -> _View:

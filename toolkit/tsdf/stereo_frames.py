@@ -38,15 +38,16 @@ def fuse_stereo(
     voxel_size: float | None = None,
     depth_max: float | None = None,
     least_confidence: float = LEAST_CONFIDENCE,
+    carve: bool = True,
     progress: Progress = SILENT,
 ) -> TsdfVolume:
-    """Fuse the depth of `stereo_depths(views, …)`; errors as `fuse_held`, whose arguments these are."""
+    """Fuse the depth of `stereo_depths(views, …)`; arguments and errors as `fuse_held`."""
     nothing = (
         "no depth could be found by matching the pictures: they show too little texture, or their poses do not fit them; find the poses"
         " again with --poses sfm, or set tsdf.enabled=off"
     )
     frames = stereo_frames(views, depths, least_confidence)
-    return fuse_held(frames, len(depths), voxel_size, depth_max, nothing=nothing, progress=progress)
+    return fuse_held(frames, len(depths), voxel_size, depth_max, carve=carve, nothing=nothing, progress=progress)
 
 
 def save_stereo(path: Path | str, names: Sequence[str], depths: Sequence[StereoDepth]) -> None:
