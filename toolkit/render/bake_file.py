@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from toolkit.camera import Similarity
 from toolkit.errors import InputError, OutputError
@@ -67,7 +67,8 @@ def write_baked(path: Path | str, field: BakedField, working_from_input: Similar
     }
     with atomic_path(path) as temporary:
         try:
-            save_file(tensors, str(temporary), metadata={METADATA_KEY: json.dumps(information, allow_nan=False)})
+            # As bytes: what safetensors writes by itself only its owner may read.
+            temporary.write_bytes(save(tensors, metadata={METADATA_KEY: json.dumps(information, allow_nan=False)}))
         except (SafetensorError, ValueError) as error:
             raise OutputError(f"cannot write {path} ({error}); free space or choose another folder") from error
 
