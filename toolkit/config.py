@@ -148,7 +148,7 @@ def _flatten(data: Any, where: str, prefix: str = "") -> list[tuple[str, Any]]:
 
 def _read_yaml(text: str, where: str) -> list[tuple[str, Any]]:
     try:
-        _refuse_traps(text, where)
+        refuse_traps(text, where)
         data = OmegaConf.to_container(OmegaConf.create(text or "{}"), resolve=False)
     except InputError:
         raise
@@ -157,8 +157,11 @@ def _read_yaml(text: str, where: str) -> list[tuple[str, Any]]:
     return _flatten(data, where)
 
 
-def _refuse_traps(text: str, where: str) -> None:
-    """What breaks the parser itself: nesting (it recurses in C and takes the process with it) and aliases that multiply.
+def refuse_traps(text: str, where: str) -> None:
+    """Look at YAML that may come from anybody before a parser does, for what breaks the parser itself.
+
+    That is nesting (it recurses in C and takes the process with it) and aliases that multiply. Call it where errors of the parser are
+    caught: this one raises them too.
 
     Raises:
         InputError: too long, nested too deeply, or with aliases.

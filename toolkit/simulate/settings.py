@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from toolkit.camera import Intrinsics
+from toolkit.config import refuse_traps
 from toolkit.errors import InputError
 from toolkit.simulate.paths import PathSettings
 
@@ -69,7 +70,10 @@ def read_scene_file(path: Path | str) -> SceneFile:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read the scene file {path}: {getattr(error, 'strerror', None) or error}") from error
     try:
+        refuse_traps(text, str(path))
         data = OmegaConf.to_container(OmegaConf.create(text or "{}"), resolve=False)
+    except InputError:
+        raise
     except Exception as error:  # the YAML parser raises its own family
         raise InputError(f"{path} is not valid YAML: {str(error).splitlines()[0]}") from error
     if not isinstance(data, dict):
