@@ -54,6 +54,7 @@ def put_comparison(
             "unit": "m" if scene.metric else "input units",
         },
         "methods": [describe_method(job, all_of_it, name, found, mesh_facts) for name in all_of_it.pictures],
+        "matching": found["matching"],
         "machine": machine(job),
         "seconds_total": round(seconds + job.stages.fresh_seconds(), 3),
     }

@@ -74,7 +74,11 @@ def measure(job: Job, all_of_it: Compared) -> dict[str, Any]:
 
     return job.stages.run(
         "compare",
-        make=lambda: {"scores": score_methods(job, all_of_it), **measure_meshes(job, all_of_it)},
+        make=lambda: {
+            "scores": score_methods(job, all_of_it),
+            **measure_meshes(job, all_of_it),
+            "matching": measure_matching(job, all_of_it),
+        },
         save=save,
         load=lambda: read_json(path),
         uses=list(all_of_it.pictures),
@@ -99,12 +103,30 @@ def score_methods(job: Job, all_of_it: Compared) -> dict[str, Any]:
 
 def depths_of_test_views(all_of_it: Compared) -> list[Array | None] | None:
     """The exact depth of the test views; None when the capture brings none."""
+    return exact_depths_of(all_of_it, np.flatnonzero(all_of_it.views.test))
+
+
+def exact_depths_of(all_of_it: Compared, indices: Array) -> list[Array | None] | None:
+    """The exact depth of the views at `indices`, None when the capture brings none."""
     from toolkit.evaluate.compare_truth import true_depths
 
     truth, views = all_of_it.truth, all_of_it.views
     if truth is None or not truth.depths:
         return None
-    return true_depths(truth, all_of_it.posed, views, np.flatnonzero(views.test), all_of_it.scene.working_from_input.scale)
+    return true_depths(truth, all_of_it.posed, views, indices, all_of_it.scene.working_from_input.scale)
+
+
+def measure_matching(job: Job, all_of_it: Compared) -> dict[str, Any] | None:
+    """How good the depth by matching of the training views is, against the exact depth or the sensor's; None without either."""
+    from pipelines.steps_stereo import match_pictures
+    from toolkit.evaluate.compare_stereo import matched_depth_scores
+
+    if "tsdf_stereo" not in all_of_it.pictures:
+        return None
+    training = np.flatnonzero(~all_of_it.views.test)
+    views = all_of_it.views.subset(training)
+    known = exact_depths_of(all_of_it, training) or views.depths
+    return matched_depth_scores(views, match_pictures(job, all_of_it.scene, all_of_it.views), known) if known else None
 
 
 def mesh_files(job: Job, methods: Mapping[str, Any]) -> dict[str, Path]:

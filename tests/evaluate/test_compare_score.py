@@ -14,8 +14,10 @@ from toolkit.camera import OPENCV, Array, Intrinsics
 from toolkit.capture.types import Capture, Frame, Views
 from toolkit.errors import InputError
 from toolkit.evaluate.compare_score import compare_views, depth_accuracy, depth_scale
+from toolkit.evaluate.compare_stereo import matched_depth_scores
 from toolkit.evaluate.compare_truth import find_truth, true_depths
 from toolkit.evaluate.images import psnr, ssim
+from toolkit.tsdf.stereo import StereoDepth
 
 CAMERA = Intrinsics(48, 36, 40.0, 40.0, 24.0, 18.0)
 
@@ -153,3 +155,23 @@ def test_damaged_true_depth_is_named(tmp_path: Path) -> None:
     views = Views(["0"], [np.zeros((36, 48, 3), np.uint8)], [CAMERA], np.eye(4)[None], np.ones(1, bool))
     with pytest.raises(InputError, match=r"0\.safetensors"):
         true_depths(truth, capture, views, [0], 1.0)
+
+
+def test_matched_depth_is_measured_on_textured_pixels_too() -> None:
+    rng = np.random.default_rng(0)
+    image = np.full((36, 48, 3), 120, np.uint8)
+    image[:, :24] = rng.integers(0, 256, (36, 24, 3))  # texture on the left half
+    views = Views(["a", "b"], [image, image], [CAMERA] * 2, np.tile(np.eye(4), (2, 1, 1)), np.zeros(2, bool))
+    truth = np.full((36, 48), 2.0, np.float32)
+    depth = np.where(np.arange(48) < 18, np.float32(2.02), np.float32(0)) * np.ones((36, 1), np.float32)
+    depth[:, 40:] = 3.0
+    found = StereoDepth(depth, (depth > 0).astype(np.float32), CAMERA)
+    scores = matched_depth_scores(views, [found, found], [truth, None])
+    assert scores is not None and scores["views"] == 1
+    assert scores["coverage"] == pytest.approx(26 / 48) and scores["median_rel"] == pytest.approx(0.01, rel=1e-4)
+    assert scores["coverage_textured"] == pytest.approx(18 / 27, abs=0.03)  # windows reach three pixels over the edge
+    assert scores["textured"] == pytest.approx(27 / 48, abs=0.03)
+    large = np.full((72, 96), 2.0, np.float32)
+    again = matched_depth_scores(views, [found, found], [large, large])
+    assert again is not None and again["views"] == 2 and again["coverage"] == scores["coverage"]
+    assert matched_depth_scores(views, [found, found], [None, np.zeros_like(truth)]) is None

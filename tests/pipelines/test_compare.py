@@ -93,6 +93,8 @@ def test_geometry_is_in_the_inputs_units(compared: Path) -> None:
     assert 0.01 < exact["voxel_size"] < 0.1  # of a corner of some metres, pictures of 128 pixels
     assert found["tsdf_stereo"]["geometry"]["f_score_4"] > 0.6
     assert found["tsdf_stereo"]["score"]["depth"]["median_rel"] < 0.03 and found["tsdf_stereo"]["score"]["depth"]["coverage"] > 0.6
+    matching = read_json(compared / "compare.json")["matching"]
+    assert matching["views"] == 6 and matching["median_rel_textured"] < 0.02 and matching["coverage_textured"] > 0.6
 
 
 def test_the_page_shows_them(compared: Path, tmp_path: Path) -> None:

@@ -71,6 +71,7 @@ def compare_data(data: dict[str, Any]) -> dict[str, Any]:
         "truth": {**dict.fromkeys(TRUTH), **(data.get("truth") or {})},
         "methods": out,
         "stages": [{**dict.fromkeys(STAGE), **stage} for stage in data.get("stages") or []],
+        "matching": data.get("matching"),
         "settings": data.get("settings") or {},
         "machine": data.get("machine") or {},
     }
@@ -175,6 +176,20 @@ def _geometry(methods: Sequence[dict[str, Any]], unit: str) -> list[Row]:
         ),
         *scores,
     ]
+
+
+def matching_line(data: dict[str, Any]) -> str | None:
+    """One sentence on how good the depth by matching was; None when it was not measured."""
+    found = data["matching"]
+    if not isinstance(found, dict) or found.get("median_rel") is None:
+        return None
+    text = (
+        f"Depth by matching, training views: {_percent(found['median_rel'])} median relative error on {words.share(found['coverage'])} of"
+        " the pixels with a known depth"
+    )
+    if found.get("median_rel_textured") is not None:
+        text += f"; where there is texture {_percent(found['median_rel_textured'])} on {words.share(found['coverage_textured'])}"
+    return text + "."
 
 
 def _mesh(methods: Sequence[dict[str, Any]]) -> list[Row]:

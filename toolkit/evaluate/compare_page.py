@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from toolkit.camera import Array
 from toolkit.evaluate import words
-from toolkit.evaluate.compare import compare_data, table
+from toolkit.evaluate.compare import compare_data, matching_line, table
 from toolkit.evaluate.compare_meshes import ERROR_VOXELS, MeshPictures
 from toolkit.evaluate.page import data_uri, flat, short_name, subtitle
 from toolkit.evaluate.pictures import DEPTH_COLOURS, ERROR_COLOURS, ERROR_TOP, Pictures, ViewPictures, colour_bar
@@ -69,6 +69,7 @@ def render_comparison(data: dict[str, Any], pictures: Pictures, meshes: Sequence
         subtitle=subtitle(data),
         headline=headline(data),
         groups=table(data),
+        matching=matching_line(data),
         views=[view_block(view, methods) for view in pictures.views],
         open_views=OPEN_VIEWS,
         left_out=pictures.left_out,

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from toolkit.evaluate.compare import compare_data, table
+from toolkit.evaluate.compare import compare_data, matching_line, table
 
 LABELS = 60  # columns for the measures' names
 WIDTH = 22  # for each method
@@ -30,4 +30,6 @@ def comparison_text(data: dict[str, Any]) -> str:
     stream = io.StringIO()
     width = LABELS + WIDTH * len(data["methods"])
     Console(file=stream, width=width, color_system=None, force_terminal=False).print(out)
-    return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()).strip("\n") + "\n"
+    text = "\n".join(line.rstrip() for line in stream.getvalue().splitlines()).strip("\n") + "\n"
+    matching = matching_line(data)
+    return text if matching is None else f"{text}{matching}\n"
