@@ -62,7 +62,7 @@ def load_model(path: Path | str, device: torch.device | str = "cpu") -> Nerfusio
         model.load_state_dict(tensors)
     except OSError as error:
         raise InputError(f"cannot read the weights {path}: {error.strerror or error}") from error
-    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError, RecursionError) as error:
+    except (SafetensorError, KeyError, TypeError, AttributeError, ValueError, RuntimeError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path} does not hold weights that can be used ({reason}); take the shipped ones or train again") from error
     return model.to(device).eval()
