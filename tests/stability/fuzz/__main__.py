@@ -7,7 +7,7 @@ import json
 import sys
 from pathlib import Path
 
-from tests.stability.fuzz.drive import fuzz
+from tests.stability.fuzz.drive import Result, fuzz
 from tests.stability.page import replace_part
 
 
@@ -20,12 +20,18 @@ def main() -> int:
     parser.add_argument("--page", type=Path, help="a page whose part `fuzz` is replaced by the result")
     chosen = parser.parse_args()
 
-    def told(inputs: int, problems: int) -> None:
-        sys.stderr.write(f"{inputs} inputs, {problems} problems\n")
+    shown = 0
+
+    def told(result: Result) -> None:
+        nonlocal shown
+        sys.stderr.write(f"{result.inputs} inputs, {len(result.problems)} problems\n")
+        for problem in result.problems[shown:]:
+            sys.stdout.write(json.dumps(problem) + "\n")
+        sys.stdout.flush()
+        shown = len(result.problems)
 
     result = fuzz(chosen.inputs, chosen.seed, chosen.jobs, chosen.only, told)
-    for problem in result.problems:
-        sys.stdout.write(json.dumps(problem) + "\n")
+    told(result)
     if chosen.page is not None:
         replace_part(chosen.page, "fuzz", result.lines())
     sys.stderr.write("\n".join(result.lines()) + "\n")

@@ -48,7 +48,10 @@ class Result:
         ]
 
 
-def fuzz(inputs: int, seed: int, jobs: int = 1, only: list[str] | None = None, told: Callable[[int, int], None] | None = None) -> Result:
+Told = Callable[[Result], None]
+
+
+def fuzz(inputs: int, seed: int, jobs: int = 1, only: list[str] | None = None, told: Told | None = None) -> Result:
     """Read `inputs` damaged files in `jobs` processes."""
     result = Result()
     began = time.monotonic()
@@ -64,9 +67,7 @@ def fuzz(inputs: int, seed: int, jobs: int = 1, only: list[str] | None = None, t
     return result
 
 
-def _one_range(
-    folder: Path, seed: int, first: int, count: int, only: list[str], result: Result, told: Callable[[int, int], None] | None
-) -> None:
+def _one_range(folder: Path, seed: int, first: int, count: int, only: list[str], result: Result, told: Told | None) -> None:
     stop = first + count
     while first < stop:
         folder.mkdir(parents=True, exist_ok=True)
@@ -88,7 +89,7 @@ def _one_range(
         first = current["number"] + 1
 
 
-def _listen(stream: Any, result: Result, told: Callable[[int, int], None] | None) -> bool:
+def _listen(stream: Any, result: Result, told: Told | None) -> bool:
     for line in stream:
         message = json.loads(line)
         if message["kind"] in ("progress", "done"):
@@ -96,7 +97,7 @@ def _listen(stream: Any, result: Result, told: Callable[[int, int], None] | None
             result.refused += message["refused"]
             result.targets.update(message["targets"])
             if told is not None:
-                told(result.inputs, len(result.problems))
+                told(result)
             if message["kind"] == "done":
                 return True
         else:

@@ -227,6 +227,46 @@ def read_fields(root: Path, number: int) -> None:
             raise ValueError("a colour that is not finite")
 
 
+def make_models(root: Path) -> None:
+    """A baked field, networks' weights, and a scene file."""
+    from toolkit.networks.model import ModelConfig, NerfusionModel
+    from toolkit.networks.weights import save_model
+    from toolkit.render.bake import bake
+    from toolkit.render.bake_file import write_baked
+
+    root.mkdir(parents=True)
+    write_baked(root / "bounded.safetensors", bake(small_field(1, 0.2)))
+    write_baked(root / "background.safetensors", bake(small_field(2, 0.3, shell=1.0)))
+    save_model(root / "weights.safetensors", NerfusionModel(ModelConfig(channels=4, hidden=4, gru_hidden=4)))
+    scene = "scene: room\npath: {kind: walk, frames: 60, fps: 10, speed: 0.5, shake: 2}\neffects:\n  - exposure: {stops: 0.5}\n"
+    (root / "scene.yaml").write_text(scene)
+
+
+def read_baked_field(root: Path, number: int) -> None:
+    """Open a baked field and look at it from outside and from inside."""
+    from toolkit.render.bake_file import read_baked
+    from toolkit.render.bake_image import BakedRenderer
+
+    renderer = BakedRenderer(read_baked(root / ("bounded.safetensors", "background.safetensors")[number % 2]), 1)
+    camera = Intrinsics(12, 9, 10.0, 10.0, 6.0, 4.5)
+    for distance in (3.0, 0.3):
+        pose = np.eye(4)
+        pose[:3, 3] = 0.1, -0.2, 0.3 - distance
+        picture = renderer.render(camera, pose)
+        if not np.isfinite(picture.rgb).all():
+            raise ValueError("a colour that is not finite")
+
+
+def read_models(root: Path, number: int) -> None:
+    from toolkit.networks.weights import load_model
+    from toolkit.simulate.settings import read_scene_file
+
+    if number % 2:
+        load_model(root / "weights.safetensors")
+    else:
+        read_scene_file(root / "scene.yaml")
+
+
 def read_tensors(root: Path, number: int) -> None:
     from pipelines.rendered import load_pictures
     from toolkit.tsdf.store import load_volume
@@ -249,5 +289,7 @@ TARGETS: tuple[Target, ...] = (
     Target("run json", RUN_FILES, make_runs, read_json_files, 2.0),
     Target("field", ("field.safetensors", "other.safetensors"), make_runs, read_fields, 3.0),
     Target("tensors", ("views.safetensors", "field.pictures.safetensors", "tsdf.safetensors"), make_runs, read_tensors, 1.5),
+    Target("baked", ("bounded.safetensors", "background.safetensors"), make_models, read_baked_field, 2.0),
+    Target("models", ("weights.safetensors", "scene.yaml", "scene.yaml"), make_models, read_models, 1.0),
     Target("points", ("points.ply",), make_extras, lambda root, number: read_ply_points(root / "points.ply"), 0.5),
 )  # fmt: skip
