@@ -99,8 +99,8 @@ def render_pass(
     """Deferred rendering: origins, directions (B, 3) → out (B, 5) colour, distance, opacity."""
     channels, hidden = len(space.width), len(space.hidden)
     cells, values = np.empty(MOST_KEPT, np.int32), np.empty((MOST_KEPT, K.VALUES), np.float32)
-    rows, weights = np.empty((MOST_KEPT, 8), np.int32), np.empty(8, np.float32)
-    feature, given = np.empty(channels, np.float32), np.zeros(channels + K.PADDED, np.float32)
+    rows, weights = np.empty((MOST_KEPT, 8), np.int32), np.empty((MOST_KEPT, 8), np.float32)
+    features, given = np.empty((MOST_KEPT, channels), np.float32), np.zeros(channels + K.PADDED, np.float32)
     h1, h2, colour, result = np.empty(hidden, np.float32), np.empty(hidden, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
     marks = np.empty(0, np.uint16)
     for ray in range(len(origins)):
@@ -111,11 +111,11 @@ def render_pass(
             given[c] = K.ZERO
         opacity = K.ZERO
         for i in range(kept):
-            K.gather_feature(space.width, volume.feature, rows[i], values[i, 0], values[i, 1], values[i, 2], weights, feature)
+            K.gather_row(space.width, volume.feature, rows, values, weights, features, i)
             weight = values[i, K.WEIGHT]
             opacity += weight
             for c in range(channels):
-                given[c] += weight * feature[c]
+                given[c] += weight * features[i, c]
         out[ray, 3], out[ray, 4] = result[0], opacity
         if kept == 0:
             for k in range(3):

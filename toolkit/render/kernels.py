@@ -142,6 +142,22 @@ def corner_rows(upper: Any, cell: Any, rows: Any) -> None:
 
 
 @njit(**OPTIONS)
+def corner_rows_of(upper: Any, cell: Any, rows: Any, index: Any) -> None:
+    """`corner_rows` into rows[index, 0 … 7]."""
+    slot, local = cell >> 9, cell & 511
+    x, y, z = local & 7, (local >> 3) & 7, local >> 6
+    if x < 7 and y < 7 and z < 7:
+        rows[index, 0], rows[index, 1], rows[index, 2], rows[index, 3] = cell, cell + 1, cell + 8, cell + 9
+        rows[index, 4], rows[index, 5], rows[index, 6], rows[index, 7] = cell + 64, cell + 65, cell + 72, cell + 73
+        return
+    zero_row = upper.shape[0] * 512
+    for corner in range(8):
+        u, v, w = x + (corner & 1), y + ((corner >> 1) & 1), z + (corner >> 2)
+        block = upper[slot, (u >> 3) | ((v >> 3) << 1) | ((w >> 3) << 2)]
+        rows[index, corner] = min(block * 512 + ((w & 7) * 8 + (v & 7)) * 8 + (u & 7), zero_row)
+
+
+@njit(**OPTIONS)
 def corner_weights(x: Any, y: Any, z: Any, weights: Any) -> None:
     """Trilinear weights of the place (x, y, z) in a voxel, in the order of `corner_rows`."""
     a, b, c = ONE - x, ONE - y, ONE - z
@@ -187,6 +203,25 @@ def gather_feature(width: Any, feature: Any, rows: Any, x: Any, y: Any, z: Any, 
     for c in range(len(width)):
         low = w0 * feature[r0, c] + w1 * feature[r1, c] + w2 * feature[r2, c] + w3 * feature[r3, c]
         out[c] = low + w4 * feature[r4, c] + w5 * feature[r5, c] + w6 * feature[r6, c] + w7 * feature[r7, c]
+
+
+@njit(**OPTIONS)
+def gather_row(width: Any, feature: Any, rows: Any, values: Any, weights: Any, out: Any, index: Any) -> None:
+    """`gather_feature` of sample `index`: rows, weights (S, 8), values (S, 8), out (S, C).
+
+    Rows are never taken as arrays of their own inside a loop over samples: each such view is counted, by an atomic operation.
+    """
+    x, y, z = values[index, X], values[index, Y], values[index, Z]
+    a, b, c = ONE - x, ONE - y, ONE - z
+    w0, w1, w2, w3 = a * b * c, x * b * c, a * y * c, x * y * c
+    w4, w5, w6, w7 = a * b * z, x * b * z, a * y * z, x * y * z
+    weights[index, 0], weights[index, 1], weights[index, 2], weights[index, 3] = w0, w1, w2, w3
+    weights[index, 4], weights[index, 5], weights[index, 6], weights[index, 7] = w4, w5, w6, w7
+    r0, r1, r2, r3 = rows[index, 0], rows[index, 1], rows[index, 2], rows[index, 3]
+    r4, r5, r6, r7 = rows[index, 4], rows[index, 5], rows[index, 6], rows[index, 7]
+    for k in range(len(width)):
+        low = w0 * feature[r0, k] + w1 * feature[r1, k] + w2 * feature[r2, k] + w3 * feature[r3, k]
+        out[index, k] = low + w4 * feature[r4, k] + w5 * feature[r5, k] + w6 * feature[r6, k] + w7 * feature[r7, k]
 
 
 @njit(**OPTIONS)
@@ -367,14 +402,13 @@ def march_ray(
                         strongest, strongest_cell = weight, cell
                 if weight > threshold and kept < cells.shape[0]:
                     cells[kept] = cell
-                    rows = all_rows[kept]
-                    corner_rows(volume.upper, cell, rows)
+                    corner_rows_of(volume.upper, cell, all_rows, kept)
                     values[kept, X], values[kept, Y], values[kept, Z] = fx, fy, fz
                     values[kept, RAW], values[kept, TAU] = raw, tau
                     values[kept, WEIGHT], values[kept, AFTER] = weight, after
                     values[kept, PLACE] = (F(step_index) + where) * unit
                     for corner in range(8):
-                        prefetch(volume.feature, np.int64(rows[corner]))
+                        prefetch(volume.feature, np.int64(all_rows[kept, corner]))
                     kept += 1
                 transmittance = after
                 if transmittance < stop:

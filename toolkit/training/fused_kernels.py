@@ -164,14 +164,13 @@ def gradient_pass(
             given[c] = ZERO
         opacity = ZERO
         for i in range(kept):
-            feature = features[i]
-            K.gather_feature(space.width, volume.feature, rows[i], values[i, 0], values[i, 1], values[i, 2], weights[i], feature)
+            K.gather_row(space.width, volume.feature, rows, values, weights, features, i)
             for corner in range(8):
                 K.prefetch(index, np.int64(rows[i, corner]))
             weight = values[i, K.WEIGHT]
             opacity += weight
             for c in range(channels):
-                given[c] += weight * feature[c]
+                given[c] += weight * features[i, c]
         scale = ONE / max(opacity, F(1e-6))
         for c in range(channels):
             given[c] *= scale
@@ -280,7 +279,6 @@ def adam_pass(
             K.prefetch(density_records, record)
             K.prefetch(feature, later)
         row = touched[thread, at]
-        own = feature_sums[thread, at]
         mine = True
         for other in range(threads):
             if other == thread:
@@ -292,23 +290,23 @@ def adam_pass(
                     break
                 density_sums[thread, at] += density_sums[other, twin]
                 for c in range(channels):
-                    own[c] += feature_sums[other, twin, c]
+                    feature_sums[thread, at, c] += feature_sums[other, twin, c]
         if not mine:
             continue
         place = index[row, 0]
-        record, moments = density_records[place], feature_records[place]
-        steps = record[COUNT] + ONE
+        steps = density_records[place, COUNT] + ONE
         scale = scales[min(int(steps), len(scales) - 1)]
         g = density_sums[thread, at]
-        m = b1 * record[FIRST] + c1 * g
-        v = b2 * record[SECOND] + c2 * g * g
-        record[COUNT], record[FIRST], record[SECOND] = steps, m, v
+        m = b1 * density_records[place, FIRST] + c1 * g
+        v = b2 * density_records[place, SECOND] + c2 * g * g
+        density_records[place, COUNT], density_records[place, FIRST], density_records[place, SECOND] = steps, m, v
         density[row] -= rates[0] * scale * m / (np.sqrt(v) + epsilon)
         step = rates[1] * scale
         for c in range(channels):
-            m = b1 * moments[c] + c1 * own[c]
-            v = b2 * moments[channels + c] + c2 * own[c] * own[c]
-            moments[c], moments[channels + c] = m, v
+            g = feature_sums[thread, at, c]
+            m = b1 * feature_records[place, c] + c1 * g
+            v = b2 * feature_records[place, channels + c] + c2 * g * g
+            feature_records[place, c], feature_records[place, channels + c] = m, v
             feature[row, c] -= step * m / (np.sqrt(v) + epsilon)
 
 

@@ -42,7 +42,8 @@ def save_volume(path: Path | str, volume: TsdfVolume) -> None:
     }
     with atomic_path(path) as temporary:
         try:
-            save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, temporary, metadata={"tsdf": json.dumps(facts)})
+            whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+            save_file(whole, temporary, metadata={"tsdf": json.dumps(facts)})
         except SafetensorError as error:  # a full disk arrives as this, not as an OSError
             raise OutputError(f"cannot write {path}: {error}; free space or choose another --out folder") from error
 
