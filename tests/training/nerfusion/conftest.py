@@ -10,9 +10,10 @@ import torch
 from toolkit.training.nerfusion import mixture, procedural, region
 
 
-@pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+@pytest.fixture(autouse=True, scope="package")
+def small() -> Iterator[None]:
     """Small textures and lattices, and one thread: sums of several may differ in their order."""
+    monkeypatch = pytest.MonkeyPatch()
     monkeypatch.setattr(procedural, "TEXELS", 128)
     monkeypatch.setattr(mixture, "BANKS", 1)
     monkeypatch.setattr(region, "LEAST", 16)
@@ -20,3 +21,4 @@ def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+    monkeypatch.undo()

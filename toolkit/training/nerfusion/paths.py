@@ -48,7 +48,7 @@ def hand_held(rng: np.random.Generator, count: int, free: Array, focus: Array, c
         # Most walks go to the side of what is looked at, as people film; the others anywhere.
         heading = np.cross(place - start, [0, 0, 1.0]) if rng.random() < 0.7 else rng.normal(0, 1, 3) * [1, 1, 0.3]
         heading = heading / max(float(np.linalg.norm(heading)), 1e-9)
-        length = away * np.exp(rng.uniform(np.log(0.6), np.log(2.5)))
+        length = away * np.exp(rng.uniform(np.log(0.5), np.log(1.8)))
         s = np.linspace(-0.5, 0.5, count)[:, None]
         centres = start + s * length * heading + wander(rng, count, 0.05 * length)
         targets = place + s * rng.uniform(-0.3, 0.8) * length * heading + wander(rng, count, 0.05 * away)

@@ -19,7 +19,7 @@ from toolkit.training.nerfusion.paths import around, hand_held
 from toolkit.training.nerfusion.samples import Pictures
 
 OBJECTS = ("table", "table", "thin", "sphere")
-ROOMS = ("room", "room", "room", "table", "table", "corridor", "street", "thin", "wall")
+ROOMS = ("room",) * 5 + ("table",) * 4 + ("thin", "corridor", "corridor", "street", "wall")
 SHAPES = (4 / 3, 4 / 3, 3 / 4, 16 / 9, 9 / 16, 1.0)  # width by height
 BANKS = 8  # sets of textures that scenes choose from
 TEXELS = 256  # a side of a texture: training pictures are small

@@ -33,6 +33,10 @@ class TargetRays:
     def __len__(self) -> int:
         return len(self.origins)
 
+    def __getitem__(self, kept: Tensor) -> TargetRays:
+        """The rays at `kept` (indices or bool)."""
+        return TargetRays(*(getattr(self, name)[kept] for name in self.__dataclass_fields__))
+
 
 def rays_through(pictures: Pictures, view: Tensor, row: Tensor, column: Tensor) -> TargetRays:
     """Rays through pixel centres; `view`, `row`, `column` (R,) int64 into `pictures`."""
@@ -54,6 +58,23 @@ def random_rays(pictures: Pictures, targets: Tensor, count: int, generator: torc
     pixel = torch.randint(height * width, (count,), generator=generator)
     device = pictures.images.device
     return rays_through(pictures, view.to(device), (pixel // width).to(device), (pixel % width).to(device))
+
+
+def in_sight(rays: TargetRays, pictures: Pictures, references: Tensor) -> Tensor:
+    """(R,) bool: where a ray ends lies inside at least one of the pictures at `references` (any shape), or nobody knows where it ends.
+
+    What no reference shows cannot be predicted; such rays would only add noise to the gradient. What hides the end is not asked.
+    """
+    points = rays.origins + rays.directions * rays.distance[:, None]
+    height, width = pictures.images.shape[2:]
+    seen = rays.distance == 0
+    for view in references.unique().tolist():
+        pose, (fx, fy, cx, cy) = pictures.world_from_camera[view], pictures.intrinsics[view].unbind()
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        depth = local[:, 2].clamp_min(1e-9)
+        u, v = local[:, 0] / depth * fx + cx, local[:, 1] / depth * fy + cy
+        seen |= (local[:, 2] > 0) & (u >= 0) & (u <= width) & (v >= 0) & (v <= height)
+    return seen
 
 
 def picture_rays(pictures: Pictures, view: int) -> TargetRays:

@@ -14,7 +14,7 @@ from toolkit.errors import InputError
 from toolkit.volume.space import Space
 
 Tensor = torch.Tensor
-SWEET = (0.2, 0.7)  # how different neighbours of a key frame are (see `view_distance`); around an object that is 6° to 20° of parallax
+SWEET = (0.2, 0.6)  # how different neighbours of a key frame are (see `view_distance`); around an object that is 6° to 17° of parallax
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from toolkit.networks.model import NerfusionModel
 from toolkit.render.fused import GAMMA, make_field
 from toolkit.training.nerfusion.health import feature_deviation, rendering_health
 from toolkit.training.nerfusion.losses import Traced, annealed, rendering_loss
-from toolkit.training.nerfusion.rays import TargetRays, random_rays
+from toolkit.training.nerfusion.rays import TargetRays, in_sight, random_rays
 from toolkit.training.nerfusion.recurrence import Recurrence
 from toolkit.training.nerfusion.samples import Pictures, Sample
 from toolkit.training.nerfusion.settings import TrainSettings
@@ -110,6 +110,7 @@ class Stepper:
         volume: LatentVolume,
         sample: Sample,
         targets: Tensor,
+        references: Tensor,
         count: int,
         which: str,
         step: int,
@@ -118,6 +119,9 @@ class Stepper:
         allowed: Tensor | None = None,
     ) -> Tensor:
         rays = random_rays(sample.pictures, targets, count, generator)
+        kept = in_sight(rays, sample.pictures, references).nonzero().view(-1)
+        if len(kept):
+            rays = rays[kept]
         behind = background_of(sample.pictures, len(rays), generator)
         prune = which != LOCAL and self.prunes(step)
         traced = render_volume(self.model, volume, rays, behind, 0.5 * sample.near, generator, prune, allowed)
@@ -132,7 +136,7 @@ class Stepper:
         """Local loss of one key frame. Leaves gradients in the parameters."""
         log = Outcome()
         volume = local_of(self.model, sample, 0, log if self.watched else None)
-        loss = self._loss(volume, sample, sample.targets[0], self.settings.loss.rays, LOCAL, step, generator, log)
+        loss = self._loss(volume, sample, sample.targets[0], sample.references[0], self.settings.loss.rays, LOCAL, step, generator, log)
         loss.backward()
         log.loss = float(loss.detach())
         return log
@@ -151,13 +155,15 @@ class Stepper:
             if self.watched and frame == 0:
                 log.note({"feature_deviation": encoder_deviation(model, sample.pictures.images[indices[:1]])})
             state, local = state.add(model, views, cameras)
-            pending.append(weights.local / frames * self._loss(local, sample, sample.targets[frame], rays, LOCAL, step, generator, log))
+            pending.append(
+                weights.local / frames * self._loss(local, sample, sample.targets[frame], indices, rays, LOCAL, step, generator, log)
+            )
             # The global volumes answer for every place they have seen, not only for the newest.
             seen = sample.targets[: frame + 1]
             for level, volume in enumerate(state.volumes):
                 name = FUSED if level == 0 else f"{FUSED}_{level}"
                 allowed = state.allowed(model, level)
-                loss = self._loss(volume, sample, seen, rays, name, step, generator, log, allowed)
+                loss = self._loss(volume, sample, seen, sample.references[: frame + 1], rays, name, step, generator, log, allowed)
                 pending.append(weights.fused / frames * loss)
             if (frame + 1) % stage.truncate == 0 or frame + 1 == frames:
                 total = torch.stack(pending).sum()

@@ -41,7 +41,10 @@ def make_model(settings: TrainSettings) -> NerfusionModel:
         raise InputError(f"model: {error}; see docs/training.md") from error
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
-        return NerfusionModel(config).train()
+        model = NerfusionModel(config).train()
+    if settings.pretrained:
+        model.encoder.load_imagenet()
+    return model
 
 
 def learning_rate(settings: TrainSettings, step: int) -> float:

@@ -74,8 +74,7 @@ def _render(
 ) -> tuple[Tensor, Tensor, float]:
     colours, distances, likelihoods = [], [], []
     for start in range(0, len(rays), CHUNK):
-        part = slice(start, start + CHUNK)
-        some = TargetRays(*(getattr(rays, name)[part] for name in rays.__dataclass_fields__))
+        some = rays[torch.arange(start, min(start + CHUNK, len(rays)), device=rays.origins.device)]
         traced: Traced = render_volume(model, volume, some, behind, near, None, prune, allowed)
         colours.append(traced.colour)
         distances.append(traced.median_distance())
