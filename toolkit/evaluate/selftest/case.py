@@ -32,6 +32,7 @@ MODULES = (
     "data",
     "data_more",
     "metrics",
+    "fits",
 )
 Run = Callable[[Path], "list[Measure]"]
 
