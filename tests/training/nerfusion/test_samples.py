@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from tests.training.nerfusion import layouts
 from tests.training.nerfusion.tiny import tiny_settings
 from toolkit.errors import InputError
+from toolkit.training.nerfusion import region
 from toolkit.training.nerfusion.drawing import depth_range, draw_sample
 from toolkit.training.nerfusion.mixture import Mixture
 from toolkit.training.nerfusion.procedural import ProceduralScene
@@ -120,7 +121,7 @@ def test_resolution_follows_the_voxel_size_within_bounds() -> None:
     space = Space((0.0, 0.0, 0.0), 1.0, 1.0)
     assert lattice_resolution(space, 0.05, 96) == 80
     assert lattice_resolution(space, 1e-4, 96) == 96
-    assert lattice_resolution(space, 10.0, 96) == 32
+    assert lattice_resolution(space, 10.0, 96) == region.LEAST
 
 
 def test_depth_range_falls_back_to_the_hint_and_refuses_without() -> None:

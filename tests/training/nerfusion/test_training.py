@@ -36,16 +36,16 @@ def same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> boo
 def test_a_run_leaves_weights_curve_and_checkpoint(tmp_path: Path) -> None:
     trainer = Trainer(tiny_settings(), tmp_path, Crew())
     before = state(trainer)
-    assert trainer.run() == 6
-    assert [path.name for path in checkpoints(tmp_path)] == ["checkpoint-0000006.safetensors"]
+    assert trainer.run() == 4
+    assert [path.name for path in checkpoints(tmp_path)] == ["checkpoint-0000004.safetensors"]
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
     curve = Curve(tmp_path)
     curve.load(100)
-    assert [row["step"] for row in curve.rows] == [1, 2, 3, 4, 5, 6]
-    assert [row["stage"] for row in curve.rows] == [1, 1, 1, 2, 2, 2]
+    assert [row["step"] for row in curve.rows] == [1, 2, 3, 4]
+    assert [row["stage"] for row in curve.rows] == [1, 1, 2, 2]
     assert all({"psnr_local", "loss", "depth_likelihood", "depth_error", "opacity_high", "feature_deviation"} <= set(r) for r in curve.rows)
-    assert all({"psnr_fused", "psnr_fused_1", "gate_update_saturated"} <= set(row) for row in curve.rows[3:])
-    assert [row["depth_weight"] > 0 for row in curve.rows] == [True, True, True, False, False, False]
+    assert all({"psnr_fused", "psnr_fused_1", "gate_update_saturated"} <= set(row) for row in curve.rows[2:])
+    assert [row["depth_weight"] > 0 for row in curve.rows] == [True, False, False, False]
     loaded = load_model(tmp_path / WEIGHTS)
     assert same(loaded.state_dict(), state(trainer))
     # Every part learns: the fusion in stage 2 only, all others from the first step.
@@ -54,18 +54,20 @@ def test_a_run_leaves_weights_curve_and_checkpoint(tmp_path: Path) -> None:
     assert checkpoint_settings(checkpoints(tmp_path)[-1])["loss"]["rays"] == SMALL["loss"]["rays"]
 
 
-@pytest.mark.parametrize("stop", [2, 5])
-def test_resuming_repeats_every_bit(tmp_path: Path, stop: int) -> None:
+def test_resuming_repeats_every_bit(tmp_path: Path) -> None:
+    """Stopped once in each stage; weights, moments of Adam and the curve are those of a run that never stopped."""
     whole = Trainer(tiny_settings(), tmp_path / "whole", Crew())
     whole.run()
-    first = Trainer(tiny_settings(), tmp_path / "parts", Crew())
-    assert first.run(until=stop) == stop
+    for stop in (1, 3):
+        first = Trainer(tiny_settings(), tmp_path / "parts", Crew(), resume=stop > 1)
+        assert first.run(until=stop) == stop
     second = Trainer(tiny_settings(), tmp_path / "parts", Crew(), resume=True)
-    assert second.step == stop and same(state(first), state(second))
+    assert second.step == 3 and same(state(first), state(second))
     second.run()
     assert same(state(whole), state(second))
     for a, b in zip(whole.model.parameters(), second.model.parameters(), strict=True):
-        assert torch.equal(whole.adam.state[a]["exp_avg_sq"], second.adam.state[b]["exp_avg_sq"])
+        for name in ("step", "exp_avg", "exp_avg_sq"):
+            assert torch.equal(whole.adam.state[a][name], second.adam.state[b][name])
     once, twice = (
         [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in trainer.curve.rows] for trainer in (whole, second)
     )
@@ -94,8 +96,8 @@ def test_a_second_run_does_not_overwrite_the_first(tmp_path: Path) -> None:
 
 
 def test_only_the_newest_checkpoints_are_kept(tmp_path: Path) -> None:
-    Trainer(tiny_settings(record={"checkpoint_every": 1, "keep": 2}), tmp_path, Crew()).run(until=4)
-    assert [path.name for path in checkpoints(tmp_path)] == ["checkpoint-0000003.safetensors", "checkpoint-0000004.safetensors"]
+    Trainer(tiny_settings(record={"checkpoint_every": 1, "keep": 2}), tmp_path, Crew()).run(until=3)
+    assert [path.name for path in checkpoints(tmp_path)] == ["checkpoint-0000002.safetensors", "checkpoint-0000003.safetensors"]
 
 
 def test_a_broken_or_foreign_checkpoint_is_refused(tmp_path: Path) -> None:
@@ -160,7 +162,7 @@ procedural.TEXELS, mixture.BANKS = 128, 1
 with join_crew("cpu") as crew:
     trainer = Trainer(tiny_settings(), Path({out!r}), crew)
     first = trainer.mixture.sample(0, 1).pictures.images.double().sum().item()
-    trainer.run(until=4)
+    trainer.run(until=3)
     total = sum(p.double().abs().sum().item() for p in trainer.model.parameters())
     Path({out!r}, f"rank{{crew.rank}}.json").write_text(json.dumps([crew.size, first, total]))
 """

@@ -13,8 +13,8 @@ SMALL: dict[str, Any] = {
     "model": {"image_channels": 16, "sampled": 8, "direction": 4, "hidden": 8, "channels": 8, "gru_hidden": 8, "features": 8},
     "pictures": {"long_side": [48, 48], "frames": 12, "views": 3, "key_frames": 2, "targets": 2},
     "volume": {"voxels_to_median": [8.0, 10.0], "most": 24},
-    "loss": {"rays": 96, "depth_steps": 4},
-    "stage": {"steps": 3, "fused_steps": 3, "most_split": 200},
+    "loss": {"rays": 96, "depth_steps": 2},
+    "stage": {"steps": 2, "fused_steps": 2, "most_split": 100},
     "optimiser": {"warmup": 2},
     "record": {"log_every": 1, "health_every": 1, "checkpoint_every": 100},
 }
