@@ -15,6 +15,7 @@ from pathlib import Path
 
 OK, WARN, FAIL = "ok", "warn", "fail"
 PACKAGES = (
+    "numba",
     "numpy",
     "torch",
     "opencv-contrib-python-headless",

@@ -72,12 +72,13 @@ def test_every_package_has_an_init_and_is_packed() -> None:
 def test_data_files_are_packed() -> None:
     """Files beside the code that are read at run time must be in package_data, or an installed copy lacks them."""
     data = setup()["options.package_data"]
-    packed = {path for package, pattern in data.items() for path in (ROOT / package.replace(".", "/")).glob(pattern)}
+    patterns = [(package, pattern.strip()) for package, given in data.items() for pattern in given.split(",")]
+    packed = {path for package, pattern in patterns for path in (ROOT / package.replace(".", "/")).glob(pattern)}
     there = {
         path
         for top in ("toolkit", "pipelines", "configs")
         for path in (ROOT / top).rglob("*")
-        if path.is_file() and path.suffix not in (".py", ".pyc")
+        if path.is_file() and path.suffix != ".py" and "__pycache__" not in path.parts
     }
     assert packed == there
     assert {entry.name for entry in resources.files("configs").iterdir()} >= {"fast.yaml", "balanced.yaml", "quality.yaml"}

@@ -342,10 +342,11 @@ def test_ctrl_c_twice_ends_at_once(tmp_path: Path) -> None:
     time.sleep(1)
     for _ in range(2):
         process.send_signal(signal.SIGINT)
-        time.sleep(0.2)
+        time.sleep(0.05)
     _, err = process.communicate(timeout=20)
     assert process.returncode == 130
-    assert "Traceback" not in err and not (tmp_path / "out" / "stages" / "field.json").exists()
+    # A fit ends within a step, so its stage may be whole by the time of the second signal; nothing after it is.
+    assert "Traceback" not in err and not (tmp_path / "out" / "report.json").exists()
 
 
 def test_two_runs_in_one_folder(tmp_path: Path, capsys: Capsys) -> None:

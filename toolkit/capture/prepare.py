@@ -126,8 +126,9 @@ def _nearest(values: Array, camera: Intrinsics, target: Intrinsics) -> Array:
     if not camera.distorted and camera == target:
         return values
     map_x, map_y, seen = resample_maps(camera, target)
-    column = np.clip(np.floor(map_x + 0.5), 0, camera.width - 1).astype(np.intp)
-    row = np.clip(np.floor(map_y + 0.5), 0, camera.height - 1).astype(np.intp)
+    # A lens may send a pixel nowhere: what is not seen has no place to be looked up at.
+    column = np.clip(np.floor(np.where(seen, map_x, 0) + 0.5), 0, camera.width - 1).astype(np.intp)
+    row = np.clip(np.floor(np.where(seen, map_y, 0) + 0.5), 0, camera.height - 1).astype(np.intp)
     return np.where(seen, values[row, column], values.dtype.type(0))
 
 
