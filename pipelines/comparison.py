@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 SHOWN_VIEWS = 8
 DEPTH_ERROR_TOP = 0.05  # share of the median depth that gets the brightest colour of a depth error
+LITTLE_DEPTH = 0.3  # share of the pixels
 MESH_SIDE = 480  # pixels of a mesh picture's long side
 TITLES = {"field": "Field", "tsdf": "TSDF", "tsdf_stereo": "TSDF of matched pictures", "tsdf_exact": "TSDF of exact depth"}
 NOTES = {"tsdf": "depth of the sensor", "tsdf_stereo": "depth by matching", "tsdf_exact": "perfect depth"}
@@ -45,7 +46,7 @@ def put_comparison(
     top = None if scale is None else DEPTH_ERROR_TOP * scale
     data = {
         **base_data(job, all_of_it.capture, all_of_it.poses),
-        "warnings": warnings_of(job, all_of_it.capture, all_of_it.poses, scene, all_of_it.views),
+        "warnings": [*warnings_of(job, all_of_it.capture, all_of_it.poses, scene, all_of_it.views), *little_depth(all_of_it)],
         "scene": scene.to_dict(),
         "truth": {
             "mesh": found["geometry"] is not None,
@@ -62,6 +63,18 @@ def put_comparison(
     tiles = method_pictures(views, indices, shown, "m" if scene.metric else "units", SHOWN_VIEWS, top)
     write_comparison(job.folder.path, data, tiles, shown_meshes(job, all_of_it), top)
     return compare_data(data)
+
+
+def little_depth(all_of_it: Compared) -> list[str]:
+    """A warning when matching found depth for few pixels."""
+    matched = all_of_it.pictures.get("tsdf_stereo")
+    share = None if matched is None else matched.facts.get("depth_share")
+    if share is None or share >= LITTLE_DEPTH:
+        return []
+    return [
+        f"matching the pictures gave depth for {100 * share:.0f}% of their pixels only: they show little texture, or their poses do not fit"
+        " them; --poses sfm finds others"
+    ]
 
 
 def describe_method(job: Job, all_of_it: Compared, name: str, found: dict[str, Any], mesh_facts: dict[str, Any] | None) -> dict[str, Any]:

@@ -71,6 +71,7 @@ def fuse_training_frames(
         picture = to_picture(volume.render(views.intrinsics[index], views.world_from_camera[index]))
         found.add(views.names[index], picture, time.monotonic() - start)
     found.facts = {
+        "depth_share": None if depths is None else round(float(np.mean([(one.depth > 0).mean() for one in depths])), 4),
         "voxel_size": volume.voxel_size,
         "depth_max": volume.depth_max,
         "frames": volume.frames,

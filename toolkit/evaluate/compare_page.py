@@ -70,7 +70,10 @@ def render_comparison(data: dict[str, Any], pictures: Pictures, meshes: Sequence
         headline=headline(data),
         groups=table(data),
         matching=matching_line(data),
-        views=[view_block(view, methods) for view in pictures.views],
+        views=[
+            view_block(view, methods, "True depth" if data["truth"]["depth"] == "exact" else "Depth of the sensor")
+            for view in pictures.views
+        ],
         open_views=OPEN_VIEWS,
         left_out=pictures.left_out,
         meshes=[block for view in meshes for block in mesh_blocks(view, methods)],
@@ -113,13 +116,13 @@ def tile(picture: Array | None, caption: str) -> Tile:
     return None if picture is None else {"caption": caption, "uri": data_uri(picture)}
 
 
-def view_block(view: ViewPictures, methods: Sequence[tuple[str, str]]) -> dict[str, Any]:
+def view_block(view: ViewPictures, methods: Sequence[tuple[str, str]], measured: str = "True depth") -> dict[str, Any]:
     """Rows of tiles of one test view: the truth in the first column, then the methods; empty places are None."""
     shown = [(title, view.methods.get(key)) for key, title in methods]
     rows = [
         [tile(view.truth, "Photo"), *(tile(getattr(one, "render", None), title) for title, one in shown)],
         [None, *(tile(getattr(one, "error", None), f"{title}: error") for title, one in shown)],
-        [tile(view.measured, "True depth"), *(tile(getattr(one, "depth", None), f"{title}: depth") for title, one in shown)],
+        [tile(view.measured, measured), *(tile(getattr(one, "depth", None), f"{title}: depth") for title, one in shown)],
         [None, *(tile(getattr(one, "depth_error", None), f"{title}: depth error") for title, one in shown)],
     ]
     kept = [row for row in rows if any(place is not None for place in row[1:])]
@@ -128,7 +131,7 @@ def view_block(view: ViewPictures, methods: Sequence[tuple[str, str]]) -> dict[s
 
 def mesh_blocks(view: MeshPictures, methods: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:
     """Rows of tiles of one view of the meshes, one row a kind."""
-    columns = [("truth", "Truth"), *methods]
+    columns = [("truth", "Truth"), *methods] if any("truth" in by_name for by_name in view.kinds.values()) else list(methods)
     rows = []
     for kind, by_name in view.kinds.items():
         row = [tile(by_name.get(key), f"{title}: {KIND_TITLES[kind]}" if key != "truth" else "True shape") for key, title in columns]
