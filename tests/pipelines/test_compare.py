@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
@@ -127,6 +128,20 @@ def test_pictures_alone(tmp_path: Path, capsys: Capsys) -> None:
     assert data["truth"]["mesh"] is False and data["truth"]["depth"] is None
     assert methods(data)["tsdf_stereo"]["geometry"] is None and methods(data)["tsdf_stereo"]["score"]["coverage"] > 0.5
     assert not list((tmp_path / "out" / "exports").glob("*.mp4"))  # only what is compared is made
+
+
+def test_little_depth_is_told(tmp_path: Path, capsys: Capsys) -> None:
+    """Pictures that mostly show a bare wall: the surface is made of what there is, and the page says so."""
+    make_corner(tmp_path / "corner", 6)
+    for path in (tmp_path / "corner" / "images").iterdir():
+        picture = cv2.imread(str(path))
+        picture[:, :100] = 120
+        cv2.imwrite(str(path), picture)
+    options = [*SMALL, "--set", "field.background=off"]
+    answer = call(capsys, "compare", tmp_path / "corner", "--out", tmp_path / "out", "--preset", "fast", *options, "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    assert any("matching the pictures gave depth for" in warning for warning in json.loads(answer.out)["warnings"])
+    assert "--poses sfm finds others" in (tmp_path / "out" / "compare.html").read_text(encoding="utf-8")
 
 
 def test_what_cannot_be_compared_is_refused(tmp_path: Path, capsys: Capsys) -> None:
