@@ -44,7 +44,7 @@ stability: $(VENV)/.installed-test
 	$(BIN)/python -m tests.stability.kills --kills 50 --page docs/stability.md
 
 fuzz: $(VENV)/.installed-test
-	$(BIN)/python -m tests.stability.fuzz --inputs 100000 --page docs/stability.md
+	$(BIN)/python -m tests.stability.fuzz --inputs 100000 --state .fuzz-state.json --page docs/stability.md
 
 lint: $(VENV)/.installed-test
 	$(RUFF) $(SOURCES)
