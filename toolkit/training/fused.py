@@ -20,6 +20,7 @@ from toolkit.training.step import Rates
 Array = np.ndarray[Any, Any]
 GUESS_CELL = 8  # pixels a side of the tiles that remember how far a view sees
 BETAS, EPSILON = (0.9, 0.99), 1e-10
+_CONSTANTS = (np.float32(BETAS[0]), np.float32(BETAS[1]), np.float32(EPSILON))
 
 
 class FusedOptimiser:
@@ -33,14 +34,14 @@ class FusedOptimiser:
         self.generator = np.random.default_rng(seed)
         self.pixels = kernels.Pixels(pool.colour.numpy(), pool.place.numpy(), pool.view.numpy(), pool.camera.numpy(), pool.pose.numpy())
         widths, heights = pool.camera[:, 4].max(), pool.height
-        shape = (len(pool.pose), int(heights) // GUESS_CELL + 1, int(widths) // GUESS_CELL + 1)
-        self.guess = np.zeros(shape, np.float32)
+        self.tiles = (int(heights) // GUESS_CELL + 1, int(widths) // GUESS_CELL + 1, GUESS_CELL)
+        self.guess = np.zeros(len(pool.pose) * self.tiles[0] * self.tiles[1], np.float32)
         self._take_decoder(field)
         self.moments = [(np.zeros_like(weight), np.zeros_like(weight)) for weight in self._weights()]
         self.decoder_steps = 0
         steps = np.arange(1, 2049)
         self.scales = np.concatenate([[1], np.sqrt(1 - BETAS[1] ** steps) / (1 - BETAS[0] ** steps)]).astype(np.float32)
-        self.executor = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
+        self.executor = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
         self.renew_rows(field)
 
     def renew_rows(self, field: Field) -> None:
@@ -49,9 +50,9 @@ class FusedOptimiser:
         rows, channels = len(field.density_rows), field.feature_rows.shape[1]
         self.index = np.full((rows, self.threads + 1), -1, np.int32)
         # Sized for the worst case; the system gives memory only to the part that is written.
-        self.density_records = K.aligned((rows, 3), np.float32, zeroed=True)
-        self.feature_records = K.aligned((rows, 2 * channels), np.float32, zeroed=True)
-        self.next_record = 0
+        self.density_records = K.aligned((rows * self.threads, 3), np.float32, zeroed=True)
+        self.feature_records = K.aligned((rows * self.threads, 2 * channels), np.float32, zeroed=True)
+        self.records, self.used = [0] * self.threads, [0] * self.threads
         self.touched = np.empty((self.threads, rows), np.int32)
         self.density_sums = np.empty((self.threads, rows), np.float32)
         self.feature_sums = K.aligned((self.threads, rows, channels), np.float32)
@@ -82,6 +83,11 @@ class FusedOptimiser:
         """(M · 512,) how often samples fell into each voxel (saturating at 15 a thread)."""
         return torch.from_numpy((self.marks & 15).sum(0, dtype=np.int32))
 
+    @property
+    def next_record(self) -> int:
+        """Rows that a gradient has come to so far."""
+        return sum(self.records)
+
     def sync(self) -> Field:
         """The field with the decoder's weights written back."""
         assert isinstance(self.field.decoder, Deferred)
@@ -100,8 +106,8 @@ class FusedOptimiser:
     def step_on(self, picks: Array, jitter: Array, rates: Rates) -> tuple[float, int]:
         """One step on the pixels `picks` (B,) with the rays' lattices moved by `jitter` (B,)."""
         rays = len(picks)
-        codes = np.empty(rays, np.uint32)
-        kernels.hit_codes(self.space, self.pixels, picks, self.guess, GUESS_CELL, codes)
+        codes, tiles = np.empty(rays, np.uint32), np.empty(rays, np.int32)
+        kernels.hit_codes(self.space, self.pixels, picks, self.guess, self.tiles, codes, tiles)
         order = np.argsort(codes)
         picks, jitter = picks[order], jitter[order]
         losses = kernels.Losses(*(np.float32(v) for v in (rates.distortion, rates.opacity, rates.colour_threshold, STOP)))
@@ -109,25 +115,26 @@ class FusedOptimiser:
         cuts = [rays * t // self.threads for t in range(self.threads + 1)]
         self._make_room(rays)
 
-        def gradients(thread: int) -> tuple[int, float, int]:
-            return self._gradients(thread, slice(cuts[thread], cuts[thread + 1]), picks, jitter, losses, depths)
+        def gradients(thread: int) -> tuple[int, float, int, tuple[Array, ...]]:
+            part = slice(cuts[thread], cuts[thread + 1])
+            kernels.forget(self.index, thread, self.touched[thread, : self.used[thread]])
+            self.used[thread], error, looked = self._gradients(thread, part, picks, jitter, losses, depths)
+            return self.used[thread], error, looked, self._weight_gradients(thread, part)
 
         results = self._each(gradients)
-        used = [result[0] for result in results]
-        for thread, count in enumerate(used):
-            self.next_record = kernels.assign_records(self.index, self.touched[thread, :count], self.next_record)
         step_sizes = np.array([rates.density, rates.feature], np.float32)
 
         def move(thread: int) -> None:
             state = (self.space.width, self.volume, self.index, self.density_records, self.feature_records)
             sums = (self.touched, self.density_sums, self.feature_sums)
-            betas = (np.float32(BETAS[0]), np.float32(BETAS[1]), np.float32(EPSILON))
-            kernels.adam_pass(*state, *sums, thread, used[thread], self.scales, step_sizes, *betas)
+            state_of_thread = (thread, self.used[thread], self.records[thread])
+            self.records[thread] = kernels.adam_pass(*state, *sums, *state_of_thread, self.scales, step_sizes, *_CONSTANTS)
+            if thread == self.threads - 1:
+                self._move_decoder(rates.decoder, [result[3] for result in results])
+            if thread == 0:
+                kernels.remember_depths(tiles[order], depths, self.guess)
 
         self._each(move)
-        self._each(lambda thread: kernels.forget(self.index, thread, self.touched[thread, : used[thread]]))
-        self._move_decoder(rates.decoder)
-        kernels.remember_depths(self.pixels, picks, depths, self.guess, GUESS_CELL)
         return sum(result[1] for result in results) / (3 * rays), sum(result[2] for result in results)
 
     def colours(self, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
@@ -138,7 +145,11 @@ class FusedOptimiser:
         return torch.from_numpy(out[:, :3])
 
     def _each(self, work: Any) -> list[Any]:
-        return [work(0)] if self.executor is None else list(self.executor.map(work, range(self.threads)))
+        """`work(thread)` of all threads, the first of them here."""
+        if self.executor is None:
+            return [work(0)]
+        others = [self.executor.submit(work, thread) for thread in range(1, self.threads)]
+        return [work(0), *(other.result() for other in others)]
 
     def _take_decoder(self, field: Field) -> None:
         """Copy the decoder's weights."""
@@ -168,23 +179,27 @@ class FusedOptimiser:
         out: tuple[int, float, int] = kernels.gradient_pass(self.space, self.volume, self.decoder, self.background, *arguments)
         return out
 
-    def _weight_gradients(self) -> tuple[Array, ...]:
-        """In the order of `_weights`. ∂L/∂W is a product of the layer's inputs with the gradients behind it, over all rays."""
-        given, h1, h2, g1, g2, g_logit = self.tape
-        return given.T @ g1, g1.sum(0), h1.T @ g2, g2.sum(0), g_logit.T @ h2, g_logit.sum(0)
+    def _weight_gradients(self, thread: int, part: slice) -> tuple[Array, ...]:
+        """In the order of `_weights`. ∂L/∂W is a product of the layer's inputs with the gradients behind it, over the rays of a part."""
+        given, h1, h2, g1, g2, g_logit = (array[part] for array in self.tape)
+        w1, b1, w2, b2, w3, b3 = (np.empty_like(weight) for weight in self._weights())
+        w3 = np.empty((len(b2), len(b3)), np.float32)
+        kernels.add_products(self.space.hidden, given, g1, w1, b1)
+        kernels.add_products(self.space.hidden, h1, g2, w2, b2)
+        kernels.add_products((0, 0, 0), h2, g_logit, w3, b3)
+        return w1, b1, w2, b2, w3.T, b3
 
     def _turn_decoder(self) -> None:
         """Renew what is kept of the weights a second time."""
         d = self.decoder
         d.w1_out[:], d.w2_out[:] = d.w1.T, d.w2.T
 
-    def _move_decoder(self, rate: float) -> None:
-        """Adam on the decoder."""
+    def _move_decoder(self, rate: float, parts: list[tuple[Array, ...]]) -> None:
+        """Adam on the decoder, with the sum of the threads' gradients."""
         self.decoder_steps += 1
         n = self.decoder_steps
         scale = np.float32(rate * np.sqrt(1 - BETAS[1] ** n) / (1 - BETAS[0] ** n))
-        for weight, gradient, (m, v) in zip(self._weights(), self._weight_gradients(), self.moments, strict=True):
-            m += np.float32(1 - BETAS[0]) * (gradient - m)
-            v += np.float32(1 - BETAS[1]) * (gradient * gradient - v)
-            weight -= scale * m / (np.sqrt(v) + np.float32(EPSILON))
+        for weight, (first, second), *own in zip(self._weights(), self.moments, *parts, strict=True):
+            gradient = np.ascontiguousarray(sum(own[1:], own[0]))
+            kernels.adam_dense(weight.reshape(-1), gradient.reshape(-1), first.reshape(-1), second.reshape(-1), scale, *_CONSTANTS)
         self._turn_decoder()

@@ -53,18 +53,17 @@ class Losses(NamedTuple):
 @njit(**K.OPTIONS)
 def pixel_ray(pixels: Any, pick: Any, ray: Any) -> None:
     """Origin and unit direction of pixel `pick` into ray[0 … 5]."""
-    view = pixels.source[pick]
-    camera, pose = pixels.camera[view], pixels.pose[view]
-    width = int(camera[4])
-    place = pixels.place[pick]
+    view = np.int64(pixels.source[pick])
+    camera, pose = pixels.camera, pixels.pose
+    width, place = np.int32(camera[view, 4]), pixels.place[pick]
     row = place // width
-    x = (F(place - row * width) + K.HALF - camera[2]) / camera[0]
-    y = (F(row) + K.HALF - camera[3]) / camera[1]
-    dx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]
-    dy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]
-    dz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]
+    x = (F(place - row * width) + K.HALF - camera[view, 2]) / camera[view, 0]
+    y = (F(row) + K.HALF - camera[view, 3]) / camera[view, 1]
+    dx = pose[view, 0, 0] * x + pose[view, 0, 1] * y + pose[view, 0, 2]
+    dy = pose[view, 1, 0] * x + pose[view, 1, 1] * y + pose[view, 1, 2]
+    dz = pose[view, 2, 0] * x + pose[view, 2, 1] * y + pose[view, 2, 2]
     scale = ONE / np.sqrt(dx * dx + dy * dy + dz * dz)
-    ray[0], ray[1], ray[2] = pose[0, 3], pose[1, 3], pose[2, 3]
+    ray[0], ray[1], ray[2] = pose[view, 0, 3], pose[view, 1, 3], pose[view, 2, 3]
     ray[3], ray[4], ray[5] = dx * scale, dy * scale, dz * scale
 
 
@@ -250,21 +249,26 @@ def adam_pass(
     feature_sums: Any,
     thread: Any,
     used: Any,
+    records: Any,
     scales: Any,
     rates: Any,
     b1: Any,
     b2: Any,
     epsilon: Any,
-) -> None:
+) -> Any:
     """Lazy Adam on rows that thread `thread` touched. A row that several touched is moved by the first of them, with the sum in their
     order, so that the result depends on the number of threads alone.
 
     Args:
-        index: (M · 512 + 1, threads + 1) int32; column 0 is a row's Adam record, given to all that were touched.
+        index: (M · 512 + 1, threads + 1) int32; column 0 is a row's Adam record, −1: it has none yet.
         density_records: (K, 3) float32; feature_records: (K, 2 C) float32, first moments, then second.
         touched, density_sums, feature_sums: (threads, …) of all `Gradients`.
+        records: how many this thread has given to rows so far; threads take turns in the order of records, so that none asks another.
         scales: (S,) float32 bias correction sqrt(1 - b2^n) / (1 - b1^n) for n steps; the last one beyond.
         rates: (2,) float32 of density and features.
+
+    Returns:
+        `records` after this pass.
     """
     channels = len(width)
     density, feature = volume.density, volume.feature
@@ -293,7 +297,11 @@ def adam_pass(
                     feature_sums[thread, at, c] += feature_sums[other, twin, c]
         if not mine:
             continue
-        place = index[row, 0]
+        place = np.int64(index[row, 0])
+        if place < 0:
+            place = records * threads + thread
+            index[row, 0] = place
+            records += 1
         steps = density_records[place, COUNT] + ONE
         scale = scales[min(int(steps), len(scales) - 1)]
         g = density_sums[thread, at]
@@ -308,16 +316,7 @@ def adam_pass(
             v = b2 * feature_records[place, channels + c] + c2 * g * g
             feature_records[place, c], feature_records[place, channels + c] = m, v
             feature[row, c] -= step * m / (np.sqrt(v) + epsilon)
-
-
-@njit(**K.OPTIONS)
-def assign_records(index: Any, touched: Any, next_record: Any) -> Any:
-    """Give rows that are touched for the first time their Adam record; returns the next free one."""
-    for at in range(len(touched)):
-        if index[touched[at], 0] < 0:
-            index[touched[at], 0] = next_record
-            next_record += 1
-    return next_record
+    return records
 
 
 @njit(**K.OPTIONS)
@@ -347,23 +346,33 @@ def _spread_bits(value: Any) -> Any:
 
 
 @njit(**K.OPTIONS)
-def hit_codes(space: Any, pixels: Any, picks: Any, guess: Any, cell: Any, codes: Any) -> None:
+def hit_codes(space: Any, pixels: Any, picks: Any, guess: Any, grid: Any, codes: Any, tiles: Any) -> None:
     """Morton codes of where rays are expected to hit: rays that look at the same place come one after the other, so that the memory
     which they share is still in the cache.
 
     Args:
-        guess: (V, gh, gw) float32 distances last seen from each view, in tiles of `cell` pixels; 0: unknown.
+        guess: (V · gh · gw,) float32 distances last seen from each view, in tiles of `cell` pixels; 0: unknown.
+        grid: ints gh, gw, cell.
+        codes: (B,) uint32 and tiles: (B,) int32, a pixel's place in `guess`: filled here.
     """
     ray = np.empty(6, np.float32)
     top = F(1023)
+    high, wide, cell = np.int32(grid[0]), np.int32(grid[1]), np.int32(grid[2])
     for index in range(len(picks)):
+        if index + AHEAD < len(picks):
+            later = picks[index + AHEAD]
+            K.prefetch(pixels.place, later)
+            K.prefetch(pixels.source, later)
+            K.prefetch(pixels.colour, later)
         pick = picks[index]
         pixel_ray(pixels, pick, ray)
-        view = pixels.source[pick]
-        width = int(pixels.camera[view, 4])
-        row = pixels.place[pick] // width
-        column = pixels.place[pick] - row * width
-        t = guess[view, row // cell, column // cell] / space.half
+        view, place = pixels.source[pick], pixels.place[pick]
+        width = np.int32(pixels.camera[view, 4])
+        row = place // width
+        column = place - row * width
+        tile = (view * high + row // cell) * wide + column // cell
+        tiles[index] = tile
+        t = guess[tile] / space.half
         x = (ray[0] - space.cx) / space.half + t * ray[3]
         y = (ray[1] - space.cy) / space.half + t * ray[4]
         z = (ray[2] - space.cz) / space.half + t * ray[5]
@@ -377,12 +386,48 @@ def hit_codes(space: Any, pixels: Any, picks: Any, guess: Any, cell: Any, codes:
 
 
 @njit(**K.OPTIONS)
-def remember_depths(pixels: Any, picks: Any, depths: Any, guess: Any, cell: Any) -> None:
-    """Write the distances of a batch into `guess`."""
-    for index in range(len(picks)):
+def remember_depths(tiles: Any, depths: Any, guess: Any) -> None:
+    """Write the distances (B,) that a batch saw into `guess`, at its tiles (B,)."""
+    for index in range(len(tiles)):
         if depths[index] > ZERO:
-            pick = picks[index]
-            view = pixels.source[pick]
-            width = int(pixels.camera[view, 4])
-            row = pixels.place[pick] // width
-            guess[view, row // cell, (pixels.place[pick] - row * width) // cell] = depths[index]
+            guess[tiles[index]] = depths[index]
+
+
+@njit(**K.OPTIONS)
+def add_products(columns: Any, inputs: Any, gradients: Any, weight: Any, bias: Any) -> None:
+    """Gradients of a layer: inputs (B, I)ᵀ @ gradients (B, O) into weight (I, O), and the sums of `gradients` into bias (O,).
+
+    Not left to BLAS, whose own threads would stand in the way of those that take parts of a batch. Four rays at a time, so that a row
+    of `weight` is read and written once for all of them.
+    """
+    outputs = len(columns)
+    weight[:] = ZERO
+    bias[:] = ZERO
+    whole = len(inputs) // 4 * 4
+    for ray in range(0, whole, 4):
+        for i in range(inputs.shape[1]):
+            a, b, c, d = inputs[ray, i], inputs[ray + 1, i], inputs[ray + 2, i], inputs[ray + 3, i]
+            if a == ZERO and b == ZERO and c == ZERO and d == ZERO:
+                continue
+            for j in range(outputs):
+                pair = a * gradients[ray, j] + b * gradients[ray + 1, j]
+                weight[i, j] += pair + (c * gradients[ray + 2, j] + d * gradients[ray + 3, j])
+        for j in range(outputs):
+            bias[j] += gradients[ray, j] + gradients[ray + 1, j] + (gradients[ray + 2, j] + gradients[ray + 3, j])
+    for ray in range(whole, len(inputs)):
+        for i in range(inputs.shape[1]):
+            a = inputs[ray, i]
+            for j in range(outputs):
+                weight[i, j] += a * gradients[ray, j]
+        for j in range(outputs):
+            bias[j] += gradients[ray, j]
+
+
+@njit(**K.OPTIONS)
+def adam_dense(values: Any, gradient: Any, first: Any, second: Any, rate: Any, b1: Any, b2: Any, epsilon: Any) -> None:
+    """Adam on all of `values`, (N,) like the others; the bias correction is part of `rate`."""
+    for i in range(len(values)):
+        g = gradient[i]
+        first[i] = b1 * first[i] + (ONE - b1) * g
+        second[i] = b2 * second[i] + (ONE - b2) * g * g
+        values[i] -= rate * first[i] / (np.sqrt(second[i]) + epsilon)

@@ -35,9 +35,8 @@ class FusedPerSampleOptimiser(FusedOptimiser):
     def _weights(self) -> tuple[Array, ...]:
         return _moved(self.net)
 
-    def _weight_gradients(self) -> tuple[Array, ...]:
-        totals = [_moved(scratch.total) for scratch in self.scratch]
-        return tuple(sum(parts[1:], parts[0]) for parts in zip(*totals, strict=True))
+    def _weight_gradients(self, thread: int, part: slice) -> tuple[Array, ...]:
+        return _moved(self.scratch[thread].total)
 
     def _turn_decoder(self) -> None:
         turn(self.net)
