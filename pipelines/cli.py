@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines import bake, bench, compare, evaluate, export, finetune, info, poses, render, run, selftest, simulate, train, tsdf
+from pipelines import bake, bench, compare, evaluate, export, finetune, info, poses, render, run, selftest, simulate, tradeoff, train, tsdf
 from pipelines.options import Json
 from toolkit import __version__
 from toolkit.errors import FieldfuseError, Interrupted
@@ -91,6 +91,7 @@ for _command in (
     bake.bake,
     evaluate.evaluate,
     compare.compare,
+    tradeoff.tradeoff,
     info.info,
     train.train,
     selftest.selftest,

@@ -22,7 +22,7 @@ LOCK = ".lock"
 RUN = "run.json"
 STAGES = "stages"
 ERROR_LOG = "error.log"
-SUBFOLDERS = (STAGES, "frames", "sparse", "renders", "tsdf", "stereo", "tsdf_stereo", "compare", "exports")
+SUBFOLDERS = (STAGES, "frames", "sparse", "renders", "tsdf", "stereo", "tsdf_stereo", "compare", "tradeoff", "exports")
 FILES = (
     "capture.json",
     "poses.json",
@@ -37,6 +37,9 @@ FILES = (
     "report.html",
     "compare.json",
     "compare.html",
+    "tradeoff.csv",
+    "tradeoff.json",
+    "tradeoff.html",
 )
 BUSY = "another fieldfuse command is working in {}; wait for it to end or choose another --out folder"
 FOREIGN = "{} holds {!r} but no fieldfuse run; choose a new or empty --out folder so that nothing of yours is replaced"

@@ -1,0 +1,178 @@
+"""`fieldfuse tradeoff SOURCE --out DIR`: what accuracy costs in time and memory on one capture, beside TSDF fusion."""
+
+from __future__ import annotations
+
+import json as writer
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pipelines.options import (
+    Config,
+    Decoder,
+    Device,
+    Holdout,
+    ImageSize,
+    Json,
+    OptionalOut,
+    Pairs,
+    PosesFrom,
+    Preset,
+    Quiet,
+    Seed,
+    Target,
+    Threads,
+    gather,
+)
+
+Axes = Annotated[
+    str | None,
+    typer.Option(
+        help="Of iterations, voxel_size, views, samples, decoder, precision those that are varied, separated by commas.", show_default=False
+    ),
+]
+Times = Annotated[
+    str | None, typer.Option(help="Seconds of fitting, separated by commas. Default: 3,10,30,60,120,300,900.", show_default=False)
+]
+Seeds = Annotated[int, typer.Option(min=1, max=20, help="How often each fit is repeated, with other seeds.")]
+SweepBudget = Annotated[
+    float | None,
+    typer.Option("--budget", min=1, help="Seconds for the whole sweep; what does not fit is left for the next call.", show_default=False),
+]
+
+
+def tradeoff(
+    target: Target,
+    out: OptionalOut = None,
+    axes: Axes = None,
+    times: Times = None,
+    seeds: Seeds = 1,
+    budget: SweepBudget = None,
+    preset: Preset = None,
+    image_size: ImageSize = None,
+    holdout: Holdout = None,
+    device: Device = None,
+    threads: Threads = None,
+    seed: Seed = None,
+    decoder: Decoder = None,
+    poses: PosesFrom = None,
+    config: Config = None,
+    pairs: Pairs = None,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Make fields and surfaces with one setting changed at a time, measure each, and show quality against time and memory.
+
+    Each point is kept as soon as it is measured: run the same command again after an interruption and it goes on.
+    """
+    from pipelines.job import bound_threads
+
+    flags = {"image_size": image_size, "holdout": holdout, "device": device, "threads": threads, "seed": seed, "decoder": decoder}
+    options = gather(preset, config, pairs, **flags, **{"poses.source": poses})
+    bound_threads(options)
+    from pipelines.console import make_progress
+
+    data = tradeoff_run(target, out, options, axes, times, seeds, budget, make_progress(quiet))
+    show(data, target if out is None else out, quiet, json)
+
+
+def tradeoff_run(
+    target: Path,
+    out: Path | None,
+    options: dict[str, Any],
+    axes: str | None = None,
+    times: str | None = None,
+    seeds: int = 1,
+    budget: float | None = None,
+    progress: Any = None,
+) -> dict[str, Any]:
+    """Measure what is missing and write `tradeoff.csv`, `tradeoff.html` and the plots; answers `tradeoff.json`.
+
+    Raises:
+        InputError: no test views, an axis that cannot be varied, times that are no numbers.
+        Interrupted: the user asked to stop; what was measured is written.
+    """
+    from pipelines.console import make_progress
+    from pipelines.job import open_job
+    from pipelines.reconstruct import BEFORE, stand
+    from pipelines.steps_stereo import match_pictures
+    from pipelines.tradeoff_plan import chosen_axes, chosen_times, plan
+    from pipelines.tradeoff_sweep import Swept, sweep
+    from toolkit.errors import InputError
+
+    ladder = chosen_times(times)
+    progress = make_progress(True) if progress is None else progress
+    with open_job(target, out, options, progress, (*BEFORE, "stereo")) as job:
+        can_vary, why_not = axes_here(job.settings)
+        chosen = chosen_axes(axes, can_vary, why_not)
+        capture, poses, posed, scene, views = stand(job)
+        if not views.test.any():
+            raise InputError("what accuracy costs is measured on pictures kept for testing, and there is none; give --holdout 8")
+        surface = "tsdf" if posed.has_depth else "tsdf_stereo"
+        if surface == "tsdf_stereo":
+            match_pictures(job, scene, views)
+        stereo = job.stages.records["stereo"].seconds if "stereo" in job.stages.records else 0.0
+        swept = Swept([], [])
+        try:
+            sweep(job, plan(chosen, ladder, seeds, surface), stereo, budget, swept)
+        finally:
+            # What was measured is shown, however the sweep ends.
+            data = put(
+                job, swept, capture, poses, scene, views, [f"The axis {name} was not varied: {why}." for name, why in why_not.items()]
+            )
+    return data
+
+
+def axes_here(settings: Any) -> tuple[list[str], dict[str, str]]:
+    """The axes that can be varied, and for the others why not."""
+    from toolkit.evaluate.tradeoff import AXES
+
+    why_not = {"keyframes": "a field that is fitted to all training views has no key frames"}
+    if settings.field.decoder == "per_sample":
+        why_not["precision"] = "a field with the decoder per sample is stored in one precision only"
+        why_not["decoder"] = "it is set; leave out --decoder to compare both"
+    return [axis for axis in AXES if axis not in why_not], why_not
+
+
+def put(job: Any, swept: Any, capture: Any, poses: Any, scene: Any, views: Any, refused: list[str]) -> dict[str, Any]:
+    """Write what is known so far into the run's folder."""
+    from pipelines.comparison import machine
+    from pipelines.summary import base_data, warnings_of
+    from toolkit.evaluate.tradeoff_page import write_tradeoff
+
+    data = {
+        **base_data(job, capture, poses),
+        "warnings": warnings_of(job, capture, poses, scene, views),
+        "scene": scene.to_dict(),
+        "unit": "m" if scene.metric else "units",
+        "views": {
+            "total": len(views),
+            "test": int(views.test.sum()),
+            "width": views.intrinsics[0].width,
+            "height": views.intrinsics[0].height,
+        },
+        "rows": swept.rows,
+        "left_out": swept.left_out,
+        "refused": refused,
+        "machine": machine(job),
+    }
+    return write_tradeoff(job.folder.path, data)
+
+
+def show(data: dict[str, Any], folder: Path, quiet: bool, as_json: bool) -> None:
+    """The result on stdout: JSON, or the sentences and where the page is."""
+    from toolkit.evaluate.tradeoff import points_of
+    from toolkit.evaluate.tradeoff_text import front_sentence, sentence, steps
+
+    if as_json:
+        sys.stdout.write(writer.dumps(data, indent=1) + "\n")
+    elif not quiet:
+        points, unit = points_of(data["rows"]), data["unit"] or "units"
+        lines = [sentence(step, unit) for step in steps(points)]
+        lines += [text for cost in ("seconds", "memory_mb") if (text := front_sentence(points, cost, "psnr", unit)) is not None]
+        lines += [f"note: {row['id']}: {row['error']}" for row in data["rows"] if row["error"] is not None]
+        lines += [f"note: not measured yet: {name}" for name in data["left_out"]]
+        lines += [f"note: {warning}" for warning in data["warnings"]]
+        sys.stdout.write("".join(f"{line}\n" for line in lines) + f"{folder / 'tradeoff.html'}\n")

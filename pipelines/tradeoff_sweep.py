@@ -1,0 +1,164 @@
+"""The loop of a sweep: each point in a process of its own, written as soon as it is known, reused when nothing that went in has changed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pipelines.job import Job
+from pipelines.tradeoff_plan import Wanted, point_id
+from toolkit.config import settings_dict
+from toolkit.errors import InputError
+from toolkit.files import fingerprint, read_json, remove, write_json
+from toolkit.poses.child import end, log_tail
+
+VERSION = 1  # raised when what a point measures changes
+TICK = 0.2  # seconds between looks at the user's wish to stop
+FIRST_GUESS = 15.0  # seconds that a point takes beside its fitting time, before one was measured
+FOLDER = "tradeoff"
+
+
+@dataclass
+class Swept:
+    """What a sweep has so far: rows, the names of what was left out for lack of time, and how many were reused."""
+
+    rows: list[dict[str, Any]]
+    left_out: list[str]
+    reused: int = 0
+
+
+def sweep(job: Job, wanted: Sequence[Wanted], stereo_seconds: float, budget: float | None, swept: Swept) -> None:
+    """Measure everything in `wanted` into `swept`; with a `budget` of seconds, what would not fit into it is left out.
+
+    Raises:
+        Interrupted: the user asked to stop; `swept` has what was finished.
+    """
+    began, beside, base_voxel = time.monotonic(), FIRST_GUESS, None
+    for one in wanted:
+        spec = job_spec(job, one, stereo_seconds, base_voxel)
+        rows = known_rows(job, one, spec)
+        if rows is not None:
+            swept.reused += 1
+        else:
+            expected = float(one.wanted.get("iterations", 0.0)) + beside
+            if budget is not None and time.monotonic() - began + expected > budget:
+                swept.left_out.append(one.name)
+                continue
+            start = time.monotonic()
+            rows = measure(job, one, spec, expected)
+            spent = time.monotonic() - start - float(one.wanted.get("iterations", 0.0))
+            beside = max(spent, 0.7 * beside)
+        swept.rows += [finish(one, row) for row in rows]
+        if one.is_surface and one.wanted["voxel_size"] == 1 and rows[0]["error"] is None:
+            base_voxel = rows[0]["setting"]["working_voxel"]
+
+
+def job_spec(job: Job, one: Wanted, stereo_seconds: float, base_voxel: float | None) -> dict[str, Any]:
+    """All that the child is told; its key stands for everything that the result depends on."""
+    settings = job.settings
+    made = {
+        name: job.stages.records[name].made for name in ("views", "scene", "poses", *(["stereo"] if "stereo" in job.stages.records else []))
+    }
+    bare = asdict(replace(settings.fit, budget=None))
+    uses = [made, asdict(settings.field), bare, asdict(settings.tsdf), settings.engine, settings.device, settings.threads, base_voxel]
+    return {
+        "key": fingerprint(VERSION, one.method, one.wanted, one.seed, list(one.variants), uses),
+        "folder": str(job.folder.path),
+        "settings": settings_dict(settings),
+        "method": one.method,
+        "wanted": one.wanted,
+        "views": one.wanted["views"],
+        "seed": one.seed,
+        "variants": list(one.variants),
+        "stereo_seconds": stereo_seconds,
+        "base_voxel": base_voxel,
+    }
+
+
+def place(job: Job, one: Wanted) -> Path:
+    return job.folder / FOLDER / "points" / f"{one.name}.json"
+
+
+def known_rows(job: Job, one: Wanted, spec: dict[str, Any]) -> list[dict[str, Any]] | None:
+    """The rows of an earlier sweep, if they are of this very point and not the remains of a crash."""
+    path = place(job, one)
+    if not path.is_file():
+        return None
+    try:
+        kept = read_json(path)
+        if kept["key"] == spec["key"] and not kept["crashed"] and kept["rows"]:
+            return [dict(row) for row in kept["rows"]]
+    except (InputError, KeyError, TypeError, ValueError):
+        pass
+    return None
+
+
+def measure(job: Job, one: Wanted, spec: dict[str, Any], expected: float) -> list[dict[str, Any]]:
+    """Have the child measure the point, keep and answer its rows; a point that cannot be made is a row with the reason."""
+    path = place(job, one)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    ask, answer, log = (
+        path.with_name(f".tmp-{name}-{one.name}.{suffix}") for name, suffix in (("job", "json"), ("answer", "json"), ("log", "txt"))
+    )
+    try:
+        write_json(ask, {**spec, "answer": str(answer)})
+        job.progress.begin(one.name)
+        start = time.monotonic()
+        code = run_child(job, ask, log, expected)
+        seconds = time.monotonic() - start
+        if answer.is_file():
+            found, crashed = read_json(answer), False
+        else:
+            ended = f"by signal {-code}" if code < 0 else f"with exit code {code}"
+            told = "; the memory may not have been enough" if code == -9 else f": {log_tail(log)}"
+            found, crashed = {"error": f"its process ended {ended}{told}"}, True
+        nothing = {"method": one.method, "wanted": one.wanted, "setting": {}, "seed": one.seed}
+        rows = found.get("rows") or [{**nothing, "error": found.get("error", "unknown")}]
+        write_json(path, {"key": spec["key"], "crashed": crashed, "wall_seconds": round(seconds, 3), "rows": rows})
+        job.progress.finish(one.name, seconds, False)
+    finally:
+        for leftover in (ask, answer, log):
+            remove(leftover)
+    return list(rows)
+
+
+def run_child(job: Job, ask: Path, log: Path, expected: float) -> int:
+    """The child's exit code.
+
+    Raises:
+        Interrupted: the user asked to stop; the child is dead by then.
+    """
+    with log.open("wb") as said:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "pipelines.tradeoff_child", str(ask)],
+            stdin=subprocess.PIPE,  # the child ends when it closes
+            stdout=said,
+            stderr=said,
+            start_new_session=True,  # so that Ctrl-C reaches us first
+        )
+    start = time.monotonic()
+    try:
+        while process.poll() is None:
+            job.progress.check()
+            job.progress.update(min(time.monotonic() - start, expected), expected)
+            time.sleep(TICK)
+    finally:
+        end(process)
+    return int(process.returncode)
+
+
+def finish(one: Wanted, row: dict[str, Any]) -> dict[str, Any]:
+    """A kept row with what the plan says about it: its name and the axes that it is a step on."""
+    variant = row.get("variant")
+    wanted = row.get("wanted") or one.wanted
+    return {
+        **row,
+        "id": point_id(row["method"], wanted),
+        "axes": [variant] if variant else list(one.axes),
+        "setting": {**row["setting"], "wanted": wanted},
+    }
