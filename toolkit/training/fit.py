@@ -23,6 +23,8 @@ from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
 from toolkit.training.engine import Engine, make_engine, warm_up
+from toolkit.training.finite import NotFiniteError
+from toolkit.training.guard import Guard, refuse_broken
 from toolkit.training.levels import all_places, finer, first_field, pruned, visible
 from toolkit.training.rays import PixelPool
 from toolkit.training.schedule import Schedule
@@ -49,6 +51,7 @@ class FitResult:
     steps: int = 0
     rays: int = 0
     interrupted: bool = False
+    notes: list[str] = default(default_factory=list)  # a sentence on each step that was not finite
 
 
 class _Clock:
@@ -98,7 +101,7 @@ def fit_field(
         start: a field to go on from, at its finest level.
 
     Raises:
-        InputError: there is no training view.
+        InputError: there is no training view, `start` is not finite, or not one step was.
     """
     device = torch.device(settings.device if settings.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu")
     train = views.subset(np.flatnonzero(~views.test))
@@ -119,11 +122,13 @@ def fit_field(
     if start is None:
         current, ladder = _first(views, train, scene, settings, device, host, generator)
     else:
+        refuse_broken(start)
         keep = torch.ones_like(start.occupied)
         current, ladder = finer(start, keep, start.resolution, host), [start.resolution]
     engine = make_engine(settings, current, pool)
     plan = Schedule(ladder, budget, settings.fit, views.background is None, settings.fit.patience)
-    result = FitResult(current)
+    guard = Guard()
+    result = FitResult(current, notes=guard.notes)
     marks = [budget * 0.02 * 50 ** (i / (TIMELINE_POINTS - 1)) for i in range(TIMELINE_POINTS - 1)]
 
     while (done := plan.position(now := clock.seconds())) < 1 and not progress.stopping():
@@ -145,7 +150,12 @@ def fit_field(
         elif plan.wants_look(done) and (psnr := validation.psnr(engine)) is not None:
             plan.look(psnr, done)
         rays = plan.rays
-        engine.step(rays, plan.rates(done, result.rays))
+        try:
+            engine.step(rays, guard.eased(plan.rates(done, result.rays)))
+        except NotFiniteError as error:
+            if guard.goes_on(error, result.steps, plan.resolution, now):
+                continue
+            break
         plan.steps_here += 1
         result.steps += 1
         result.rays += rays

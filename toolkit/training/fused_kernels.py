@@ -320,6 +320,15 @@ def adam_pass(
 
 
 @njit(**K.OPTIONS)
+def magnitude(values: Any) -> Any:
+    """Sum of the absolute values of (N,) float32: NaN or infinite where one of them is, or where they are huge."""
+    total = ZERO
+    for at in range(len(values)):
+        total += abs(values[at])
+    return total
+
+
+@njit(**K.OPTIONS)
 def forget(index: Any, thread: Any, touched: Any) -> None:
     """Make `index` good for the next batch."""
     for at in range(len(touched)):

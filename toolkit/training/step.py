@@ -12,6 +12,7 @@ from toolkit.render.field import Field, density
 from toolkit.render.march import BRICK, Samples, march
 from toolkit.render.rays import OPACITY_FLOOR
 from toolkit.training.adam import LazyAdam
+from toolkit.training.finite import NotFiniteError, check
 from toolkit.training.rays import Batch
 from toolkit.volume.lookup import corners, gather, scatter
 
@@ -66,16 +67,27 @@ class Optimiser:
         """Interval of every sample in the units of `Samples.place`."""
         return torch.full_like(weight, BRICK / (self.field.fine * self.field.resolution))
 
-    def _move(self, rows: Tensor, corner_weights: Tensor, g_density: Tensor, g_feature: Tensor, rates: Rates) -> None:
-        """From gradients of what was looked up to a step of the rows that it was looked up from."""
+    def _move(self, rows: Tensor, corner_weights: Tensor, g_density: Tensor, g_feature: Tensor, rates: Rates, residual: Tensor) -> None:
+        """From gradients of what was looked up to a step of the rows that it was looked up from.
+
+        Raises:
+            NotFiniteError: the loss or a gradient is not finite; nothing is moved.
+        """
         touched, (density_gradient, feature_gradient) = scatter(rows, corner_weights, (g_density, g_feature))
         if len(touched) and int(touched[-1]) == self.field.topology.zero_row:  # the zero row stays zero
             touched, density_gradient, feature_gradient = touched[:-1], density_gradient[:-1], feature_gradient[:-1]
+        weights = ((f"the gradient of the decoder's {name}", value.grad) for name, value in self.field.decoder.named_parameters())
+        of_rows = [("the gradient of the densities", density_gradient), ("the gradient of the features", feature_gradient)]
+        check([("the colour error", residual), *of_rows, *((name, value) for name, value in weights if value is not None)])
         self.density.step(touched, density_gradient, rates.density)
         self.feature.step(touched, feature_gradient, rates.feature)
 
     def step(self, batch: Batch, rates: Rates, generator: torch.Generator) -> tuple[float, int]:
-        """One step. Returns the mean squared colour error of the batch and the number of samples that were looked at."""
+        """One step. Returns the mean squared colour error of the batch and the number of samples that were looked at.
+
+        Raises:
+            NotFiniteError: the loss or a gradient is not finite; nothing was moved.
+        """
         field = self.field
         jitter = torch.rand(len(batch.origins), generator=generator).to(field.device)
         samples = march(field.grid, batch.origins, batch.directions, field.near, field.fine, jitter)
@@ -83,7 +95,12 @@ class Optimiser:
             group["lr"] = rates.decoder
         deferred = isinstance(field.decoder, Deferred)
         behind = torch.rand(len(batch.origins), 3, generator=generator).to(field.device) if rates.random_background else field.background
-        error = (self._deferred if deferred else self._per_sample)(batch, samples, rates, behind)
+        try:
+            error = (self._deferred if deferred else self._per_sample)(batch, samples, rates, behind)
+        except NotFiniteError:
+            self.decoder.zero_grad(set_to_none=True)
+            self.seen.nan_to_num_(0.0)
+            raise
         self.decoder.step()
         self.decoder.zero_grad(set_to_none=True)
         return error, len(samples)
@@ -126,7 +143,7 @@ class Optimiser:
             g_weight = g_weight + g_distortion * (rates.distortion / count)
         g_thickness = thickness_gradient(weight, transmittance, thickness, g_weight, kept.first, kept.ray, count)
         g_raw = torch.where(raw < RAW_MAX, g_thickness * thickness, torch.zeros_like(raw))  # ∂τ/∂raw = τ
-        self._move(rows, corner_weights, g_raw, per_ray[:, :-1] * weight[:, None], rates)
+        self._move(rows, corner_weights, g_raw, per_ray[:, :-1] * weight[:, None], rates, residual)
         return float(residual.square().mean())
 
     def _per_sample(self, batch: Batch, samples: Samples, rates: Rates, behind: Tensor) -> float:
@@ -154,5 +171,5 @@ class Optimiser:
         g_thickness = thickness_gradient(weight, transmittance, tau, g_weight, samples.first, samples.ray, count)
         torch.autograd.backward([thickness, colour], [g_thickness, weight[:, None] * g_mixed])
         assert features.grad is not None and base.grad is not None
-        self._move(rows, corner_weights, base.grad, features.grad, rates)
+        self._move(rows, corner_weights, base.grad, features.grad, rates, residual)
         return float(residual.square().mean())

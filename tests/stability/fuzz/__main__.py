@@ -17,7 +17,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", action="append", default=[], help="a target's name; may be repeated")
-    parser.add_argument("--state", type=Path, help="a file that notes how far it came; a run that was stopped goes on from it; removed at the end")
+    parser.add_argument("--state", type=Path, help="notes how far it came, so that a run that was stopped goes on; removed at the end")
     parser.add_argument("--page", type=Path, help="a page whose part `fuzz` is replaced by the result")
     chosen = parser.parse_args()
 
