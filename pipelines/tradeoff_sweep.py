@@ -64,8 +64,11 @@ def job_spec(job: Job, one: Wanted, stereo_seconds: float, base_voxel: float | N
     made = {
         name: job.stages.records[name].made for name in ("views", "scene", "poses", *(["stereo"] if "stereo" in job.stages.records else []))
     }
-    bare = asdict(replace(settings.fit, budget=None))
-    uses = [made, asdict(settings.field), bare, asdict(settings.tsdf), settings.engine, settings.device, settings.threads, base_voxel]
+    if one.is_surface:
+        own: list[Any] = [asdict(settings.tsdf), base_voxel]
+    else:
+        own = [asdict(settings.field), asdict(replace(settings.fit, budget=None)), settings.engine, settings.device]
+    uses = [made, own, settings.threads]
     return {
         "key": fingerprint(VERSION, one.method, one.wanted, one.seed, list(one.variants), uses),
         "folder": str(job.folder.path),

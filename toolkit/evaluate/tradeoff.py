@@ -75,6 +75,11 @@ class Point:
     spread: dict[str, float] = field(default_factory=dict)
     seeds: int = 1
 
+    @property
+    def shown_otherwise(self) -> bool:
+        """The same result as another point's, only rendered or stored in another way: its cost is not in the making."""
+        return self.axes in (("samples",), ("precision",))
+
     def value(self, axis: str) -> Any:
         return self.setting.get(axis)
 
@@ -111,10 +116,13 @@ def points_of(rows: Iterable[dict[str, Any]]) -> list[Point]:
 
 
 def pareto(points: Sequence[Point], cost: str = "seconds", measure: str = "psnr") -> list[Point]:
-    """Points that no other is both cheaper and at least as good as, the cheapest first; their quality rises from each to the next."""
+    """Points that no other is both cheaper and at least as good as, the cheapest first; their quality rises from each to the next.
+
+    What is only shown otherwise takes no part.
+    """
     better: Callable[[float, float], bool] = (lambda a, b: a > b) if MEASURES[measure][3] else (lambda a, b: a < b)
     sign = -1 if MEASURES[measure][3] else 1
-    known = [point for point in points if cost in point.mean and measure in point.mean]
+    known = [point for point in points if cost in point.mean and measure in point.mean and not point.shown_otherwise]
     front: list[Point] = []
     for point in sorted(known, key=lambda point: (point.mean[cost], sign * point.mean[measure])):
         if not front or better(point.mean[measure], front[-1].mean[measure]):

@@ -1,0 +1,97 @@
+"""`fieldfuse tradeoff` from end to end: made, interrupted, gone on with, and refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pipelines.tradeoff_plan import base_time, chosen_axes, chosen_times, plan
+from tests.pipelines.made import call
+from tests.pipelines.test_matched import make_corner
+from toolkit.errors import InputError
+from toolkit.files import read_json, write_json
+
+Capsys = pytest.CaptureFixture[str]
+SMALL = ["--holdout", "4", "--threads", "1", "--quiet", "--json", "--set", "field.resolution=64"]
+
+
+def test_one_step_at_a_time_around_the_default() -> None:
+    found = plan(["iterations", "voxel_size", "views", "samples", "decoder", "precision"], [3, 10, 30, 60, 120], 2, "tsdf")
+    assert found[0].id == "field-30s" and len(found[0].variants) == 4 and found[1].id == "tsdf"
+    assert len({one.name for one in found}) == len(found)
+    first = [one for one in found if one.seed == 0]
+    assert sum(one.is_surface for one in first) == 6 and not any(one.is_surface for one in found if one.seed)
+    for one in first:
+        default = {"iterations": 30, "voxel_size": 1.0, "views": 1.0, "decoder": "deferred"}
+        differs = [axis for axis, value in default.items() if one.wanted.get(axis, value) != value]
+        assert len(differs) <= 1 or (one.method == "field_per_sample" and set(differs) <= {"iterations", "decoder"})
+    assert {one.wanted["iterations"] for one in first if one.method == "field_per_sample"} == {10, 30, 60}
+
+
+def test_only_what_is_asked_for() -> None:
+    assert [one.id for one in plan(["views"], [5.0, 900.0], 1, "tsdf_stereo")] == [
+        "field-5s",
+        "tsdf_stereo",
+        "field-5s-views0.25",
+        "field-5s-views0.5",
+    ]
+    assert [one.id for one in plan(["iterations"], [3.0, 10.0], 1, None)] == ["field-10s", "field-3s"]
+    assert base_time([60.0, 120.0]) == 60 and base_time([10.0, 29.0]) == 29
+
+
+def test_axes_and_times_are_checked() -> None:
+    assert chosen_axes("voxel-size, views,views", ["views", "voxel_size"], {}) == ["voxel_size", "views"]
+    assert chosen_times("10,3, 3") == [3, 10]
+    for text in ("", "3,ten", "-1", "nan", "1e9"):
+        with pytest.raises(InputError, match="--times is"):
+            chosen_times(text)
+    with pytest.raises(InputError, match="there is no axis 'colour'; here views can be varied"):
+        chosen_axes("colour", ["views"], {})
+    with pytest.raises(InputError, match="the axis keyframes cannot be varied, because there are none; here views can be varied"):
+        chosen_axes("keyframes", ["views"], {"keyframes": "there are none"})
+
+
+def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, capsys: Capsys) -> None:
+    make_corner(tmp_path / "corner", depth=True)
+    out = tmp_path / "out"
+    command = ["tradeoff", tmp_path / "corner", "--out", out, *SMALL, "--times", "1", "--axes", "iterations,precision"]
+    short = json.loads(call(capsys, *command, "--budget", "1").out)
+    assert short["rows"] == [] and short["left_out"] == ["field-1s-seed0", "tsdf-seed0"]  # nothing fits into a second
+    answer = call(capsys, *command)
+    assert answer.code == 0, answer.err
+    data = json.loads(answer.out)
+    found = {row["id"]: row for row in data["rows"]}
+    assert list(found) == ["field-1s", "field-1s-precisionuint8", "field-1s-precisionfloat32", "tsdf"]
+    for row in found.values():
+        assert row["error"] is None and row["psnr"] > 8 and row["seconds"] > 0 and row["disk_bytes"] > 1000 and row["memory_mb"] > 1
+        assert row["depth_error"] is not None and len(row["load"]) == 2
+    assert found["field-1s"]["seconds"] > 1 and set(found["tsdf"]["stages"]) == {"fuse", "mesh"}
+    assert found["field-1s"]["disk_bytes"] < found["field-1s-precisionfloat32"]["disk_bytes"]
+    assert abs(found["field-1s"]["psnr"] - found["field-1s-precisionuint8"]["psnr"]) < 1
+    assert data["unit"] == "units" and (out / "tradeoff.csv").read_text().count("\n") == 5
+
+    # The rest of a crash is made again, what is finished is reused.
+    path = out / "tradeoff" / "points" / "tsdf-seed0.json"
+    write_json(path, {**read_json(path), "crashed": True, "rows": []})
+    kept = {row["id"]: row for row in json.loads(call(capsys, *command).out)["rows"]}
+    assert kept["field-1s"] == found["field-1s"] and kept["tsdf"]["psnr"] == pytest.approx(found["tsdf"]["psnr"], abs=0.01)
+    # A point that cannot be made is told, and the others stay.
+    again = call(capsys, *command, "--set", "tsdf.voxel_size=0.000001")
+    kept = {row["id"]: row for row in json.loads(again.out)["rows"]}
+    assert kept["field-1s"] == found["field-1s"]
+    assert "finer than the pixels" in kept["tsdf"]["error"] and kept["tsdf"]["psnr"] is None
+    assert "finer than the pixels" in (out / "tradeoff.html").read_text()
+
+
+def test_what_cannot_be_measured_is_refused(tmp_path: Path, capsys: Capsys) -> None:
+    make_corner(tmp_path / "corner", 5)
+    for arguments, words in (
+        (["--axes", "keyframes"], "has no key frames; here iterations, voxel_size, views, samples, decoder, precision can be varied"),
+        (["--decoder", "per_sample", "--axes", "precision"], "one precision only"),
+        (["--holdout", "0", "--times", "1"], "--holdout 8"),
+        (["--times", "soon"], "--times is 'soon'"),
+    ):
+        answer = call(capsys, "tradeoff", tmp_path / "corner", "--out", tmp_path / "out", "--quiet", *arguments)
+        assert answer.code == 2 and words in answer.sentence(), answer.err
