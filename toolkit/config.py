@@ -16,7 +16,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 
 MAX_YAML = 2**18  # characters
 MAX_NESTING = 16
@@ -133,7 +133,7 @@ def _set(config: DictConfig, key: str, value: Any, where: str) -> None:
     try:
         OmegaConf.update(config, full, value)
     except (OmegaConfBaseException, ValueError) as error:
-        raise InputError(f"{where}: {value!r} does not fit the setting {key!r} ({str(error).splitlines()[0]})") from error
+        raise InputError(f"{where}: {value!r} does not fit the setting {key!r} ({first_line(error)})") from error
 
 
 def _flatten(data: Any, where: str, prefix: str = "") -> list[tuple[str, Any]]:
@@ -153,7 +153,7 @@ def _read_yaml(text: str, where: str) -> list[tuple[str, Any]]:
     except InputError:
         raise
     except Exception as error:  # the YAML parser raises its own family
-        raise InputError(f"{where} is not valid YAML: {(str(error).splitlines() or ['unreadable'])[0]}") from error
+        raise InputError(f"{where} is not valid YAML: {first_line(error)}") from error
     return _flatten(data, where)
 
 

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 
+def first_line(error: BaseException) -> str:
+    """What an exception says, without what follows its first line; its kind where it says nothing."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
 class FieldfuseError(Exception):
     """Something that stops the job and has a reason that a user can act on (the command line exits with code 2)."""
 

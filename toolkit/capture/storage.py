@@ -56,7 +56,7 @@ def capture_from_dict(data: dict[str, Any]) -> Capture:
             warnings=tuple(str(warning) for warning in data["warnings"]),
             extra=dict(data["extra"]),
         )
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise InputError(
             f"the stored capture is not usable ({type(error).__name__}: {error}); run the job again in a new folder"
         ) from error

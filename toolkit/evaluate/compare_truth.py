@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 
 from toolkit.camera import Array, Intrinsics, resample_maps
 from toolkit.capture.types import Capture, Views
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 from toolkit.files import inside, read_json
 
 FOLDER = "ground_truth"
@@ -90,4 +90,4 @@ def _read_depth(path: Path) -> Array:
             raise ValueError(f"its depth is {depth.dtype} of shape {depth.shape}")
         return np.asarray(depth)
     except (SafetensorError, OSError, ValueError) as error:
-        raise InputError(f"the true depth {path} cannot be read ({str(error).splitlines()[0]}); make the capture again") from error
+        raise InputError(f"the true depth {path} cannot be read ({first_line(error)}); make the capture again") from error

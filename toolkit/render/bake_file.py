@@ -118,7 +118,7 @@ def _checked(arrays: dict[str, Array], about: dict[str, Any]) -> BakedField:
     x, y, z = (int(v) for v in about["table_origin"])
     _require(max(abs(v) for v in (x, y, z)) <= resolution, "its block table lies outside the lattice")
     background = np.array([float(v) for v in about["background"]], np.float32)
-    _require(background.shape == (3,), "its background is not a colour")
+    _require(background.shape == (3,) and bool(np.isfinite(background).all()), "its background is not a colour")
     _check_arrays(arrays, resolution)
     channels = arrays["feature"].shape[1]
     hidden = len(arrays["decoder.b1"])

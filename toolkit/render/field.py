@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from toolkit.camera import Similarity
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 from toolkit.networks.decoder import Deferred, PerSample, make_decoder
 from toolkit.render.composite import RAW_MAX, UNITS
 from toolkit.render.march import MarchGrid
@@ -156,7 +156,7 @@ class Field:
             decoder = make_decoder(kind, data.features.shape[1], hidden)
             decoder.load_state_dict(data.decoder)
         except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-            reason = str(error).splitlines()[0]
+            reason = first_line(error)
             raise InputError(f"{where} does not hold a field that can be used ({reason}); fit it again") from error
         blocks = len(data.keys)
         return cls(

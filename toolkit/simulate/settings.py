@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from toolkit.camera import Intrinsics
 from toolkit.config import refuse_traps
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 from toolkit.simulate.paths import PathSettings
 
 MAX_BYTES = 2**20
@@ -75,7 +75,7 @@ def read_scene_file(path: Path | str) -> SceneFile:
     except InputError:
         raise
     except Exception as error:  # the YAML parser raises its own family
-        raise InputError(f"{path} is not valid YAML: {str(error).splitlines()[0]}") from error
+        raise InputError(f"{path} is not valid YAML: {first_line(error)}") from error
     if not isinstance(data, dict):
         raise InputError(f"{path} must hold `key: value` pairs")
     return scene_file({str(key): value for key, value in data.items()}, str(path))
@@ -95,7 +95,7 @@ def scene_file(data: dict[str, Any], where: str) -> SceneFile:
         merged = OmegaConf.to_object(OmegaConf.merge(base, rest))
     except (OmegaConfBaseException, ValueError) as error:
         key = getattr(error, "full_key", None) or "a value"
-        raise InputError(f"{where}: {key} does not fit ({str(error).splitlines()[0]})") from error
+        raise InputError(f"{where}: {key} does not fit ({first_line(error)})") from error
     assert isinstance(merged, SceneFile)
     merged.effects = effects
     _check(merged, where)

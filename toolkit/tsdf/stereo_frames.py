@@ -12,7 +12,7 @@ from safetensors.numpy import save_file
 
 from toolkit.camera import Intrinsics
 from toolkit.capture.types import Views
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 from toolkit.files import atomic_path
 from toolkit.progress import SILENT, Progress
 from toolkit.tsdf.frames import DepthFrame, cover
@@ -86,4 +86,4 @@ def load_stereo(path: Path | str) -> tuple[list[str], list[StereoDepth]]:
                 raise ValueError("there are not as many names as depth maps")
             return names, out
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path} cannot be read ({str(error).splitlines()[0]}); remove it and run the command again") from error
+        raise InputError(f"{path} cannot be read ({first_line(error)}); remove it and run the command again") from error

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import nn
 
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 from toolkit.files import atomic_path
 
 Tensor = torch.Tensor
@@ -81,7 +81,7 @@ def load_checkpoint(path: Path, model: nn.Module, adam: torch.optim.Adam) -> int
             }
     except (KeyError, ValueError, RuntimeError) as error:
         raise InputError(
-            f"{path} is not a checkpoint of these networks ({str(error).splitlines()[0]}); start anew in another folder"
+            f"{path} is not a checkpoint of these networks ({first_line(error)}); start anew in another folder"
         ) from error
     return step
 

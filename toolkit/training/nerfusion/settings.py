@@ -10,7 +10,8 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from toolkit.errors import InputError
+from toolkit.config import refuse_traps
+from toolkit.errors import InputError, first_line
 
 KINDS = ("procedural", "shards", "scannet", "dtu", "scanned_objects", "synthetic")
 
@@ -123,16 +124,20 @@ def load_train_settings(path: Path | str | None = None, data: dict[str, Any] | N
     config = OmegaConf.structured(TrainSettings)
     try:
         if path is not None:
-            config = OmegaConf.merge(config, OmegaConf.create(Path(path).read_text(encoding="utf-8")))
+            text = Path(path).read_text(encoding="utf-8")
+            refuse_traps(text, str(path))
+            config = OmegaConf.merge(config, OmegaConf.create(text))
         if data is not None:
             config = OmegaConf.merge(config, OmegaConf.create(data))
         settings = OmegaConf.to_object(config)
-    except OSError as error:
-        raise InputError(f"cannot read the training settings {path}: {error.strerror or error}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read the training settings {path}: {getattr(error, 'strerror', None) or error}") from error
+    except InputError:
+        raise
     except (OmegaConfBaseException, ValueError, TypeError) as error:
-        raise InputError(f"{path or 'the training settings'}: {str(error).splitlines()[0]}; see docs/training.md") from error
+        raise InputError(f"{path or 'the training settings'}: {first_line(error)}; see docs/training.md") from error
     except Exception as error:  # the YAML parser raises its own family
-        raise InputError(f"{path or 'the training settings'} is not valid YAML: {str(error).splitlines()[0]}") from error
+        raise InputError(f"{path or 'the training settings'} is not valid YAML: {first_line(error)}") from error
     assert isinstance(settings, TrainSettings)
     _check(settings)
     return settings
