@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
+
+if TYPE_CHECKING:
+    from pipelines.job import Job
+    from toolkit.capture.types import Views
+    from toolkit.poses.scene import Scene
+    from toolkit.render.bake import BakedField
+    from toolkit.render.field import Field
+
+SEEN = 0.01  # see --seen
 
 
 def bake(
@@ -16,7 +25,7 @@ def bake(
     out: OptionalOut = None,
     seen: Annotated[
         float, typer.Option(min=0, max=1, help="Voxels in which no training pixel has more of its light are left out; 0 keeps all.")
-    ] = 0.01,
+    ] = SEEN,
     to: Annotated[Path | None, typer.Option(help="The file. Default: DIR/exports/baked.safetensors.", show_default=False)] = None,
     threads: Threads = None,
     config: Config = None,
@@ -59,10 +68,7 @@ def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: floa
     from pipelines.reconstruct import BEFORE, stand
     from pipelines.steps_results import fit_radiance_field
     from toolkit.evaluate.images import psnr
-    from toolkit.render.bake import bake as quantise
-    from toolkit.render.bake_file import read_baked, write_baked
     from toolkit.render.bake_image import BakedRenderer
-    from toolkit.render.bake_views import seen_voxels
     from toolkit.render.image import make_renderer, render_view
 
     with open_job(target, out, options, make_progress(quiet), (*BEFORE, "field")) as job:
@@ -71,18 +77,11 @@ def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: floa
         field = field.to("cpu")
         job.progress.begin("bake")
         start = time.monotonic()
-        threads = torch.get_num_threads()
-        train, test = np.flatnonzero(~views.test), np.flatnonzero(views.test)
-        keep = None
-        if seen > 0:
-            lenses = [views.intrinsics[i] for i in train]
-            keep = seen_voxels(field, lenses, views.world_from_camera[train], seen, threads, job.progress)
-        place = to or job.folder / "exports" / "baked.safetensors"
-        write_baked(place, quantise(field, keep), scene.working_from_input)
-        baked = read_baked(place)
-        renderer, view = BakedRenderer(baked, threads), make_renderer(field)
+        place = to or default_place(job)
+        baked = write(job, field, views, scene, seen, place)
+        renderer, view = BakedRenderer(baked, torch.get_num_threads()), make_renderer(field)
         scores = []
-        for index in test:
+        for index in np.flatnonzero(views.test):
             job.progress.check()
             lens, pose = views.intrinsics[index], views.world_from_camera[index]
             truth = views.images[index].astype(np.float32) / 255
@@ -102,3 +101,40 @@ def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: floa
         "psnr": None if mean is None else round(float(mean[0]), 3),
         "loss": None if mean is None else round(float(mean[0] - mean[1]), 3),
     }
+
+
+def default_place(job: Job) -> Path:
+    """Where a run's baked field lies."""
+    return job.folder / "exports" / "baked.safetensors"
+
+
+def write(job: Job, field: Field, views: Views, scene: Scene, seen: float, place: Path) -> BakedField:
+    """Bake `field` (on the CPU) into the file `place` and open that.
+
+    Raises:
+        InputError: a decoder that cannot be baked.
+        OutputError: the file cannot be written.
+    """
+    import numpy as np
+    import torch
+
+    from toolkit.render.bake import bake as quantise
+    from toolkit.render.bake_file import read_baked, write_baked
+    from toolkit.render.bake_views import seen_voxels
+
+    keep, train = None, np.flatnonzero(~views.test)
+    if seen > 0:
+        lenses = [views.intrinsics[i] for i in train]
+        keep = seen_voxels(field, lenses, views.world_from_camera[train], seen, torch.get_num_threads(), job.progress)
+    write_baked(place, quantise(field, keep), scene.working_from_input)
+    return read_baked(place)
+
+
+def baked_of(job: Job, field: Field, views: Views, scene: Scene) -> BakedField:
+    """The run's baked field; made first where there is none, or one of an earlier fit."""
+    from toolkit.render.bake_file import read_baked
+
+    place, source = default_place(job), job.folder / "field.safetensors"
+    if place.is_file() and source.is_file() and place.stat().st_mtime_ns >= source.stat().st_mtime_ns:
+        return read_baked(place)
+    return write(job, field.to("cpu"), views, scene, SEEN, place)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipelines.bake import baked_of
 from pipelines.console import make_progress
 from pipelines.job import Job, open_job
 from pipelines.reconstruct import BEFORE, stand
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
     from toolkit.poses.scene import Scene
     from toolkit.render.field import Field
 
+Camera = Callable[[Intrinsics, Array], Any]  # lens, pose → a `Rendered`
+
 VIDEO = (".mp4",)
 MAX_CAMERAS = 100_000
 
@@ -41,6 +45,7 @@ def render_run(
     frames: int,
     fps: float,
     image_size: int | None,
+    baked: bool,
     quiet: bool,
 ) -> dict[str, Any]:
     """Render what is asked for; the field of a run's folder is taken as it is.
@@ -72,15 +77,25 @@ def render_run(
         )
         start = time.monotonic()
         job.progress.begin("render")
-        write(job, field, names, lenses, poses, place, fps)
+        write(job, camera_of(job, field, ready, scene, baked), names, lenses, poses, place, fps)
         seconds = time.monotonic() - start
         job.progress.finish("render", seconds, False)
     return {"pictures": len(names), "width": lenses[0].width, "height": lenses[0].height, "seconds": round(seconds, 3), "to": str(place)}
 
 
-def write(job: Job, field: Field, names: list[str], lenses: list[Intrinsics], poses: Array, to: Path, fps: float) -> None:
+def camera_of(job: Job, field: Field, views: Views, scene: Scene, baked: bool) -> Camera:
+    """What takes pictures of the field, or of its baked copy."""
+    from toolkit.render.bake_image import BakedRenderer
+    from toolkit.render.image import make_renderer, render_view
+
+    if baked:
+        return BakedRenderer(baked_of(job, field, views, scene)).render
+    return partial(render_view, field, view=make_renderer(field))
+
+
+def write(job: Job, camera: Camera, names: list[str], lenses: list[Intrinsics], poses: Array, to: Path, fps: float) -> None:
     """Render every camera and write it as it comes."""
-    frames = pictures(field, lenses, poses, job.progress)
+    frames = pictures(camera, lenses, poses, job.progress)
     if to.suffix.lower() in VIDEO:
         from toolkit.export.video import write_video
 
@@ -92,15 +107,12 @@ def write(job: Job, field: Field, names: list[str], lenses: list[Intrinsics], po
         write_png(to / f"{index:04d}_{file_name(Path(name).stem)}.png", frame)
 
 
-def pictures(field: Field, lenses: list[Intrinsics], poses: Array, progress: Progress) -> Iterator[Array]:
+def pictures(camera: Camera, lenses: list[Intrinsics], poses: Array, progress: Progress) -> Iterator[Array]:
     """(H, W, 3) uint8 for each camera (working frame), one at a time."""
-    from toolkit.render.image import make_renderer, render_view
-
-    view = make_renderer(field)
     for index, (lens, pose) in enumerate(zip(lenses, poses, strict=True)):
         progress.check()
         progress.update(index, len(lenses))
-        yield to_picture(render_view(field, lens, pose, view)).rgb
+        yield to_picture(camera(lens, pose)).rgb
 
 
 def sized(lens: Intrinsics, long_side: int | None) -> Intrinsics:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.job import Job
-from pipelines.render_path import orbit_cameras, pictures
+from pipelines.render_path import camera_of, orbit_cameras, pictures
 from pipelines.rendered import Pictures, to_picture
 from pipelines.summary import put_cameras
 from toolkit.camera import Intrinsics, Similarity
@@ -124,7 +124,8 @@ def export_field(
     if "video" in formats:
         _, lenses, around = orbit_cameras(views, scene, job.settings.export.video_frames)
         job.progress.update(0, len(around), "orbit video")
-        write_video(folder / "orbit.mp4", pictures(field, [at_most(lens, VIDEO_SIDE) for lens in lenses], around, job.progress), FPS)
+        camera = camera_of(job, field, views, scene, baked=False)
+        write_video(folder / "orbit.mp4", pictures(camera, [at_most(lens, VIDEO_SIDE) for lens in lenses], around, job.progress), FPS)
         written.append(folder / "orbit.mp4")
     return facts, written
 

@@ -149,6 +149,22 @@ def test_render_paths(done: Path, tmp_path: Path, capsys: Capsys) -> None:
     assert len(list((tmp_path / "given").iterdir())) == 16
 
 
+def test_the_baked_field_is_made_once_and_looks_like_the_field(done: Path, tmp_path: Path, capsys: Capsys) -> None:
+    assert call(capsys, "render", done, "--views", "test", "--to", tmp_path / "exact", "--quiet").code == 0
+    made = []
+    for folder in ("first", "second", "third"):
+        if folder == "third":
+            os.utime(done / "field.safetensors")  # a field that is newer than its baked copy is baked again
+        answer = call(capsys, "render", done, "--views", "test", "--baked", "--to", tmp_path / folder, "--quiet")
+        assert answer.code == 0, answer.err
+        made.append((done / "exports" / "baked.safetensors").stat().st_mtime_ns)
+    assert made[0] == made[1] < made[2]
+    for path in sorted((tmp_path / "exact").iterdir()):
+        exact, first, second = (cv2.imread(str(tmp_path / folder / path.name)) / 255 for folder in ("exact", "first", "second"))
+        assert np.array_equal(first, second)
+        assert -10 * np.log10(np.mean((exact - first) ** 2) + 1e-12) > 30
+
+
 def test_render_refuses_what_it_cannot_do(done: Path, tmp_path: Path, capsys: Capsys) -> None:
     assert "orbit or test" in call(capsys, "render", done, "--views", "train").sentence()
     assert ".mp4" in call(capsys, "render", done, "--to", tmp_path / "x.gif").sentence()
