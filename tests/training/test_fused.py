@@ -14,6 +14,7 @@ from toolkit.capture.types import Views
 from toolkit.render.compiled import CompiledRenderer
 from toolkit.render.field import Field
 from toolkit.render.rays import render_rays
+from toolkit.training import fused_kernels
 from toolkit.training import step as step_module
 from toolkit.training.fused import FusedOptimiser
 from toolkit.training.rays import PixelPool
@@ -104,6 +105,18 @@ def test_gradients_agree(shell: float, threads: int, monkeypatch: pytest.MonkeyP
         scale = float(wanted.abs().max())
         assert scale > 0
         torch.testing.assert_close(got, wanted, atol=1e-4 * scale, rtol=1e-4)
+
+
+@pytest.mark.parametrize("rays", [0, 1, 3, 4, 257])
+def test_products_of_a_layer(rays: int) -> None:
+    """Sums over rays of inputs times gradients, against NumPy in float64; half of the inputs are zero, as behind a ReLU."""
+    generator = np.random.default_rng(rays)
+    inputs, gradients = (generator.normal(size=(rays, width)).astype(np.float32) for width in (24, 32))
+    inputs[generator.random(inputs.shape) < 0.5] = 0
+    weight, bias = np.full((24, 32), np.nan, np.float32), np.full(32, np.nan, np.float32)
+    fused_kernels.add_products((0,) * 32, inputs, gradients, weight, bias)
+    np.testing.assert_allclose(weight, inputs.T.astype(float) @ gradients, atol=1e-4)
+    np.testing.assert_allclose(bias, gradients.astype(float).sum(0), atol=1e-4)
 
 
 def test_a_step_moves_rows_as_the_reference_does() -> None:

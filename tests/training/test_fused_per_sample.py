@@ -116,14 +116,37 @@ def gradients(engine: FusedPerSampleOptimiser, picks: torch.Tensor, monkeypatch:
     return [*dense, *(parameter.detach() for parameter in decoder.parameters())]
 
 
+def clear_of_zero(field: Field, pool: PixelPool, picks: torch.Tensor, margin: float) -> torch.Tensor:
+    """Which of the rays `picks` have no sample with a hidden unit whose input lies within `margin` of zero."""
+    assert isinstance(field.decoder, PerSample)
+    nearest: list[float] = []
+    layers = [field.decoder.body[0], field.decoder.body[2], field.decoder.colour[0]]
+    hooks = [
+        layer.register_forward_hook(lambda _m, _i, out: nearest.append(float(out.abs().min()) if out.numel() else 1.0)) for layer in layers
+    ]
+    clear = []
+    for pick in picks:
+        nearest.clear()
+        batch = pool.take(pick[None])
+        render_rays(field, batch.origins, batch.directions)
+        clear.append(min(nearest, default=1.0) > margin)
+    for hook in hooks:
+        hook.remove()
+    return torch.tensor(clear)
+
+
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("shell", [0.0, 1.0])
 def test_gradients_agree(shell: float, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where rounding cannot put a hidden unit on the other side of its ReLU, gradients agree within 1e-4 of the largest; at a voxel's
+    border, where a place in it is worth few digits, within 1e-3."""
     field = made_field(shell, 0.5, -3.5)
     pool = PixelPool(made_views())
-    picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(0))[:200]
-    # In float32 the reference's angles are off by 1e-5, enough to put a hidden unit on the other side of its ReLU here and there.
+    picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(0))[:400]
+    # In float32 the reference's own angles are off by 1e-5, and places in a voxel by as much, which the encoding multiplies by 16.
     monkeypatch.setattr("toolkit.networks.decoder.positional", lambda values, count: positional(values.double(), count).float())
+    picks = picks[clear_of_zero(field, pool, picks, 5e-4)]
+    assert len(picks) > 60
     expected = torch_gradients(field, pool, picks, RATES, monkeypatch)  # undoes the patches
     monkeypatch.setattr("toolkit.training.fused.STOP", 0.0)
     monkeypatch.setattr("toolkit.training.fused_per_sample.NEGLIGIBLE", -1.0)
@@ -131,10 +154,9 @@ def test_gradients_agree(shell: float, threads: int, monkeypatch: pytest.MonkeyP
     for wanted, value in zip(expected, got, strict=True):
         scale = float(wanted.abs().max())
         assert scale > 0
-        # One such unit on the other side changes one sample's part of the gradient; everything else agrees.
-        assert float((value - wanted).norm()) < 1e-2 * float(wanted.norm())
-        if wanted.numel() > 10_000:
-            assert float(((value - wanted).abs() <= 1e-4 * scale).float().mean()) > 0.9995
+        torch.testing.assert_close(value, wanted, atol=1e-3 * scale, rtol=1e-3)
+        assert float((value - wanted).norm()) < 5e-4 * float(wanted.norm())
+        assert float(((value - wanted).abs() <= 1e-4 * scale).float().mean()) > 0.9998
 
 
 def test_what_is_left_out_has_no_weight(monkeypatch: pytest.MonkeyPatch, every_sample: None) -> None:
