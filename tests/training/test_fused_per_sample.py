@@ -156,7 +156,7 @@ def test_gradients_agree(shell: float, threads: int, monkeypatch: pytest.MonkeyP
         assert scale > 0
         torch.testing.assert_close(value, wanted, atol=1e-3 * scale, rtol=1e-3)
         assert float((value - wanted).norm()) < 5e-4 * float(wanted.norm())
-        assert float(((value - wanted).abs() <= 1e-4 * scale).float().mean()) > 0.9998
+        assert float(((value - wanted).abs() <= 1e-4 * scale).float().mean()) > 0.995
 
 
 def test_what_is_left_out_has_no_weight(monkeypatch: pytest.MonkeyPatch, every_sample: None) -> None:
