@@ -25,6 +25,7 @@ ERROR_LOG = "error.log"
 SUBFOLDERS = (STAGES, "frames", "sparse", "renders", "tsdf", "stereo", "tsdf_stereo", "compare", "tradeoff", "exports")
 FILES = (
     "capture.json",
+    "plan.json",
     "poses.json",
     "scene.json",
     "keyframes.json",

@@ -8,13 +8,16 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipelines.console import ConsoleProgress
 from pipelines.folder import RunFolder, is_run_folder
 from pipelines.stages import Stages
 from toolkit.config import Settings, load_settings
 from toolkit.errors import InputError
+
+if TYPE_CHECKING:
+    from pipelines.total_budget import TotalBudget
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -29,6 +32,7 @@ class Job:
     progress: ConsoleProgress
     stages: Stages
     other_field: bool = False  # the settings of the field differ from those that the folder was made with
+    plan: TotalBudget | None = None  # chooses settings as the run goes on, so that it takes as long as was asked for
 
 
 @contextmanager

@@ -35,13 +35,20 @@ def run_job(
 ) -> dict[str, Any]:
     """Open the run's folder and make `goals` in it, with all that they need; see `open_job` for the arguments."""
     with open_job(target, out, options, progress, trusted) as job:
+        if options.get("total_budget") is not None:
+            from pipelines.total_budget import TotalBudget
+
+            job.plan = TotalBudget(options["total_budget"])
         wanted = frozenset(goals)
         return reconstruct(job, wanted, go_on) if wanted else reconstruct_poses(job)
 
 
 def stand(job: Job) -> tuple[Capture, PoseResult, Capture, Scene, Views]:
     """What every result stands on: capture, poses, the posed capture, the scene, and the views made ready."""
-    capture = choose_frames(job, find_capture(job))
+    capture = find_capture(job)
+    if job.plan is not None:
+        job.plan.choose_pictures(job, capture)
+    capture = choose_frames(job, capture)
     poses = find_camera_poses(job, capture)
     posed = poses.apply(capture)
     scene = measure_scene(job, posed)
@@ -74,11 +81,15 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
     if ("tsdf" in goals and wants_tsdf(job, posed)) or stages.usable("tsdf"):
         pictures["tsdf"] = fuse_tsdf(job, posed, scene, views)
     if goals & {"field", "render", "export"} or stages.usable("field"):
+        if job.plan is not None:
+            job.plan.choose_fit(job, views, scene)
         field, timeline = fit_radiance_field(job, views, scene, go_on)
         if "render" in goals or stages.usable("render"):
             pictures["field"] = render_test_views(job, field, views)
         # Who has asked to stop waits for the report, not for a video.
         if stages.usable("export") or ("export" in goals and not stages.stopped()):
+            if job.plan is not None:
+                job.plan.choose_exports(job)
             exported = export_results(job, field, poses, posed, scene, views)
     scores = score_pictures(job, views, pictures)
     return put_report(job, capture, poses, scene, views, field, timeline, pictures, scores, exported, time.monotonic() - start)

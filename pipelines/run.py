@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+import typer
+
 from pipelines.options import (
     Budget,
     Config,
@@ -21,6 +25,16 @@ from pipelines.options import (
     Threads,
     gather,
 )
+from toolkit.errors import InputError
+
+TotalBudget = Annotated[
+    float | None,
+    typer.Option(
+        min=10,
+        help="Seconds for the whole run: picture size, voxels, a video's frames, fitting time and exports are chosen for it.",
+        show_default=False,
+    ),
+]
 
 
 def run(
@@ -28,6 +42,7 @@ def run(
     out: Out,
     preset: Preset = None,
     budget: Budget = None,
+    total_budget: TotalBudget = None,
     image_size: ImageSize = None,
     holdout: Holdout = None,
     device: Device = None,
@@ -47,6 +62,11 @@ def run(
     """
     from pipelines.work import work
 
+    options_given = {"--preset": preset, "--budget": budget, "--image-size": image_size}
+    for name, value in options_given.items():
+        if total_budget is not None and value is not None:
+            raise InputError(f"--total-budget chooses what {name} would set; give one of them")
     flags = {"budget": budget, "image_size": image_size, "holdout": holdout, "device": device, "threads": threads, "seed": seed}
     flags |= {"engine": engine, "decoder": decoder, "poses.source": poses}
-    work(source, out, gather(preset, config, pairs, **flags), ("tsdf", "field", "render", "export"), quiet=quiet, as_json=json)
+    options = {**gather(preset, config, pairs, **flags), "total_budget": total_budget}
+    work(source, out, options, ("tsdf", "field", "render", "export"), quiet=quiet, as_json=json)

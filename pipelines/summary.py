@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import time
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from pipelines.job import Job
 from pipelines.rendered import Pictures
 from toolkit import __version__
 from toolkit.config import settings_dict
+from toolkit.files import write_json
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Capture, Views
@@ -162,6 +164,7 @@ def put_report(
     from toolkit.evaluate.report import report_data, write_report
 
     notes = [export_facts["note"]] if export_facts and "note" in export_facts else []
+    began, told = time.monotonic(), None if job.plan is None else job.plan.told(job)
     data = {
         **base_data(job, capture, poses),
         "warnings": warnings_of(job, capture, poses, scene, views) + notes,
@@ -180,8 +183,13 @@ def put_report(
         "export_facts": export_facts,
         "seconds_total": round(seconds + job.stages.fresh_seconds(), 3),
     }
+    if job.plan is not None and told is not None:
+        data |= {"budget": told, "notes": [job.plan.note(told)]}
     shown = {name: [*found.pictures] for name, found in pictures.items()}
     unit = "m" if scene.metric else "units"
     tiles = make_pictures(views, np.flatnonzero(views.test), shown.get("field"), shown.get("tsdf"), unit)
     write_report(job.folder.path, data, tiles)
+    if job.plan is not None:
+        data["budget"] = job.plan.finish(job, time.monotonic() - began)
+        write_json(job.folder / "report.json", report_data(data, job.folder.path))
     return report_data(data, job.folder.path)

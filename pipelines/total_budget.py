@@ -1,0 +1,220 @@
+"""`fieldfuse run --total-budget SECONDS`: settings chosen so that the whole run takes so long, and what was predicted beside what it took.
+
+Decided step by step, each time from what is known by then: pictures when the capture is known, the fit's seconds and its finest lattice
+when everything before it is done, the exports when the field can be rendered.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import psutil
+
+from toolkit.evaluate import budget as model
+from toolkit.files import read_json, write_json
+
+if TYPE_CHECKING:
+    from pipelines.job import Job
+    from toolkit.capture.types import Capture, Views
+    from toolkit.poses.scene import Scene
+
+FILE = "plan.json"
+LONGEST_START = 60.0  # seconds; a process that is older was not started for this command
+NOT_FITTED = ("capture", "frames", "poses", "scene", "views", "tsdf", "render", "export", "evaluate", "report")
+WORTH_LEARNING = 0.3  # seconds; shorter stages say little
+
+
+class TotalBudget:
+    """The plan of one run: what was asked for, what was chosen, what was predicted."""
+
+    def __init__(self, seconds: float) -> None:
+        self.asked = seconds
+        started = time.time() - psutil.Process().create_time()
+        self._began = time.monotonic() - (started if started < LONGEST_START else 0.0)
+        self.speed: model.Speed | None = None
+        self.work: model.Work | None = None
+        self.choice: model.Choice | None = None
+        self.predicted: dict[str, float] = {}
+        self.again = False  # an earlier run of the same plan has decided everything
+        self.name = ""
+
+    def elapsed(self) -> float:
+        return time.monotonic() - self._began
+
+    def choose_pictures(self, job: Job, capture: Capture) -> None:
+        """Decide picture size and a video's frames; predict every stage."""
+        from toolkit.evaluate.budget_probe import self_test
+
+        settings = job.settings
+        threads = settings.threads or psutil.cpu_count() or 1
+        self.name = model.signature(threads, settings.device)
+        self.speed = model.remembered(self.name)
+        if self.speed is None:
+            job.progress.begin("self-test")
+            start = time.monotonic()
+            self.speed = self_test(settings)
+            job.progress.finish("self-test", time.monotonic() - start, False)
+            model.remember(self.name, self.speed)
+        self.work = work_of(capture, settings)
+        kept = self._kept(job)
+        if kept is not None:
+            self.choice, self.again = kept, True
+        else:
+            self.choice = model.choose(self.speed, self.work, self.asked - self.elapsed(), settings.capture.max_frames)
+        settings.capture.image_size = self.choice.image_size
+        if self.choice.max_frames is not None:
+            settings.capture.max_frames = self.choice.max_frames
+        before = self.elapsed() - job.stages.records["capture"].seconds * (not job.stages.cached["capture"])
+        parts = model.predict(self.speed, self.work, self.choice)
+        parts["export"] = model.EXPORT_SHARE * max(0.0, self.asked - before - sum(parts.values()))
+        parts["start"] = before
+        parts["fit"] = model.fit_seconds(self.asked, 0.0, sum(parts.values()))
+        self.predicted = parts
+
+    def choose_fit(self, job: Job, views: Views, scene: Scene) -> None:
+        """Decide the fit's seconds and its finest lattice from what is left."""
+        assert self.speed is not None and self.work is not None and self.choice is not None
+        if not self.again:
+            pace = self._pace(job)
+            after = sum(self.predicted.get(stage, 0.0) for stage in ("render", "evaluate", "report")) * pace
+            left = self.asked - self.elapsed() - after
+            self.choice.fit_seconds = round(max(model.LEAST_FIT, left * (1 - model.EXPORT_SHARE)), 2)
+            self.choice.resolution = model.resolution_for(
+                self.choice.fit_seconds, self.speed.units["fit"] * pace, finest(job, views, scene)
+            )
+        job.settings.fit.budget = self.choice.fit_seconds
+        job.settings.field.resolution = self.choice.resolution
+
+    def choose_exports(self, job: Job) -> None:
+        """Decide how much is rendered for mesh and video, at the pace that the test views were rendered at."""
+        assert self.work is not None and self.choice is not None
+        export = job.settings.export
+        if not self.again:
+            rays = model.amounts(self.work, self.choice)["render"]
+            spent = job.stages.records["render"].seconds
+            after = sum(self.predicted.get(stage, 0.0) for stage in ("evaluate", "report")) * self._pace(job)
+            factor = self.speed.factors.get("export", 1.0) if self.speed is not None else 1.0
+            a_ray = factor * spent / rays if rays else self._predicted_ray()
+            left = self.asked - self.elapsed() - after
+            views, frames = model.exports_for(self.work, self.choice, left, a_ray)
+            self.choice.mesh_views, self.choice.video_frames = min(views, export.mesh_views), min(frames, export.video_frames)
+            self._keep(job)
+        assert self.choice.mesh_views is not None and self.choice.video_frames is not None
+        export.mesh_views = self.choice.mesh_views
+        if self.choice.video_frames:
+            export.video_frames = self.choice.video_frames
+        else:
+            export.formats = [name for name in export.formats if name != "video"]
+
+    def told(self, job: Job) -> dict[str, Any]:
+        """The report's part `budget`: seconds asked for, predicted and real, in all and by stage, and what was chosen."""
+        assert self.choice is not None
+        real = {record.name: record.seconds for record in job.stages.records.values()}
+        names = {**dict.fromkeys(self.predicted), **dict.fromkeys(name for name in real if name not in ("field", "keyframes"))}
+        shown = {
+            name: {"predicted": _round(self.predicted.get(name)), "real": _round(real.get("field" if name == "fit" else name))}
+            for name in names
+        }
+        return {
+            "asked_seconds": self.asked,
+            "predicted_seconds": _round(sum(self.predicted.values())),
+            "real_seconds": _round(self.elapsed()),
+            "stages": shown,
+            "choice": self.choice.to_dict(),
+            "reused": any(job.stages.cached.values()),
+        }
+
+    def note(self, told: dict[str, Any]) -> str:
+        """One sentence for the page."""
+        chosen = self.choice
+        assert chosen is not None
+        parts = [f"pictures of {chosen.image_size} pixels", f"{chosen.fit_seconds:g} s of fitting", f"at most {chosen.resolution}³ voxels"]
+        if chosen.max_frames is not None:
+            parts.append(f"{chosen.max_frames} frames")
+        parts.append("no video" if not chosen.video_frames else f"{chosen.video_frames} video frames")
+        return (
+            f"Of the {told['asked_seconds']:g} s asked for, {told['predicted_seconds']:.0f} s were predicted and"
+            f" {told['real_seconds']:.0f} s spent until this page was written; chosen: {', '.join(parts)}."
+        )
+
+    def finish(self, job: Job, report_seconds: float) -> dict[str, Any]:
+        """After the report: correct its total, and learn from stages that took other than predicted."""
+        told = self.told(job)
+        told["stages"]["report"] = {"predicted": _round(self.predicted.get("report")), "real": _round(report_seconds)}
+        if self.speed is not None and not told["reused"]:
+            for name in NOT_FITTED:
+                real, predicted = told["stages"].get(name, {}).get("real"), self.predicted.get(name)
+                if real and predicted and max(real, predicted) > WORTH_LEARNING and name != "export":
+                    self.speed.learn(name, predicted, real)
+            if abs(told["real_seconds"] - self.asked) > 2 * model.AGREES * self.asked:
+                model.remember(self.name, None)  # so far off that the machine must have changed: measured again next time
+            else:
+                model.remember(self.name, self.speed)
+        return told
+
+    def _pace(self, job: Job) -> float:
+        """How much slower than predicted the stages were so far; other work on the machine slows the rest, too."""
+        done = [name for name in ("capture", "scene", "views") if name in self.predicted and not job.stages.cached.get(name, True)]
+        real = sum(job.stages.records[name].seconds for name in done)
+        predicted = sum(self.predicted[name] for name in done)
+        return min(max(real / predicted, 0.5), 3.0) if predicted > 0.5 else 1.0
+
+    def _predicted_ray(self) -> float:
+        assert self.speed is not None
+        return self.speed.seconds("export", 1.0)
+
+    def _keep(self, job: Job) -> None:
+        assert self.choice is not None
+        write_json(job.folder / FILE, {"asked": self.asked, "source": str(job.source), "choice": self.choice.to_dict()})
+
+    def _kept(self, job: Job) -> model.Choice | None:
+        """What an earlier run of this very plan decided."""
+        path = job.folder / FILE
+        if not path.is_file():
+            return None
+        try:
+            kept = read_json(path)
+            if kept["asked"] == self.asked and kept["source"] == str(job.source):
+                return model.Choice(**kept["choice"])
+        except (KeyError, TypeError, ValueError):
+            pass
+        return None
+
+
+def _round(value: float | None) -> float | None:
+    return None if value is None else round(value, 2)
+
+
+def work_of(capture: Capture, settings: Any) -> model.Work:
+    """What the capture asks for, from what its headers say."""
+    from pipelines.summary import picture_size
+    from toolkit.capture.prepare import held_out
+
+    width, height = picture_size(capture)
+    video = capture.kind == "video"
+    frames = settings.capture.max_frames if video else len(capture.frames)
+    test = (
+        round(frames / settings.capture.holdout)
+        if video and settings.capture.holdout
+        else int(held_out(capture, settings.capture.holdout).sum())
+    )
+    posed = settings.poses.source == "given" or (settings.poses.source == "auto" and capture.posed)
+    outlined = not posed or capture.has_depth or capture.alpha or (capture.points is not None and len(capture.points) > 0)
+    total = int(capture.extra.get("frames") or len(capture.frames)) if video else frames
+    depth = settings.tsdf.enabled != "off" and capture.has_depth
+    return model.Work(frames, width or 640, height or 480, test, posed, depth, bool(outlined), video, total)
+
+
+def finest(job: Job, views: Views, scene: Scene) -> int:
+    """The lattice that a fit would end at without a budget."""
+    import numpy as np
+
+    from toolkit.training.start import MARGIN, ROOM_MARGIN, finest_resolution, make_space
+
+    settings = job.settings.field
+    if settings.resolution is not None:
+        return settings.resolution
+    background = scene.has_background if settings.background == "auto" else settings.background == "on"
+    space = make_space(scene, background and views.background is None, MARGIN if views.background is not None else ROOM_MARGIN)
+    return finest_resolution(space, views.subset(np.flatnonzero(~views.test)), scene)

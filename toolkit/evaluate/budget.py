@@ -1,0 +1,238 @@
+"""A small model of time: what each stage of a run takes on this machine, and which settings fit into a given number of seconds.
+
+Seconds of a stage = amount of work (pixels, frames, views) × what a unit takes here (a quick self-test) × a factor learnt from runs.
+The fit takes what is left. What was learnt is kept in the user's cache folder under the machine's signature.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from toolkit.errors import FieldfuseError
+from toolkit.files import fingerprint, read_json, write_json
+
+SIZES = (160, 240, 320, 400, 480, 640, 800, 960)  # long sides that pictures are brought to
+RAYS_A_PIXEL = 0.6  # rays that a fit should have for each training pixel: with fewer, smaller pictures end better in the same time
+VOXELS_A_RAY = 2.0  # as the schedule: a finer level is worth its voxels only when so few rays are left for each
+SURFACE = 3.0  # occupied voxels of a lattice of n a side, in n²
+FIT_SHARE = 0.35  # of the seconds, at least, that the fit should have when pictures are chosen
+LEAST_FIT = 2.0  # seconds
+EXPORT_SHARE = 0.25  # of the seconds, at most, that are planned for exports
+MESH_SHARE = 0.6  # of the exports' seconds, the rest is the video's
+MESH_VIEWS, VIDEO_FRAMES = (12, 60), (24, 90)  # fewest and most
+SIFT_FRAMES = 100
+AGREES = 0.15  # relative error of a prediction that is still good
+LEARNING = 0.7  # of what a run shows about a factor, the part that is believed
+FACTOR_RANGE = (0.05, 20.0)
+
+# Stage → (kind of the self-test's unit, how many of them a unit of this stage's work takes). Measured once; factors learn the rest.
+COST = {
+    "capture": ("decode", 1.0),
+    "frames": ("decode", 2.0),
+    "poses": ("features", 1.3),
+    "scene": ("features", 1.0),
+    "views": ("decode", 2.5),
+    "tsdf": ("decode", 4.0),
+    "render": ("ray", 1.5),
+    "export": ("ray", 1.5),
+    "evaluate": ("score", 1.0),
+    "report": ("decode", 6.0),
+}
+KINDS = ("decode", "features", "ray", "fit", "score")
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a capture asks for.
+
+    Attributes:
+        frames, width, height: pictures that are used, and their size as they lie on disk. total: of a video's frames, else `frames`.
+    """
+
+    frames: int
+    width: int
+    height: int
+    test: int
+    posed: bool
+    depth: bool
+    outlined: bool  # depth, alpha or points tell where the scene is; nothing has to be triangulated
+    video: bool = False
+    total: int = 0
+
+    @property
+    def megapixels(self) -> float:
+        return self.width * self.height / 1e6
+
+    def pixels(self, long_side: int) -> float:
+        """Of one picture brought to `long_side`."""
+        factor = min(1.0, long_side / max(self.width, self.height))
+        return self.width * self.height * factor * factor
+
+
+@dataclass
+class Choice:
+    """Settings that fit into the seconds; None: not decided yet."""
+
+    image_size: int
+    max_frames: int | None = None  # of a video
+    fit_seconds: float | None = None
+    resolution: int | None = None
+    mesh_views: int | None = None
+    video_frames: int | None = None  # 0: no video
+
+    def to_dict(self) -> dict[str, Any]:
+        return dict(vars(self))
+
+
+@dataclass
+class Speed:
+    """What a unit of each kind takes on this machine, and the factors that runs taught."""
+
+    units: dict[str, float]  # kind → seconds
+    factors: dict[str, float] = field(default_factory=dict)  # stage → factor
+
+    def seconds(self, stage: str, amount: float) -> float:
+        kind, share = COST[stage]
+        return amount * share * self.units[kind] * self.factors.get(stage, 1.0)
+
+    def learn(self, stage: str, predicted: float, real: float) -> None:
+        """Move a stage's factor towards what a run showed."""
+        if predicted > 0 and real > 0:
+            factor = self.factors.get(stage, 1.0) * (real / predicted) ** LEARNING
+            self.factors[stage] = min(max(factor, FACTOR_RANGE[0]), FACTOR_RANGE[1])
+
+
+def amounts(work: Work, choice: Choice) -> dict[str, float]:
+    """Stage → amount of work: megapixels decoded, pictures looked at for features, rays, megapixels scored."""
+    frames = min(work.frames, choice.max_frames or work.frames)
+    test = work.test * frames / max(work.frames, 1)
+    pixels = work.pixels(choice.image_size)
+    methods = 2 if work.depth else 1
+    return {
+        "capture": (0.0 if work.video else frames * work.megapixels),
+        "frames": work.total * work.megapixels if work.video else 0.0,
+        "poses": 0.0 if work.posed else sift_work(frames),
+        "scene": 0.05 * frames * work.megapixels if work.outlined else float(min(frames, SIFT_FRAMES)),
+        "views": frames * work.megapixels,
+        "tsdf": (frames - test) * work.megapixels if work.depth else 0.0,
+        "render": test * pixels,
+        "evaluate": test * pixels / 1e6 * methods,
+        "report": 1 + 0.2 * min(test, 12) * methods,
+        "export": export_rays(work, choice),
+    }
+
+
+def sift_work(frames: int) -> float:
+    """Pictures' worth of features: structure from motion matches all pairs of few pictures, neighbours of many."""
+    return frames * (4.0 + min(frames, 60) / 8.0)
+
+
+def export_rays(work: Work, choice: Choice, mesh_side: int = 400, video_side: int = 640) -> float:
+    """Rays of the mesh's views and the video's."""
+    shown = [(choice.mesh_views or 0, mesh_side), (choice.video_frames or 0, video_side)]
+    return sum(count * work.pixels(min(side, choice.image_size)) for count, side in shown)
+
+
+def predict(speed: Speed, work: Work, choice: Choice) -> dict[str, float]:
+    """Stage → seconds, the fit left out."""
+    return {stage: speed.seconds(stage, amount) for stage, amount in amounts(work, choice).items() if amount > 0}
+
+
+def choose(speed: Speed, work: Work, total: float, most_frames: int = 150) -> Choice:
+    """Picture size and, for a video, how many frames, for a run of `total` seconds.
+
+    The largest pictures whose fit still gets `FIT_SHARE` of the seconds and enough rays for its training pixels; a video's frames are
+    halved until that works for some size.
+    """
+    counts: list[int | None] = [None]
+    if work.video:
+        counts = [most_frames, *(count for count in (100, 75, 50, 36, 24) if count < most_frames)]
+    best = None
+    for count in counts:
+        for size in SIZES:
+            if size > SIZES[0] and size > 1.2 * max(work.width, work.height):
+                break
+            choice = Choice(size, count)
+            rest = total * (1 - EXPORT_SHARE) - sum(predict(speed, work, choice).values())
+            best = choice if best is None or rest >= FIT_SHARE * total else best
+            training = (min(work.frames, count or work.frames) - work.test) * work.pixels(size)
+            if rest < FIT_SHARE * total or rest / speed.units["fit"] < RAYS_A_PIXEL * training:
+                break
+            best = choice
+        if best is not None and best.max_frames == count and best.image_size > SIZES[0]:
+            break
+    assert best is not None
+    return best
+
+
+def fit_seconds(total: float, spent: float, rest: float) -> float:
+    """What is left for the fit when `spent` seconds are gone and `rest` are needed after it."""
+    return max(LEAST_FIT, total - spent - rest)
+
+
+def resolution_for(seconds: float, unit: float, finest: int) -> int:
+    """The finest lattice that a fit of so many seconds can fill, at `unit` seconds a ray; at most `finest`."""
+    most = (seconds / unit * VOXELS_A_RAY / SURFACE) ** 0.5
+    return max(64, min(finest, int(most // 32) * 32))
+
+
+def exports_for(work: Work, choice: Choice, seconds: float, a_ray: float) -> tuple[int, int]:
+    """Views of the mesh and frames of the video that `seconds` allow, at `a_ray` seconds a ray; no video when it would be too short."""
+
+    def count(share: float, side: int, limits: tuple[int, int]) -> int:
+        each = work.pixels(min(side, choice.image_size)) * a_ray
+        return min(limits[1], int(seconds * share / max(each, 1e-9)))
+
+    video = count(1 - MESH_SHARE, 640, VIDEO_FRAMES)
+    if video < VIDEO_FRAMES[0]:
+        return max(MESH_VIEWS[0], count(1.0, 400, MESH_VIEWS)), 0
+    return max(MESH_VIEWS[0], count(MESH_SHARE, 400, MESH_VIEWS)), video
+
+
+# ------------------------------------------------------------------------------------------------- what is remembered
+
+
+def cache_file() -> Path:
+    """Where the user's cache folder keeps what was learnt."""
+    root = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(root) / "fieldfuse" / "speed.json"
+
+
+def signature(threads: int, device: str) -> str:
+    """What times depend on: processor, cores, threads, libraries."""
+    from toolkit.evaluate.speed import machine
+
+    about = machine(threads)
+    return fingerprint([about[key] for key in ("machine", "system", "cores", "threads", "python", "versions")], device)
+
+
+def remembered(name: str) -> Speed | None:
+    """What is known of the machine `name`; None when nothing usable is."""
+    try:
+        entry = read_json(cache_file())[name]
+        units = {kind: float(entry["units"][kind]) for kind in KINDS}
+        factors = {str(stage): float(value) for stage, value in entry["factors"].items() if stage in COST}
+    except (FieldfuseError, KeyError, TypeError, ValueError, AttributeError):
+        return None
+    good = all(0 < value < 1e4 for value in units.values()) and all(0 < value < 1e3 for value in factors.values())
+    return Speed(units, factors) if good else None
+
+
+def remember(name: str, speed: Speed | None) -> None:
+    """Keep what is known of the machine `name`, or forget it (None); a cache that cannot be written is no error."""
+    path = cache_file()
+    try:
+        known = read_json(path)
+    except FieldfuseError:
+        known = {}
+    known = known if isinstance(known, dict) else {}
+    known.pop(name, None)
+    if speed is not None:
+        known[name] = {"units": speed.units, "factors": speed.factors}
+    try:
+        write_json(path, known)
+    except FieldfuseError:
+        return
