@@ -37,4 +37,6 @@ def train(
             progress.begin("training")
             taken = trainer.run(steps, progress)
     if crew.leads and not quiet:
+        if trainer.caution.met:
+            typer.echo(f"note: {trainer.caution.met} steps were not finite and moved nothing, the last at {trainer.caution.last}")
         typer.echo(f"{out / WEIGHTS} ({taken} steps)")

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from tests.training.nerfusion.tiny import SMALL, merged, tiny_settings
 from toolkit.errors import InputError
 from toolkit.networks.weights import load_model
 from toolkit.progress import Progress
+from toolkit.training.nerfusion.caution import RECOVER, Caution
 from toolkit.training.nerfusion.checkpoint import checkpoint_settings, checkpoints
 from toolkit.training.nerfusion.curve import Curve
 from toolkit.training.nerfusion.distributed import Crew, join_crew
@@ -131,22 +136,77 @@ def test_reduced_precision_stays_close(tmp_path: Path) -> None:
     assert reduced["loss"] == pytest.approx(full["loss"], rel=0.1)
 
 
-def test_bad_gradients_do_not_reach_the_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def poison(trainer: Trainer, monkeypatch: pytest.MonkeyPatch, steps: Iterable[int], loss: bool = False) -> None:
+    """At these steps a gradient, or the loss alone, is not finite."""
+    wrong = set(steps)
+    for name in ("stage_one", "stage_two"):
+        whole = getattr(trainer.stepper, name)
+
+        def poisoned(sample, step, generator, whole=whole):  # type: ignore[no-untyped-def]
+            outcome = whole(sample, step, generator)
+            if step in wrong and loss:
+                outcome.loss = float("nan")
+            elif step in wrong:
+                next(trainer.model.parameters()).grad[:] = float("nan")  # type: ignore[index]
+            return outcome
+
+        monkeypatch.setattr(trainer.stepper, name, poisoned)
+
+
+@pytest.mark.parametrize("loss", [False, True])
+def test_a_bad_step_moves_nothing_and_the_next_ones_are_smaller(loss: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = Trainer(tiny_settings(), tmp_path, Crew())
     before = state(trainer)
-    whole = trainer.stepper.stage_one
+    poison(trainer, monkeypatch, {0}, loss)
+    row = trainer.one_step()
+    assert same(before, state(trainer)) and not trainer.adam.state and row["skipped"] == 1
+    name = next(name for name, _ in trainer.model.named_parameters())
+    assert trainer.caution.last == ("step 1: the loss" if loss else f"step 1: the gradient of {name}")
+    trainer.step = 1
+    row = trainer.one_step()
+    assert row["rate"] == learning_rate(trainer.settings, 1) / 2 and row["skipped"] == 0 and not same(before, state(trainer))
+    for _ in range(RECOVER - 1):
+        trainer.caution.well()
+    assert trainer.caution == Caution(met=1, last=trainer.caution.last)
 
-    def poisoned(*arguments):  # type: ignore[no-untyped-def]
-        outcome = whole(*arguments)
-        next(trainer.model.parameters()).grad[:] = float("nan")  # type: ignore[index]
-        return outcome
 
-    monkeypatch.setattr(trainer.stepper, "stage_one", poisoned)
-    trainer.one_step()
-    assert same(before, state(trainer))
-    trainer._bad = 19
-    with pytest.raises(InputError, match="no finite gradient"):
-        trainer.one_step()
+def test_training_gives_up_with_the_weights_of_the_last_good_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = Trainer(tiny_settings(), tmp_path, Crew())
+    poison(trainer, monkeypatch, range(4))
+    monkeypatch.setattr("toolkit.training.nerfusion.caution.MOST", 2)
+    with pytest.raises(InputError, match=r"the last at step 2 in the gradient of .*; the weights of the last good step"):
+        trainer.run()
+    assert trainer.caution.slower == 0.25
+    loaded = load_model(tmp_path / WEIGHTS)
+    assert same(loaded.state_dict(), state(trainer)) and all(bool(torch.isfinite(v).all()) for v in loaded.state_dict().values())
+
+
+def test_resuming_after_a_bad_step_repeats_every_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = Trainer(tiny_settings(), tmp_path / "whole", Crew())
+    poison(whole, monkeypatch, {0})
+    whole.run(2)
+    first = Trainer(tiny_settings(), tmp_path / "parts", Crew())
+    poison(first, monkeypatch, {0})
+    first.run(1)
+    second = Trainer(tiny_settings(), tmp_path / "parts", Crew(), resume=True)
+    assert second.caution == first.caution and second.caution.slower == 0.5
+    second.run(2)
+    assert same(state(whole), state(second))
+
+
+@pytest.mark.parametrize("change", [{"slower": 0.0}, {"slower": float("nan")}, {"slower": 2.0}, {"met": "1"}, {"more": 1}])
+def test_a_checkpoint_with_a_damaged_record_of_bad_steps_is_refused(change: dict[str, object], tmp_path: Path) -> None:
+    trainer = Trainer(tiny_settings(), tmp_path, Crew())
+    trainer.save()
+    (path,) = checkpoints(tmp_path)
+    with safe_open(path, "pt") as file:
+        tensors, meta = {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata())  # noqa: SIM118
+    save_file(tensors, path, {**meta, "caution": json.dumps({**Caution().to_dict(), **change})})
+    with pytest.raises(InputError, match="is not a training checkpoint"):
+        Trainer(tiny_settings(), tmp_path, Crew(), resume=True)
+    del meta["caution"]
+    save_file(tensors, path, meta)
+    assert Trainer(tiny_settings(), tmp_path, Crew(), resume=True).caution == Caution()
 
 
 WORKER = """

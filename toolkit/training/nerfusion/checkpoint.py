@@ -17,6 +17,7 @@ from torch import nn
 
 from toolkit.errors import InputError, first_line
 from toolkit.files import atomic_path
+from toolkit.training.nerfusion.caution import Caution
 
 Tensor = torch.Tensor
 MODEL, FIRST, SECOND, COUNT = "model.", "adam.first.", "adam.second.", "adam.step."
@@ -28,7 +29,9 @@ def checkpoint_name(step: int) -> str:
     return f"checkpoint-{step:07d}.safetensors"
 
 
-def save_checkpoint(folder: Path, step: int, model: nn.Module, adam: torch.optim.Adam, settings: dict[str, Any], keep: int) -> Path:
+def save_checkpoint(
+    folder: Path, step: int, model: nn.Module, adam: torch.optim.Adam, settings: dict[str, Any], keep: int, caution: Caution
+) -> Path:
     """Write the state after `step` steps, and remove all but the newest `keep` checkpoints.
 
     Raises:
@@ -40,7 +43,7 @@ def save_checkpoint(folder: Path, step: int, model: nn.Module, adam: torch.optim
         if state:
             tensors[FIRST + name], tensors[SECOND + name] = state["exp_avg"], state["exp_avg_sq"]
             tensors[COUNT + name] = torch.as_tensor(state["step"], dtype=torch.float32).reshape(1)
-    meta = {"format": FORMAT, "step": str(step), "settings": json.dumps(settings)}
+    meta = {"format": FORMAT, "step": str(step), "settings": json.dumps(settings), "caution": json.dumps(caution.to_dict())}
     path = folder / checkpoint_name(step)
     with atomic_path(path) as temporary:
         save_file({name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}, temporary, metadata=meta)
@@ -80,10 +83,22 @@ def load_checkpoint(path: Path, model: nn.Module, adam: torch.optim.Adam) -> int
                 "exp_avg_sq": second.to(parameter.device).clone(),
             }
     except (KeyError, ValueError, RuntimeError) as error:
-        raise InputError(
-            f"{path} is not a checkpoint of these networks ({first_line(error)}); start anew in another folder"
-        ) from error
+        raise InputError(f"{path} is not a checkpoint of these networks ({first_line(error)}); start anew in another folder") from error
     return step
+
+
+def load_caution(path: Path) -> Caution:
+    """What a run had met when the checkpoint was made; nothing, for checkpoints that do not tell.
+
+    Raises:
+        InputError: not a checkpoint.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            text = (file.metadata() or {}).get("caution")
+        return Caution() if text is None else Caution.from_dict(json.loads(text))
+    except (OSError, SafetensorError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not a training checkpoint ({first_line(error)}); choose another") from error
 
 
 def checkpoint_settings(path: Path) -> dict[str, Any]:

@@ -12,7 +12,8 @@ from toolkit.errors import InputError
 from toolkit.networks.model import NerfusionModel
 from toolkit.networks.weights import config_from, load_model, save_model
 from toolkit.progress import SILENT, Progress
-from toolkit.training.nerfusion.checkpoint import checkpoints, load_checkpoint, save_checkpoint
+from toolkit.training.nerfusion.caution import MOST, Caution, where_not_finite
+from toolkit.training.nerfusion.checkpoint import checkpoints, load_caution, load_checkpoint, save_checkpoint
 from toolkit.training.nerfusion.curve import Curve
 from toolkit.training.nerfusion.distributed import Crew
 from toolkit.training.nerfusion.gates import GateWatch
@@ -24,7 +25,6 @@ from toolkit.training.nerfusion.validate import validate
 
 WEIGHTS = "weights.safetensors"
 BETAS = (0.9, 0.999)
-BAD_STEPS = 20  # steps in a row without finite gradients after which training gives up
 
 
 def make_model(settings: TrainSettings) -> NerfusionModel:
@@ -56,6 +56,16 @@ def learning_rate(settings: TrainSettings, step: int) -> float:
     return asked.rate * (asked.final + (1 - asked.final) * 0.5 * (1 + math.cos(math.pi * min(1.0, done))))
 
 
+def clipped(model: NerfusionModel, most: float) -> float:
+    """Scale the gradients down to the norm `most`; answers the norm that they had. Those that are not finite stay as they are: NaN."""
+    try:
+        return float(torch.nn.utils.clip_grad_norm_(model.parameters(), most, error_if_nonfinite=True))
+    except RuntimeError as error:
+        if "non-finite" not in str(error):
+            raise
+        return math.nan
+
+
 class Trainer:
     """One training run in a folder.
 
@@ -75,10 +85,11 @@ class Trainer:
         self.stepper = Stepper(self.model, settings)
         self.curve = Curve(out)
         self.gates = GateWatch(self.model)
-        self.step = 0
+        self.step, self.caution = 0, Caution()
         found = checkpoints(out)
         if resume and found:
             self.step = load_checkpoint(found[-1], self.model, self.adam)
+            self.caution = load_caution(found[-1])
             self.curve.load(self.step)
         elif found and crew.leads:
             raise InputError(f"{out} already holds a training run; go on with it by --resume, or choose another --out folder")
@@ -86,7 +97,6 @@ class Trainer:
         if crew.leads:
             self.cases = [case for folder in settings.record.captures for case in load_cases(folder, settings)]
         self._gathered: list[dict[str, float]] = []
-        self._bad = 0
 
     def run(self, until: int | None = None, progress: Progress = SILENT) -> int:
         """Train up to step `until` (the settings' total by default); answers the steps taken in all.
@@ -94,7 +104,7 @@ class Trainer:
         A request to stop is honoured after the step at hand; what there is is kept.
 
         Raises:
-            InputError: no finite gradient for many steps, or the data cannot be read.
+            InputError: no finite gradient for many steps (what was learnt before is kept), or the data cannot be read.
             OutputError: results cannot be written.
         """
         last = min(until or self.settings.total_steps, self.settings.total_steps)
@@ -135,22 +145,33 @@ class Trainer:
         with torch.autocast(self.crew.device.type, torch.bfloat16, enabled=settings.optimiser.reduced):
             outcome: Outcome = (self.stepper.stage_two if second else self.stepper.stage_one)(sample, step, generator)
         self.crew.average_gradients(self.model.parameters())
-        norm = float(torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.optimiser.clip))
-        rate = learning_rate(settings, step)
-        if math.isfinite(norm):
+        norm = clipped(self.model, settings.optimiser.clip)
+        rate = learning_rate(settings, step) * self.caution.slower
+        # The same on all processes, so that their weights stay equal.
+        good = math.isfinite(norm) and not self.crew.any(not math.isfinite(outcome.loss))
+        if good:
             for group in self.adam.param_groups:
                 group["lr"] = rate
             self.adam.step()
-            self._bad = 0
+            self.caution.well()
         else:
-            # One bad sample must not end a run of days; many in a row mean that the weights are gone.
-            self._bad += 1
-            if self._bad >= BAD_STEPS:
-                raise InputError(f"{BAD_STEPS} steps in a row had no finite gradient; lower optimiser.rate and go on from a checkpoint")
-        row = {"loss": outcome.loss, "loss_depth": outcome.depth_loss, "gradient_norm": norm, "rate": rate}
+            self._skip(outcome.loss)
+        row = {"loss": outcome.loss, "loss_depth": outcome.depth_loss, "gradient_norm": norm, "rate": rate, "skipped": float(not good)}
         row |= outcome.means() | self.gates.shares()
         row |= {"seconds_data": drawn - start, "seconds": time.monotonic() - start, "voxels": float(sample.resolution)}
         return row
+
+    def _skip(self, loss: float) -> None:
+        """One bad sample must not end a run of days; many in a row mean that the settings cannot work."""
+        where = where_not_finite(loss, self.model.named_parameters())
+        self.caution.bad(f"step {self.step + 1}: {where}")
+        if self.caution.gives_up:
+            if self.crew.leads:
+                self.save()
+            raise InputError(
+                f"{MOST} steps in a row were not finite, the last at step {self.step + 1} in {where}; the weights of the last good step "
+                f"are in {self.out}, lower optimiser.rate and go on from them by start_from"
+            )
 
     def _log(self) -> None:
         rows, self._gathered = self._gathered, []
@@ -181,6 +202,8 @@ class Trainer:
         Raises:
             OutputError: the folder is not writable.
         """
-        save_checkpoint(self.out, self.step, self.model, self.adam, train_settings_dict(self.settings), self.settings.record.keep)
+        save_checkpoint(
+            self.out, self.step, self.model, self.adam, train_settings_dict(self.settings), self.settings.record.keep, self.caution
+        )
         save_model(self.out / WEIGHTS, self.model, {"steps": self.step})
         self.curve.write()
