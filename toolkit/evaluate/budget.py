@@ -22,6 +22,7 @@ FIT_SHARE = 0.35  # of the seconds, at least, that the fit should have when pict
 LEAST_FIT = 2.0  # seconds
 EXPORT_SHARE = 0.25  # of the seconds, at most, that are planned for exports
 MESH_SHARE = 0.6  # of the exports' seconds, the rest is the video's
+FRAME_COUNTS = (100, 75, 50, 36, 24)  # of a video
 MESH_VIEWS, VIDEO_FRAMES = (12, 60), (24, 90)  # fewest and most
 SIFT_FRAMES = 100
 AGREES = 0.15  # relative error of a prediction that is still good
@@ -144,28 +145,25 @@ def predict(speed: Speed, work: Work, choice: Choice) -> dict[str, float]:
 def choose(speed: Speed, work: Work, total: float, most_frames: int = 150) -> Choice:
     """Picture size and, for a video, how many frames, for a run of `total` seconds.
 
-    The largest pictures whose fit still gets `FIT_SHARE` of the seconds and enough rays for its training pixels; a video's frames are
-    halved until that works for some size.
+    The largest pictures whose fit still gets `FIT_SHARE` of the seconds and enough rays for its training pixels; of a video the most
+    frames for which there is such a size. The smallest of everything when there is none.
     """
     counts: list[int | None] = [None]
     if work.video:
-        counts = [most_frames, *(count for count in (100, 75, 50, 36, 24) if count < most_frames)]
-    best = None
+        counts = [most_frames, *(count for count in FRAME_COUNTS if count < most_frames)]
+    sizes = [size for size in SIZES if size == SIZES[0] or size <= 1.2 * max(work.width, work.height)]
     for count in counts:
-        for size in SIZES:
-            if size > SIZES[0] and size > 1.2 * max(work.width, work.height):
-                break
-            choice = Choice(size, count)
-            rest = total * (1 - EXPORT_SHARE) - sum(predict(speed, work, choice).values())
-            best = choice if best is None or rest >= FIT_SHARE * total else best
-            training = (min(work.frames, count or work.frames) - work.test) * work.pixels(size)
-            if rest < FIT_SHARE * total or rest / speed.units["fit"] < RAYS_A_PIXEL * training:
-                break
-            best = choice
-        if best is not None and best.max_frames == count and best.image_size > SIZES[0]:
-            break
-    assert best is not None
-    return best
+        fitting = [size for size in sizes if _fits(speed, work, Choice(size, count), total)]
+        if fitting:
+            return Choice(max(fitting), count)
+    return Choice(SIZES[0], counts[-1])
+
+
+def _fits(speed: Speed, work: Work, choice: Choice, total: float) -> bool:
+    """Whether enough is left for the fit."""
+    left = total * (1 - EXPORT_SHARE) - sum(predict(speed, work, choice).values())
+    training = (1 - work.test / max(work.frames, 1)) * min(work.frames, choice.max_frames or work.frames)
+    return left >= FIT_SHARE * total and left / speed.units["fit"] >= RAYS_A_PIXEL * training * work.pixels(choice.image_size)
 
 
 def fit_seconds(total: float, spent: float, rest: float) -> float:

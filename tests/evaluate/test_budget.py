@@ -1,0 +1,103 @@
+"""The model of time: what it chooses, what it learns, what it remembers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from toolkit.config import load_settings
+from toolkit.evaluate import budget as model
+from toolkit.evaluate.budget import Choice, Speed, Work
+from toolkit.evaluate.budget_probe import self_test
+from toolkit.files import write_json
+
+UNITS = {"decode": 0.02, "features": 0.1, "ray": 3e-6, "fit": 1e-5, "score": 5.0}
+FOX = Work(50, 540, 960, 7, posed=True, depth=False, outlined=False)
+
+
+def test_more_seconds_give_larger_pictures() -> None:
+    sizes = [model.choose(Speed(UNITS), FOX, seconds).image_size for seconds in (15, 30, 60, 120, 600)]
+    assert sizes == sorted(sizes) and sizes[0] < sizes[-1] <= 960
+
+
+def test_a_slower_machine_gets_smaller_pictures() -> None:
+    slow = Speed({kind: 6 * value for kind, value in UNITS.items()})
+    assert model.choose(slow, FOX, 60).image_size < model.choose(Speed(UNITS), FOX, 60).image_size
+
+
+def test_a_video_gives_fewer_frames_when_time_is_short() -> None:
+    video = Work(150, 1280, 720, 19, posed=False, depth=False, outlined=True, video=True, total=900)
+    few, many = (model.choose(Speed(UNITS), video, seconds, 150) for seconds in (60, 2000))
+    assert few.max_frames is not None and many.max_frames == 150 and few.max_frames < 150
+
+
+@given(st.floats(10, 1000), st.integers(4, 400), st.integers(64, 4000), st.integers(64, 4000), st.booleans(), st.booleans(), st.booleans())
+def test_there_is_always_a_choice(seconds: float, frames: int, width: int, height: int, depth: bool, outlined: bool, video: bool) -> None:
+    work = Work(frames, width, height, frames // 8, posed=not video, depth=depth, outlined=outlined, video=video, total=10 * frames)
+    choice = model.choose(Speed(UNITS), work, seconds, frames)
+    assert choice.image_size in model.SIZES and (choice.max_frames is not None) == video
+    assert all(value > 0 for value in model.predict(Speed(UNITS), work, choice).values())
+
+
+@given(st.floats(1, 1000), st.floats(1e-7, 1e-3), st.integers(64, 512))
+def test_the_lattice_can_be_filled(seconds: float, unit: float, finest: int) -> None:
+    found = model.resolution_for(seconds, unit, finest)
+    assert 64 <= found <= finest
+    if found > 64:
+        assert model.SURFACE * found**2 <= model.VOXELS_A_RAY * seconds / unit
+
+
+def test_exports_fit_into_what_is_left() -> None:
+    choice = Choice(240)
+    each = FOX.pixels(240)
+    for seconds in (0.1, 2.0, 10.0, 100.0):
+        views, frames = model.exports_for(FOX, choice, seconds, 1e-5)
+        assert 12 <= views <= 60 and (frames == 0 or 24 <= frames <= 90)
+        assert views == 12 or (views + frames) * each * 1e-5 <= seconds * 1.01
+    assert model.exports_for(FOX, choice, 100.0, 1e-5) == (60, 90)
+    assert model.exports_for(FOX, choice, -5.0, 1e-5) == (12, 0)
+
+
+def test_runs_teach_the_model() -> None:
+    speed = Speed(dict(UNITS))
+    first = speed.seconds("views", 10)
+    for _ in range(6):
+        speed.learn("views", speed.seconds("views", 10), 3 * first)
+    assert speed.seconds("views", 10) == pytest.approx(3 * first, rel=0.01)
+    speed.learn("scene", 1.0, 1e9)
+    assert speed.factors["scene"] == model.FACTOR_RANGE[1]
+
+
+def test_what_was_learnt_is_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    name = model.signature(1, "cpu")
+    assert name == model.signature(1, "cpu") != model.signature(2, "cpu")
+    assert model.remembered(name) is None
+    model.remember(name, Speed(UNITS, {"views": 2.0}))
+    model.remember("another", Speed(UNITS))
+    assert model.remembered(name) == Speed(UNITS, {"views": 2.0})
+    model.remember(name, None)
+    assert model.remembered(name) is None and model.remembered("another") is not None
+    for damaged in ([], {name: 3}, {name: {"units": UNITS, "factors": {"views": -1}}}, {name: {"units": {}, "factors": {}}}):
+        write_json(model.cache_file(), damaged)
+        assert model.remembered(name) is None
+    model.cache_file().write_text("not json")
+    assert model.remembered(name) is None
+    model.remember(name, Speed(UNITS))
+    assert model.remembered(name) is not None
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    model.remember("it", Speed(UNITS))
+    assert model.remembered("it") is None
+
+
+def test_the_self_test_measures_every_kind() -> None:
+    speed = self_test(load_settings("balanced", flags={"device": "cpu"}))
+    assert set(speed.units) == set(model.KINDS)
+    assert 1e-8 < speed.units["ray"] < 1e-3 and 1e-8 < speed.units["fit"] < 1e-2 and speed.units["features"] > 1e-3
