@@ -28,8 +28,9 @@ from toolkit.training.guard import Guard, refuse_broken
 from toolkit.training.levels import all_places, finer, first_field, pruned, visible
 from toolkit.training.rays import PixelPool
 from toolkit.training.schedule import Schedule
-from toolkit.training.start import MARGIN, ROOM_MARGIN, finest_resolution, levels, make_space, possible
+from toolkit.training.start import colour_behind, finest_resolution, levels, possible, space_of
 from toolkit.volume.host import Host, TorchHost
+from toolkit.volume.space import Space
 
 DEFAULT_BUDGET = 120.0
 START_RAW = -4.5  # of the first density: thin enough that every voxel along a ray is tried, thick enough that none is ignored
@@ -88,7 +89,13 @@ class _Sample:
 
 
 def fit_field(
-    views: Views, scene: Scene, settings: Settings, progress: Progress = SILENT, host: Host | None = None, start: Field | None = None
+    views: Views,
+    scene: Scene,
+    settings: Settings,
+    progress: Progress = SILENT,
+    host: Host | None = None,
+    start: Field | None = None,
+    coarse: bool = False,
 ) -> FitResult:
     """Fit a field to the training views.
 
@@ -99,6 +106,7 @@ def fit_field(
         progress: `stopping()` ends the fit early and keeps what there is.
         host: where rows live while they change (`GridHost` puts them into Open3D's hash map).
         start: a field to go on from, at its finest level.
+        coarse: `start` is a first guess and no fitted field: climb from its level to the finest, as from the classical start.
 
     Raises:
         InputError: there is no training view, `start` is not finite, or not one step was.
@@ -125,6 +133,8 @@ def fit_field(
         refuse_broken(start)
         keep = torch.ones_like(start.occupied)
         current, ladder = finer(start, keep, start.resolution, host), [start.resolution]
+        if coarse:
+            ladder += [resolution for resolution in _ladder(views, train, scene, settings)[1] if resolution > start.resolution]
     engine = make_engine(settings, current, pool)
     plan = Schedule(ladder, budget, settings.fit, views.background is None, settings.fit.patience)
     guard = Guard()
@@ -182,21 +192,19 @@ def _first(
     views: Views, train: Views, scene: Scene, settings: Settings, device: torch.device, host: Host, generator: torch.Generator
 ) -> tuple[Field, list[int]]:
     """The classical start at the coarsest level, and the resolutions to climb."""
-    wanted = settings.field.background
-    background = scene.has_background if wanted == "auto" else wanted == "on"
-    space = make_space(scene, background and views.background is None, MARGIN if views.background is not None else ROOM_MARGIN)
-    ladder = levels(settings.field.resolution or finest_resolution(space, train, scene))
+    space, ladder = _ladder(views, train, scene, settings)
     places = possible(space, ladder[0], all_places(space, ladder[0]), views)
     decoder = make_decoder(settings.field.decoder, settings.field.channels, settings.field.hidden).to(device)
-    if views.background is not None:
-        behind = torch.tensor(views.background)
-    else:
-        behind = torch.from_numpy(np.mean([image.reshape(-1, 3).mean(0) for image in train.images], axis=0) / 255).float()
+    behind = colour_behind(views).to(device)
     near = 0.5 * scene.near
     fine = 4
-    return first_field(
-        space, ladder[0], places, settings.field.channels, START_RAW, decoder, behind.float().to(device), near, fine, host, generator
-    ), ladder
+    return first_field(space, ladder[0], places, settings.field.channels, START_RAW, decoder, behind, near, fine, host, generator), ladder
+
+
+def _ladder(views: Views, train: Views, scene: Scene, settings: Settings) -> tuple[Space, list[int]]:
+    """The space, and its resolutions from coarse to fine."""
+    space = space_of(views, scene, settings.field.background)
+    return space, levels(settings.field.resolution or finest_resolution(space, train, scene))
 
 
 def _measure(result: FitResult, held_out: _Sample, engine: Engine, seconds: float) -> None:

@@ -39,6 +39,20 @@ def make_space(scene: Scene, background: bool, margin: float = MARGIN) -> Space:
     return Space((x, y, z), half, 0.0, (bx, by, bz))
 
 
+def space_of(views: Views, scene: Scene, background: str = "auto") -> Space:
+    """The space that fits of these views use. `background`: auto (as the scene says) | on | off."""
+    wanted = scene.has_background if background == "auto" else background == "on"
+    return make_space(scene, wanted and views.background is None, MARGIN if views.background is not None else ROOM_MARGIN)
+
+
+def colour_behind(views: Views) -> Tensor:
+    """(3,) float32 colour behind everything: known for captures with alpha, else the mean of the training pictures."""
+    if views.background is not None:
+        return torch.tensor(views.background, dtype=torch.float32)
+    train = np.flatnonzero(~np.asarray(views.test))
+    return torch.from_numpy(np.mean([views.images[i].reshape(-1, 3).mean(0) for i in train], axis=0) / 255).float()
+
+
 def finest_resolution(space: Space, views: Views, scene: Scene) -> int:
     """Voxels a side so that one voxel in the middle of the scene spans `PIXELS` pixels of the training views.
 

@@ -1,0 +1,129 @@
+"""Direct inference: from key frames to a radiance field by the trained networks alone, without any per-scene optimisation.
+
+Encoder → local volumes → fusion → global volume → field (NeRFusion, sections 3.1 and 3.2), one key frame after the other, so that the
+field can be looked at while key frames come in. The space is the one that a fit of the same views uses, so a fit can go on from it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from toolkit.capture.types import Views
+from toolkit.errors import InputError
+from toolkit.fusion import Fused, FusionOptions, fuse_views
+from toolkit.keyframes import KeyFrames
+from toolkit.networks import weights
+from toolkit.networks.lattice import Lattice
+from toolkit.networks.model import NerfusionModel
+from toolkit.networks.weights import load_model
+from toolkit.poses.scene import Scene
+from toolkit.progress import SILENT, Progress
+from toolkit.render.field import Field
+from toolkit.render.fused import GAMMA, make_field, without_empty_blocks
+from toolkit.training.start import colour_behind, space_of
+from toolkit.volume.space import Space
+from toolkit.volume.topology import BLOCK
+
+SHIPPED = Path(weights.__file__).parent / "weights" / "nerfusion.safetensors"
+VOXELS_TO_MEDIAN = 40.0  # voxels that make up the median depth: what the shipped weights do best with
+LEAST, MOST = 32, 256  # resolution of the lattice
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """What direct inference can be told.
+
+    Attributes:
+        voxels: voxels that make up the median depth, on the finest lattice.
+        levels: lattices, each of half the voxel size of the one before; 1: the paper's single one.
+        gamma: see-through voxels (exp(−optical thickness) above it) are not rendered; None: all are.
+    """
+
+    voxels: float = VOXELS_TO_MEDIAN
+    levels: int = 1
+    gamma: float | None = GAMMA
+
+
+def load_networks(path: Path | str | None = None, device: torch.device | str = "cpu") -> NerfusionModel:
+    """The shipped networks, or those in the file at `path`.
+
+    Raises:
+        InputError: the file is missing or does not hold networks.
+    """
+    return load_model(SHIPPED if path is None else path, device)
+
+
+def lattice_of(space: Space, scene: Scene, options: NetworkOptions) -> Lattice:
+    """The finest lattice: about `options.voxels` voxels to the median depth, within what memory allows."""
+    unit = BLOCK * 2 ** (options.levels - 1)
+    wanted = 2 * space.extent * space.half / (scene.median_depth / options.voxels)
+    return Lattice(space, int(np.clip(unit * round(wanted / unit), max(LEAST, unit), MOST)))
+
+
+class Inference:
+    """The networks at work on one capture: iterate to fuse key frame after key frame, and ask for the field in between or at the end."""
+
+    def __init__(
+        self,
+        model: NerfusionModel,
+        views: Views,
+        scene: Scene,
+        keys: KeyFrames,
+        background: str = "auto",
+        options: NetworkOptions | None = None,
+    ) -> None:
+        """
+        Args:
+            views: all views; only those not marked `test` are looked at.
+            keys: indices into the training views.
+            background: as in the settings.
+
+        Raises:
+            InputError: there is no training view or no key frame.
+        """
+        train = np.flatnonzero(~np.asarray(views.test))
+        if len(train) == 0 or len(keys.indices) == 0:
+            raise InputError("no training view is left for the networks; lower --holdout or give more pictures")
+        self.model, self.keys, self.options = model, keys, options or NetworkOptions()
+        self.train = views.subset(train)
+        self.near, self.far = scene.near, scene.far
+        self.lattice = lattice_of(space_of(views, scene, background), scene, self.options)
+        self.behind = colour_behind(views).to(model.device)
+        self.seconds = self.encode_seconds = 0.0
+        self.done = 0
+        self._latest: Fused | None = None
+
+    def frames(self, progress: Progress = SILENT) -> Iterator[int]:
+        """Fuse the key frames in order; yields each one's index among the training views when it is in the volume.
+
+        Raises:
+            Interrupted: the user asked to stop.
+        """
+        options = FusionOptions(self.options.levels, self.near, self.far)
+        for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress):
+            self._latest = fused
+            self.seconds += fused.seconds
+            self.encode_seconds += fused.encode_seconds
+            self.done += 1
+            yield fused.frame
+
+    @torch.no_grad()
+    def field(self) -> Field:
+        """The field of the key frames so far, in memory of its own; it shares the networks' decoder.
+
+        Raises:
+            InputError: no key frame has been fused yet.
+        """
+        if self._latest is None:
+            raise InputError("no key frame has been fused yet, so there is no field; fuse one first")
+        start = time.perf_counter()
+        gamma, allowed = self.options.gamma, self._latest.allowed
+        made = without_empty_blocks(make_field(self.model, self._latest.volume, self.behind, gamma, 0.5 * self.near, allowed=allowed))
+        self.seconds += time.perf_counter() - start
+        return made

@@ -1,0 +1,94 @@
+"""From the networks' field to the start of a fit: geometry and, for the deferred decoder, features and decoder at a level of the fit.
+
+The fit's lattice is another one than the networks', so values are interpolated. What the networks know nothing of starts as thin and grey
+as in the classical start; densities are kept between two bounds, so that a mistake of the networks can still be unlearnt.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from toolkit.capture.types import Views
+from toolkit.config import Settings
+from toolkit.networks.decoder import Deferred, PerSample, make_decoder
+from toolkit.poses.scene import Scene
+from toolkit.render.field import Field
+from toolkit.training.levels import FEATURE_NOISE, all_places, occupancy
+from toolkit.training.start import possible
+from toolkit.volume.edit import resample
+
+Tensor = torch.Tensor
+THIN = -4.5  # raw density of what is see-through or unknown, as in the classical start
+THICK = 2.0  # largest raw density of the start
+RESOLUTION = 64  # level of the fit at which the networks' field comes in
+
+
+def widened(decoder: Deferred, hidden: int, generator: torch.Generator) -> Deferred:
+    """The same function with `hidden` units a layer (at least its own): the new ones read, but nobody reads them yet."""
+    if hidden < decoder.hidden:
+        raise ValueError(f"a decoder of {decoder.hidden} hidden units cannot be narrowed to {hidden}")
+    out = Deferred(decoder.channels, hidden)
+    with torch.no_grad():
+        for old, new in zip(decoder.layers, out.layers, strict=True):
+            rows, columns = old.weight.shape
+            fresh = torch.randn(new.weight.shape, generator=generator) / new.weight.shape[1] ** 0.5
+            fresh[:rows] = 0  # old units do not read new ones
+            fresh[:rows, :columns] = old.weight.cpu()
+            new.weight.copy_(fresh)
+            new.bias.zero_()
+            new.bias[:rows] = old.bias.cpu()
+    return out
+
+
+def network_start(made: Field, views: Views, scene: Scene, settings: Settings, resolution: int = RESOLUTION) -> Field:
+    """The first field of a fit, at `resolution` voxels a side, from the networks' field `made` of the same space.
+
+    With the deferred decoder and as many features as the networks have, features and decoder come along; otherwise geometry alone.
+
+    Args:
+        views: all views; which voxels can hold something is judged from the training views, as in the classical start.
+
+    Raises:
+        ValueError: `resolution` is not a positive multiple of 8.
+    """
+    if resolution < 8 or resolution % 8:
+        raise ValueError(f"the resolution must be a positive multiple of 8, not {resolution}")
+    generator = torch.Generator().manual_seed(settings.seed)
+    device = made.device
+    places = possible(made.space, resolution, all_places(made.space, resolution), views)
+    topology, occupied = occupancy(places.to(device))
+    scale = made.resolution / resolution
+    # Thickness instead of its logarithm is what adds up when voxels are merged; the mark tells what the networks knew.
+    known = torch.cat([torch.ones_like(made.density_rows[:-1]), made.density_rows.new_zeros(1)])
+    raw, feature, mark = resample(made.topology, made.occupied, [made.density_rows, made.feature_rows, known], topology.keys, scale)
+    density = torch.where(mark > 0, raw.clamp(THIN, THICK), torch.full_like(raw, THIN))
+    density[-1] = 0
+    taken = _takes_features(made, settings)
+    channels, hidden = settings.field.channels, settings.field.hidden
+    noise = (torch.randn(len(density), channels, generator=generator) * FEATURE_NOISE).to(device)
+    decoder: Deferred | PerSample
+    if taken and isinstance(made.decoder, Deferred):
+        decoder = widened(made.decoder, hidden, generator)
+        rows = torch.where((mark > 0)[:, None], feature, noise)
+    else:
+        decoder = make_decoder(settings.field.decoder, channels, hidden)
+        rows = noise
+    rows[-1] = 0
+    return replace(
+        made,
+        resolution=resolution,
+        topology=topology,
+        occupied=occupied,
+        density_rows=density,
+        feature_rows=rows.contiguous(),
+        decoder=decoder.to(device),
+        near=0.5 * scene.near,
+    )
+
+
+def _takes_features(made: Field, settings: Settings) -> bool:
+    """Whether the fit's decoder can take over the networks' features."""
+    same = isinstance(made.decoder, Deferred) and settings.field.decoder == "deferred"
+    return same and made.feature_rows.shape[1] == settings.field.channels and made.decoder.hidden <= settings.field.hidden
