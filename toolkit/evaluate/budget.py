@@ -213,7 +213,7 @@ def remembered(name: str) -> Speed | None:
         entry = read_json(cache_file())[name]
         units = {kind: float(entry["units"][kind]) for kind in KINDS}
         factors = {str(stage): float(value) for stage, value in entry["factors"].items() if stage in COST}
-    except (FieldfuseError, KeyError, TypeError, ValueError, AttributeError):
+    except (FieldfuseError, KeyError, TypeError, ValueError, AttributeError, OverflowError):
         return None
     good = all(0 < value < 1e4 for value in units.values()) and all(0 < value < 1e3 for value in factors.values())
     return Speed(units, factors) if good else None
