@@ -85,5 +85,5 @@ def load_stereo(path: Path | str) -> tuple[list[str], list[StereoDepth]]:
             if len(names) != len(out):
                 raise ValueError("there are not as many names as depth maps")
             return names, out
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (InputError, SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         raise InputError(f"{path} cannot be read ({first_line(error)}); remove it and run the command again") from error

@@ -14,6 +14,7 @@ import torch
 
 from tests.capture.layouts import LAYOUTS
 from tests.capture.made import eyes, render, save_picture
+from tests.stability.fuzz.models import make_models, make_training, read_baked_field, read_models, read_training
 from toolkit.camera import Intrinsics, Similarity
 from toolkit.capture import open_capture
 from toolkit.capture.checks import check_capture
@@ -227,46 +228,6 @@ def read_fields(root: Path, number: int) -> None:
             raise ValueError("a colour that is not finite")
 
 
-def make_models(root: Path) -> None:
-    """A baked field, networks' weights, and a scene file."""
-    from toolkit.networks.model import ModelConfig, NerfusionModel
-    from toolkit.networks.weights import save_model
-    from toolkit.render.bake import bake
-    from toolkit.render.bake_file import write_baked
-
-    root.mkdir(parents=True)
-    write_baked(root / "bounded.safetensors", bake(small_field(1, 0.2)))
-    write_baked(root / "background.safetensors", bake(small_field(2, 0.3, shell=1.0)))
-    save_model(root / "weights.safetensors", NerfusionModel(ModelConfig(channels=4, hidden=4, gru_hidden=4)))
-    scene = "scene: room\npath: {kind: walk, frames: 60, fps: 10, speed: 0.5, shake: 2}\neffects:\n  - exposure: {stops: 0.5}\n"
-    (root / "scene.yaml").write_text(scene)
-
-
-def read_baked_field(root: Path, number: int) -> None:
-    """Open a baked field and look at it from outside and from inside."""
-    from toolkit.render.bake_file import read_baked
-    from toolkit.render.bake_image import BakedRenderer
-
-    renderer = BakedRenderer(read_baked(root / ("bounded.safetensors", "background.safetensors")[number % 2]), 1)
-    camera = Intrinsics(12, 9, 10.0, 10.0, 6.0, 4.5)
-    for distance in (3.0, 0.3):
-        pose = np.eye(4)
-        pose[:3, 3] = 0.1, -0.2, 0.3 - distance
-        picture = renderer.render(camera, pose)
-        if not np.isfinite(picture.rgb).all():
-            raise ValueError("a colour that is not finite")
-
-
-def read_models(root: Path, number: int) -> None:
-    from toolkit.networks.weights import load_model
-    from toolkit.simulate.settings import read_scene_file
-
-    if number % 2:
-        load_model(root / "weights.safetensors")
-    else:
-        read_scene_file(root / "scene.yaml")
-
-
 def read_tensors(root: Path, number: int) -> None:
     from pipelines.rendered import load_pictures
     from toolkit.tsdf.store import load_volume
@@ -281,6 +242,7 @@ def read_tensors(root: Path, number: int) -> None:
 
 
 RUN_FILES = ("run.json", "capture.json", "poses.json", "scene.json", "stages/views.json", "settings.yaml", "source/transforms.json")
+TRAINING_FILES = ("shard.safetensors", "checkpoint-0000007.safetensors", "train.yaml", "depths.safetensors", "fieldfuse/speed.json")
 TARGETS: tuple[Target, ...] = (
     *(Target(layout, files, LAYOUTS[layout][1], read_capture, 1.0) for layout, files in FILES.items()),
     Target("extras", ("transforms.json", "mask1.png", "depth2.npy", "points.ply"), make_extras, read_capture, 2.0),
@@ -291,5 +253,6 @@ TARGETS: tuple[Target, ...] = (
     Target("tensors", ("views.safetensors", "field.pictures.safetensors", "tsdf.safetensors"), make_runs, read_tensors, 1.5),
     Target("baked", ("bounded.safetensors", "background.safetensors"), make_models, read_baked_field, 2.0),
     Target("models", ("weights.safetensors", "scene.yaml", "scene.yaml"), make_models, read_models, 1.0),
+    Target("training", TRAINING_FILES, make_training, read_training, 1.0),
     Target("points", ("points.ply",), make_extras, lambda root, number: read_ply_points(root / "points.ply"), 0.5),
 )  # fmt: skip

@@ -81,8 +81,11 @@ class ShardScene:
                 poses = file.get_tensor("world_from_camera").numpy()
                 shape = file.get_slice("images").get_shape()
                 depth_shape = file.get_slice("depths").get_shape()
+                kinds = file.get_slice("images").get_dtype(), file.get_slice("depths").get_dtype()
             if len(shape) != 4 or shape[1] != 3 or depth_shape != [shape[0], *shape[2:]] or self._intrinsics.shape != (shape[0], 4):
                 raise ValueError("its arrays do not belong together")
+            if kinds != ("U8", "F32"):
+                raise ValueError(f"its pictures and depths have the types {kinds}")
             if len(poses) != shape[0] or not bool(torch.isfinite(self._intrinsics).all()):
                 raise ValueError("its cameras are not usable")
         except (OSError, SafetensorError, KeyError, ValueError) as error:

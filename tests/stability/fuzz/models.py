@@ -1,0 +1,99 @@
+"""Samples of what is learnt or baked: baked fields, weights, scene files, shards, checkpoints, depth by matching, speeds of machines."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests.training.nerfusion.tiny import tiny_settings
+from toolkit.camera import Intrinsics
+from toolkit.evaluate import budget
+from toolkit.evaluate.selftest.edit import small_field
+from toolkit.files import write_json
+from toolkit.networks.model import ModelConfig, NerfusionModel
+from toolkit.networks.weights import load_model, save_model
+from toolkit.render.bake import bake
+from toolkit.render.bake_file import read_baked, write_baked
+from toolkit.render.bake_image import BakedRenderer
+from toolkit.simulate.settings import read_scene_file
+from toolkit.training.nerfusion.caution import Caution
+from toolkit.training.nerfusion.checkpoint import checkpoint_settings, load_caution, load_checkpoint, save_checkpoint
+from toolkit.training.nerfusion.settings import load_train_settings, train_settings_dict
+from toolkit.training.nerfusion.shards import ShardScene, write_shard
+from toolkit.training.nerfusion.train import make_model
+from toolkit.tsdf.stereo import StereoDepth
+from toolkit.tsdf.stereo_frames import load_stereo, save_stereo
+
+
+def make_models(root: Path) -> None:
+    """A baked field, networks' weights, and a scene file."""
+    root.mkdir(parents=True)
+    write_baked(root / "bounded.safetensors", bake(small_field(1, 0.2)))
+    write_baked(root / "background.safetensors", bake(small_field(2, 0.3, shell=1.0)))
+    save_model(root / "weights.safetensors", NerfusionModel(ModelConfig(channels=4, hidden=4, gru_hidden=4)))
+    scene = "scene: room\npath: {kind: walk, frames: 60, fps: 10, speed: 0.5, shake: 2}\neffects:\n  - exposure: {stops: 0.5}\n"
+    (root / "scene.yaml").write_text(scene)
+
+
+def read_baked_field(root: Path, number: int) -> None:
+    """Open a baked field and look at it from outside and from inside."""
+    renderer = BakedRenderer(read_baked(root / ("bounded.safetensors", "background.safetensors")[number % 2]), 1)
+    camera = Intrinsics(12, 9, 10.0, 10.0, 6.0, 4.5)
+    for distance in (3.0, 0.3):
+        pose = np.eye(4)
+        pose[:3, 3] = 0.1, -0.2, 0.3 - distance
+        picture = renderer.render(camera, pose)
+        if not np.isfinite(picture.rgb).all():
+            raise ValueError("a colour that is not finite")
+
+
+def read_models(root: Path, number: int) -> None:
+
+    if number % 2:
+        load_model(root / "weights.safetensors")
+    else:
+        read_scene_file(root / "scene.yaml")
+
+
+def make_training(root: Path) -> None:
+    """A shard of training pictures, a checkpoint, settings, depth by matching, and what is remembered of a machine."""
+    root.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    pictures, depths = rng.integers(0, 255, (4, 3, 12, 16), dtype=np.uint8), np.ones((4, 12, 16), np.float32)
+    cameras, poses = np.tile([15.0, 15.0, 8.0, 6.0], (4, 1)), np.tile(np.eye(4), (4, 1, 1))
+    write_shard(root / "shard.safetensors", pictures, depths, cameras, poses, kind="room", ordered=True)
+    settings = tiny_settings()
+    model = make_model(settings)
+    adam = torch.optim.Adam(model.parameters())
+    for parameter in model.parameters():
+        parameter.grad = torch.zeros_like(parameter)
+    adam.step()
+    save_checkpoint(root, 7, model, adam, train_settings_dict(settings), 1, Caution())
+    (root / "train.yaml").write_text(
+        "seed: 3\nstage: {steps: 10, fused_steps: 5}\noptimiser: {rate: 1e-3}\nsources:\n  - {kind: procedural}\n"
+    )
+    camera = Intrinsics(16, 12, 15.0, 15.0, 8.0, 6.0)
+    save_stereo(root / "depths.safetensors", ["a", "b"], [StereoDepth(depths[0], depths[0], camera)] * 2)
+    speed = {"units": dict.fromkeys(budget.KINDS, 1.0), "factors": dict.fromkeys(budget.COST, 1.0)}
+    (root / "fieldfuse").mkdir()
+    write_json(root / "fieldfuse" / "speed.json", {"machine": speed})
+
+
+def read_training(root: Path, number: int) -> None:
+    """Each file by its own reader; a file of speeds that is damaged counts as none."""
+    os.environ["XDG_CACHE_HOME"] = str(root)
+    budget.remembered("machine")
+    load_train_settings(root / "train.yaml")
+    scene = ShardScene(root / "shard.safetensors", 8)
+    scene.pictures([0, 3])
+    load_stereo(root / "depths.safetensors")
+    model = make_model(tiny_settings())
+    path = root / "checkpoint-0000007.safetensors"
+    load_checkpoint(path, model, torch.optim.Adam(model.parameters()))
+    load_caution(path)
+    checkpoint_settings(path)
+    if not all(bool(torch.isfinite(parameter).all()) for parameter in model.parameters()):
+        raise ValueError("a weight that is not finite")
