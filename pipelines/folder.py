@@ -32,6 +32,7 @@ FILES = (
     "views.safetensors",
     "field.safetensors",
     "timeline.json",
+    "fit_notes.json",
     "mesh.ply",
     "evaluation.json",
     "report.json",

@@ -66,6 +66,7 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
     )
 
 
+FIT_NOTES = "fit_notes.json"  # what a reader of the numbers has to know of the fit; there only when there is something
 Fitted = tuple["Field", list[dict[str, Any]]]
 
 
@@ -79,7 +80,8 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     from toolkit.volume.grid_host import GridHost
 
     settings = job.settings
-    path, times = job.folder / "field.safetensors", job.folder / "timeline.json"
+    path, times, told = job.folder / "field.safetensors", job.folder / "timeline.json", job.folder / FIT_NOTES
+    notes: list[str] = []
     start = job.stages.record("field") if go_on and job.stages.usable("field") and not job.other_field else None
 
     def load() -> Fitted:
@@ -89,9 +91,11 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
         set_seeds(settings.seed)
         if start is None:
             result = fit_field(views, scene, settings, job.progress, GridHost(settings.device))
+            notes.extend(result.notes)
             return result.field, result.timeline
         field, timeline = load()
         result = fit_field(views, scene, settings, job.progress, GridHost(settings.device), start=field)
+        notes.extend(result.notes)
         spent = timeline[-1]["seconds"] if timeline else 0.0
         return result.field, timeline + [{**point, "seconds": round(spent + point["seconds"], 3)} for point in result.timeline]
 
@@ -99,7 +103,9 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
         field, timeline = value
         field.save(path, scene.working_from_input, {"budget": settings.fit.budget, "seed": settings.seed})
         write_json(times, timeline)
-        return [path, times]
+        if notes:
+            write_json(told, notes)
+        return [path, times, *([told] if notes else [])]
 
     uses = [
         asdict(settings.field),
@@ -113,6 +119,12 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     value = job.stages.run("field", make, save, load, uses=uses, after=["scene", "views"], keeps=True)
     # The file holds less precision than memory: what is shown and scored is what everybody can load.
     return value if job.stages.cached["field"] else load()
+
+
+def fit_notes(job: Job) -> list[str]:
+    """What the fit of this run's field had to say."""
+    record = job.stages.records.get("field")
+    return [str(text) for text in read_json(job.folder / FIT_NOTES)] if record is not None and FIT_NOTES in record.outputs else []
 
 
 def render_test_views(job: Job, field: Field, views: Views) -> Pictures:

@@ -13,6 +13,7 @@ import numpy as np
 from pipelines.folder import command_line
 from pipelines.job import Job
 from pipelines.rendered import Pictures
+from pipelines.steps_results import fit_notes
 from toolkit import __version__
 from toolkit.config import settings_dict
 from toolkit.files import write_json
@@ -108,7 +109,7 @@ def unique(texts: list[str]) -> list[str]:
 
 def warnings_of(job: Job, capture: Capture, poses: PoseResult, scene: Scene, views: Views) -> list[str]:
     """Everything that a reader of the numbers has to know."""
-    texts = [*capture.warnings, *poses.warnings, *scene.warnings]
+    texts = [*capture.warnings, *poses.warnings, *scene.warnings, *fit_notes(job)]
     if not np.any(views.test):
         texts.append(NO_TEST_VIEWS)
     elif poses.source == "sfm":
