@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.networks.aggregate import FLAGS, aggregate, direction_spread, evidence
+from toolkit.networks.aggregate import CUES, FLAGS, aggregate, agreement, direction_spread, evidence
 
 
 @settings(max_examples=30, deadline=None)
@@ -54,6 +54,15 @@ def test_seen_once_does_not_read_as_consistent() -> None:
     once, thrice = rows[:, 8:12]
     assert not once.any() and bool((thrice < -1).all()), "the logarithm of a variance of zero is its lowest value, not its absence"
     assert rows[0, 12] == 0 and rows[1, 12] == 1
+
+
+def test_agreement_is_of_a_group_and_lowest_where_views_agree() -> None:
+    variance = torch.tensor([[0.0, 0.0, 1.0], [0.4, 0.2, 0.0], [0.4, 0.2, 0.0]])
+    found = agreement(variance, torch.tensor([3, 2, 1]), (slice(2), slice(2, 3)))
+    assert found.shape == (3, CUES)
+    assert float(found[0, 0]) < -1 and float(found[1, 1]) < -1, "no variance is the lowest value"
+    torch.testing.assert_close(found[1, 0], torch.log(torch.tensor(0.3 + 1e-4)) / 4 + 1)
+    assert not found[2].any(), "one view neither agrees nor disagrees"
 
 
 def test_spread_is_the_angle_between_views() -> None:

@@ -121,13 +121,14 @@ def test_local_network_against_dense_convolutions() -> None:
     seen = torch.rand(topology.zero_row, generator=generator) < 0.5
     mask = torch.cat([seen, seen.new_zeros(1)])[:, None]
     rows = torch.relu(torch.randn((len(mask), 6), generator=generator, dtype=torch.float64)) * mask
-    colours = torch.randn((len(mask), 3), generator=generator, dtype=torch.float64) * mask
+    start = torch.randn((len(mask), 4), generator=generator, dtype=torch.float64) * mask
+    network.agreement.data.fill_(1.5)
     x, present = dense_of(rows[:-1], topology, low, 3), dense_of(seen.double()[:, None], topology, low, 3)
     for number, layer in enumerate(network.convolutions):
         x = F.conv3d(torch.relu(x) if number else x, layer.weight, layer.bias, padding=1) * present
     expected = rows_of(x, topology, low)
-    expected[:, :3] += colours[:-1]
-    found = network(rows, colours, topology, seen)
+    expected[:, :4] += start[:-1] * torch.tensor([1, 1, 1, 1.5])
+    found = network(rows, start, topology, seen)
     torch.testing.assert_close(found[:-1], expected, atol=1e-10, rtol=1e-8)
     assert not found[-1].any() and not found[:-1][~seen].any()
 

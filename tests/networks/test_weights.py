@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from tests.networks.made import SMALL, small_model
 from toolkit.errors import InputError, OutputError
 from toolkit.networks.model import ModelConfig, NerfusionModel
-from toolkit.networks.weights import METADATA_KEY, config_from, load_model, save_model
+from toolkit.networks.weights import METADATA_KEY, VERSION, config_from, load_model, save_model
 
 
 def test_there_and_back(tmp_path: Path) -> None:
@@ -34,7 +34,7 @@ def test_the_default_model_fits(tmp_path: Path) -> None:
 
 def described(**changes: object) -> dict[str, str]:
     config = {name: getattr(SMALL, name) for name in SMALL.__dataclass_fields__}
-    data = {"version": 2, "config": config | changes.pop("config", {}), "meta": {}} | changes  # type: ignore[operator]
+    data = {"version": VERSION, "config": config | changes.pop("config", {}), "meta": {}} | changes  # type: ignore[operator]
     return {METADATA_KEY: json.dumps(data)}
 
 

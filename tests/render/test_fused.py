@@ -124,7 +124,8 @@ def test_a_small_volume_learns_from_its_pictures() -> None:
     assert last < 0.65 * first, f"the loss fell from {first:.4f} to {last:.4f} only"
 
 
-@pytest.mark.xfail(reason="since features are compared at the size of a voxel's step, colours alone do not move the wall in so few steps")
 def test_what_is_rendered_moves_to_where_the_wall_is() -> None:
     _, errors = learnt()
-    assert np.mean(errors[-5:]) < 0.85 * np.mean(errors[:5])
+    first, last = np.mean(errors[:5]), np.mean(errors[-5:])
+    assert first < 0.1, f"at the start views that agree already tell roughly where the wall is, not {first:.1%} off"
+    assert last < 0.85 * first, f"colours alone moved the wall from {first:.1%} to {last:.1%}"

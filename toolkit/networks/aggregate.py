@@ -6,11 +6,14 @@ the voxel all of that is zero and a flag says so (else "seen once" would read as
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 LOG_FLOOR = 1e-4  # variance at which the logarithm ends
 FLAGS = 4
+CUES = 2
 
 
 def aggregate(values: Tensor, visible: Tensor, with_variance: bool = True) -> tuple[Tensor, Tensor, Tensor]:
@@ -52,6 +55,22 @@ def evidence(mean: Tensor, variance: Tensor, count: Tensor, footprint: Tensor, s
     disparity = torch.log2(step + 0.05) * several[:, 0]
     flags = torch.stack([several[:, 0], 1 / count.to(mean.dtype), torch.log2(footprint) / 4, disparity / 4], 1)
     return torch.cat([mean, squashed * several, logarithm, flags], 1)
+
+
+def agreement(variance: Tensor, count: Tensor, groups: Sequence[slice]) -> Tensor:
+    """How far the views disagree about each voxel as a whole: one number a group of channels, which `evidence` has only channel by channel.
+
+    The variance of three values is a rough number; that of a group is much steadier, and its logarithm cannot be had from the logarithms
+    of its members.
+
+    Args:
+        variance: (N, C) from `aggregate`; count: (N,) views; groups: of columns.
+
+    Returns:
+        (N, groups) logarithm of the mean variance about [−1, 1], lower where views agree; zero where fewer than two views tell.
+    """
+    means = torch.stack([variance[:, group].mean(1) for group in groups], 1)
+    return (torch.log(means + LOG_FLOOR) / 4 + 1) * (count >= 2)[:, None].to(variance.dtype)
 
 
 def direction_spread(points: Tensor, positions: Tensor, visible: Tensor) -> Tensor:

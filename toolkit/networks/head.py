@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from toolkit.networks.local import COLOUR_SCALE
+from toolkit.networks.local import AGREEMENT, COLOUR_SCALE
 
 START = -3.0  # log optical thickness of a voxel at the start: thin enough that every voxel along a ray is tried
 SCALE = 3.0  # the density output's gain, so that latents of ±1 span fog and walls
@@ -24,11 +24,15 @@ class FieldHead(nn.Module):
         nn.init.zeros_(first.bias)
         self.body = nn.Sequential(first, nn.ReLU())
         self.density = nn.Linear(hidden, 1)
+        self.agreement = nn.Linear(channels, 1, bias=False)  # density starts where the views agree
         self.features = nn.Linear(hidden, features)
         self.skip = nn.Linear(channels, features, bias=False)
         nn.init.kaiming_normal_(self.density.weight, nonlinearity="linear")
         nn.init.zeros_(self.density.bias)
         with torch.no_grad():
+            self.density.weight.mul_(0.1)
+            nn.init.zeros_(self.agreement.weight)
+            self.agreement.weight[:, AGREEMENT] = 1.0
             self.features.weight.mul_(0.1)
             nn.init.zeros_(self.features.bias)
             nn.init.zeros_(self.skip.weight)
@@ -37,11 +41,11 @@ class FieldHead(nn.Module):
 
     def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         hidden = self.body(latent)
-        return self._thickness(hidden), self.features(hidden) + self.skip(latent)
+        return self._thickness(latent, hidden), self.features(hidden) + self.skip(latent)
 
     def thickness(self, latent: Tensor) -> Tensor:
         """The first of the two alone."""
-        return self._thickness(self.body(latent))
+        return self._thickness(latent, self.body(latent))
 
-    def _thickness(self, hidden: Tensor) -> Tensor:
-        return START + SCALE * self.density(hidden).squeeze(1)
+    def _thickness(self, latent: Tensor, hidden: Tensor) -> Tensor:
+        return START + SCALE * (self.density(hidden) + self.agreement(latent)).squeeze(1)

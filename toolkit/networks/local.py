@@ -11,6 +11,7 @@ from toolkit.networks.block_conv import BlockConv3d
 from toolkit.volume.topology import Topology
 
 COLOUR_SCALE = 4.0  # a latent colour of ±1 is a colour logit of ±4
+AGREEMENT = 3  # the latent that starts as how well the views agree
 MOST = 0.93  # latent colours are kept inside this, so that tanh is not driven to its ends
 
 
@@ -23,8 +24,10 @@ def colour_latent(colour: Tensor) -> Tensor:
 class LocalReconstruction(nn.Module):
     """Per-voxel projection to few channels, then `layers` sparse 3×3×3 convolutions with ReLU between them.
 
-    The views' mean colour is added to the first three outputs, which by convention are the voxel's colour: at the start a local volume
-    already carries the pictures' colours and the network learns what to change.
+    The views' mean colour is added to the first three outputs, which by convention are the voxel's colour, and how well their colours
+    agree to the fourth, from which the head's density starts: so a local volume carries the pictures' colours and a rough geometry from
+    the first step on, and the network learns what to change. Without the second, colours alone do not find surfaces: a fog of mean colours
+    is a minimum of its own.
     """
 
     def __init__(self, inputs: int, hidden: int, channels: int, layers: int = 5) -> None:
@@ -39,14 +42,15 @@ class LocalReconstruction(nn.Module):
         nn.init.kaiming_normal_(last.weight, nonlinearity="linear")
         with torch.no_grad():
             last.weight.mul_(0.5)  # mostly within tanh's straight part
-            last.weight[:3].mul_(0.1)  # the first three start as the mean colour
+            last.weight[: AGREEMENT + 1].mul_(0.1)  # they start as what is added to them
+        self.agreement = nn.Parameter(torch.ones(1))  # gain of what is added to the fourth output
 
-    def forward(self, rows: Tensor, colours: Tensor, topology: Topology, seen: Tensor) -> Tensor:
+    def forward(self, rows: Tensor, start: Tensor, topology: Topology, seen: Tensor) -> Tensor:
         """Raw local volume, before tanh.
 
         Args:
             rows: (M · 512 + 1, hidden) projected evidence (`project`, with ReLU), zero where nothing is seen.
-            colours: (M · 512 + 1, 3) latent mean colours, zero where nothing is seen.
+            start: (M · 512 + 1, 4) latent mean colours, and how well the views agree, zero where nothing is seen.
             seen: (M · 512,) bool.
 
         Returns:
@@ -54,4 +58,5 @@ class LocalReconstruction(nn.Module):
         """
         for number, convolution in enumerate(self.convolutions):
             rows = convolution(torch.relu(rows) if number else rows, topology, seen)
-        return torch.cat([rows[:, :3] + colours, rows[:, 3:]], 1)
+        first = rows[:, : AGREEMENT + 1] + torch.cat([start[:, :AGREEMENT], self.agreement * start[:, AGREEMENT:]], 1)
+        return torch.cat([first, rows[:, AGREEMENT + 1 :]], 1)

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from toolkit.networks.aggregate import FLAGS, aggregate, direction_spread, evidence
+from toolkit.networks.aggregate import CUES, FLAGS, aggregate, agreement, direction_spread, evidence
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
 from toolkit.networks.decoder import make_decoder
@@ -69,7 +69,7 @@ class NerfusionModel(nn.Module):
         self.encoder = ImageEncoder(config.image_channels, config.encoder)
         self.sample = Sampled(config.image_channels, self.encoder.widths[0], config.sampled)
         self.direction = DirectionCode(config.direction) if config.direction else None
-        inputs = 3 * (config.sampled + config.direction + 2 * COLOURS) + FLAGS
+        inputs = 3 * (config.sampled + config.direction + 2 * COLOURS) + FLAGS + CUES
         self.local = LocalReconstruction(inputs, config.hidden, config.channels)
         self.fusion: FusionGRU | RunningMean = FusionGRU(config.channels, config.gru_hidden) if config.fusion == "gru" else RunningMean()
         self.to_field = FieldHead(config.channels, config.head_hidden, config.features)
@@ -126,19 +126,20 @@ class NerfusionModel(nn.Module):
             topology = Topology(keys[visible_blocks(*block_balls(lattice, keys), cameras, near, far)])
         rows = torch.arange(topology.zero_row, device=topology.device) if wanted is None else wanted.nonzero().view(-1)
         parts = [self._observe(views, cameras, lattice, topology, part, near, far) for part in rows.split(CHUNK)]
-        where, projected, colours, counts = (torch.cat(values) for values in zip(*parts, strict=True))
+        where, projected, starts, counts = (torch.cat(values) for values in zip(*parts, strict=True))
         topology, where = _without_empty_blocks(topology, where)
         config, size = self.config, topology.zero_row
         count = torch.zeros(size, device=topology.device).index_copy(0, where, counts)
         latent = projected.new_zeros((size + 1, config.hidden)).index_copy(0, where, projected)
-        colour = colours.new_zeros((size + 1, COLOURS)).index_copy(0, where, colours)
-        raw = self.local(latent, colour, topology, count > 0)
+        start = starts.new_zeros((size + 1, starts.shape[1])).index_copy(0, where, starts)
+        raw = self.local(latent, start, topology, count > 0)
         return LocalVolume(lattice, topology, torch.tanh(raw), count, raw)
 
     def _observe(
         self, views: Sequence[EncodedView], cameras: Cameras, lattice: Lattice, topology: Topology, rows: Tensor, near: float, far: float
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Of the corners `rows`: those that a view sees, their evidence projected to few channels, latent mean colour, and view count."""
+        """Of the corners `rows`: those that a view sees, their evidence projected to few channels, what latents start from (mean colour,
+        how well the views agree), and view count."""
         contracted = lattice.contracted(topology.keys, rows)
         points, size = lattice.working(contracted)
         projection = project(points, size, cameras, near, far)
@@ -151,9 +152,10 @@ class NerfusionModel(nn.Module):
         footprint = torch.exp((torch.log(projection.footprint) * visible).sum(0) / visible.sum(0).clamp_min(1))
         step = footprint * direction_spread(points, cameras.positions, visible)
         mean, variance, count = aggregate(look_up(views, projection, step), visible, self.config.variance)
-        projected = torch.relu(self.local.project(evidence(mean, variance, count, footprint, step)))
+        cues = agreement(variance, count, (slice(self.config.sampled), slice(-2 * COLOURS, -COLOURS)))
+        projected = torch.relu(self.local.project(torch.cat([evidence(mean, variance, count, footprint, step), cues], 1)))
         colour = colour_latent((mean[:, -COLOURS:] / COLOUR_GAIN + 0.5).clamp(0, 1))
-        return rows, projected, colour, count.to(torch.float32)
+        return rows, projected, torch.cat([colour, -cues[:, 1:]], 1), count.to(torch.float32)
 
     def start(self, lattice: Lattice) -> LatentVolume:
         """The global volume before the first key frame."""
