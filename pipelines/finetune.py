@@ -22,9 +22,10 @@ def finetune(
     """Fit the field of a run for another --budget seconds, then render, export and score it.
 
     The folder then holds these settings; the `run` command that made it would fit its own field again.
-    With other settings of the field itself (its decoder, say) it is fitted anew on the same pictures and poses.
+    With other settings of the field itself (its decoder, say) it is fitted anew on the same pictures and poses; the field of a run with
+    --no-finetune is the start of the fit.
     """
     from pipelines.work import work
 
-    flags = {"budget": budget, "device": device, "threads": threads, "seed": seed, "engine": engine, "decoder": decoder}
+    flags = {"budget": budget, "device": device, "threads": threads, "seed": seed, "engine": engine, "decoder": decoder, "finetune": True}
     work(target, out, gather(None, config, pairs, **flags), ("field", "render", "export"), quiet=quiet, as_json=json, go_on=True)

@@ -17,7 +17,9 @@ from toolkit.config import Settings, load_settings
 from toolkit.errors import InputError
 
 if TYPE_CHECKING:
+    from pipelines.steps_network import NetworkField
     from pipelines.total_budget import TotalBudget
+    from toolkit.keyframes import KeyFrames
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -32,6 +34,8 @@ class Job:
     progress: ConsoleProgress
     stages: Stages
     other_field: bool = False  # the settings of the field differ from those that the folder was made with
+    keys: KeyFrames | None = None  # the key frames, once chosen
+    network: NetworkField | None = None  # the networks' field, once this command has made or loaded it
     plan: TotalBudget | None = None  # chooses settings as the run goes on, so that it takes as long as was asked for
 
 
@@ -71,7 +75,8 @@ def open_job(
             settings = read_settings(options, about["settings"])
             set_threads(settings.threads)
             settings.device = choose_device(settings.device)
-            other = settings.field != read_settings({}, about["settings"]).field
+            before = read_settings({}, about["settings"])
+            other = settings.field != before.field or settings.fit.finetune != before.fit.finetune
         folder.start(source, settings)
         yield Job(folder, source, settings, progress, Stages(folder, progress, trusted if again else ()), other)
 

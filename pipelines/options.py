@@ -26,6 +26,14 @@ Threads = Annotated[int | None, typer.Option(help="Threads to use; default: all 
 Seed = Annotated[int | None, typer.Option(help="Seed of all random numbers; default 0.", show_default=False)]
 Engine = Annotated[str | None, typer.Option(help="auto (default): numba on the CPU, torch on CUDA; numba or torch.", show_default=False)]
 Decoder = Annotated[str | None, typer.Option(help="deferred (default) or per_sample (the paper's).", show_default=False)]
+Init = Annotated[
+    str | None,
+    typer.Option(help="Start of the fit: network, classical, or auto (default): the networks' when pictures are few.", show_default=False),
+]
+Finetune = Annotated[
+    bool | None,
+    typer.Option("--finetune/--no-finetune", help="Whether the networks' field is fitted; without it is the result.", show_default=False),
+]
 PosesFrom = Annotated[str | None, typer.Option("--poses", help="auto (default), given, or sfm: ignore given poses.", show_default=False)]
 Config = Annotated[Path | None, typer.Option(help="YAML file with settings.", show_default=False)]
 Pairs = Annotated[list[str] | None, typer.Option("--set", help="Any setting as key=value; may be repeated.", show_default=False)]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pipelines.console import ConsoleProgress
 from pipelines.job import Job, open_job
 from pipelines.steps_capture import choose_frames, choose_keyframes, find_camera_poses, find_capture, make_views, measure_scene
+from pipelines.steps_network import make_network_field, render_network_views, uses_network
 from pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views, score_pictures, wants_tsdf
 from pipelines.steps_stereo import reuse_matched
 from pipelines.summary import put_report, summarise_poses
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 BEFORE = ("capture", "frames", "poses", "scene", "keyframes", "views")  # what every result stands on
 RESULTS = ("tsdf", "field", "render", "export")
+FOR_FIELD = ("network", "direct")  # made with the field
 ALL = frozenset(RESULTS)
 
 
@@ -44,15 +46,16 @@ def run_job(
 
 
 def stand(job: Job) -> tuple[Capture, PoseResult, Capture, Scene, Views]:
-    """What every result stands on: capture, poses, the posed capture, the scene, and the views made ready."""
+    """What every result stands on: capture, poses, the posed capture (as far as it takes part), the scene, and the views made ready."""
+    from toolkit.capture.subset import limited
+
     capture = find_capture(job)
     if job.plan is not None:
         job.plan.choose_pictures(job, capture)
     capture = choose_frames(job, capture)
     poses = find_camera_poses(job, capture)
-    posed = poses.apply(capture)
+    posed = limited(poses.apply(capture), job.settings.capture.holdout, job.settings.views.limit)
     scene = measure_scene(job, posed)
-    choose_keyframes(job, posed, scene)
     return capture, poses, posed, scene, make_views(job, posed, scene)
 
 
@@ -72,7 +75,9 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
     start = time.monotonic()
     stages = job.stages
     stages.trust(set(RESULTS) - goals)
+    stages.trust(() if "field" in goals else FOR_FIELD)
     capture, poses, posed, scene, views = stand(job)
+    choose_keyframes(job, scene, views)
 
     timeline: list[dict[str, Any]] = []
     field, exported = None, None
@@ -81,6 +86,10 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
     if ("tsdf" in goals and wants_tsdf(job, posed)) or stages.usable("tsdf"):
         pictures["tsdf"] = fuse_tsdf(job, posed, scene, views)
     if goals & {"field", "render", "export"} or stages.usable("field"):
+        if uses_network(job, views):
+            made = make_network_field(job, views, scene)
+            if job.settings.fit.finetune:  # else the field is this one
+                pictures["network"] = render_network_views(job, made, views)
         if job.plan is not None:
             job.plan.choose_fit(job, views, scene)
         field, timeline = fit_radiance_field(job, views, scene, go_on)

@@ -12,8 +12,10 @@ from pipelines.options import (
     Decoder,
     Device,
     Engine,
+    Finetune,
     Holdout,
     ImageSize,
+    Init,
     Json,
     Out,
     Pairs,
@@ -50,6 +52,8 @@ def run(
     seed: Seed = None,
     engine: Engine = None,
     decoder: Decoder = None,
+    init: Init = None,
+    finetune: Finetune = None,
     poses: PosesFrom = None,
     config: Config = None,
     pairs: Pairs = None,
@@ -67,6 +71,6 @@ def run(
         if total_budget is not None and value is not None:
             raise InputError(f"--total-budget chooses what {name} would set; give one of them")
     flags = {"budget": budget, "image_size": image_size, "holdout": holdout, "device": device, "threads": threads, "seed": seed}
-    flags |= {"engine": engine, "decoder": decoder, "poses.source": poses}
+    flags |= {"engine": engine, "decoder": decoder, "poses.source": poses, "init": init, "finetune": finetune}
     options = {**gather(preset, config, pairs, **flags), "total_budget": total_budget}
     work(source, out, options, ("tsdf", "field", "render", "export"), quiet=quiet, as_json=json)

@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.job import Job, set_seeds
+from toolkit.errors import InputError
 from toolkit.files import fingerprint, read_json, write_json
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Capture, Views
+    from toolkit.keyframes import KeyFrames
     from toolkit.poses.result import PoseResult
     from toolkit.poses.scene import Scene
 
@@ -121,34 +123,60 @@ def measure_scene(job: Job, posed: Capture) -> Scene:
         set_seeds(job.settings.seed)
         return describe_scene(posed, job.progress)
 
-    return job.stages.run("scene", make=make, save=save, load=lambda: Scene.from_dict(read_json(path)), after=["poses"])
+    uses = limit_of(job)
+    return job.stages.run("scene", make=make, save=save, load=lambda: Scene.from_dict(read_json(path)), uses=uses, after=["poses"])
 
 
-def choose_keyframes(job: Job, posed: Capture, scene: Scene) -> dict[str, Any]:
-    """Key frames among the training pictures, with their neighbours, by name."""
+def limit_of(job: Job) -> list[int] | None:
+    """What decides which pictures take part at all."""
+    limit = job.settings.views.limit
+    return None if limit is None else [limit, job.settings.capture.holdout]
+
+
+def choose_keyframes(job: Job, scene: Scene, views: Views) -> KeyFrames:
+    """Key frames among the training views and their neighbours, as indices into the training views; the file has their names."""
     import numpy as np
 
-    from toolkit.capture.prepare import held_out
-    from toolkit.keyframes import select_keyframes
+    from toolkit.capture.subset import sharpness
+    from toolkit.keyframes import KeyFrames, select_keyframes
 
+    if job.keys is not None:
+        return job.keys
     path = job.folder / "keyframes.json"
-    holdout = job.settings.capture.holdout
+    settings = job.settings.keyframes
+    train = np.flatnonzero(~np.asarray(views.test))
+    names = [views.names[int(index)] for index in train]
 
-    def make() -> dict[str, Any]:
-        frames = [frame for frame, test in zip(posed.frames, held_out(posed, holdout), strict=True) if not test]
-        poses = scene.working_from_input.poses(np.array([frame.world_from_camera for frame in frames]))
-        chosen = select_keyframes(poses, [frame.intrinsics for frame in frames if frame.intrinsics is not None], scene.median_depth)
-        names = [frame.name for frame in frames]
-        return {
-            "keyframes": [names[int(index)] for index in chosen.indices],
-            "neighbours": [[names[int(index)] for index in row] for row in chosen.neighbours],
-        }
+    def make() -> KeyFrames:
+        if len(train) == 0:
+            return KeyFrames(np.zeros(0, np.int64), np.zeros((0, 0), np.int64))
+        clear = np.array([sharpness(views.images[int(index)]) for index in train])
+        cameras = [views.intrinsics[int(index)] for index in train]
+        return select_keyframes(
+            views.world_from_camera[train],
+            cameras,
+            scene.median_depth,
+            method=settings.method,
+            most=settings.most,
+            every=settings.every,
+            sharpness=clear,
+        )
 
-    def save(value: dict[str, Any]) -> list[Path]:
-        write_json(path, value)
+    def save(keys: KeyFrames) -> list[Path]:
+        chosen = [names[int(index)] for index in keys.indices]
+        write_json(path, {"keyframes": chosen, "neighbours": [[names[int(index)] for index in row] for row in keys.neighbours]})
         return [path]
 
-    return job.stages.run("keyframes", make=make, save=save, load=lambda: read_json(path), uses=holdout, after=["poses", "scene"])
+    def load() -> KeyFrames:
+        data, place = read_json(path), {name: index for index, name in enumerate(names)}
+        try:
+            neighbours = [[place[name] for name in row] for row in data["neighbours"]]
+            return KeyFrames.from_dict({"indices": [place[name] for name in data["keyframes"]], "neighbours": neighbours})
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{path} does not fit the views of this run; remove it and run the command again") from error
+
+    job.keys = job.stages.run("keyframes", make=make, save=save, load=load, uses=asdict(settings), after=["scene", "views"], version=2)
+    return job.keys
 
 
 def make_views(job: Job, posed: Capture, scene: Scene) -> Views:
@@ -168,7 +196,7 @@ def make_views(job: Job, posed: Capture, scene: Scene) -> Views:
         make=lambda: prepare_views(posed, scene.working_from_input, settings, job.progress),
         save=save,
         load=lambda: load_views(path),
-        uses=[settings.image_size, settings.holdout, pixel_state(posed)],
+        uses=[settings.image_size, settings.holdout, limit_of(job), pixel_state(posed)],
         after=["poses", "scene"],
     )
 

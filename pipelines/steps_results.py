@@ -73,15 +73,19 @@ Fitted = tuple["Field", list[dict[str, Any]]]
 def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False) -> Fitted:
     """Optimise the field on the training views; held-out views only measure the timeline.
 
-    With `go_on` the field that the folder has is the start, and the budget is for what is added.
+    The start is classical, or the networks' field, which is the result itself without fine-tuning. With `go_on` the field that the folder
+    has is the start, and the budget is for what is added.
     """
+    from pipelines.steps_network import make_network_field, uses_network
     from toolkit.render.field import Field
     from toolkit.training.fit import fit_field
+    from toolkit.training.network_start import network_start
     from toolkit.volume.grid_host import GridHost
 
     settings = job.settings
     path, times, told = job.folder / "field.safetensors", job.folder / "timeline.json", job.folder / FIT_NOTES
     notes: list[str] = []
+    made = make_network_field(job, views, scene) if uses_network(job, views) else None
     start = job.stages.record("field") if go_on and job.stages.usable("field") and not job.other_field else None
 
     def load() -> Fitted:
@@ -89,8 +93,11 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
 
     def make() -> Fitted:
         set_seeds(settings.seed)
+        if start is None and made is not None and not settings.fit.finetune:
+            return made.field, []
         if start is None:
-            result = fit_field(views, scene, settings, job.progress, GridHost(settings.device))
+            first = None if made is None else network_start(made.field, views, scene, settings)
+            result = fit_field(views, scene, settings, job.progress, GridHost(settings.device), start=first, coarse=first is not None)
             notes.extend(result.notes)
             return result.field, result.timeline
         field, timeline = load()
@@ -116,7 +123,8 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
         settings.seed,
         start and start.made,
     ]
-    value = job.stages.run("field", make, save, load, uses=uses, after=["scene", "views"], keeps=True)
+    after = ["scene", "views", *(["network"] if made is not None else [])]
+    value = job.stages.run("field", make, save, load, uses=uses, after=after, keeps=True)
     # The file holds less precision than memory: what is shown and scored is what everybody can load.
     return value if job.stages.cached["field"] else load()
 
@@ -204,5 +212,5 @@ def score_pictures(job: Job, views: Views, pictures: dict[str, Pictures]) -> dic
         save=save,
         load=lambda: read_json(path),
         uses=sorted(pictures),
-        after=["views", *last_of(job, "tsdf", "render")],
+        after=["views", *last_of(job, "tsdf", "render", "direct")],
     )

@@ -114,6 +114,8 @@ def warnings_of(job: Job, capture: Capture, poses: PoseResult, scene: Scene, vie
         texts.append(NO_TEST_VIEWS)
     elif poses.source == "sfm":
         texts.append(SEEN_BY_SFM)
+    if not job.settings.fit.finetune:
+        texts.append("the field is the networks' own (direct inference); nothing was fitted, and fieldfuse finetune goes on from here")
     texts += [
         f"the stage {name!r} was stopped early on request; run the same command again to do it in full" for name in job.stages.stopped()
     ]
@@ -161,7 +163,7 @@ def put_report(
     seconds: float,
 ) -> dict[str, Any]:
     """Write report.json and report.html; `seconds` is what this command took so far, reused stages count as they took."""
-    from toolkit.evaluate.pictures import make_pictures
+    from toolkit.evaluate.pictures import method_pictures
     from toolkit.evaluate.report import report_data, write_report
 
     notes = [export_facts["note"]] if export_facts and "note" in export_facts else []
@@ -177,7 +179,7 @@ def put_report(
             "height": views.intrinsics[0].height,
         },
         "field": describe_field(field),
-        "evaluation": {"field": scores.get("field"), "tsdf": scores.get("tsdf")},
+        "evaluation": {name: scores.get(name) for name in ("field", "tsdf", *(["network"] if "network" in scores else []))},
         "baseline": scores.get("nearest_image"),
         "timeline": timeline,
         "exports": exported_files(job),
@@ -188,7 +190,7 @@ def put_report(
         data |= {"budget": told, "notes": [job.plan.note(told)]}
     shown = {name: [*found.pictures] for name, found in pictures.items()}
     unit = "m" if scene.metric else "units"
-    tiles = make_pictures(views, np.flatnonzero(views.test), shown.get("field"), shown.get("tsdf"), unit)
+    tiles = method_pictures(views, np.flatnonzero(views.test), shown, unit)
     write_report(job.folder.path, data, tiles)
     if job.plan is not None:
         data["budget"] = job.plan.finish(job, time.monotonic() - began)

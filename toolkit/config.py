@@ -38,17 +38,37 @@ class PosesSettings:
 
 
 @dataclass
+class ViewsSettings:
+    limit: int | None = None  # this many evenly spread training views; held-out views stay the same; None: all
+
+
+@dataclass
+class KeyframesSettings:
+    method: str = "parallax"  # parallax (with overlap and sharpness) | uniform: every n-th training view, as in the paper
+    every: int = 10  # n of `uniform`
+    most: int = 12  # key frames that the networks fuse at most
+
+
+@dataclass
+class NetworkSettings:
+    weights: str | None = None  # file of trained networks; None: the shipped ones
+    voxels: float = 24.0  # voxels that make up the median depth, on the finest lattice
+    levels: int = 1  # lattices, each of half the voxel size of the one before; 1: the paper's single one
+
+
+@dataclass
 class FieldSettings:
     channels: int = 16  # features a voxel
     decoder: str = "deferred"  # deferred | per_sample (the paper's)
     hidden: int = 64  # width of the decoder
     background: str = "auto"  # auto | on | off: contract what lies outside the region of interest
     resolution: int | None = None  # voxels along the longest side of the volume; None: by preset and picture size
-    init: str = "classical"
+    init: str = "auto"  # auto (by the number of training views) | network | classical
 
 
 @dataclass
 class FitSettings:
+    finetune: bool = True  # False: the networks' field is the result, nothing is fitted
     budget: float | None = None  # seconds; None: by preset
     max_rays: int = 2048  # rays a step at the finest level; many small steps beat few large ones
     rate_density: float = 0.15
@@ -85,6 +105,9 @@ class Settings:
     seed: int = 0
     capture: CaptureSettings = default(default_factory=CaptureSettings)
     poses: PosesSettings = default(default_factory=PosesSettings)
+    views: ViewsSettings = default(default_factory=ViewsSettings)
+    keyframes: KeyframesSettings = default(default_factory=KeyframesSettings)
+    network: NetworkSettings = default(default_factory=NetworkSettings)
     field: FieldSettings = default(default_factory=FieldSettings)
     fit: FitSettings = default(default_factory=FitSettings)
     tsdf: TsdfSettings = default(default_factory=TsdfSettings)
@@ -99,6 +122,7 @@ SHORT_NAMES = {
     "decoder": "field.decoder",
     "background": "field.background",
     "init": "field.init",
+    "finetune": "fit.finetune",
 }
 CHOICES = {
     "preset": ("fast", "balanced", "quality"),
@@ -108,7 +132,8 @@ CHOICES = {
     "poses.matching": ("auto", "exhaustive", "sequential"),
     "field.decoder": ("deferred", "per_sample"),
     "field.background": ("auto", "on", "off"),
-    "field.init": ("classical",),
+    "field.init": ("auto", "network", "classical"),
+    "keyframes.method": ("parallax", "uniform"),
     "tsdf.enabled": ("auto", "on", "off"),
 }
 
@@ -238,12 +263,18 @@ def _check_ranges(settings: Settings) -> None:
         "field.resolution": settings.field.resolution,
         "capture.max_frames": settings.capture.max_frames,
         "tsdf.voxel_size": settings.tsdf.voxel_size,
+        "views.limit": settings.views.limit,
+        "keyframes.every": settings.keyframes.every,
+        "keyframes.most": settings.keyframes.most,
+        "network.voxels": settings.network.voxels,
     }
     for name, value in positive.items():
         if value is not None and not 0 < value < 1e9:
             raise InputError(f"{name} is {value:g}; it must be a positive number")
     if settings.capture.holdout < 0 or settings.capture.holdout == 1:
         raise InputError(f"holdout is {settings.capture.holdout}; it must be 0 (no test views) or at least 2")
+    if not 1 <= settings.network.levels <= 4:
+        raise InputError(f"network.levels is {settings.network.levels}; it must lie between 1 and 4")
     if settings.capture.image_size is not None and settings.capture.image_size < 16:
         raise InputError(f"image_size is {settings.capture.image_size}; at least 16 pixels are needed")
 

@@ -1,7 +1,8 @@
 """Key frames and each one's neighbours: the views from which local volumes are built (NeRFusion, section 3.1 and 4).
 
 The paper samples frames evenly and takes the ones next in time; here frames are chosen by how much they move against the
-depth of the scene, and neighbours by overlap and parallax. Even sampling stays as an option. Pure NumPy.
+depth of the scene, neighbours by overlap and parallax, and of frames that show the same the sharpest. Even sampling stays as an option.
+Pure NumPy.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from toolkit.poses.overlap import best_neighbours, overlap, parallax
 BY_PARALLAX = "parallax"
 UNIFORM = "uniform"
 VIEWS = 3  # K in the paper: a key frame and K − 1 neighbours
+BLURRED = 0.8  # of the sharpness of a frame beside it: a key frame that gives way to that one
 
 
 @dataclass
@@ -48,17 +50,20 @@ def select_keyframes(
     min_parallax: float = 5.0,
     max_overlap: float = 0.8,
     every: int = 10,
+    sharpness: Array | None = None,
 ) -> KeyFrames:
     """Choose key frames among posed frames, and K − 1 neighbours for each among all frames.
 
     `parallax`: greedy in the given order. A frame is taken when it differs from every key frame so far: by more than
-    `min_parallax` degrees of parallax (baseline against `median_depth`), or by an overlap below `max_overlap` (rotation).
+    `min_parallax` degrees of parallax (baseline against `median_depth`), or by an overlap below `max_overlap` (rotation). With
+    `sharpness`, a blurred key frame then gives way to the sharpest of the frames that stand within half of these bounds from it.
     `uniform`: each `every`-th frame, as in the paper.
 
     Args:
         world_from_camera: (N, 4, 4), in the frame that `median_depth` is measured in.
         most: at most this many; beyond it, those are kept that are farthest from each other.
         views: K, 2 or more.
+        sharpness: (N,) of any unit, comparable between frames that show nearly the same; None: not looked at.
 
     Raises:
         InputError: no frames, a depth that is not positive, or an unknown method.
@@ -80,6 +85,8 @@ def select_keyframes(
             chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, most).round().astype(int)]
     else:
         chosen = _greedy(shares, angles, min_parallax, max_overlap)
+        if sharpness is not None:
+            chosen = _sharper(chosen, np.asarray(sharpness), shares, angles, min_parallax, max_overlap)
         if most is not None and len(chosen) > most:
             chosen = _farthest(poses, median_depth, chosen, most)
     indices = np.array(sorted(chosen), dtype=np.int64)
@@ -94,6 +101,21 @@ def _greedy(shares: Array, angles: Array, min_parallax: float, max_overlap: floa
         if np.all((angle > min_parallax) | (common < max_overlap)):
             chosen.append(i)
     return chosen
+
+
+def _sharper(chosen: list[int], sharpness: Array, shares: Array, angles: Array, min_parallax: float, max_overlap: float) -> list[int]:
+    """Blurred ones of `chosen` replaced by much sharper frames from nearly the same place; never two by the same."""
+    kept = set(chosen)
+    for index in chosen:
+        common = np.minimum(shares[index], shares[:, index])
+        angle = np.minimum(angles[index], angles[:, index])
+        beside = (angle <= 0.5 * min_parallax) & (common >= 0.5 * (1 + max_overlap))
+        beside[list(kept)] = False
+        if beside.any():
+            best = int(np.argmax(np.where(beside, sharpness, -np.inf)))
+            if sharpness[index] < BLURRED * sharpness[best]:
+                kept = kept - {index} | {best}
+    return sorted(kept)
 
 
 def _farthest(poses: Array, depth: float, chosen: list[int], most: int) -> list[int]:

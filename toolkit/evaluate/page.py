@@ -24,7 +24,7 @@ LONGEST = 480  # pixels of an embedded tile's long side: sharp at the size it is
 QUALITY = 86
 TILE_HEIGHT = 380  # CSS pixels at most, so that upright pictures do not fill the screen
 OPEN_VIEWS = 3  # views shown at once; the others are one click away
-METHODS = (("field", "Field"), ("tsdf", "TSDF"))
+METHODS = (("field", "Field"), ("network", "Networks alone"), ("tsdf", "TSDF"))
 
 
 def data_uri(picture: Array, lossless: bool = False) -> str:
@@ -47,7 +47,7 @@ def scores_by_name(score: dict[str, Any] | None) -> dict[str, dict[str, Any]]:
 
 def view_rows(data: dict[str, Any], pictures: Pictures) -> list[dict[str, Any]]:
     """What the template shows of each view: its name, and for each method a row of four captioned tiles."""
-    scores = {key: scores_by_name(data["evaluation"][key]) for key, _ in METHODS}
+    scores = {key: scores_by_name(data["evaluation"].get(key)) for key, _ in METHODS}
     out = []
     for view in pictures.views:
         rows: list[dict[str, Any]] = []
@@ -68,10 +68,12 @@ def comparison(data: dict[str, Any]) -> list[dict[str, Any]]:
     """Rows of the table of headline numbers, and for each measure whether a row is the best (when there are two to compare)."""
     rows = []
     for key, title in METHODS:
-        score = data["evaluation"][key]
+        score = data["evaluation"].get(key)
         if score is None:
             continue
-        rows.append({**score, "title": title, "note": "", "part": False})
+        frames = score.get("key_frames")
+        note = "" if frames is None else f"{words.whole(frames)} key frames fused in {words.duration(score.get('seconds'))}, nothing fitted"
+        rows.append({**score, "title": title, "note": note, "part": False})
         if score.get("psnr_masked") is not None:
             note = f"where it has surface: {words.share(score.get('coverage'))} of the pixels"
             rows.append({"title": title, "note": note, "psnr": score["psnr_masked"], "part": True})
@@ -100,7 +102,7 @@ def headline(data: dict[str, Any]) -> list[tuple[str, str, str]]:
     evaluation, poses, field = data["evaluation"], data["poses"], data["field"]
     out = []
     for key, title in METHODS:
-        score = evaluation[key]
+        score = evaluation.get(key)
         if score is not None and score["psnr"] is not None:
             views = f"{score['views']} test view{'' if score['views'] == 1 else 's'}" if score["views"] is not None else "test views"
             out.append((words.decimal(score["psnr"], 1), "dB", f"{title}: PSNR on {views}"))

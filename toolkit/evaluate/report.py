@@ -93,8 +93,8 @@ def report_data(data: dict[str, Any], folder: Path | None = None) -> dict[str, A
     if not isinstance(data, dict):
         raise InputError(f"a report is made of a table of names and values, not of a {type(data).__name__}")
     evaluation = _part(data.get("evaluation"), ("field", "tsdf"), "evaluation")
-    for method in ("field", "tsdf"):
-        if evaluation[method] is not None:
+    for method in ("field", "tsdf", "network"):
+        if evaluation.get(method) is not None:
             evaluation[method] = _part(evaluation[method], SCORE, f"evaluation.{method}")
     floor = data.get("baseline") or evaluation.get("nearest_image")
     evaluation["nearest_image"] = None if floor is None else _part(floor, ("views", "psnr"), "baseline")

@@ -15,15 +15,15 @@ from toolkit.evaluate.report import report_data
 
 
 def headline_table(data: dict[str, Any]) -> Table:
-    """One row a method (field, TSDF, nearest training picture), facts of the run in the caption. `data` as for `write_report`."""
+    """One row a method (field, networks alone, TSDF, nearest picture), facts of the run in the caption. `data` as for `write_report`."""
     data = report_data(data)
     unit = words.unit_of(data)
     evaluation = data["evaluation"]
     table = Table(box=box.SIMPLE_HEAD, title_justify="left", caption_justify="left", caption_style="")
     for name in ("", "PSNR", "SSIM", "LPIPS", f"depth error ({unit})", "render a view"):
         table.add_column(name, justify="left" if name == "" else "right", no_wrap=True)
-    for key, title in (("field", "field"), ("tsdf", "TSDF")):
-        score = evaluation[key]
+    for key, title in (("field", "field"), ("network", "networks alone"), ("tsdf", "TSDF")):
+        score = evaluation.get(key)
         if score is not None:
             table.add_row(
                 title,
@@ -33,6 +33,8 @@ def headline_table(data: dict[str, Any]) -> Table:
                 words.significant(score["depth_abs_err"]),
                 words.duration(score["seconds_per_view"]),
             )
+            if score.get("key_frames") is not None:
+                table.add_row(f"  {words.whole(score['key_frames'])} key frames in {words.duration(score.get('seconds'))}")
             if score.get("psnr_masked") is not None:
                 table.add_row(f"  on its surface, {words.share(score.get('coverage'))} of the pixels", words.decimal(score["psnr_masked"]))
     floor = evaluation.get("nearest_image")

@@ -26,7 +26,10 @@ COARSEST = 32
 FINEST = 512
 PIXELS = 2.0  # of the training views, a voxel in the middle of the scene
 OBJECT_PIXELS = 1.3  # the same where alpha cuts the object out: fewer voxels are in play, so they may be finer
-SEEN_BY = 3  # training views that must see a voxel: fewer cannot tell its depth
+SEEN_BY = 3  # training views that must see a voxel: fewer cannot tell its depth …
+# … but with few views most places are seen by one or two. What is left out there is missing from every picture: with 3 to 12 views it
+# cost up to 9 dB on validation views, while with more than 24 nothing was gained or lost.
+FEW_VIEWS = 24
 
 
 def make_space(scene: Scene, background: bool, margin: float = MARGIN) -> Space:
@@ -92,7 +95,7 @@ def possible(space: Space, resolution: int, places: Tensor, views: Views) -> Ten
         visible, empty = _look(views, int(index), points, np.broadcast_to(radius, len(points)))
         seen += visible
         emptied += empty
-    keep = (seen >= min(SEEN_BY, len(train))) & (emptied <= 0.02 * len(train))
+    keep = (seen >= (SEEN_BY if len(train) >= FEW_VIEWS else 1)) & (emptied <= 0.02 * len(train))
     return places[torch.from_numpy(keep)] if keep.any() else places
 
 

@@ -1,0 +1,156 @@
+"""The networks' field (direct inference): fused key frame by key frame, with a picture of it that is renewed as key frames come in."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.job import Job, set_seeds
+from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture, write_png, write_pngs
+from pipelines.steps_capture import choose_keyframes
+from toolkit.errors import InputError
+from toolkit.files import fingerprint, read_json, write_json
+
+if TYPE_CHECKING:
+    from toolkit.capture.types import Views
+    from toolkit.poses.scene import Scene
+    from toolkit.render.field import Field
+    from toolkit.training.from_network import Inference
+
+PREVIEW = "preview.png"
+PREVIEW_SIDE = 160  # pixels of the preview's pictures
+FIRST_PREVIEW = 3  # key frames after which there is one; with fewer in all, after the last
+
+
+@dataclass
+class NetworkField:
+    """The field and how it came to be (plain data)."""
+
+    field: Field
+    facts: dict[str, Any]
+
+
+def uses_network(job: Job, views: Views) -> bool:
+    """Whether this run starts from the networks (or ends with them).
+
+    Raises:
+        InputError: the settings contradict each other.
+    """
+    from toolkit.training.network_start import FEW_VIEWS
+
+    settings = job.settings
+    if settings.field.init == "classical" and not settings.fit.finetune:
+        raise InputError("without fine-tuning the networks' field is the result, so init cannot be 'classical'; drop one of the two")
+    if settings.field.init != "auto":
+        return settings.field.init == "network"
+    return not settings.fit.finetune or int(np.count_nonzero(~np.asarray(views.test))) <= FEW_VIEWS
+
+
+def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
+    """The stage `network`; made once a command."""
+    from toolkit.render.field import Field
+    from toolkit.training.from_network import SHIPPED
+
+    if job.network is not None:
+        return job.network
+    keys = choose_keyframes(job, scene, views)
+    settings = job.settings
+    path, about = job.folder / "network.safetensors", job.folder / "network.json"
+    weights = Path(settings.network.weights) if settings.network.weights else SHIPPED
+    if not weights.is_file():
+        raise InputError(f"there are no trained networks at {weights}; leave network.weights out for the shipped ones")
+
+    def make() -> NetworkField:
+        from toolkit.training.from_network import Inference, NetworkOptions, load_networks
+
+        set_seeds(settings.seed)
+        start = time.monotonic()
+        options = NetworkOptions(settings.network.voxels, settings.network.levels)
+        model = load_networks(weights, settings.device)
+        inference = Inference(model, views, scene, keys, settings.field.background, options)
+        first = _stream(job, inference, start)
+        facts = {
+            "key_frames": inference.done,
+            "seconds": round(inference.seconds, 3),
+            "encode_seconds": round(inference.encode_seconds, 3),
+            "first_preview_seconds": first,
+            "resolution": inference.lattice.resolution,
+        }
+        return NetworkField(inference.field(), facts)
+
+    def save(value: NetworkField) -> list[Path]:
+        value.field.save(path, scene.working_from_input, value.facts)
+        write_json(about, value.facts)
+        return [path, about, job.folder / PREVIEW]
+
+    def load() -> NetworkField:
+        return NetworkField(Field.load(path).to(settings.device), read_json(about))
+
+    uses = [asdict(settings.network), fingerprint(weights), settings.field.background, settings.device, settings.seed]
+    value = job.stages.run("network", make, save, load, uses=uses, after=["scene", "views", "keyframes"])
+    # As with a fitted field, what is used is what everybody can load.
+    job.network = value if job.stages.cached["network"] else load()
+    return job.network
+
+
+def _stream(job: Job, inference: Inference, start: float) -> float:
+    """Fuse all key frames, the preview renewed after each; answers the seconds from the third key frame to the first picture."""
+    path, total = job.folder / PREVIEW, len(inference.keys.indices)
+    first: float | None = None
+    for frame in inference.frames(job.progress):
+        if inference.done < min(FIRST_PREVIEW, total):
+            continue
+        begin = time.monotonic()
+        write_png(path, preview(inference, frame))
+        if first is None:
+            first = round(time.monotonic() - begin, 3)
+            when = f"{inference.done} key frames, {begin - start + first:.1f} s"
+            job.progress.say(f"network: {path} shows what {when} have given; it is renewed at each key frame")
+    assert first is not None
+    return first
+
+
+def preview(inference: Inference, frame: int) -> Any:
+    """(H, 3 · W, 3) uint8: the newest key frame's photo, the field of all key frames so far from there, and its depth."""
+    import cv2
+
+    from toolkit.evaluate.pictures import depth_picture, depth_range
+    from toolkit.render.image import make_renderer, render_view
+
+    camera, photo = inference.train.intrinsics[frame], inference.train.images[frame]
+    shrink = min(1.0, PREVIEW_SIDE / max(camera.width, camera.height))
+    camera = camera.scaled(max(1, round(shrink * camera.width)), max(1, round(shrink * camera.height)))
+    field = inference.field()
+    # The compiled renderer is faster, but the first picture must not wait for a compiler.
+    shown = to_picture(render_view(field, camera, inference.train.world_from_camera[frame], make_renderer(field, "torch")))
+    small = cv2.resize(photo, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return np.concatenate([small, shown.rgb, depth_picture(shown.depth, depth_range([shown.depth]))], axis=1)
+
+
+def render_network_views(job: Job, made: NetworkField, views: Views) -> Pictures:
+    """The networks' field at the held-out views, before anything was fitted."""
+    from toolkit.render.image import make_renderer, render_view
+
+    kept = job.folder / "renders" / "network.safetensors"
+
+    def make() -> Pictures:
+        pictures = Pictures(facts=dict(made.facts))
+        view = make_renderer(made.field, job.settings.engine)
+        indices = np.flatnonzero(views.test)
+        for count, index in enumerate(indices):
+            job.progress.update(count, len(indices), views.names[index])
+            job.progress.check()
+            start = time.monotonic()
+            picture = to_picture(render_view(made.field, views.intrinsics[index], views.world_from_camera[index], view))
+            pictures.add(views.names[index], picture, time.monotonic() - start)
+        return pictures
+
+    def save(pictures: Pictures) -> list[Path]:
+        save_pictures(kept, pictures)
+        return [kept, *write_pngs(kept.parent, "network", pictures)]
+
+    return job.stages.run("direct", make=make, save=save, load=lambda: load_pictures(kept), after=["network", "views"])
