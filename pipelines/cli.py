@@ -12,7 +12,24 @@ from typing import Annotated
 
 import typer
 
-from pipelines import bake, bench, compare, evaluate, export, finetune, info, poses, render, run, selftest, simulate, tradeoff, train, tsdf
+from pipelines import (
+    bake,
+    bench,
+    compare,
+    evaluate,
+    export,
+    few_views,
+    finetune,
+    info,
+    poses,
+    render,
+    run,
+    selftest,
+    simulate,
+    tradeoff,
+    train,
+    tsdf,
+)
 from pipelines.options import Json
 from toolkit import __version__
 from toolkit.errors import FieldfuseError, Interrupted
@@ -98,6 +115,8 @@ for _command in (
     simulate.simulate,
 ):
     app.command()(_command)
+bench.app.command("few-views")(few_views.few_views)
+bench.app.command("ablations")(few_views.ablations)
 app.add_typer(bench.app, name="bench")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from dataclasses import field as default
 
@@ -22,6 +23,7 @@ from toolkit.networks.decoder import make_decoder
 from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
+from toolkit.training import room, trial
 from toolkit.training.engine import Engine, make_engine, warm_up
 from toolkit.training.finite import NotFiniteError
 from toolkit.training.guard import Guard, refuse_broken
@@ -52,23 +54,25 @@ class FitResult:
     steps: int = 0
     rays: int = 0
     interrupted: bool = False
+    distortion: float = 0.0  # weight of the distortion loss that was taken
     notes: list[str] = default(default_factory=list)  # a sentence on each step that was not finite
 
 
 class _Clock:
     """Fitting seconds; stands still while something else is measured."""
 
-    def __init__(self) -> None:
-        self._spent, self._since = 0.0, time.perf_counter()
+    def __init__(self, ticks: Callable[[], float]) -> None:
+        self.ticks = ticks
+        self._spent, self._since = 0.0, ticks()
 
     def seconds(self) -> float:
-        return self._spent + time.perf_counter() - self._since
+        return self._spent + self.ticks() - self._since
 
     def pause(self) -> None:
         self._spent = self.seconds()
 
     def go_on(self) -> None:
-        self._since = time.perf_counter()
+        self._since = self.ticks()
 
 
 class _Sample:
@@ -96,6 +100,7 @@ def fit_field(
     host: Host | None = None,
     start: Field | None = None,
     coarse: bool = False,
+    ticks: Callable[[], float] = time.perf_counter,
 ) -> FitResult:
     """Fit a field to the training views.
 
@@ -107,9 +112,10 @@ def fit_field(
         host: where rows live while they change (`GridHost` puts them into Open3D's hash map).
         start: a field to go on from, at its finest level.
         coarse: `start` is a first guess and no fitted field: climb from its level to the finest, as from the classical start.
+        ticks: the clock, in seconds, that the budget is counted on; a benchmark beside other work takes `time.process_time`.
 
     Raises:
-        InputError: there is no training view, `start` is not finite, or not one step was.
+        InputError: there is no training view, `start` is not finite, not one step was, or it does not fit into memory.
     """
     device = torch.device(settings.device if settings.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu")
     train = views.subset(np.flatnonzero(~views.test))
@@ -121,12 +127,13 @@ def fit_field(
     held_out = _Sample(views, np.flatnonzero(views.test), TIMELINE_PIXELS, device)
     aside = np.arange(len(train)) % VALIDATION_SHARE == VALIDATION_SHARE // 2 if len(train) >= LEAST_VIEWS else np.zeros(len(train), bool)
     validation = _Sample(train, np.flatnonzero(aside), VALIDATION_PIXELS, device)
+    room.require_start(train, start, settings, device)
     # Views that are kept aside come last, so that joining them is a matter of a limit.
     pool = PixelPool(train.subset(np.argsort(aside, kind="stable")), device)
     pool.limit = int((pool.view < np.count_nonzero(~aside)).sum())
     budget = settings.fit.budget or DEFAULT_BUDGET
     warm_up(settings, progress)
-    clock = _Clock()
+    clock = _Clock(ticks)
     if start is None:
         current, ladder = _first(views, train, scene, settings, device, host, generator)
     else:
@@ -147,11 +154,17 @@ def fit_field(
             growth = (ladder[plan.level + 1] / current.resolution) ** 3
             if int(keep.sum()) * growth > MANY_VOXELS:
                 keep &= engine.visits > 0  # memory is bounded: what no ray came to is the first to go
-            if plan.worth(int(keep.sum()) * growth, (budget - now) * result.rays / max(now, 1e-3)):
+            rays_left = (budget - now) * result.rays / max(now, 1e-3)
+            if plan.worth(int(keep.sum()) * growth, rays_left) and room.fits(current, keep, plan, settings, guard.notes):
                 plan.climb()
                 engine.let_go()
-                current = finer(current, keep, plan.resolution, host)
+                current = finer(engine.sync(), keep, plan.resolution, host)
                 engine.renew_rows(current)
+                if plan.level == trial.LEVEL and budget >= trial.LEAST_BUDGET and validation.batch is not None:
+                    rates = plan.rates(done, result.rays)
+                    plan.strength = trial.best_strength(
+                        current, lambda copied: make_engine(settings, copied, pool), validation.psnr, rates, plan.rays
+                    )
         elif plan.wants_pruning(done):
             current = pruned(current, visible(current, engine.seen, engine.visits, settings.fit.prune_weight))
             engine.go_on_with(current)
@@ -180,6 +193,7 @@ def fit_field(
     clock.pause()
     result.interrupted = progress.stopping()
     result.seconds = clock._spent
+    result.distortion = plan.distortion
     _measure(result, held_out, engine, result.seconds)
     current = engine.sync()
     engine.let_go()

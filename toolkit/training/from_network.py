@@ -25,13 +25,15 @@ from toolkit.networks.weights import load_model
 from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
-from toolkit.render.fused import GAMMA, make_field, without_empty_blocks
+from toolkit.render.fused import make_field, without_empty_blocks
 from toolkit.training.start import colour_behind, space_of
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK
 
 SHIPPED = Path(weights.__file__).parent / "weights" / "nerfusion.safetensors"
-VOXELS_TO_MEDIAN = 40.0  # voxels that make up the median depth: what the shipped weights do best with
+# Voxels that make up the median depth. With 40 instead, validation pictures of gum lost 0.7 dB and a key frame took four times as long.
+VOXELS_TO_MEDIAN = 24.0
+GAMMA = 0.95  # the paper's 0.6 cuts holes where the networks are in doubt: 15.1 instead of 16.2 dB there
 LEAST, MOST = 32, 256  # resolution of the lattice
 
 

@@ -1,0 +1,155 @@
+"""`fieldfuse bench few-views SOURCE` and `fieldfuse bench ablations SOURCE`: tables of what few pictures and parts of the networks give."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipelines.options import Config, ImageSize, Out, Pairs, Quiet, Seed, Source, gather
+
+if TYPE_CHECKING:
+    from pipelines.job import Job
+    from toolkit.capture.types import Capture
+    from toolkit.evaluate.few_views import Ground
+
+ALL = "all"
+FILE = "few_views"
+ABLATIONS = "ablations"
+
+
+def few_views(
+    source: Source,
+    out: Out,
+    views: Annotated[str, typer.Option(help="Numbers of training views, by comma; 'all' is one.")] = "3,6,12,all",
+    budgets: Annotated[str, typer.Option(help="Seconds of fitting (processor time of one thread), by comma.")] = "30,120",
+    image_size: ImageSize = None,
+    seed: Seed = None,
+    config: Config = None,
+    pairs: Pairs = None,
+    quiet: Quiet = False,
+) -> None:
+    """Held-out quality of 3, 6, 12 … training views: networks alone, and fits from their start and from the classical one.
+
+    Rows that OUT/few_views.json has already are not measured again, so an interrupted table goes on when the command is repeated.
+    """
+    from toolkit.evaluate.few_views import few_views_rows, few_views_table
+    from toolkit.files import read_json
+    from toolkit.training.from_network import load_networks
+
+    seconds = numbers(budgets, "budgets")
+    counts = [None if part == ALL else int(part) for part in wanted(views)]
+    with _job(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as (job, posed):
+        path = job.folder.path / f"{FILE}.json"
+        rows: list[dict[str, Any]] = read_json(path)["rows"] if path.is_file() else []
+        model = load_networks(job.settings.network.weights, job.settings.device)
+        for count in counts:
+            ground = ground_of(job, posed, count)
+            done = {(row["views"], row["start"], row["budget"]) for row in rows}
+            for row in few_views_rows(ground, model, seconds, done, job.progress):
+                rows.append(row)
+                _keep(job, FILE, rows, few_views_table(rows))
+                job.progress.say(f"{row['views']} views, {row['start']}, {row['budget']:g} s: {row['psnr']:.2f} dB")
+    _tell(few_views_table(rows), quiet)
+
+
+def ablations(
+    source: Source,
+    out: Out,
+    views: Annotated[str, typer.Option(help="Number of training views, or 'all'.")] = ALL,
+    image_size: ImageSize = None,
+    seed: Seed = None,
+    config: Config = None,
+    pairs: Pairs = None,
+    quiet: Quiet = False,
+) -> None:
+    """Direct inference with parts of the trained networks switched off: variance, direction code, GRU, pruning."""
+    from toolkit.evaluate.few_views import ablation_rows, ablation_table
+    from toolkit.training.from_network import load_networks
+
+    count = None if views == ALL else int(numbers(views, "views")[0])
+    rows = []
+    with _job(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as (job, posed):
+        model = load_networks(job.settings.network.weights, job.settings.device)
+        for row in ablation_rows(ground_of(job, posed, count), model, job.progress):
+            rows.append(row)
+            _keep(job, ABLATIONS, rows, ablation_table(rows))
+    _tell(ablation_table(rows), quiet)
+
+
+def wanted(text: str) -> list[str]:
+    """`3,6,all` → its parts.
+
+    Raises:
+        InputError: something is neither a positive whole number nor `all`.
+    """
+    from toolkit.errors import InputError
+
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    for part in parts:
+        if part != ALL and not (part.isdigit() and int(part) > 0):
+            raise InputError(f"--views {text!r}: {part!r} is neither a positive number nor 'all'")
+    return parts
+
+
+def numbers(text: str, name: str) -> list[float]:
+    """`30,120` → its numbers.
+
+    Raises:
+        InputError: something is not a positive number.
+    """
+    from toolkit.errors import InputError
+
+    try:
+        values = [float(part) for part in text.split(",") if part.strip()]
+    except ValueError as error:
+        raise InputError(f"--{name} {text!r} must be numbers separated by commas") from error
+    if not values or any(not 0 < value < 1e6 for value in values):
+        raise InputError(f"--{name} {text!r} must be positive numbers")
+    return values
+
+
+@contextmanager
+def _job(source: Path, out: Path, options: dict[str, Any], quiet: bool) -> Iterator[tuple[Job, Capture]]:
+    """A job of one thread on `source`, with everything up to the poses done."""
+    from pipelines.console import make_progress
+    from pipelines.job import bound_threads
+
+    bound_threads(options)
+    from pipelines.job import open_job
+    from pipelines.steps_capture import choose_frames, find_camera_poses, find_capture
+
+    with open_job(source, out, options, make_progress(quiet)) as job:
+        capture = choose_frames(job, find_capture(job))
+        yield job, find_camera_poses(job, capture).apply(capture)
+
+
+def ground_of(job: Job, posed: Capture, count: int | None) -> Ground:
+    """The capture with `count` of its training views (None: all), as a run would prepare it."""
+    from toolkit.capture.prepare import prepare_views
+    from toolkit.capture.subset import limited
+    from toolkit.evaluate.few_views import Ground
+    from toolkit.poses.scene import describe_scene
+
+    some = limited(posed, job.settings.capture.holdout, count)
+    scene = describe_scene(some, job.progress)
+    return Ground(prepare_views(some, scene.working_from_input, job.settings.capture, job.progress), scene, job.settings)
+
+
+def _keep(job: Job, name: str, rows: list[dict[str, Any]], table: str) -> None:
+    from toolkit.config import settings_dict
+    from toolkit.evaluate.speed import machine
+    from toolkit.files import atomic_path, write_json
+
+    about = {"source": str(job.source), "machine": machine(1), "settings": settings_dict(job.settings), "rows": rows}
+    write_json(job.folder / f"{name}.json", about)
+    with atomic_path(job.folder / f"{name}.md") as temporary:
+        temporary.write_text(table, encoding="utf-8")
+
+
+def _tell(table: str, quiet: bool) -> None:
+    if not quiet:
+        typer.echo(table.rstrip())

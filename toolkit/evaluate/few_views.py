@@ -1,0 +1,173 @@
+"""What a few training views give: the networks alone, the fit from the networks' start, and the fit from the classical one.
+
+Held-out views are the same for every number of training views. Seconds are of one thread's processor time, so that other work on the
+machine does not blur the comparison; the networks' seconds stand beside, they are not part of a fit's budget.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from toolkit.capture.types import Views
+from toolkit.config import Settings
+from toolkit.evaluate.baseline import nearest_image_scores
+from toolkit.evaluate.score import score_views
+from toolkit.keyframes import KeyFrames, select_keyframes
+from toolkit.networks.gru import RunningMean
+from toolkit.networks.model import NerfusionModel
+from toolkit.poses.scene import Scene
+from toolkit.progress import SILENT, Progress
+from toolkit.render.field import Field
+from toolkit.render.image import make_renderer, render_view
+
+STARTS = ("direct", "network", "classical")
+SHOWN = ("psnr", "ssim", "lpips", "depth_abs_err")
+ABLATIONS = ("whole", "no variance", "no direction code", "mean instead of GRU", "no pruning")
+
+
+@dataclass(frozen=True)
+class Ground:
+    """One capture with some of its training views."""
+
+    views: Views
+    scene: Scene
+    settings: Settings
+
+    @property
+    def training(self) -> int:
+        """Number of training views."""
+        return int(np.count_nonzero(~np.asarray(self.views.test)))
+
+    def keys(self) -> KeyFrames:
+        """Key frames among the training views, as a run chooses them but for sharpness."""
+        train = np.flatnonzero(~np.asarray(self.views.test))
+        chosen = self.settings.keyframes
+        return select_keyframes(
+            self.views.world_from_camera[train],
+            [self.views.intrinsics[int(i)] for i in train],
+            self.scene.median_depth,
+            method=chosen.method,
+            every=chosen.every,
+            most=chosen.most,
+        )
+
+
+def measured(field: Field, ground: Ground) -> dict[str, Any]:
+    """Mean scores of a field over the held-out views."""
+    views = ground.views
+    view = make_renderer(field, ground.settings.engine)
+    indices = np.flatnonzero(views.test)
+    shown = (render_view(field, views.intrinsics[i], views.world_from_camera[i], view) for i in indices)
+    scores = score_views(shown, views, indices)
+    return {name: scores[name] for name in SHOWN}
+
+
+def infer(model: NerfusionModel, ground: Ground, pruned: bool = True, progress: Progress = SILENT) -> tuple[Field, dict[str, Any]]:
+    """The networks' field, and its seconds (processor time) and number of key frames."""
+    from toolkit.training.from_network import Inference, NetworkOptions
+
+    network = ground.settings.network
+    options = NetworkOptions(network.voxels, network.levels, *([] if pruned else [None]))
+    start = time.process_time()
+    inference = Inference(model, ground.views, ground.scene, ground.keys(), ground.settings.field.background, options)
+    for _ in inference.frames(progress):
+        pass
+    field = inference.field()
+    return field, {"key_frames": inference.done, "seconds": round(time.process_time() - start, 2)}
+
+
+def few_views_rows(
+    ground: Ground, model: NerfusionModel, budgets: Iterable[float], done: set[tuple[Any, ...]], progress: Progress = SILENT
+) -> Iterable[dict[str, Any]]:
+    """A row for the nearest training picture, one for the networks alone, and two for each budget, each as soon as it is measured.
+
+    Args:
+        done: (views, start, budget) of rows that are there already.
+    """
+    from toolkit.training.fit import fit_field
+    from toolkit.training.network_start import network_start
+
+    views, scene, settings, count = ground.views, ground.scene, ground.settings, ground.training
+    budgets = list(budgets)
+    if (count, "nearest", 0) not in done:
+        nearest = nearest_image_scores(views, np.flatnonzero(views.test))
+        yield {"views": count, "start": "nearest", "budget": 0, "psnr": nearest["psnr"]}
+    made: Field | None = None
+    if any((count, "network", budget) not in done for budget in budgets) or (count, "direct", 0) not in done:
+        made, facts = infer(model, ground, progress=progress)
+        if (count, "direct", 0) not in done:
+            yield {"views": count, "start": "direct", "budget": 0, **measured(made, ground), **facts}
+    for budget in budgets:
+        for start in STARTS[1:]:
+            if (count, start, budget) in done:
+                continue
+            progress.check()
+            settings.fit.budget = budget
+            first = network_start(made, views, scene, settings) if start == "network" and made is not None else None
+            fitted = fit_field(views, scene, settings, progress, start=first, coarse=first is not None, ticks=time.process_time)
+            row = {"views": count, "start": start, "budget": budget, **measured(fitted.field, ground)}
+            yield {**row, "steps": fitted.steps, "resolution": fitted.field.resolution}
+
+
+def ablation_rows(ground: Ground, model: NerfusionModel, progress: Progress = SILENT) -> Iterable[dict[str, Any]]:
+    """Direct inference with parts of the trained networks switched off, one at a time. Nothing is trained again without them."""
+    for name in ABLATIONS:
+        progress.check()
+        with _without(model, name):
+            field, facts = infer(model, ground, pruned=name != "no pruning", progress=progress)
+            yield {"views": ground.training, "part": name, **measured(field, ground), **facts}
+
+
+class _without:
+    """The model with one part switched off while the context is open."""
+
+    def __init__(self, model: NerfusionModel, name: str) -> None:
+        self.model, self.name = model, name
+        self.config, self.fusion = model.config, model.fusion
+
+    def __enter__(self) -> None:
+        from dataclasses import replace
+
+        if self.name == "no variance":
+            self.model.config = replace(self.config, variance=False)
+        elif self.name == "mean instead of GRU":
+            self.model.fusion = RunningMean()
+        elif self.name == "no direction code" and self.model.direction is not None:
+            self.hook = self.model.direction.register_forward_hook(lambda module, given, out: out * 0)
+
+    def __exit__(self, *_: object) -> None:
+        self.model.config, self.model.fusion = self.config, self.fusion
+        if self.name == "no direction code" and self.model.direction is not None:
+            self.hook.remove()
+
+
+def few_views_table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: a line for each number of views."""
+    budgets = sorted({row["budget"] for row in rows if row["start"] in ("network", "classical")})
+    fits = [(budget, start) for budget in budgets for start in ("classical", "network")]
+    found = {(row["views"], row["start"], row["budget"]): row for row in rows}
+    head = ["training views", "nearest picture", "networks alone", "their seconds"]
+    head += [f"{start} start, {budget:g} s" for budget, start in fits]
+    lines = [" | ".join(["", *head, ""]).strip(), "|".join(["", *(" --- " for _ in head), ""])]
+    for count in sorted({row["views"] for row in rows}):
+        direct = found.get((count, "direct", 0), {})
+        cells = [str(count), _decibel(found.get((count, "nearest", 0))), _decibel(direct), f"{direct['seconds']:.0f}" if direct else ""]
+        cells += [_decibel(found.get((count, start, budget))) for budget, start in fits]
+        lines.append(" | ".join(["", *cells, ""]).strip())
+    return "\n".join(lines) + "\n"
+
+
+def ablation_table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: a line for each part."""
+    lines = ["| networks | PSNR | SSIM | seconds |", "| --- | --- | --- | --- |"]
+    lines += [f"| {row['part']} | {_decibel(row)} | {row['ssim']:.3f} | {row['seconds']:.0f} |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _decibel(row: dict[str, Any] | None) -> str:
+    return f"{row['psnr']:.2f}" if row and row.get("psnr") is not None else ""
