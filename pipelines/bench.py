@@ -1,4 +1,4 @@
-"""`fieldfuse bench …`: how fast this machine is at what Fieldfuse does."""
+"""`fieldfuse bench …`: how fast this machine is at what Fieldfuse does; and published protocols (see `bench_suite`)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipelines.bench_suite import add_suites
 from pipelines.options import Quiet, Threads
 
 if TYPE_CHECKING:
@@ -149,3 +150,6 @@ def _time(microseconds: float, unit: str) -> str:
     if microseconds >= 1e4:
         return f"{microseconds / 1e3:.1f} ms a {unit}"
     return f"{microseconds:.3g} µs a {unit}" if microseconds >= 0.1 else f"{microseconds * 1e3:.3g} ns a {unit}"
+
+
+add_suites(app)

@@ -1,0 +1,246 @@
+"""`fieldfuse bench SUITE DATA --out DIR`: a published protocol on data that the user brings; and its tables put into a page."""
+
+from __future__ import annotations
+
+import json as writer
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipelines.options import Device, ImageSize, Json, Out, Pairs, Preset, Quiet, Seed, Threads, gather
+
+if TYPE_CHECKING:
+    from pipelines.job import Job
+    from pipelines.rendered import Pictures
+    from toolkit.capture.types import Views
+    from toolkit.evaluate.suites.base import Suite, Variant
+    from toolkit.poses.scene import Scene
+
+HELP = {
+    "nerf-synthetic": "NeRF-synthetic with the splits of its Blender files.",
+    "dtu": "DTU: 3 views direct and fitted, 16 views fitted, 4 test views.",
+    "scannet": "ScanNet: the eight scenes of NerfingMVS.",
+    "llff": "LLFF: every eighth picture held out.",
+    "posed": "Any posed captures: their own split, else every eighth picture held out.",
+}
+RESULTS = "results"
+SUFFIXES = (".json", ".md")
+
+Data = Annotated[Path, typer.Argument(help="Folder with one subfolder a scene, or one scene.", show_default=False)]
+Scenes = Annotated[str | None, typer.Option(help="Names of scenes, separated by commas; default: all that are there.", show_default=False)]
+Variants = Annotated[str | None, typer.Option(help="Keys of variants, separated by commas; default: all.", show_default=False)]
+FitBudget = Annotated[float | None, typer.Option("--budget", help="Seconds of optimisation of each scene.", show_default=False)]
+
+
+def add_suites(app: typer.Typer) -> None:
+    """One command a suite, and `table`."""
+    for name, text in HELP.items():
+        app.command(name, help=text)(_command(name))
+    app.command("table")(table)
+
+
+def _command(name: str) -> Any:
+    def command(
+        data: Data,
+        out: Out,
+        scenes: Scenes = None,
+        variants: Variants = None,
+        budget: FitBudget = None,
+        image_size: ImageSize = None,
+        preset: Preset = None,
+        device: Device = None,
+        threads: Threads = None,
+        seed: Seed = None,
+        pairs: Pairs = None,
+        quiet: Quiet = False,
+        json: Json = False,
+    ) -> None:
+        from pipelines.job import bound_threads
+
+        flags = {"budget": budget, "image_size": image_size, "device": device, "threads": threads, "seed": seed}
+        options = gather(preset, None, pairs, **flags)
+        bound_threads(options)
+        from pipelines.console import make_progress
+
+        found = bench_suite(name, data, out, options, _names(scenes), _names(variants), make_progress(quiet))
+        if json:
+            sys.stdout.write(writer.dumps(found, indent=1) + "\n")
+        elif not quiet:
+            sys.stdout.write((out / f"{RESULTS}.md").read_text(encoding="utf-8"))
+
+    return command
+
+
+def _names(text: str | None) -> list[str] | None:
+    return None if text is None else [part.strip() for part in text.split(",") if part.strip()]
+
+
+def bench_suite(
+    name: str, data: Path, out: Path, options: dict[str, Any], scenes: list[str] | None, variants: list[str] | None, progress: Any
+) -> dict[str, Any]:
+    """Run the protocol, write `results.json` and `results.md` into `out` after every scene; answers the former.
+
+    Raises:
+        InputError: no such scene or variant.
+    """
+    from toolkit.errors import InputError, Interrupted, OutputError
+    from toolkit.evaluate.suites import suite_of
+
+    suite = suite_of(name)
+    if options["flags"].get("image_size") is None:
+        options["flags"]["image_size"] = suite.long_side
+    chosen = [suite.variant(key) for key in variants] if variants is not None else list(suite.variants)
+    rows: list[dict[str, Any]] = []
+    for scene, source in suite.find(data, scenes):
+        for variant in chosen:
+            place = out / scene / variant.key
+            progress.say(f"{scene}, {variant.title}")
+            try:
+                row = run_variant(suite, variant, source, place, options, progress)
+            except (Interrupted, OutputError):
+                raise
+            except InputError as error:
+                row = {"error": " ".join(str(error).split())}
+            rows.append({"scene": scene, "variant": variant.key, "error": None, **row})
+            found = put(suite, rows, out, options)
+    return found
+
+
+def run_variant(suite: Suite, variant: Variant, source: Path, place: Path, options: dict[str, Any], progress: Any) -> dict[str, Any]:
+    """One scene in one variant: a run's own stages on the frames that the protocol picks."""
+    import numpy as np
+
+    from pipelines.job import open_job
+    from pipelines.steps_capture import find_camera_poses, find_capture, make_views, measure_scene
+    from pipelines.steps_results import fit_radiance_field, render_test_views
+    from toolkit.evaluate.compare_score import compare_views
+    from toolkit.evaluate.report import plain
+
+    start = time.monotonic()
+    with open_job(source, place, options, progress) as job:
+        capture = variant.pick(find_capture(job))
+        poses = find_camera_poses(job, capture)
+        posed = poses.apply(capture)
+        scene = measure_scene(job, posed)
+        views = make_views(job, posed, scene)
+        if variant.fitted:
+            field, _ = fit_radiance_field(job, views, scene)
+            voxels, pictures = field.voxels, render_test_views(job, field, views)
+        else:
+            pictures = render_directly(job, views, scene)
+            voxels = pictures.facts["voxels"]
+        indices = np.flatnonzero(views.test)
+        score = compare_views({"it": pictures.pictures}, views, indices, {"it": pictures.seconds})["it"]
+        made = job.stages.records["field" if variant.fitted else "direct"]
+        found = {
+            **{key: score[key] for key in ("psnr", "ssim", "lpips", "abs_err", "acc_1", "acc_5", "seconds_per_view")},
+            "train": int(np.sum(~views.test)),
+            "test": int(np.sum(views.test)),
+            "width": views.intrinsics[0].width,
+            "height": views.intrinsics[0].height,
+            "fit_seconds": made.seconds,
+            "peak_memory_mb": made.peak_memory_mb,
+            "seconds": round(time.monotonic() - start + job.stages.fresh_seconds(), 3),
+            "voxels": voxels,
+            "stages": job.stages.summary(),
+        }
+        out = plain(found)
+        assert isinstance(out, dict)
+        return out
+
+
+def render_directly(job: Job, views: Views, scene: Scene) -> Pictures:
+    """The stage `direct`: the networks' field, not fitted, at the test views."""
+    from pipelines.direct_field import direct_field
+    from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture
+    from toolkit.render.image import render_view
+
+    kept = job.folder / "renders" / "direct.safetensors"
+
+    def make() -> Pictures:
+        import numpy as np
+
+        field, key_frames = direct_field(job.settings, views, scene, job.progress)
+        pictures = Pictures()
+        for index in np.flatnonzero(views.test):
+            job.progress.check()
+            start = time.monotonic()
+            picture = to_picture(render_view(field, views.intrinsics[index], views.world_from_camera[index]))
+            pictures.add(views.names[index], picture, time.monotonic() - start)
+        pictures.facts = {"voxels": field.voxels, "key_frames": key_frames}
+        return pictures
+
+    def save(pictures: Pictures) -> list[Path]:
+        save_pictures(kept, pictures)
+        return [kept]
+
+    return job.stages.run("direct", make, save, lambda: load_pictures(kept), uses=job.settings.device, after=["scene", "views"])
+
+
+def put(suite: Suite, rows: list[dict[str, Any]], out: Path, options: dict[str, Any]) -> dict[str, Any]:
+    """Write what there is so far."""
+    from pipelines.folder import command_line
+    from pipelines.job import read_settings
+    from toolkit import __version__
+    from toolkit.config import settings_dict
+    from toolkit.evaluate.suites.base import PAPER
+    from toolkit.evaluate.suites.tables import suite_table
+    from toolkit.files import atomic_path, write_json
+
+    settings = read_settings(options)
+    reported = {variant.key: variant.reported for variant in suite.variants if variant.reported}
+    data = {
+        "suite": suite.name,
+        "version": __version__,
+        "command": command_line(),
+        "protocol": suite.protocol,
+        "differs": suite.differs,
+        "reported_not_measured": {"source": PAPER, "values": reported},
+        "rows": rows,
+        "settings": settings_dict(settings),
+        "machine": _machine(settings),
+    }
+    write_json(out / f"{RESULTS}.json", data)
+    with atomic_path(out / f"{RESULTS}.md") as temporary:
+        temporary.write_text(suite_table(suite, data), encoding="utf-8")
+    return data
+
+
+def _machine(settings: Any) -> dict[str, Any]:
+    import os
+
+    from toolkit.evaluate.speed import machine
+
+    about = machine(settings.threads or os.cpu_count() or 1)
+    return {**about, "device": settings.device, "measured": time.strftime("%Y-%m-%d %H:%M")}
+
+
+def table(
+    files: Annotated[list[Path], typer.Argument(help="results.json of a benchmark, or tradeoff.json.", show_default=False)],
+    into: Annotated[Path, typer.Option(help="Markdown page; what stands between the table's marks is replaced.", show_default=False)],
+    name: Annotated[
+        str | None, typer.Option(help="Name of the table; default: of the folder that the file lies in.", show_default=False)
+    ] = None,
+) -> None:
+    """Put measured tables into a Markdown page, between marks, so that no number in it is typed."""
+    from toolkit.errors import InputError
+    from toolkit.evaluate.suites import suite_of
+    from toolkit.evaluate.suites.tables import put_between_marks, suite_table
+    from toolkit.evaluate.tradeoff_page import tradeoff_data
+    from toolkit.evaluate.tradeoff_table import tradeoff_table
+    from toolkit.files import read_json
+
+    for path in files:
+        data = read_json(path)
+        title = name or path.resolve().parent.name
+        try:
+            found = data if data["rows"] is not None else {}
+            text = suite_table(suite_of(found["suite"]), found) if "suite" in found else tradeoff_table(tradeoff_data(found), title)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise InputError(
+                f"{path} holds no results of a benchmark or a trade-off ({error}); give results.json or tradeoff.json"
+            ) from error
+        put_between_marks(into, title, text)

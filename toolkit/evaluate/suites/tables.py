@@ -1,0 +1,98 @@
+"""Results of a benchmark as Markdown, with the paper's numbers beside them, and such tables put into a page between marks."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from toolkit.errors import InputError
+from toolkit.evaluate import words
+from toolkit.evaluate.suites.base import PAPER, Suite, summary
+from toolkit.files import atomic_path
+
+MEASURES = ("psnr", "ssim", "lpips")
+DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3}
+COLUMNS = ("scene", "PSNR", "SSIM", "LPIPS", "training / test views", "pixels", "fit", "whole", "voxels")
+REPORTED = "reported, not measured"
+BEGIN, END = "<!-- measured: {} -->", "<!-- end of {} -->"
+
+
+def suite_table(suite: Suite, data: dict[str, Any]) -> str:
+    """A section of Markdown: protocol, machine, command, one table a variant. `data` as `fieldfuse bench` writes it."""
+    lines = [f"### {suite.title}", "", f"Protocol: {suite.protocol}."]
+    if suite.differs:
+        lines.append(f"Not as in the paper: {suite.differs}.")
+    lines += ["", machine_line(data["machine"]), "", f"    {data['command']}", ""]
+    for variant in suite.variants:
+        rows = [row for row in data["rows"] if row["variant"] == variant.key]
+        if rows:
+            lines += [f"**{variant.title[:1].upper()}{variant.title[1:]}**", "", *table(rows, variant.reported, len(suite.scenes)), ""]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def table(rows: Sequence[dict[str, Any]], reported: dict[str, float], scenes: int) -> list[str]:
+    """Lines of a table: a row a scene, their mean when there are several, and what the paper reports."""
+    lines = [_line(COLUMNS), _line(["---"] * len(COLUMNS))]
+    for row in rows:
+        if row.get("error"):
+            lines.append(_line([row["scene"], f"not made: {row['error']}", *[""] * (len(COLUMNS) - 2)]))
+            continue
+        size = f"{row['width']}×{row['height']}"
+        facts = [f"{row['train']} / {row['test']}", size, *(words.duration(row[key]) for key in ("fit_seconds", "seconds"))]
+        lines.append(_line([row["scene"], *_scores(row), *facts, words.whole(row["voxels"])]))
+    made = [row for row in rows if not row.get("error")]
+    empty = [""] * (len(COLUMNS) - 1 - len(MEASURES))
+    if len(made) > 1:
+        lines.append(_line([f"mean of {len(made)}", *_scores(summary(made, MEASURES)), *empty]))
+    if reported:
+        whose = f"{PAPER}, mean of all its scenes" if scenes == 0 else f"{PAPER}, mean of {scenes}"
+        lines.append(
+            _line([f"*{whose}: {REPORTED}*", *(f"*{text}*" if text != words.NONE else text for text in _scores(reported)), *empty])
+        )
+    return lines
+
+
+def _scores(row: dict[str, Any]) -> list[str]:
+    return [words.decimal(row.get(key), DIGITS[key]) for key in MEASURES]
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(str(cell).replace("|", "/") for cell in cells) + " |"
+
+
+def machine_line(machine: dict[str, Any]) -> str:
+    """What it was measured on, in a sentence."""
+    load = machine.get("load")
+    busy = "" if load is None else f", load {load:.1f} (where it is above the cores, times are upper bounds)"
+    return (
+        f"Measured {machine.get('measured', '')} on {machine.get('cores')} cores with {machine.get('threads')} threads,"
+        f" {machine.get('device', 'cpu')}{busy}:"
+    )
+
+
+def put_between_marks(page: Path, name: str, text: str) -> None:
+    """Replace what stands between the marks of `name` in a Markdown page by `text`; marks that are not there are added at its end.
+
+    Raises:
+        InputError: the page cannot be read, or one of its marks is missing.
+    """
+    if not re.fullmatch(r"[\w .-]+", name):
+        raise InputError(f"{name!r} cannot be the name of a table; use letters, digits, dots and dashes")
+    begin, end = BEGIN.format(name), END.format(name)
+    try:
+        old = page.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read the page {page} ({error}); give a Markdown file") from error
+    block = f"{begin}\n{text.strip()}\n{end}"
+    if (begin in old) != (end in old) or old.count(begin) > 1 or old.count(end) > 1:
+        raise InputError(f"{page} must hold both marks of {name!r} once, or neither: {begin} and {end}")
+    if begin in old:
+        before, rest = old.split(begin, 1)
+        after = rest.split(end, 1)[1]
+        new = before + block + after
+    else:
+        new = old.rstrip("\n") + f"\n\n{block}\n"
+    with atomic_path(page) as temporary:
+        temporary.write_text(new, encoding="utf-8")
