@@ -54,7 +54,6 @@ class FitResult:
     steps: int = 0
     rays: int = 0
     interrupted: bool = False
-    distortion: float = 0.0  # weight of the distortion loss that was taken
     notes: list[str] = default(default_factory=list)  # a sentence on each step that was not finite
 
 
@@ -158,13 +157,8 @@ def fit_field(
             if plan.worth(int(keep.sum()) * growth, rays_left) and room.fits(current, keep, plan, settings, guard.notes):
                 plan.climb()
                 engine.let_go()
-                current = finer(engine.sync(), keep, plan.resolution, host)
+                current = finer(current, keep, plan.resolution, host)
                 engine.renew_rows(current)
-                if plan.level == trial.LEVEL and budget >= trial.LEAST_BUDGET and validation.batch is not None:
-                    rates = plan.rates(done, result.rays)
-                    plan.strength = trial.best_strength(
-                        current, lambda copied: make_engine(settings, copied, pool), validation.psnr, rates, plan.rays
-                    )
         elif plan.wants_pruning(done):
             current = pruned(current, visible(current, engine.seen, engine.visits, settings.fit.prune_weight))
             engine.go_on_with(current)
@@ -193,7 +187,6 @@ def fit_field(
     clock.pause()
     result.interrupted = progress.stopping()
     result.seconds = clock._spent
-    result.distortion = plan.distortion
     _measure(result, held_out, engine, result.seconds)
     current = engine.sync()
     engine.let_go()
