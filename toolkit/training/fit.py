@@ -23,7 +23,7 @@ from toolkit.networks.decoder import make_decoder
 from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
-from toolkit.training import room, trial
+from toolkit.training import room
 from toolkit.training.engine import Engine, make_engine, warm_up
 from toolkit.training.finite import NotFiniteError
 from toolkit.training.guard import Guard, refuse_broken
