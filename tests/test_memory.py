@@ -55,3 +55,15 @@ def test_a_limit_of_the_process_counts() -> None:
     )
     assert done.returncode == 0, done.stderr
     assert 0 < int(done.stdout) <= 2**26
+
+
+def test_work_that_makes_do_takes_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available", lambda: memory.SPARE + 4 * memory.GIB)
+    assert memory.bounded(memory.GIB) == memory.GIB and memory.bounded(8 * memory.GIB) == 2 * memory.GIB
+    assert [memory.workers(wanted, memory.GIB, "one of them", "do less") for wanted in (1, 3, 4, 9)] == [1, 3, 4, 4]
+    with pytest.raises(InputError, match=r"one of them needs about 5\.0 GB"):
+        memory.workers(2, 5 * memory.GIB, "one of them", "do less")
+    monkeypatch.setattr(memory, "available", lambda: 0)
+    assert memory.bounded(memory.GIB) == 0
+    monkeypatch.setattr(memory, "available", lambda: None)
+    assert memory.bounded(8 * memory.GIB) == 8 * memory.GIB and memory.workers(9, memory.GIB, "x", "y") == 9

@@ -42,6 +42,23 @@ def require(size: int, what: str, advice: str) -> None:
         raise InputError(f"{what} needs about {size / GIB:.1f} GB of memory and {max(there, 0) / GIB:.1f} GB is free; {advice}")
 
 
+def bounded(most: int, share: float = 0.5) -> int:
+    """`most` bytes, or `share` of what is there when that is less: for work that makes do with what it is given."""
+    there = available()
+    return most if there is None else max(0, min(most, int(share * (there - SPARE))))
+
+
+def workers(wanted: int, each: int, what: str, advice: str) -> int:
+    """How many of `wanted` workers, of which each takes `each` bytes, there is room for.
+
+    Raises:
+        InputError: not for one; `what` and `advice` as for `require`.
+    """
+    require(each, what, advice)
+    there = available()
+    return wanted if there is None else max(1, min(wanted, (there - SPARE) // max(1, each)))
+
+
 def _kilobytes(path: Path, name: str) -> int:
     entries = dict(line.split(":", 1) for line in path.read_text(encoding="ascii").splitlines() if ":" in line)
     return int(entries[name].split()[0]) * 1024

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from toolkit import errors
+from toolkit import errors, memory
 from toolkit.camera import Intrinsics
+from toolkit.capture.headers import read_bytes, read_header
+from toolkit.capture.prepare import target_size
 from toolkit.capture.types import Capture
 from toolkit.config import PosesSettings
 from toolkit.errors import FieldfuseError, InputError, PoseError
@@ -24,6 +26,7 @@ from toolkit.poses.sensor import scale_to_depth
 from toolkit.progress import SILENT, Progress
 
 WORKER = "toolkit.poses.worker"
+SIFT_BYTES = 300  # that COLMAP takes for a pixel of a picture in which it looks for features, whatever the picture's size
 MAX_RESULT_BYTES = 2 * 2**30
 
 
@@ -42,7 +45,7 @@ def find_poses(
 
     Raises:
         PoseError: no usable poses, and why; or the child process crashed.
-        InputError: a picture cannot be read.
+        InputError: a picture cannot be read, or there is too little memory.
         Interrupted: the user asked to stop.
     """
     settings = settings or PosesSettings()
@@ -51,7 +54,11 @@ def find_poses(
             f"{capture.root}: {len(capture.frames)} picture is not enough to find poses, at least 3 from different "
             f"places are needed; add photos that overlap"
         )
-    workers = max(1, threads or os.cpu_count() or 1)
+    wanted = max(1, threads or os.cpu_count() or 1)
+    pixels = _pixels(capture, settings.image_size)
+    workers = memory.workers(
+        wanted, SIFT_BYTES * pixels, f"finding features in {pixels / 1e6:.1f} million pixels", "lower poses.image_size"
+    )
     job = plan(capture, Path(out).resolve() / "sparse", settings, seed, workers)
     seconds: dict[str, float] = {}
     began = time.monotonic()
@@ -64,6 +71,18 @@ def find_poses(
         result = scale_to_depth(result, capture)
     result.seconds = {**seconds, "total": time.monotonic() - began}
     return result
+
+
+def _pixels(capture: Capture, long_side: int) -> int:
+    """Of the first picture, as it is looked at for features."""
+    frame = capture.frames[0]
+    if frame.video_index is not None:
+        width, height = int(capture.extra.get("width") or long_side), int(capture.extra.get("height") or long_side)
+    else:
+        header = read_header(read_bytes(frame.image), frame.image)
+        width, height = header.width, header.height
+    width, height = target_size(max(1, width), max(1, height), long_side)
+    return width * height
 
 
 def _run(job: Job, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:

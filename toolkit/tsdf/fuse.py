@@ -22,6 +22,7 @@ log = logging.getLogger(__name__)
 
 SAMPLE_FRAMES = 12  # frames looked at before fusion, for voxel size, range and memory
 FINEST = 0.3  # smallest voxel in pixels: Open3D looks at every fourth pixel for the blocks of 8 voxels to fill
+COARSER = 1.4  # from one try of a voxel size to the next
 HOPELESS = 16  # how many times too many blocks are counted before counting stops
 
 
@@ -51,6 +52,23 @@ def estimate_blocks(sample: Sequence[DepthFrame], volume: TsdfVolume, total: int
         raise too_fine(volume.voxel_size, len(union), volume.max_blocks)
     unseen = len(union) * (len(union) / max(passed, 1)) if total > len(sample) else 0.0
     return int(1.2 * (len(union) + unseen)) + largest
+
+
+def with_room(sample: Sequence[DepthFrame], voxel_size: float | None, depth_max: float, total: int) -> tuple[float, int]:
+    """Voxel size and blocks for `total` frames; a size that was not asked for is made coarser until the blocks fit into memory.
+
+    Raises:
+        InputError: the size that was asked for is too fine for the memory, or for the pixels.
+    """
+    focal = min(frame.depth_intrinsics.fx for frame in sample)
+    size = voxel_size or automatic_voxel_size([frame.depth for frame in sample], focal)
+    while True:
+        try:
+            return size, estimate_blocks(sample, TsdfVolume(size, depth_max, expected_blocks=64), total)
+        except InputError:
+            if voxel_size is not None or size > depth_max:
+                raise
+            size *= COARSER
 
 
 def fuse_frames(
@@ -100,9 +118,7 @@ def fuse_capture(
     spread = np.unique(np.linspace(0, len(wanted) - 1, SAMPLE_FRAMES).round().astype(int))
     sample = list(capture_depth_frames(capture, working_from_input, [wanted[i] for i in spread]))
     depths = [frame.depth for frame in sample]
-    focal = min(frame.depth_intrinsics.fx for frame in sample)
     depth_max = settings.depth_max or automatic_depth_max(depths)
-    voxel_size = settings.voxel_size or automatic_voxel_size(depths, focal)
-    expected = estimate_blocks(sample, TsdfVolume(voxel_size, depth_max, expected_blocks=64), len(wanted))
+    voxel_size, expected = with_room(sample, settings.voxel_size, depth_max, len(wanted))
     del sample, depths
     return fuse_frames(capture_depth_frames(capture, working_from_input, wanted), voxel_size, depth_max, len(wanted), expected, progress)

@@ -6,13 +6,12 @@ from collections.abc import Iterable, Sequence
 
 from toolkit.errors import InputError
 from toolkit.progress import SILENT, Progress
-from toolkit.tsdf.frames import DepthFrame, automatic_depth_max, automatic_voxel_size
-from toolkit.tsdf.fuse import estimate_blocks
+from toolkit.tsdf.frames import DepthFrame, automatic_depth_max
+from toolkit.tsdf.fuse import with_room
 from toolkit.tsdf.volume import TsdfVolume
 
 CONFIRMED = 1.5  # surface that a single view shows is left out ...
 MANY_VIEWS = 10  # ... from so many views on
-COARSER = 1.4
 FUSION = 0.1  # of the time that making the frames takes, for the progress
 
 
@@ -61,15 +60,6 @@ def fuse_held(
 
 def _with_room(frames: Sequence[DepthFrame], voxel_size: float | None, depth_max: float | None) -> TsdfVolume:
     """An empty volume that the frames fit into."""
-    depths = [frame.depth for frame in frames]
-    depth_max = depth_max or automatic_depth_max(depths)
-    size = voxel_size or automatic_voxel_size(depths, min(frame.depth_intrinsics.fx for frame in frames))
-    while True:
-        try:
-            expected = estimate_blocks(frames, TsdfVolume(size, depth_max, expected_blocks=64), len(frames))
-            break
-        except InputError:
-            if voxel_size is not None:
-                raise
-            size *= COARSER
+    depth_max = depth_max or automatic_depth_max([frame.depth for frame in frames])
+    size, expected = with_room(frames, voxel_size, depth_max, len(frames))
     return TsdfVolume(size, depth_max, expected_blocks=2 * expected)

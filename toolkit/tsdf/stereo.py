@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from toolkit import memory
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture.types import Views
 from toolkit.errors import InputError
@@ -34,7 +35,8 @@ STEP = (
     1.5  # pixels that the picture of the neighbour that moves most moves by from one plane to the next; refinement finds what lies between
 )
 PLANES = (32, 128)  # fewest and most planes
-MOST_WORKERS = 8  # each holds two volumes of costs
+MOST_WORKERS = 8
+COSTS_HELD = 3  # volumes of costs that a worker has room for: those of the sweep, those that are smoothed, and pictures
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ def stereo_depths(
         matched: neighbours that each picture is matched with.
 
     Raises:
-        InputError: fewer than two views, no two of them that see the same from different places, or a range that is none.
+        InputError: fewer than two views, no two of them that see the same from different places, a range that is none, or too little
+            memory.
         Interrupted: the user asked to stop.
     """
     if len(views) < 2:
@@ -98,7 +101,9 @@ def stereo_depths(
         depth, confidence = confirmed(index, known, maps, cameras, poses, needed=min(2, max(1, len(known))))
         return StereoDepth(depth, confidence, cameras[index])
 
-    workers = max(1, min(MOST_WORKERS, cv2.getNumThreads()))
+    each = COSTS_HELD * PLANES[1] * 4 * max(camera.width * camera.height for camera in cameras)
+    what = f"matching pictures of {long_side} pixels for depth"
+    workers = memory.workers(max(1, min(MOST_WORKERS, cv2.getNumThreads())), each, what, "close other programs")
     maps: list[Array] = []
     with ThreadPoolExecutor(workers) as pool:
         try:

@@ -22,6 +22,7 @@ import numpy as np
 import open3d as o3d
 import open3d.core as o3c
 
+from toolkit import memory
 from toolkit.camera import Array, Intrinsics, invert
 from toolkit.errors import InputError
 from toolkit.tsdf.frames import DepthFrame
@@ -65,17 +66,17 @@ class TsdfVolume:
         voxel_size, depth_max: working units; depth beyond depth_max is not fused.
         truncation: half width of the band around the surface, in voxels.
         expected_blocks: room made beforehand (see `estimate_blocks`); it grows when that was too little.
-        max_bytes: bound of the voxels' memory.
+        max_bytes: bound of the voxels' memory; None: `MAX_BYTES`, or half of what is free when that is less (growing copies everything).
     """
 
     def __init__(
-        self, voxel_size: float, depth_max: float, truncation: float = 4.0, expected_blocks: int = 4000, max_bytes: int = MAX_BYTES
+        self, voxel_size: float, depth_max: float, truncation: float = 4.0, expected_blocks: int = 4000, max_bytes: int | None = None
     ) -> None:
         for name, value in (("voxel size", voxel_size), ("largest depth", depth_max), ("truncation", truncation)):
             if not SMALLEST <= value <= LARGEST:
                 raise InputError(f"the {name} of the TSDF is {value:g}; it must be a positive number between {SMALLEST:g} and {LARGEST:g}")
         self.voxel_size, self.depth_max, self.truncation = float(voxel_size), float(depth_max), float(truncation)
-        self.max_blocks = max(1, max_bytes // BYTES_PER_BLOCK)
+        self.max_blocks = max(1, (memory.bounded(MAX_BYTES) if max_bytes is None else max_bytes) // BYTES_PER_BLOCK)
         self.frames = 0
         self.empty_frames = 0
         self.touches = 0  # blocks written to, summed over frames
