@@ -30,7 +30,8 @@ from pipelines.options import (
 Axes = Annotated[
     str | None,
     typer.Option(
-        help="Of iterations, voxel_size, views, samples, decoder, precision those that are varied, separated by commas.", show_default=False
+        help="Of iterations, voxel_size, keyframes, views, samples, decoder, precision those that are varied, separated by commas.",
+        show_default=False,
     ),
 ]
 Times = Annotated[
@@ -128,8 +129,11 @@ def tradeoff_run(
 def axes_here(settings: Any) -> tuple[list[str], dict[str, str]]:
     """The axes that can be varied, and for the others why not."""
     from toolkit.evaluate.tradeoff import AXES
+    from toolkit.training.from_network import SHIPPED
 
-    why_not = {"keyframes": "a field that is fitted to all training views has no key frames"}
+    why_not = {}
+    if not SHIPPED.is_file():
+        why_not["keyframes"] = "only the networks have key frames, and their weights are not installed"
     if settings.field.decoder == "per_sample":
         why_not["precision"] = "a field with the decoder per sample is stored in one precision only"
         why_not["decoder"] = "it is set; leave out --decoder to compare both"

@@ -30,14 +30,15 @@ def measure(spec: dict[str, Any]) -> list[dict[str, Any]]:
         InputError: the point cannot be made (a voxel too fine for the memory, say).
     """
     from pipelines.job import read_settings, set_threads
-    from pipelines.tradeoff_make import make_field, make_surface, open_ground
+    from pipelines.tradeoff_make import make_direct, make_field, make_surface, open_ground
 
     settings = read_settings({}, spec["settings"])
     settings.seed = spec["seed"]
     set_threads(settings.threads)
     before = load_average()
     ground = open_ground(Path(spec["folder"]), settings, spec["views"])
-    make = make_surface if spec["method"].startswith("tsdf") else make_field
+    makers = {"direct": make_direct, "tsdf": make_surface, "tsdf_stereo": make_surface}
+    make = makers.get(spec["method"], make_field)
     with tempfile.TemporaryDirectory(prefix="fieldfuse-") as scratch:
         made = make(ground, spec, Path(scratch))
         rows = [row_of(ground, spec, one) for one in made]

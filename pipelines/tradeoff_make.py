@@ -200,6 +200,25 @@ def vary(ground: Ground, fitted: Field, kept: Field, path: Path, changed: dict[s
     return show, place.stat().st_size
 
 
+def make_direct(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dict[str, Any]]:
+    """The networks' field of some of the key frames, not fitted."""
+    from pipelines.direct_field import direct_field
+    from toolkit.progress import SILENT
+    from toolkit.render.field import Field
+
+    settings, share = ground.settings, float(spec["wanted"]["keyframes"])
+    path = scratch / "field.safetensors"
+    with Cost(ground) as cost:
+        made, count = direct_field(settings, ground.chosen, ground.scene, SILENT, share)
+        cost.lap("fuse")
+        made.save(path, ground.scene.working_from_input)
+        cost.lap("save")
+    field = Field.load(path).to(settings.device)
+    voxel = field.voxel_size / ground.scene.working_from_input.scale
+    setting = {"keyframes": count, "voxel_size": voxel, "views": len(ground.used), "resolution": field.resolution, "voxels": field.voxels}
+    return [{"setting": setting, **cost.facts(), "disk_bytes": path.stat().st_size, "show": shown_field(field, settings.engine)}]
+
+
 def make_surface(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dict[str, Any]]:
     """Fuse depth into a surface: the sensor's, or what matching found for the run."""
     from toolkit.export.mesh import write_mesh

@@ -12,6 +12,7 @@ TIMES = (3.0, 10.0, 30.0, 60.0, 120.0, 300.0, 900.0)
 BASE_TIME = 30.0  # the largest of the times up to this is the default that single steps start from
 SURFACE_VOXELS = (4.0, 2.0, 1.0, 0.5)  # of the automatic voxel size, for surfaces …
 FIELD_VOXELS = (2.0, 1.4, 0.7)  # … and for fields, beside the automatic one
+KEY_FRAMES = (0.25, 0.5)  # of the key frames that the networks fuse, beside all of them
 SHARES = (0.25, 0.5)  # of the training views, beside all of them
 SAMPLES = (2, 8)  # in a brick of four voxels along a ray, beside 4
 PRECISIONS = ("uint8", "float32")  # of the stored field, beside float16
@@ -123,6 +124,8 @@ def plan(axes: Iterable[str], times: Sequence[float], seeds: int, surface: str |
     out = _fields(axes, ladder, base, both, 0)
     if surface is not None:
         out[1:1] = _surfaces(axes, surface)
+    if "keyframes" in axes:
+        out += [Wanted("direct", {"keyframes": share, "views": 1.0}, ("keyframes",)) for share in (1.0, *KEY_FRAMES)]
     for seed in range(1, seeds):
         out += _fields(axes, ladder, base, both, seed)
     return out

@@ -88,7 +88,10 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, capsys: Capsys) -> Non
 def test_what_cannot_be_measured_is_refused(tmp_path: Path, capsys: Capsys) -> None:
     make_corner(tmp_path / "corner", 5)
     for arguments, words in (
-        (["--axes", "keyframes"], "has no key frames; here iterations, voxel_size, views, samples, decoder, precision can be varied"),
+        (
+            ["--axes", "colour"],
+            "no axis 'colour'; here iterations, voxel_size, keyframes, views, samples, decoder, precision can be varied",
+        ),
         (["--decoder", "per_sample", "--axes", "precision"], "one precision only"),
         (["--holdout", "0", "--times", "1"], "--holdout 8"),
         (["--times", "soon"], "--times is 'soon'"),

@@ -125,9 +125,10 @@ def setting_text(point: Point, unit: str = "units") -> str:
     parts = []
     if point.value("iterations") is not None:
         parts.append(value_text("iterations", point.value("iterations")))
-    for axis in ("voxel_size", "keyframes"):
-        if point.value(axis) is not None and (axis in point.axes or not parts):
-            parts.append(f"{'' if axis == 'voxel_size' else 'key frames '}{value_text(axis, point.value(axis), unit)}")
+    if point.value("keyframes") is not None:
+        parts.append(f"{point.value('keyframes')} key frames")
+    if point.value("voxel_size") is not None and ("voxel_size" in point.axes or not parts):
+        parts.append(value_text("voxel_size", point.value("voxel_size"), unit))
     wanted = point.setting.get("wanted") or {}
     if wanted.get("views", 1) != 1:
         parts.append(f"{point.value('views')} views")
