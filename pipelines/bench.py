@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from toolkit.evaluate.speed import Case
 
 app = typer.Typer(help="Benchmarks on this machine.", no_args_is_help=True, add_completion=False, rich_markup_mode=None)
-PARTS = ("step", "render", "threads", "order", "lookup", "convolution", "keyframe", "tsdf", "jobs")
+PARTS = ("step", "growth", "render", "threads", "order", "lookup", "convolution", "keyframe", "tsdf", "jobs")
 
 
 @app.callback()
@@ -70,7 +70,7 @@ def measure(parts: tuple[str, ...], threads: int | None, repetitions: int, budge
 
     from pipelines.console import make_progress
     from pipelines.job import set_threads
-    from toolkit.evaluate import speed_cases, speed_jobs
+    from toolkit.evaluate import speed_cases, speed_growth, speed_jobs
     from toolkit.evaluate.speed import machine
 
     threads = threads or os.cpu_count() or 1
@@ -78,6 +78,7 @@ def measure(parts: tuple[str, ...], threads: int | None, repetitions: int, budge
     data: dict[str, Any] = {"machine": machine(threads), "cases": []}
     makers = {
         "step": lambda: speed_cases.step_cases(repetitions=repetitions),
+        "growth": lambda: speed_growth.growth_cases(repetitions=repetitions),
         "render": lambda: speed_cases.render_cases(repetitions=repetitions),
         "threads": lambda: speed_cases.thread_cases(max(threads, 2), repetitions=repetitions),
         "order": lambda: [speed_cases.order_case(repetitions=repetitions)],
@@ -107,14 +108,15 @@ def measure(parts: tuple[str, ...], threads: int | None, repetitions: int, budge
 
 
 def growth(cases: list[Case]) -> dict[str, float]:
-    """Exponent of the processor time a unit over the lattice's side, for each kind of case that was measured at several sizes."""
+    """Exponent of the processor time a unit over the size (the lattice's side, or what the case names), for each kind of case that was
+    measured at several sizes."""
     from toolkit.evaluate.speed import exponent
 
     out = {}
     for name in dict.fromkeys(case.name for case in cases):
         same = [case for case in cases if case.name == name]
         if len(same) > 1:
-            sizes = [float(case.size.rstrip("³")) for case in same]
+            sizes = [float(case.size.rstrip("³").split()[0]) for case in same]
             out[name] = round(exponent(sizes, [case.ours.processor / case.units for case in same]), 3)
     return out
 
@@ -142,6 +144,10 @@ def show(data: dict[str, Any]) -> None:
         reached = "no held-out pixel" if job["psnr"] is None else f"{job['psnr']:.1f} dB"
         what = f"fit of {job['views']} views {job['width']} wide, {job['engine']}, {job['budget']:g} s"
         console.print(f"{what}: {reached}, {job['rays']:,} rays")
+    if data["growth"]:
+        console.print(
+            "time a unit grows with the size to the power: " + ", ".join(f"{name} {b:+.2f}" for name, b in data["growth"].items())
+        )
     about = data["machine"]
     console.print(f"{about['machine']}, {about['cores']} cores, {about['threads']} threads, load {about['load']} to {about['load_after']}")
 

@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from toolkit.evaluate import speed, speed_cases
+from pipelines import bench
+from toolkit.evaluate import speed, speed_cases, speed_growth
 from toolkit.evaluate.speed import Case, Timed
 from toolkit.evaluate.speed_state import CHANNELS, around, lens, sphere_field, sphere_pixels
 from toolkit.render.bake import bake
@@ -63,6 +64,15 @@ def test_ratios_are_of_the_clock_that_is_asked_for() -> None:
 def test_growth_is_fitted() -> None:
     sizes = np.array([10.0, 20.0, 40.0])
     assert speed.exponent(list(sizes), list(3 * sizes**1.7)) == pytest.approx(1.7)
+
+
+def test_growth_is_measured_over_rays_and_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, sizes in (("RAYS", (64, 256)), ("SIDES", (16, 32)), ("VIEWS", (4, 8)), ("LATTICE", 32)):
+        monkeypatch.setattr(speed_growth, name, sizes)
+    cases = list(speed_growth.growth_cases(1))
+    assert [case.size for case in cases] == ["64 rays", "256 rays", "16 pixels", "32 pixels", "4 pictures", "8 pictures"]
+    assert set(bench.growth(cases)) == {case.name for case in cases}
+    assert [case.units for case in cases[:2]] == [256, 1024]
 
 
 def test_pieces_of_work_are_timed_in_turns() -> None:

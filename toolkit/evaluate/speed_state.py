@@ -20,7 +20,7 @@ from toolkit.volume.space import Space
 
 RADIUS = 0.7  # of the sphere, in half sizes of the region
 THICK = 4  # voxels of the sphere's wall, on either side
-CHANNELS, HIDDEN = 16, 32
+CHANNELS, HIDDEN = 16, 64  # the defaults of a fit
 
 
 def sphere_field(resolution: int, seed: int = 0) -> Field:
@@ -53,10 +53,10 @@ def lens(width: int, height: int) -> Intrinsics:
     return Intrinsics(width, height, 1.3 * height, 1.3 * height, width / 2, height / 2)
 
 
-def sphere_pixels(side: int = 96, seed: int = 0) -> PixelPool:
-    """Pixels of random colour: what is fitted does not matter, only what it takes."""
+def sphere_pixels(side: int = 96, seed: int = 0, count: int = 8) -> PixelPool:
+    """Pixels of random colour in `count` square pictures: what is fitted does not matter, only what it takes."""
     generator = np.random.default_rng(seed)
-    poses = around()
+    poses = around(count)
     images = [generator.integers(0, 256, (side, side, 3), dtype=np.uint8) for _ in poses]
     names = [str(index) for index in range(len(poses))]
     return PixelPool(Views(names, images, [lens(side, side)] * len(poses), poses, np.zeros(len(poses), bool)))
