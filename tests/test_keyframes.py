@@ -98,3 +98,24 @@ def test_convergence_and_guessed_depth():
     assert guessed_depth(arc(20, 120.0)) == pytest.approx(np.median(depth), rel=0.6)
     ahead = np.array([look_at(np.array([x, 0.0, 0.0]), np.array([x, 0.0, 9.0])) for x in np.linspace(-1, 1, 9)])
     assert guessed_depth(ahead) > 0
+
+
+def test_a_blurred_key_frame_gives_way_to_a_sharp_frame_beside_it():
+    poses = arc(100, 90.0)
+    plain = choose(poses)
+    clear = np.ones(len(poses))
+    assert choose(poses, sharpness=clear).indices.tolist() == plain.indices.tolist()
+    blurred = int(plain.indices[3])
+    clear[blurred] = 0.3
+    keys = choose(poses, sharpness=clear)
+    assert blurred not in keys.indices and len(keys.indices) == len(plain.indices)
+    (other,) = set(keys.indices.tolist()) - set(plain.indices.tolist())
+    angles = parallax(poses, 3.0)
+    assert angles[blurred, other] <= 2.5
+    np.testing.assert_array_equal(keys.neighbours[keys.indices.tolist().index(other)], best_neighbours_of(poses)[other])
+
+
+def best_neighbours_of(poses):
+    from toolkit.poses.overlap import best_neighbours
+
+    return best_neighbours(poses, overlap(poses, [CAMERA] * len(poses), 3.0), parallax(poses, 3.0), 2)

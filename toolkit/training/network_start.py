@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from toolkit.capture.types import Views
@@ -16,7 +17,7 @@ from toolkit.networks.decoder import Deferred, PerSample, make_decoder
 from toolkit.poses.scene import Scene
 from toolkit.render.field import Field
 from toolkit.training.levels import FEATURE_NOISE, all_places, occupancy
-from toolkit.training.start import possible
+from toolkit.training.start import finest_resolution, levels, possible
 from toolkit.volume.edit import resample
 
 Tensor = torch.Tensor
@@ -43,19 +44,18 @@ def widened(decoder: Deferred, hidden: int, generator: torch.Generator) -> Defer
     return out
 
 
-def network_start(made: Field, views: Views, scene: Scene, settings: Settings, resolution: int = RESOLUTION) -> Field:
-    """The first field of a fit, at `resolution` voxels a side, from the networks' field `made` of the same space.
+def network_start(made: Field, views: Views, scene: Scene, settings: Settings) -> Field:
+    """The first field of a fit, at `RESOLUTION` voxels a side (the fit's finest, when that is less), from the networks' field `made`.
 
     With the deferred decoder and as many features as the networks have, features and decoder come along; otherwise geometry alone.
 
     Args:
+        made: of the space that the fit uses.
         views: all views; which voxels can hold something is judged from the training views, as in the classical start.
-
-    Raises:
-        ValueError: `resolution` is not a positive multiple of 8.
     """
-    if resolution < 8 or resolution % 8:
-        raise ValueError(f"the resolution must be a positive multiple of 8, not {resolution}")
+    train = views.subset(np.flatnonzero(~np.asarray(views.test)))
+    rungs = levels(settings.field.resolution or finest_resolution(made.space, train, scene))
+    resolution = max(rung for rung in rungs if rung <= max(RESOLUTION, rungs[0]))
     generator = torch.Generator().manual_seed(settings.seed)
     device = made.device
     places = possible(made.space, resolution, all_places(made.space, resolution), views)

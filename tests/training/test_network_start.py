@@ -1,0 +1,157 @@
+"""The networks' field as the start of a fit, and direct inference as it is streamed."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.networks.made import INTRINSICS, SMALL, small_model, wall_pictures
+from toolkit.camera import Similarity
+from toolkit.capture.types import Views
+from toolkit.config import Settings, load_settings
+from toolkit.errors import InputError
+from toolkit.keyframes import KeyFrames
+from toolkit.networks.decoder import Deferred
+from toolkit.poses.scene import Scene
+from toolkit.render.field import Field
+from toolkit.render.image import render_view
+from toolkit.training.fit import fit_field
+from toolkit.training.from_network import Inference, NetworkOptions, load_networks
+from toolkit.training.network_start import THICK, THIN, network_start, widened
+from toolkit.training.start import space_of
+from toolkit.volume.lookup import corners, gather
+
+DEPTH = 2.0
+
+
+def wall_views(count: int = 4) -> Views:
+    images, world = wall_pictures(count, DEPTH)
+    pixels = [(image.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8) for image in images]
+    return Views([str(i) for i in range(count)], pixels, [INTRINSICS] * count, world, np.arange(count) == 1)
+
+
+def scene() -> Scene:
+    return Scene(Similarity.identity(), np.zeros(3), np.full(3, 0.8), DEPTH, 1.0, 3.0, 0.0, False, False)
+
+
+def settings(*pairs: str) -> Settings:
+    return load_settings(pairs=["field.channels=8", "field.hidden=16", "field.resolution=64", "device=cpu", "budget=1", *pairs])
+
+
+def inference(options: NetworkOptions | None = None) -> Inference:
+    model = small_model()
+    with torch.no_grad():
+        model.to_field.density.weight.mul_(6)  # opinions that differ from place to place, as a trained network's do
+    keys = KeyFrames(np.array([0, 2]), np.array([[1], [1]]))
+    return Inference(model.eval(), wall_views(), scene(), keys, options=options or NetworkOptions(16.0))
+
+
+def made() -> Field:
+    running = inference()
+    assert list(running.frames()) == [0, 2] and running.done == 2
+    return running.field()
+
+
+@pytest.mark.parametrize("hidden", [8, 11, 64])
+def test_a_wider_decoder_is_the_same_function(hidden: int) -> None:
+    torch.manual_seed(3)
+    decoder = Deferred(8, 8)
+    with torch.no_grad():
+        decoder.layers[2].weight.normal_()
+        decoder.layers[2].bias.normal_()
+    wide = widened(decoder, hidden, torch.Generator().manual_seed(0))
+    features, directions = torch.randn(50, 8), torch.nn.functional.normalize(torch.randn(50, 3), dim=1)
+    torch.testing.assert_close(wide(features, directions), decoder(features, directions))
+    assert wide.hidden == hidden
+    # The new units are alive: some input moves them, so that a gradient can come to what reads them.
+    if hidden > 8:
+        assert bool((wide.layers[0].weight[8:] != 0).all())
+    with pytest.raises(ValueError, match="narrowed"):
+        widened(decoder, 4, torch.Generator())
+
+
+def test_the_start_holds_what_the_networks_say_and_is_thin_where_they_say_nothing() -> None:
+    field, views = made(), wall_views()
+    start = network_start(field, views, scene(), settings())
+    assert start.resolution == 64 and start.space == field.space == space_of(views, scene())
+    assert isinstance(start.decoder, Deferred) and start.decoder.hidden == 16
+    assert float(start.density_rows[:-1].min()) >= THIN and float(start.density_rows.max()) <= THICK
+    assert not start.density_rows[-1] and not start.feature_rows[-1].any()
+    rows = start.occupied.nonzero().squeeze(1)
+    places = start.topology.keys[rows // 512].long() * 8 + torch.stack([rows % 8, rows // 8 % 8, rows // 64 % 8], 1)
+    theirs = places.double() * field.resolution / start.resolution
+    cell = theirs.floor().long()
+    slot = field.topology.find(cell >> 3)
+    local = cell & 7
+    there = slot.clamp_min(0) * 512 + (local[:, 2] * 8 + local[:, 1]) * 8 + local[:, 0]
+    inside = (slot >= 0) & field.occupied[there]
+    assert 100 < int(inside.sum()) < len(inside)
+    at, weights = corners(field.topology, there[inside], (theirs - cell)[inside].float())
+    expected = gather(field.density_rows, at, weights).clamp(THIN, THICK)
+    torch.testing.assert_close(start.density_rows[rows[inside]], expected, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(start.feature_rows[rows[inside]], gather(field.feature_rows, at, weights), atol=1e-4, rtol=1e-4)
+
+
+def test_what_the_decoder_cannot_take_over_stays_behind() -> None:
+    field, views = made(), wall_views()
+    for pairs in (["decoder=per_sample"], ["field.channels=4"], ["field.hidden=4"]):
+        start = network_start(field, views, scene(), settings(*pairs))
+        assert start.feature_rows.abs().max() < 0.5, pairs  # the classical noise
+        assert bool((start.density_rows > THIN + 0.01).any())
+    assert network_start(field, views, scene(), settings("field.resolution=32")).resolution == 32
+
+
+def test_a_fit_climbs_from_it() -> None:
+    """With a clock that goes on at each look, so that the steps are the same however busy the machine is."""
+    views, chosen = wall_views(), settings("field.resolution=96")
+    start = network_start(made(), views, scene(), chosen)
+    clock = itertools.count(0, 0.0005)
+    result = fit_field(views, scene(), chosen, start=start, coarse=True, ticks=lambda: next(clock))
+    assert result.field.resolution == 96 and result.steps > 1000
+    train = views.subset(np.flatnonzero(~views.test))
+    before, after = (np.mean([error(field, train, i) for i in range(3)]) for field in (start, result.field))
+    assert after < 0.2 * before
+
+
+def error(field: Field, views: Views, index: int) -> float:
+    """Mean squared colour error at a view."""
+    shown = render_view(field, views.intrinsics[index], views.world_from_camera[index]).rgb
+    return float(np.mean((shown - views.images[index] / 255) ** 2))
+
+
+def test_held_out_views_are_never_looked_at() -> None:
+    running = inference()
+    assert running.train.names == ["0", "2", "3"]
+    views = wall_views()
+    views.images[1] = np.zeros_like(views.images[1])
+    spoilt = Inference(running.model, views, scene(), running.keys, options=running.options)
+    list(running.frames())
+    list(spoilt.frames())
+    assert torch.equal(running.field().density_rows, spoilt.field().density_rows)
+
+
+def test_the_field_can_be_had_after_every_key_frame_and_grows() -> None:
+    running = inference(NetworkOptions(16.0, gamma=None))
+    with pytest.raises(InputError, match="no key frame"):
+        running.field()
+    voxels = [running.field().voxels for _ in running.frames()]
+    assert len(voxels) == 2 and 0 < voxels[0] <= voxels[1]
+    assert running.seconds > running.encode_seconds > 0
+
+
+def test_nothing_to_look_at_is_said() -> None:
+    views = wall_views()
+    views.test[:] = True
+    with pytest.raises(InputError, match="no training view"):
+        Inference(small_model(), views, scene(), KeyFrames(np.zeros(0, int), np.zeros((0, 0), int)))
+
+
+def test_networks_are_found(tmp_path: Path) -> None:
+    assert load_networks().config.features == 16
+    with pytest.raises(InputError, match="nowhere"):
+        load_networks(tmp_path / "nowhere.safetensors")
+    assert SMALL.features == 8
