@@ -26,6 +26,7 @@ def few_views(
     out: Out,
     views: Annotated[str, typer.Option(help="Numbers of training views, by comma; 'all' is one.")] = "3,6,12,all",
     budgets: Annotated[str, typer.Option(help="Seconds of fitting (processor time of one thread), by comma.")] = "30,120",
+    starts: Annotated[str, typer.Option(help="What is measured, by comma.")] = "direct,network,classical",
     image_size: ImageSize = None,
     seed: Seed = None,
     config: Config = None,
@@ -40,7 +41,7 @@ def few_views(
     from toolkit.files import read_json
     from toolkit.training.from_network import load_networks
 
-    seconds = numbers(budgets, "budgets")
+    seconds, measured = numbers(budgets, "budgets"), part_of(starts)
     counts = [None if part == ALL else int(part) for part in wanted(views)]
     with _job(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as (job, posed):
         path = job.folder.path / f"{FILE}.json"
@@ -49,7 +50,7 @@ def few_views(
         for count in counts:
             ground = ground_of(job, posed, count)
             done = {(row["views"], row["start"], row["budget"]) for row in rows}
-            for row in few_views_rows(ground, model, seconds, done, job.progress):
+            for row in few_views_rows(ground, model, seconds, done, measured, job.progress):
                 rows.append(row)
                 _keep(job, FILE, rows, few_views_table(rows))
                 job.progress.say(f"{row['views']} views, {row['start']}, {row['budget']:g} s: {row['psnr']:.2f} dB")
@@ -92,6 +93,22 @@ def wanted(text: str) -> list[str]:
     for part in parts:
         if part != ALL and not (part.isdigit() and int(part) > 0):
             raise InputError(f"--views {text!r}: {part!r} is neither a positive number nor 'all'")
+    return parts
+
+
+def part_of(text: str) -> list[str]:
+    """`direct,network` → its parts.
+
+    Raises:
+        InputError: something is none of the starts.
+    """
+    from toolkit.errors import InputError
+    from toolkit.evaluate.few_views import STARTS
+
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    for part in parts:
+        if part not in STARTS:
+            raise InputError(f"--starts {text!r}: there is no {part!r}; known are {', '.join(STARTS)}")
     return parts
 
 

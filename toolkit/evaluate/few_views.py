@@ -82,29 +82,36 @@ def infer(model: NerfusionModel, ground: Ground, pruned: bool = True, progress: 
 
 
 def few_views_rows(
-    ground: Ground, model: NerfusionModel, budgets: Iterable[float], done: set[tuple[Any, ...]], progress: Progress = SILENT
+    ground: Ground,
+    model: NerfusionModel,
+    budgets: Iterable[float],
+    done: set[tuple[Any, ...]],
+    starts: Iterable[str] = STARTS,
+    progress: Progress = SILENT,
 ) -> Iterable[dict[str, Any]]:
     """A row for the nearest training picture, one for the networks alone, and two for each budget, each as soon as it is measured.
 
     Args:
+        starts: what is measured, a part of `STARTS`.
         done: (views, start, budget) of rows that are there already.
     """
     from toolkit.training.fit import fit_field
     from toolkit.training.network_start import network_start
 
     views, scene, settings, count = ground.views, ground.scene, ground.settings, ground.training
-    budgets = list(budgets)
+    budgets, starts = list(budgets), list(starts)
     if (count, "nearest", 0) not in done:
         nearest = nearest_image_scores(views, np.flatnonzero(views.test))
         yield {"views": count, "start": "nearest", "budget": 0, "psnr": nearest["psnr"]}
     made: Field | None = None
-    if any((count, "network", budget) not in done for budget in budgets) or (count, "direct", 0) not in done:
+    alone = "direct" in starts and (count, "direct", 0) not in done
+    if alone or ("network" in starts and any((count, "network", budget) not in done for budget in budgets)):
         made, facts = infer(model, ground, progress=progress)
-        if (count, "direct", 0) not in done:
+        if alone:
             yield {"views": count, "start": "direct", "budget": 0, **measured(made, ground), **facts}
     for budget in budgets:
         for start in STARTS[1:]:
-            if (count, start, budget) in done:
+            if start not in starts or (count, start, budget) in done:
                 continue
             progress.check()
             settings.fit.budget = budget
