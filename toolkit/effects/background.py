@@ -13,7 +13,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+
+from toolkit.camera import Array
+from toolkit.effects.evidence import Evidence
 
 Tensor = torch.Tensor
 
@@ -78,3 +82,40 @@ def _clouds(effect: Background, azimuth: Tensor, elevation: Tensor) -> Tensor:
             wave = float(turns[k]) * azimuth + (0.05 + 0.3 * float(slope[k])) * (octave + 1) * elevation + 6.28 * float(phase[k])
             total += 0.6**octave * torch.sin(wave)
     return torch.sigmoid(1.5 * total - 0.5)
+
+
+THRESHOLD = 0.02  # share of what is seen
+BEYOND = 10.0  # times as far as the scene usually is
+TELLS = 2.0  # working pixels of parallax that a point at that distance would still show
+STRAIGHT = 1.5  # working pixels: rays that differ less are parallel
+
+
+def evidence(directions: Array, centres: Array, point: Array, focal: Array, usual: float) -> Evidence:
+    """Share of the points, among those whose distance can be told, that lie far beyond everything else: parallax does not reach them.
+
+    Args:
+        directions: (O, 3) unit rays in the world. centres: (O, 3) where they start. focal: (O,) working pixels. point: (O,) ascending.
+        usual: median depth of the points that show parallax.
+    """
+    count = int(point.max(initial=-1)) + 1
+    seen = np.maximum(np.bincount(point, minlength=count), 1)
+    total = np.stack([np.bincount(point, column, count) for column in directions.T], axis=1)
+    mean = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+    middle = np.stack([np.bincount(point, column, count) for column in centres.T], axis=1) / seen[:, None]
+    off = np.linalg.norm(directions - mean[point], axis=1) * focal
+    aside = centres - middle[point]
+    aside -= (aside * mean[point]).sum(1, keepdims=True) * mean[point]
+    baseline = np.zeros(count)
+    np.maximum.at(baseline, point, np.linalg.norm(aside, axis=1) * focal)
+    worst = np.zeros(count)
+    np.maximum.at(worst, point, off)
+    tells = baseline > TELLS * BEYOND * usual
+    far = tells & (worst < STRAIGHT) & (worst < 0.5 * baseline / (BEYOND * usual) + 0.5)
+    share = float(far.sum() / max(int(tells.sum()), 1)) if int(tells.sum()) >= 50 else 0.0
+    return Evidence(
+        "background",
+        share,
+        THRESHOLD,
+        f"{100 * share:.1f}% of the points lie more than {BEYOND:g} times as far as the scene usually is; "
+        f"{100 * THRESHOLD:g}% or more speak for a distant background",
+    )

@@ -118,7 +118,9 @@ def _parameters(name: str, wanted: Any, where: str) -> Any:
     if not isinstance(wanted, Mapping):
         raise InputError(f"{where}: {name} takes a strength or parameters, not {str(wanted)[:40]!r}")
     values = dict(wanted)
-    base = _parameters(name, values.pop("strength", None), where)
+    # For highlights `strength` is a parameter too; a word is one of the three strengths, a number that parameter.
+    word = values.pop("strength", None) if not isinstance(values.get("strength"), int | float) else None
+    base = _parameters(name, word, where)
     known = {entry.name: getattr(base, entry.name) for entry in fields(base)}
     for key, value in values.items():
         if key not in known:

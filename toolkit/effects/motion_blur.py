@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from toolkit.camera import Array
+from toolkit.effects.evidence import ROUNDS, Evidence, Tracks, robust, without_points_and_frames
 
 Tensor = torch.Tensor
 
@@ -39,3 +40,54 @@ def forward(pictures: list[Tensor]) -> Tensor:
     for picture in pictures[1:]:
         total += picture
     return total / len(pictures)
+
+
+THRESHOLD = 0.06  # factors of two of the slopes' energy
+BLURRED = -0.7  # factors of two below the others: such a frame is worth less than it costs
+FEWEST = 100
+TREND = 8  # frames from which on a slow trend is told from blur, which comes and goes
+
+
+def evidence(slope: Array, depth: Array, frame: Array, point: Array, frames: int) -> Evidence:
+    """Whether the same points are sharper in some frames than in others.
+
+    The slopes' energy at an observation is the point's own, times the frame's sharpness, times a power of the depth (from nearby, slopes a
+    pixel are gentler). Slow trends over the frames are no blur of a moving camera and are taken out.
+
+    Args:
+        slope: (O,) mean square of the slopes of log light round the observation. depth: (O,) along z. frame, point: (O,).
+
+    Returns:
+        `parameters["sharpness"]`: (frames,) factors of two of the energy, mean 0; 0 where nothing is told.
+    """
+    used = (slope > 1e-5) & (depth > 0)
+    if int(used.sum()) < FEWEST:
+        return Evidence("motion_blur", 0.0, THRESHOLD, "too few points are shared between pictures to compare their sharpness")
+    number = np.unique(point[used], return_inverse=True)[1]
+    tracks = Tracks(np.zeros((int(used.sum()), 3)), frame[used], number, np.zeros(int(used.sum())))
+    energy, distance = np.log2(slope[used])[:, None], np.log2(depth[used])[:, None]
+    weight, constants, left = np.ones(len(number)), np.zeros((frames, 1)), energy
+    for _ in range(ROUNDS):
+        plain, _ = without_points_and_frames(np.concatenate([energy, distance], axis=1), tracks, weight, frames)
+        bend = float((weight * plain[:, 1] ** 2).sum())
+        power = float((weight * plain[:, 0] * plain[:, 1]).sum()) / bend if bend > 1e-9 else 0.0
+        left, constants = without_points_and_frames(energy - power * distance, tracks, weight, frames)
+        weight, _ = robust(left[:, 0])
+    seen = np.bincount(tracks.frame, weight, frames)
+    told = seen > 0
+    values = constants[told, 0]
+    if len(values) >= TREND:
+        steps = np.linspace(-1, 1, len(values))
+        values = values - np.polynomial.Polynomial.fit(steps, values, 2)(steps)
+    chance = float((float((weight * left[:, 0] ** 2).sum() / weight.sum()) / np.maximum(seen[told], 1)).mean())
+    deviation = float(np.sqrt(max(float(np.mean(values**2)) - chance, 0.0)))
+    sharpness = np.zeros(frames)
+    sharpness[told] = values
+    return Evidence(
+        "motion_blur",
+        deviation,
+        THRESHOLD,
+        f"the slopes of the same points differ in energy by {deviation:.2f} factors of two (deviation over frames); "
+        f"{THRESHOLD:g} or more speak for frames that are blurred by motion or focus",
+        {"sharpness": sharpness.tolist()},
+    )

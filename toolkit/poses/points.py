@@ -50,7 +50,7 @@ def triangulate(capture: Capture, progress: Progress = SILENT) -> Cloud:
     for n, (i, j) in enumerate(pairs):
         progress.check()
         progress.update(len(frames) + n * len(frames) / len(pairs), 2 * len(frames), f"points, pair {n + 1} of {len(pairs)}")
-        found = _mutual(descriptors[i], descriptors[j])
+        found = mutual_matches(descriptors[i], descriptors[j])
         if len(found):
             off = epipolar_distance(poses[i], poses[j], flat[i][found[:, 0]], flat[j][found[:, 1]]) * 0.5 * (focal[i] + focal[j])
             found = found[off < EPIPOLAR]
@@ -99,7 +99,7 @@ def undistorted(camera: Intrinsics, pixels: Array) -> Array:
     return ideal
 
 
-def _mutual(first: Array, second: Array) -> Array:
+def mutual_matches(first: Array, second: Array) -> Array:
     """(K, 2) indices of mutual best matches that pass the ratio test, of unit descriptors."""
     if len(first) < 2 or len(second) < 2:
         return np.zeros((0, 2), np.int64)

@@ -1,0 +1,233 @@
+"""Bundle adjustment of points with exactly those other unknowns that are asked for: a lens, rows one after the other, poses.
+
+Observation o of point X in frame f, q_o on the ideal image plane, is predicted as
+
+    c = exp(−w_f) (R_fᵀ (X − t_f) − d_f),   c' = c − u_o·(Ω_f × c + V_f),   x = c'_xy / c'_z,   q = x·(1 + k1·r² + k2·r⁴)
+
+(w_f, d_f): correction of a pose in its own axes; (k1, k2): the lens beyond what the capture tells; u_o: the row's share of
+the height, −1/2 to 1/2, and (Ω_f, V_f): how far the camera turns and moves while the rows of frame f are read. Levenberg-Marquardt with
+Huber's weights; points are eliminated by the Schur complement (Triggs et al. 2000, section 6).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from toolkit.camera import Array
+from toolkit.effects.evidence import TUNING
+
+LENS, ROWS, POSES = "distortion", "rolling_shutter", "poses"
+UNKNOWNS = (LENS, ROWS, POSES)
+STEPS = 12
+POINTS_A_CHUNK = 512
+SLACK = 1e-3  # relative fall of the cost below which a fit is done
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is seen, and where everything is taken to be."""
+
+    poses: Array  # (F, 4, 4) world_from_camera
+    points: Array  # (P, 3)
+    frame: Array  # (O,) int
+    point: Array  # (O,) int, ascending
+    place: Array  # (O, 2) observed, on the ideal image plane
+    focal: Array  # (F,) working pixels
+    row: Array  # (O,) −1/2 … 1/2
+    motion: Array  # (F, 6) Ω (radians) and V while the rows are read, camera axes
+    lens: tuple[float, float] = (0.0, 0.0)  # k1, k2
+
+    def only(self, points: Array) -> Problem:
+        """The problem of some points (P,) bool."""
+        keep = points[self.point]
+        number = np.cumsum(points) - 1
+        return replace(
+            self,
+            points=self.points[points],
+            frame=self.frame[keep],
+            point=number[self.point[keep]],
+            place=self.place[keep],
+            row=self.row[keep],
+        )
+
+    def like(self, other: Problem) -> Problem:
+        """These points, with the cameras of another."""
+        return replace(self, poses=other.poses, lens=other.lens, motion=other.motion)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A problem at its optimum."""
+
+    problem: Problem
+    residual: Array  # (O, 2) working pixels, predicted minus observed
+    scatter: float  # their robust deviation, corrected for the points' freedom
+
+
+def predict(problem: Problem) -> tuple[Array, Array]:
+    """(O, 3) points in camera axes and (O, 2) predicted places."""
+    pose = problem.poses[problem.frame]
+    camera = np.einsum("oji,oj->oi", pose[:, :3, :3], problem.points[problem.point] - pose[:, :3, 3])
+    if problem.motion.any():
+        motion = problem.motion[problem.frame]
+        camera = camera - problem.row[:, None] * (np.cross(motion[:, :3], camera) + motion[:, 3:])
+    front = np.maximum(camera[:, 2:], 1e-9)
+    x = camera[:, :2] / front
+    k1, k2 = problem.lens
+    r2 = (x**2).sum(1, keepdims=True)
+    return camera, x * (1 + r2 * (k1 + r2 * k2))
+
+
+def residuals(problem: Problem) -> Array:
+    """(O, 2) working pixels."""
+    return np.asarray((predict(problem)[1] - problem.place) * problem.focal[problem.frame, None])
+
+
+def scatter(residual: Array) -> float:
+    """Deviation of residuals (O, 2) by the median of their lengths (Rayleigh: median = 1.1774 deviations)."""
+    return float(np.median(np.linalg.norm(residual, axis=1)) / 1.1774) if len(residual) else np.inf
+
+
+def adjust(problem: Problem, unknown: frozenset[str] = frozenset(), steps: int = STEPS) -> Fitted:
+    """Fit the points and what is `unknown` beside them."""
+    damping, current = 1e-3, problem
+    left = residuals(current)
+    width = TUNING * max(scatter(left), 1e-3)
+    cost = _cost(left, width)
+    for _ in range(steps):
+        moved = _step(current, left, width, unknown, damping)
+        new = residuals(moved)
+        value = _cost(new, width)
+        if not value < cost:
+            damping *= 10
+            if damping > 1e4:
+                break
+            continue
+        done = value > (1 - SLACK) * cost
+        current, left, damping = moved, new, max(damping / 5, 1e-7)
+        width = TUNING * max(scatter(left), 1e-3)
+        cost = _cost(left, width)
+        if done:
+            break
+    return Fitted(current, left, scatter(left))
+
+
+def _cost(residual: Array, width: float) -> float:
+    """Huber's cost over the number of residuals."""
+    size = np.linalg.norm(residual, axis=1)
+    return float(np.where(size < width, 0.5 * size**2, width * (size - 0.5 * width)).mean())
+
+
+def _step(problem: Problem, left: Array, width: float, unknown: frozenset[str], damping: float) -> Problem:
+    """One damped Gauss-Newton step."""
+    by_point, by_camera, columns, count = _slopes(problem, unknown)
+    weight = np.minimum(1, width / np.maximum(np.linalg.norm(left, axis=1), 1e-12))
+    points = len(problem.points)
+    heavy = by_point * weight[:, None, None]
+    ends = np.searchsorted(problem.point, np.arange(points))
+    v = _sum(np.einsum("oai,oaj->oij", heavy, by_point), ends, points)
+    g = _sum(np.einsum("oai,oa->oi", heavy, left), ends, points)
+    v += (damping * np.trace(v, axis1=1, axis2=2)[:, None, None] / 3 + 1e-12) * np.eye(3)
+    inverse = np.linalg.inv(v)
+    if count == 0:
+        return replace(problem, points=problem.points - np.einsum("pij,pj->pi", inverse, g))
+    matrix, right = np.zeros((count, count)), np.zeros(count)
+    weighted = by_camera * weight[:, None, None]
+    np.add.at(right, columns, np.einsum("oac,oa->oc", weighted, left))
+    block = np.einsum("oac,oad->ocd", weighted, by_camera)
+    np.add.at(matrix, (columns[:, :, None], columns[:, None, :]), block)
+    matrix[np.diag_indices(count)] *= 1 + damping
+    matrix[np.diag_indices(count)] += 1e-9 * np.trace(matrix) / count
+    mixed = np.einsum("oac,oai->oci", weighted, by_point)  # (O, K, 3)
+    root = np.linalg.cholesky(inverse)
+    whole = np.append(ends, len(problem.point))
+    for start in range(0, points, POINTS_A_CHUNK):
+        stop = min(start + POINTS_A_CHUNK, points)
+        mine = slice(whole[start], whole[stop])
+        tied = np.zeros((count, stop - start, 3))
+        at = (problem.point[mine] - start)[:, None]
+        np.add.at(tied, (columns[mine], np.broadcast_to(at, columns[mine].shape)), mixed[mine])
+        tied = np.einsum("cpi,pij->cpj", tied, root[start:stop]).reshape(count, -1)
+        matrix -= tied @ tied.T
+        right -= tied @ np.einsum("pji,pj->pi", root[start:stop], g[start:stop]).ravel()
+    cameras = -np.linalg.solve(matrix, right)
+    pulled = g + _sum(np.einsum("oci,oc->oi", mixed, cameras[columns]), ends, points)
+    moved = replace(problem, points=problem.points - np.einsum("pij,pj->pi", inverse, pulled))
+    return _with(moved, cameras, unknown)
+
+
+def _sum(values: Array, ends: Array, points: int) -> Array:
+    """Sums over the observations of each point; every point has some."""
+    return np.asarray(np.add.reduceat(values, ends, axis=0)) if points else values[:0]
+
+
+def _slopes(problem: Problem, unknown: frozenset[str]) -> tuple[Array, Array, Array, int]:
+    """Derivatives of the residuals by the points (O, 2, 3) and by what else is unknown (O, 2, K), its columns (O, K), and their number."""
+    camera, _ = predict(problem)
+    z = np.maximum(camera[:, 2], 1e-9)
+    x = camera[:, :2] / z[:, None]
+    k1, k2 = problem.lens
+    r2 = (x**2).sum(1)
+    radial, bend = 1 + r2 * (k1 + r2 * k2), 2 * k1 + 4 * k2 * r2
+    lens = radial[:, None, None] * np.eye(2) + bend[:, None, None] * x[:, :, None] * x[:, None, :]
+    flat = np.zeros((len(x), 2, 3))
+    flat[:, 0, 0] = flat[:, 1, 1] = 1 / z
+    flat[:, :, 2] = -x / z[:, None]
+    by_place = np.einsum("oab,obc->oac", lens, flat) * problem.focal[problem.frame, None, None]  # of camera axes
+    by_point = np.einsum("oac,oic->oai", by_place, problem.poses[problem.frame, :3, :3])
+    parts, columns = [], []
+    frames = len(problem.poses)
+    first = 0
+    rigid = np.concatenate([np.einsum("oac,ocd->oad", by_place, _cross(camera)), -by_place], axis=2)  # of (w, d)
+    if POSES in unknown:
+        parts.append(rigid)
+        columns.append(6 * problem.frame[:, None] + np.arange(6))
+        first = 6 * frames
+    if LENS in unknown:
+        focal = problem.focal[problem.frame, None]
+        grown = np.stack([x * r2[:, None], x * r2[:, None] ** 2], axis=2)
+        parts.append(grown * focal[:, :, None])
+        columns.append(np.broadcast_to(first + np.arange(2), (len(x), 2)))
+        first += 2
+    if ROWS in unknown:
+        parts.append(problem.row[:, None, None] * rigid)
+        columns.append(first + 6 * problem.frame[:, None] + np.arange(6))
+        first += 6 * frames
+    if not parts:
+        return by_point, np.zeros((len(x), 2, 0)), np.zeros((len(x), 0), np.int64), 0
+    return by_point, np.concatenate(parts, axis=2), np.concatenate(columns, axis=1), first
+
+
+def _with(problem: Problem, step: Array, unknown: frozenset[str]) -> Problem:
+    first = 0
+    if POSES in unknown:
+        first = 6 * len(problem.poses)
+        moved = step[:first].reshape(-1, 6)
+        poses = problem.poses.copy()
+        poses[:, :3, 3] += np.einsum("fij,fj->fi", poses[:, :3, :3], moved[:, 3:])
+        poses[:, :3, :3] = poses[:, :3, :3] @ rotation(moved[:, :3])
+        problem = replace(problem, poses=poses)
+    if LENS in unknown:
+        k1, k2 = (float(a + b) for a, b in zip(problem.lens, step[first : first + 2], strict=True))
+        problem = replace(problem, lens=(k1, k2))
+        first += 2
+    if ROWS in unknown:
+        problem = replace(problem, motion=problem.motion + step[first:].reshape(-1, 6))
+    return problem
+
+
+def _cross(v: Array) -> Array:
+    """(N, 3) → (N, 3, 3) with [v] w = v × w."""
+    x, y, z = v.T
+    zero = np.zeros_like(x)
+    return np.asarray(np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3))
+
+
+def rotation(vectors: Array) -> Array:
+    """(N, 3) rotation vectors → (N, 3, 3) (Rodrigues)."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    cross = _cross(vectors)
+    small = np.maximum(angle, 1e-12)
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + (1 - np.cos(angle)) / small**2 * (cross @ cross))

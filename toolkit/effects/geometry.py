@@ -1,0 +1,145 @@
+"""Which of lens, rows and poses explain where points are seen, judged by points that took no part in the fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from toolkit.camera import Array, invert
+from toolkit.effects.adjust import LENS, POSES, ROWS, UNKNOWNS, Problem, adjust, residuals, scatter
+from toolkit.effects.sightings import LONG_SIDE, LOOSE, Sightings
+from toolkit.poses.points import intersect
+
+MOST_POINTS = 1600  # that take part
+HELD_OUT = 4  # every so manieth point is kept out of the fits
+FEWEST = 60  # points without which nothing is told
+OUTLIER = 6.0  # deviations of a point's worst observation beyond which it is taken for a wrong match, once nothing explains it
+MARGIN = {LENS: 0.08, POSES: 0.25, ROWS: 0.15}  # least relative fall of the held-out residual, larger for what has more numbers
+LEAST = 0.015  # working pixels by which it has to fall at least
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One unknown beside the others that are kept."""
+
+    before: float  # working pixels: scatter of held-out points without it
+    after: float
+    kept: bool
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What was found about where points are seen."""
+
+    problem: Problem  # all points, with the cameras that explain them
+    kept: frozenset[str]
+    choices: dict[str, Choice]
+    scatter: float  # working pixels, of held-out points, as the capture stands
+    left: float  # the same with what was kept
+    observation: Array  # (O',) which of the sightings' observations the problem's are
+    profile: list[float] = field(default_factory=list)  # radial residual at five radii, working pixels, before anything is explained
+
+
+def open_problem(seen: Sightings) -> tuple[Problem, Array]:
+    """Points where rays meet, wide tolerance, and the observations (O',) that they have."""
+    place = seen.ideal()
+    focal = seen.focal
+    known = np.isfinite(place).all(1)
+    tolerance = LOOSE * LONG_SIDE * min(1.0, float(np.median(focal)) / LONG_SIDE) / focal[seen.frame]
+    rows = np.flatnonzero(known)
+    points, point, kept, _ = intersect(seen.poses, seen.frame[rows], place[rows], seen.point[rows], tolerance[rows])
+    used = rows[kept]
+    order = np.argsort(point, kind="stable")
+    point, used = point[order], used[order]
+    still = np.zeros((len(seen.poses), 6))
+    problem = Problem(seen.poses, points, seen.frame[used], point, place[used], focal, seen.row()[used], still)
+    if len(points) > MOST_POINTS:  # those that most pictures show tell most
+        counts = np.bincount(point, minlength=len(points))
+        chosen = np.zeros(len(points), dtype=bool)
+        chosen[np.argsort(-counts, kind="stable")[:MOST_POINTS]] = True
+        used = used[chosen[point]]
+        problem = problem.only(chosen)
+    return problem, used
+
+
+def steps_of(poses: Array, times: Array) -> Array:
+    """(F, 6) radians and units that each camera turns and moves in one step of the capture, in its own axes; 0 where not known."""
+    count = len(poses)
+    motion = np.zeros((count, 6))
+    if not np.isfinite(times).all() or count < 3:
+        return motion
+    usual = float(np.median(np.diff(times)))
+    for index in range(1, count - 1):
+        passed = times[index + 1] - times[index - 1]
+        if passed < 2.5 * usual:
+            here, relative = poses[index, :3, :3].T, invert(poses[index - 1]) @ poses[index + 1]
+            motion[index, :3] = here @ poses[index - 1, :3, :3] @ _vector(relative[:3, :3]) / passed
+            motion[index, 3:] = here @ (poses[index + 1, :3, 3] - poses[index - 1, :3, 3]) / passed
+    return motion
+
+
+def readout(motion: Array, steps: Array) -> tuple[float, float]:
+    """Which share of a step the rows take, when cameras move by `motion` (F, 6) meanwhile and by `steps` (F, 6) a step.
+
+    Judged by the turns alone; second, how well the two agree (cosine, 1: alike).
+    """
+    known = steps[:, :3].any(1)
+    product = float((motion[known, :3] * steps[known, :3]).sum())
+    size, other = float((steps[known, :3] ** 2).sum()), float((motion[known, :3] ** 2).sum())
+    if size <= 0 or other <= 0:
+        return 0.0, 0.0
+    return product / size, product / np.sqrt(size * other)
+
+
+def _vector(rotation: Array) -> Array:
+    """(3, 3) → rotation vector (3,), for angles below a half turn."""
+    axis = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
+    sine, cosine = 0.5 * float(np.linalg.norm(axis)), 0.5 * (float(np.trace(rotation)) - 1)
+    return 0.5 * axis * (np.arctan2(sine, cosine) / sine if sine > 1e-12 else 1.0)
+
+
+def explain(seen: Sightings) -> Explained | None:
+    """Try the unknowns one by one and, where one helps held-out points by a margin, in every combination. None: too few points."""
+    whole, used = open_problem(seen)
+    if len(whole.points) < FEWEST:
+        return None
+    every = adjust(whole, frozenset(UNKNOWNS), steps=5)
+    worst = np.zeros(len(whole.points))
+    np.maximum.at(worst, whole.point, np.linalg.norm(every.residual, axis=1))
+    good = worst < OUTLIER * max(every.scatter, 0.15)
+    used, whole = used[good[whole.point]], whole.only(good)
+    if len(whole.points) < FEWEST:
+        return None
+    out = np.arange(len(whole.points)) % HELD_OUT == HELD_OUT // 2
+    fit, held = whole.only(~out), whole.only(out)
+    held = adjust(held).problem
+    start = scatter(residuals(held))
+    tried: dict[frozenset[str], tuple[float, Problem]] = {frozenset(): (start, whole)}
+
+    def attempt(unknown: frozenset[str]) -> float:
+        if unknown not in tried:
+            fitted = adjust(fit, unknown).problem
+            tried[unknown] = (adjust(held.like(fitted)).scatter, fitted)
+        return tried[unknown][0]
+
+    def score(unknown: frozenset[str]) -> float:
+        return attempt(unknown) * float(np.prod([1 / (1 - MARGIN[name]) for name in unknown])) + LEAST * len(unknown)
+
+    before = adjust(whole)
+    kept = min([frozenset[str](), *(frozenset({name}) for name in UNKNOWNS)], key=score)
+    if kept:  # poses can mimic a lens or rows, and these each other: every combination is tried
+        both = [frozenset(UNKNOWNS) - {name} for name in UNKNOWNS]
+        kept = min([*list(tried), *both, frozenset(UNKNOWNS)], key=score)
+    choices = {name: Choice(attempt(kept - {name}), attempt(kept | {name}), name in kept) for name in UNKNOWNS}
+    value, base = tried[kept]
+    problem = adjust(whole.like(base)).problem
+    return Explained(problem, kept, choices, start, value, used, _profile(seen, used, before.problem, before.residual))
+
+
+def _profile(seen: Sightings, used: Array, problem: Problem, residual: Array) -> list[float]:
+    """Median residual away from the middle, in five rings of equal width."""
+    length = np.linalg.norm(problem.place, axis=1, keepdims=True)
+    outwards = -(residual * problem.place / np.maximum(length, 1e-9)).sum(1)
+    ring = np.clip((seen.radius()[used] * 5).astype(int), 0, 4)
+    return [round(float(np.median(outwards[ring == k])), 3) if (ring == k).any() else 0.0 for k in range(5)]

@@ -1,0 +1,143 @@
+"""Which of exposure and vignetting explain the light of shared points, judged by points that took no part in the fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from toolkit.camera import Array
+from toolkit.effects import exposure, vignetting
+from toolkit.effects.evidence import BRIGHTEST, DARKEST, ROUNDS, Evidence, Tracks, robust, without_points_and_frames
+
+EXPOSURE, VIGNETTING = "exposure", "vignetting"
+HELD_OUT = 4  # every so manieth point is kept out of the fits
+MARGIN = {EXPOSURE: 0.08, VIGNETTING: 0.05}  # least relative fall of the held-out deviation
+LEAST = 0.0015  # stops by which it has to fall at least
+
+
+@dataclass(frozen=True)
+class Light:
+    """What was found about the light of shared points.
+
+    Attributes:
+        gain: (frames, 3) gains of the frames, geometric mean 1, with the vignetting taken out first when it is kept.
+        corner: share of the light that is left at half a diagonal.
+        before, after: stops, the deviation of held-out points without the effect and with it, beside what else is kept.
+    """
+
+    evidence: dict[str, Evidence]
+    kept: frozenset[str]
+    before: dict[str, float]
+    after: dict[str, float]
+    gain: Array
+    corner: float
+
+    def canonical(self, tracks: Tracks, kept: Iterable[str] | None = None) -> Tracks:
+        """The tracks with what was kept taken out."""
+        kept = self.kept if kept is None else kept
+        out = vignetting.corrected(tracks, self.corner) if VIGNETTING in kept else tracks
+        return replace(out, linear=out.linear / self.gain[out.frame]) if EXPOSURE in kept else out
+
+
+def explain(tracks: Tracks, frames: int) -> Light:
+    """Evidence of both, and which of them help held-out points by a margin, alone or together."""
+    out = tracks.point % HELD_OUT == HELD_OUT // 2
+    fit, held = _rows(tracks, ~out), _rows(tracks, out)
+    falloff = vignetting.evidence(fit, frames)
+    corner = float(falloff.parameters.get("corner", 1.0))
+    deviations: dict[frozenset[str], float] = {}
+    found: dict[frozenset[str], Evidence] = {}
+    for bent in (False, True):
+        base = frozenset({VIGNETTING} if bent else ())
+        flat = vignetting.corrected(fit, corner) if bent else fit
+        flat_held = vignetting.corrected(held, corner) if bent else held
+        drift = exposure.evidence(flat, frames)
+        gain = np.array(drift.parameters.get("gain", np.ones((frames, 3))))
+        found[base] = drift
+        deviations[base] = spread(flat_held)
+        deviations[base | {EXPOSURE}] = spread(replace(flat_held, linear=flat_held.linear / gain[flat_held.frame]))
+    allowed = [
+        kept
+        for kept in deviations
+        if (VIGNETTING not in kept or falloff.found) and (EXPOSURE not in kept or found[kept - {EXPOSURE}].found)
+    ]
+    kept = min(allowed, key=lambda one: deviations[one] * float(np.prod([1 / (1 - MARGIN[name]) for name in one])) + LEAST * len(one))
+    final = vignetting.evidence(tracks, frames)
+    corner = float(final.parameters.get("corner", 1.0))
+    drift = exposure.evidence(vignetting.corrected(tracks, corner) if VIGNETTING in kept else tracks, frames)
+    return Light(
+        evidence={EXPOSURE: drift, VIGNETTING: final},
+        kept=kept,
+        before={name: deviations[kept - {name}] for name in (EXPOSURE, VIGNETTING)},
+        after={name: deviations[kept | {name}] for name in (EXPOSURE, VIGNETTING)},
+        gain=np.array(drift.parameters.get("gain", np.ones((frames, 3)))),
+        corner=corner,
+    )
+
+
+def spread(tracks: Tracks) -> float:
+    """Stops: robust deviation of points' light between the pictures that show them; 0 when there are none."""
+    used = tracks.usable()
+    if not len(used.frame):
+        return 0.0
+    light = np.log2(used.linear)
+    points = int(used.point.max()) + 1
+    order = np.lexsort((light.mean(1), used.point))
+    starts = np.searchsorted(used.point[order], np.arange(points))
+    counts = np.bincount(used.point, minlength=points)
+    middle = light[order[starts + counts // 2]]  # the observation of median light
+    return float(1.4826 * np.median(np.abs(light - middle[used.point]).max(1)))
+
+
+def frame_gains(tracks: Tracks, frames: int, train: Array) -> Array:
+    """(frames, 3) gains: of training frames from the points that they share, with geometric mean 1; of others by comparison with these.
+
+    Args:
+        train: (frames,) bool.
+    """
+    gain = np.ones((frames, 3))
+    number = np.cumsum(train) - 1
+    mine = _rows(tracks, train[tracks.frame])
+    inner = exposure.evidence(replace(mine, frame=number[mine.frame]), int(train.sum()))
+    if "gain" not in inner.parameters:
+        return gain
+    gain[train] = np.array(inner.parameters["gain"])
+    points = int(tracks.point.max(initial=-1)) + 1
+    bright = ((tracks.linear > DARKEST) & (tracks.linear < BRIGHTEST)).all(1)
+    light = np.log2(np.maximum(tracks.linear, 1e-6)) - np.log2(gain[tracks.frame])
+    known = train[tracks.frame] & bright
+    count = np.bincount(tracks.point[known], minlength=points)
+    mean = np.stack([np.bincount(tracks.point[known], light[known, c], points) for c in range(3)], axis=1) / np.maximum(count[:, None], 1)
+    for frame in np.flatnonzero(~train):
+        rows = (tracks.frame == frame) & bright & (count[tracks.point] > 0)
+        if rows.sum() >= 10:
+            gain[frame] = np.exp2(np.median(light[rows] - mean[tracks.point[rows]], axis=0))
+        elif train.any():  # the neighbours in the list: exposure changes smoothly
+            near = np.flatnonzero(train)[np.argsort(np.abs(np.flatnonzero(train) - frame), kind="stable")[:2]]
+            gain[frame] = np.exp2(np.log2(gain[near]).mean(0))
+    return gain
+
+
+def left_over(tracks: Tracks, frames: int) -> tuple[Array, Array]:
+    """Stops (O,) by which observations differ from their points, all frames' gains taken out; and which of them could be used (O,) bool."""
+    bright = ((tracks.linear > DARKEST) & (tracks.linear < BRIGHTEST)).all(1)
+    counts = np.bincount(tracks.point[bright], minlength=int(tracks.point.max(initial=-1)) + 1)
+    use = bright & (counts[tracks.point] > 2)
+    out = np.zeros(len(tracks.frame))
+    if not use.any():
+        return out, use
+    used = _rows(tracks, use)
+    weight = np.ones(len(used.frame))
+    light, left = np.log2(used.linear), np.zeros((len(used.frame), 3))
+    for _ in range(ROUNDS):
+        left, _ = without_points_and_frames(light, used, weight, frames)
+        weight, _ = robust(left)
+    out[use] = left.mean(1)
+    return out, use
+
+
+def _rows(tracks: Tracks, keep: Array) -> Tracks:
+    point = np.unique(tracks.point[keep], return_inverse=True)[1]
+    return Tracks(tracks.linear[keep], tracks.frame[keep], point, tracks.radius[keep])

@@ -1,0 +1,179 @@
+"""All evidence of a posed capture at once, and what is decided from it before anything is fitted."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from toolkit.camera import Array
+from toolkit.capture.types import Capture
+from toolkit.effects import background, geometry, light, motion_blur, view_dependence
+from toolkit.effects.adjust import LENS, POSES, ROWS, Problem, predict
+from toolkit.effects.evidence import Evidence
+from toolkit.effects.light import EXPOSURE, VIGNETTING
+from toolkit.effects.sightings import Sightings, choose, gather
+from toolkit.progress import SILENT, Progress
+
+PIXELS = "working pixels"
+BLUR, VIEWS, FAR = "motion_blur", "view_dependence", "background"
+ORDER = (EXPOSURE, VIGNETTING, LENS, ROWS, VIEWS, FAR, BLUR, POSES)
+MOST_FRAMES = 40  # that are looked at before anything speaks for an effect
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found about one effect, and whether it is there.
+
+    Attributes:
+        before, after: what held-out points are off without and with the effect, in `unit`; None where nothing is fitted.
+        there: the number is above its threshold, and held-out points agree by a margin.
+    """
+
+    effect: str
+    number: float
+    threshold: float
+    reason: str
+    there: bool
+    before: float | None = None
+    after: float | None = None
+    unit: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        out: dict[str, Any] = {
+            "effect": self.effect,
+            "number": round(self.number, 4),
+            "threshold": self.threshold,
+            "there": self.there,
+            "reason": self.reason,
+        }
+        if self.before is not None and self.after is not None:
+            out["held_out"] = {"before": round(self.before, 4), "after": round(self.after, 4), "unit": self.unit}
+        return out
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Everything that was found."""
+
+    findings: dict[str, Finding]  # in the order of `ORDER`
+    seen: Sightings | None
+    explained: geometry.Explained | None
+    light: light.Light | None
+    sharpness: Array  # (F,) factors of two of the slopes' energy
+    seconds: float
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def there(self) -> frozenset[str]:
+        return frozenset(name for name, finding in self.findings.items() if finding.there)
+
+
+def survey(capture: Capture, indices: list[int] | None = None, progress: Progress = SILENT, most: int | None = MOST_FRAMES) -> Survey:
+    """Look at a posed capture.
+
+    Args:
+        indices: the frames that may be looked at (training frames); None: all.
+        most: how many of them are; None: all.
+
+    Raises:
+        InputError: a picture cannot be read.
+    """
+    began = time.monotonic()
+    allowed = list(range(len(capture.frames))) if indices is None else list(indices)
+    chosen = allowed if most is None else [allowed[k] for k in choose(len(allowed), most)]
+    seen = gather(capture, chosen, progress)
+    return look(seen, began)
+
+
+def look(seen: Sightings, began: float | None = None) -> Survey:
+    """The evidence that sightings hold."""
+    began = time.monotonic() if began is None else began
+    explained = geometry.explain(seen) if len(seen.frame) else None
+    frames = len(seen.names)
+    if explained is None:
+        nothing = {name: Finding(name, 0.0, 0.0, "too few points are shared between pictures to tell", False) for name in ORDER}
+        return Survey(nothing, None, None, None, np.zeros(frames), time.monotonic() - began, {"frames": frames, "points": seen.points})
+    mine = np.zeros(len(seen.frame), dtype=bool)
+    mine[explained.observation] = True
+    kept = seen.where(mine)
+    # `where` drops points that are left with one observation; the problem has none of these, so both number alike.
+    found = light.explain(kept.tracks(), frames)
+    flat = found.canonical(kept.tracks())
+    left, use = light.left_over(flat, frames)
+    place = kept.pixel * kept.scale[kept.frame][:, None]
+    dependence = view_dependence.evidence(left[use], kept.frame[use], place[use])
+    depth = np.zeros(len(kept.frame))
+    order = np.argsort(explained.observation, kind="stable")
+    depth[:] = predict(explained.problem)[0][order, 2]
+    blur = motion_blur.evidence(kept.slope[:, 0] + kept.slope[:, 2], depth, kept.frame, kept.point, frames)
+    usual = float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
+    findings = {
+        **{name: _of_light(found, name) for name in (EXPOSURE, VIGNETTING)},
+        LENS: _lens(explained),
+        ROWS: _rows(explained, seen),
+        VIEWS: _plain(dependence),
+        FAR: _plain(_far(seen, explained.problem, usual)),
+        BLUR: _plain(blur),
+        POSES: _poses(explained),
+    }
+    sharpness = np.array(blur.parameters.get("sharpness", np.zeros(frames)))
+    facts = {"frames": frames, "points": len(explained.problem.points), "observations": len(explained.observation)}
+    return Survey(findings, seen, explained, found, sharpness, time.monotonic() - began, facts)
+
+
+def _plain(evidence: Evidence) -> Finding:
+    return Finding(evidence.effect, evidence.number, evidence.threshold, evidence.reason, evidence.found)
+
+
+def _of_light(found: light.Light, name: str) -> Finding:
+    evidence = found.evidence[name]
+    before, after = found.before[name], found.after[name]
+    return Finding(name, evidence.number, evidence.threshold, evidence.reason, name in found.kept, before, after, "stops")
+
+
+def _gain(choice: geometry.Choice) -> float:
+    return 1 - choice.after / choice.before if choice.before > 0 else 0.0
+
+
+def _lens(found: geometry.Explained) -> Finding:
+    choice = found.choices[LENS]
+    rings = ", ".join(f"{value:+.2f}" for value in found.profile)
+    reason = (
+        f"a lens with k1 and k2 beyond the given one lowers what held-out points are off by {100 * _gain(choice):.0f}%; from the middle "
+        f"to the corners points lie {rings} working pixels too far out"
+    )
+    return Finding(LENS, max(_gain(choice), 0.0), geometry.MARGIN[LENS], reason, choice.kept, choice.before, choice.after, PIXELS)
+
+
+def _rows(found: geometry.Explained, seen: Sightings) -> Finding:
+    choice = found.choices[ROWS]
+    reason = f"rows read one after the other lower what held-out points are off by {100 * _gain(choice):.0f}%"
+    if choice.kept:
+        share, alike = geometry.readout(found.problem.motion, geometry.steps_of(found.problem.poses, seen.times))
+        if alike > 0.5:
+            reason += f"; the camera turns as if reading took {share:.2f} of the time between two pictures"
+        reason += "; this is not corrected: film with a global shutter, or move more slowly"
+    return Finding(ROWS, max(_gain(choice), 0.0), geometry.MARGIN[ROWS], reason, choice.kept, choice.before, choice.after, PIXELS)
+
+
+def _poses(found: geometry.Explained) -> Finding:
+    choice = found.choices[POSES]
+    reason = (
+        f"held-out points are {choice.before:.2f} working pixels off with the given poses, {choice.after:.2f} with refined ones: "
+        f"{100 * _gain(choice):.0f}% less"
+    )
+    return Finding(POSES, max(_gain(choice), 0.0), geometry.MARGIN[POSES], reason, choice.kept, choice.before, choice.after, PIXELS)
+
+
+def _far(seen: Sightings, problem: Problem, usual: float) -> Evidence:
+    """Also the points that no two rays of which meet: those the problem does not have."""
+    ideal = seen.ideal()
+    known = np.isfinite(ideal).all(1)
+    poses = problem.poses[seen.frame[known]]
+    rays = np.einsum("oij,oj->oi", poses[:, :3, :3], np.concatenate([ideal[known], np.ones((int(known.sum()), 1))], axis=1))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    number = np.unique(seen.point[known], return_inverse=True)[1]
+    return background.evidence(rays, poses[:, :3, 3], number, seen.focal[seen.frame[known]], usual)

@@ -1,0 +1,159 @@
+"""Sixty small simulated captures whose effects are known: what the detection of effects is measured on."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from toolkit.effects.listed import parse
+from toolkit.errors import InputError
+from toolkit.files import read_json, write_json
+from toolkit.progress import SILENT, Progress
+from toolkit.simulate.curve import rotations
+from toolkit.simulate.settings import SceneFile, scene_file
+from toolkit.simulate.simulate import prepare, simulate
+
+WIDTH, HEIGHT, FRAMES, FPS, SIDE = 256, 192, 16, 5.0, 1
+STRENGTHS = ("weak", "medium", "strong")
+EFFECTS = ("exposure", "vignetting", "distortion", "rolling_shutter", "highlights", "background", "motion_blur", "poses")
+BLUR_SAMPLES = {"weak": 3, "medium": 5, "strong": 9}  # of the shutter's time: fewer than usual, for pictures this small
+# The effect's own presets change hardly a pixel here (38 dB and more between with and without): lamps are small and paths short.
+HIGHLIGHTS = {"weak": (1.0, 0.12), "medium": (1.5, 0.25), "strong": (2.0, 0.4)}  # strength, coat
+SHOWS = 0.03  # share of the pixels that highlights or a background change by more than `CHANGE`; else the scene is drawn anew
+CHANGE = 8  # of 255
+TRIES = 12
+POSE_ERROR = {"weak": (0.08, 0.001), "medium": (0.3, 0.004), "strong": (0.8, 0.012)}  # degrees, and share of the way to what is seen
+SCENES = ("room", "table", "corridor", "street", "room", "sphere")
+PATHS = {"room": "walk", "street": "walk", "corridor": "forward", "table": "orbit", "sphere": "orbit"}
+SPEED = {"room": 0.5, "street": 1.0, "corridor": 0.8, "table": 0.9, "sphere": 0.9}  # metres a second
+SHAKE = 8.0  # degrees a second: a hand
+FIRST_SEED = 90_000  # of the captures that stand in the documentation; development uses others
+PLACES = {"highlights": ("room", "sphere", "table"), "background": ("street",)}  # where an effect shows at all
+
+
+@dataclass(frozen=True)
+class Planned:
+    """One capture: its scene, and which effects it has in which strength. `poses` stands for errors of the given poses."""
+
+    name: str
+    scene: str
+    seed: int
+    effects: tuple[tuple[str, str], ...]
+
+
+def plan(first_seed: int = FIRST_SEED) -> list[Planned]:
+    """12 captures without any effect, each of the eight alone in three strengths, and 24 pairs of medium and strong ones.
+
+    What a real capture has anyway and nothing corrects (a little sensor noise, compression) is in every third of them.
+    """
+    wanted: list[tuple[tuple[str, str], ...]] = [()] * 12
+    wanted += [((effect, strength),) for effect in EFFECTS for strength in STRENGTHS]
+    pairs = [(first, second) for step in (1, 2, 3) for first, second in zip(EFFECTS, EFFECTS[step:] + EFFECTS[:step], strict=True)]
+    wanted += [
+        ((first, STRENGTHS[1 + n % 2]), (second, STRENGTHS[1 + n // 2 % 2])) for n, (first, second) in enumerate(dict.fromkeys(pairs))
+    ]
+    out = []
+    for number, effects in enumerate(wanted):
+        fits = [set(PLACES[effect]) for effect, _ in effects if effect in PLACES]
+        scenes = [scene for scene in SCENES if all(scene in places for places in fits)]
+        if not scenes:  # highlights before a distant background: a street's windows and cars are glossy too
+            scenes = ["street"]
+        label = "+".join(f"{effect}-{strength}" for effect, strength in effects) or "clean"
+        out.append(Planned(f"{number:02d}-{label}", scenes[number % len(scenes)], first_seed + number, effects))
+    return out
+
+
+def film(planned: Planned, folder: Path, progress: Progress = SILENT) -> Path:
+    """Simulate one capture below `folder` unless it is there; its `transforms.json` knows neither the lens nor the true poses.
+
+    Returns:
+        the capture's folder, with what it holds in `planned.json`.
+    """
+    place = folder / planned.name
+    about = place / "planned.json"
+    if about.is_file():
+        return place
+    listed: list[Any] = []
+    for effect, strength in planned.effects:
+        if effect == "motion_blur":
+            listed.append({effect: {"strength": strength, "samples": BLUR_SAMPLES[strength]}})
+        elif effect == "highlights":
+            listed.append({effect: dict(zip(("strength", "coat"), HIGHLIGHTS[strength], strict=True))})
+        elif effect != "poses":
+            listed.append(f"{effect}:{strength}")
+    if planned.seed % 3 == 2:
+        listed.append("sensor_noise:weak")
+    for attempt in range(TRIES):
+        settings = _settings(planned, planned.seed + 1000 * attempt)
+        try:
+            if shown(settings, planned, listed) > SHOWS:
+                break
+        except InputError:  # the path does not fit into this scene
+            continue
+    simulate(settings, place, effects=listed, progress=progress, workers=1)
+    _forget(place / "transforms.json", planned)
+    write_json(about, {"scene": planned.scene, "seed": settings.seed, "effects": dict(planned.effects), "fps": FPS})
+    return place
+
+
+def _settings(planned: Planned, seed: int) -> SceneFile:
+    return scene_file(
+        {
+            "scene": planned.scene,
+            "seed": seed,
+            "side": SIDE,
+            "camera": {"width": WIDTH, "height": HEIGHT},
+            "path": {"kind": PATHS[planned.scene], "frames": FRAMES, "fps": FPS, "speed": SPEED[planned.scene], "shake": SHAKE},
+        },
+        planned.name,
+    )
+
+
+def shown(settings: SceneFile, planned: Planned, listed: list[Any]) -> float:
+    """Share of the pixels that those effects change which only show where the scene lets them; 1 where there is none of these."""
+    names = {effect for effect, strength in planned.effects if effect in PLACES and strength != "weak"}
+    if not names:
+        prepare(settings, Path(), parse([], planned.name))
+        return 1.0
+    least = 1.0
+    for name in names:
+        mine = [entry for entry in listed if (next(iter(entry)) if isinstance(entry, dict) else entry.split(":")[0]) == name]
+        films = [prepare(settings, Path(), parse(effects, planned.name)) for effects in ([], mine)]
+        changes = [
+            np.abs(films[0].shot(index).rgb.astype(int) - films[1].shot(index).rgb).max(2) > CHANGE
+            for index in (1, FRAMES // 2, FRAMES - 2)
+        ]
+        least = min(least, float(np.mean(changes)))
+    return least
+
+
+def _forget(path: Path, planned: Planned) -> None:
+    """Take the lens out of the cameras, and put the planned error on their poses."""
+    data: dict[str, Any] = read_json(path)
+    for key in ("k1", "k2", "p1", "p2", "k3"):
+        data.pop(key, None)
+    data["camera_model"] = "PINHOLE"
+    strength = dict(planned.effects).get("poses")
+    if strength is not None:
+        degrees, share = POSE_ERROR[strength]
+        rng = np.random.default_rng([planned.seed, 4711])
+        depth = _median_depth(path.parent)
+        turns = rotations(np.deg2rad(rng.normal(0, degrees / np.sqrt(3), (len(data["frames"]), 3))))
+        for entry, turn in zip(data["frames"], turns, strict=True):
+            pose = np.array(entry["transform_matrix"])
+            pose[:3, :3] = pose[:3, :3] @ turn
+            pose[:3, 3] += rng.normal(0, share * depth / np.sqrt(3), 3)
+            entry["transform_matrix"] = pose.tolist()
+    path.write_text(json.dumps(data), encoding="utf-8")
+
+
+def _median_depth(place: Path) -> float:
+    """Median over frames of the median depth, metres."""
+    from safetensors.numpy import load_file
+
+    depths = [load_file(path)["depth"] for path in sorted((place / "ground_truth" / "frames").glob("*.safetensors"))]
+    return float(np.median([np.median(depth[depth > 0]) for depth in depths if (depth > 0).any()]))
