@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 FILE = "plan.json"
 LONGEST_START = 60.0  # seconds; a process that is older was not started for this command
 NOT_FITTED = ("capture", "frames", "poses", "scene", "views", "tsdf", "render", "export", "evaluate", "report")
+TOO_FEW = " The smallest choice needs about {:.0f} s on this machine as busy as it is; give more, or expect that."
 WORTH_LEARNING = 0.3  # seconds; shorter stages say little
 
 
@@ -136,6 +137,7 @@ class TotalBudget:
         return (
             f"Of the {told['asked_seconds']:g} s asked for, {told['predicted_seconds']:.0f} s were predicted and"
             f" {told['real_seconds']:.0f} s spent until this page was written; chosen: {', '.join(parts)}."
+            + (TOO_FEW.format(told["predicted_seconds"]) if told["predicted_seconds"] > (1 + model.AGREES) * self.asked else "")
         )
 
     def finish(self, job: Job, report_seconds: float) -> dict[str, Any]:
