@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from safetensors import SafetensorError
 
-from toolkit.errors import InputError, OutputError
+from toolkit.errors import InputError, OutputError, first_line
 
 MAX_JSON_BYTES = 64 * 2**20
 
@@ -35,6 +36,8 @@ def atomic_path(target: Path | str) -> Iterator[Path]:
         temporary.replace(target)
     except OSError as error:
         raise OutputError(f"cannot write {target}: {error.strerror or error}; free space or choose another --out folder") from error
+    except SafetensorError as error:  # says of a full disk what an OSError would
+        raise OutputError(f"cannot write {target}: {first_line(error)}; free space or choose another --out folder") from error
     finally:
         with suppress(OSError):  # what went wrong is already on its way up
             remove(temporary)

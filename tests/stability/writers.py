@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from pipelines.rendered import Picture, Pictures, save_pictures, write_png, write_pngs
+from tests.stability.writers_more import more_writers
 from toolkit.camera import Intrinsics, Similarity
 from toolkit.capture.types import Views
 from toolkit.capture.views_file import save_views
@@ -116,7 +117,7 @@ def main() -> int:
     place = Path(sys.argv[1])
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     result: dict[str, Any] = {}
-    every = writers()
+    every = writers() | more_writers(place)
     for name, write in every.items():
         folder = place / name.replace(" ", "_")
         folder.mkdir()

@@ -121,9 +121,11 @@ def write_sheet(path: Path, rows: Sequence[Predicted]) -> None:
     strips = [_strip(one) for one in rows]
     width = max(strip.shape[1] for strip in strips)
     whole = np.concatenate([np.pad(strip, ((0, 2), (0, width - strip.shape[1]), (0, 0)), constant_values=255) for strip in strips])
+    done, data = cv2.imencode(".png", whole[:, :, ::-1])
+    if not done:
+        raise OutputError(f"cannot make a PNG for {path}; the sheet has shape {whole.shape}")
     with atomic_path(path) as temporary:
-        if not cv2.imwrite(str(temporary), whole[:, :, ::-1]):
-            raise OutputError(f"cannot write {path}; free space or choose another --out folder")
+        temporary.write_bytes(data.tobytes())
 
 
 def _strip(one: Predicted) -> Array:

@@ -1,0 +1,110 @@
+"""The rest of the writers for `writers`: what is baked, learnt, simulated, compared and drawn. Each takes a folder."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from pipelines.folder import RunFolder
+from tests.evaluate.test_compare_page import made, pictures
+from tests.evaluate.test_tradeoff import ladder
+from tests.simulate.test_simulate import SMALL
+from tests.training.nerfusion.tiny import tiny_settings
+from toolkit.camera import Intrinsics
+from toolkit.capture.select import select_frames
+from toolkit.capture.video import read_video
+from toolkit.config import CaptureSettings, Settings
+from toolkit.evaluate.compare_page import write_comparison
+from toolkit.evaluate.pictures import write_picture, write_strips
+from toolkit.evaluate.selftest.data import texture
+from toolkit.evaluate.selftest.edit import small_field
+from toolkit.evaluate.tradeoff_page import write_tradeoff
+from toolkit.networks.weights import save_model
+from toolkit.render.bake import bake
+from toolkit.render.bake_file import write_baked
+from toolkit.simulate.settings import scene_file
+from toolkit.simulate.simulate import simulate
+from toolkit.training.nerfusion.caution import Caution
+from toolkit.training.nerfusion.checkpoint import save_checkpoint
+from toolkit.training.nerfusion.curve import Curve
+from toolkit.training.nerfusion.shards import write_shard
+from toolkit.training.nerfusion.train import make_model
+from toolkit.tsdf.stereo import StereoDepth
+from toolkit.tsdf.stereo_frames import save_stereo
+
+Write = Callable[[Path], object]
+
+
+def more_writers(place: Path) -> dict[str, Write]:
+    """By name. `place` is for what they read."""
+    baked, model = bake(small_field(1, 0.2)), make_model(tiny_settings())
+    adam = torch.optim.Adam(model.parameters())
+    shown, meshes = pictures()
+    tradeoff = {
+        "source": "/x",
+        "unit": "m",
+        "rows": ladder(),
+        "warnings": [],
+        "machine": {"cores": 2},
+        "stages": [],
+        "left_out": [],
+        "refused": [],
+    }
+    camera, depth = Intrinsics(16, 12, 15.0, 15.0, 8.0, 6.0), np.ones((12, 16), np.float32)
+    scene, numbers = scene_file({**SMALL, "path": {"frames": 2, "fps": 4, "speed": 0.4}, "depth": True}, "test"), itertools.count()
+    video = place / "film.avi"
+    writer = cv2.VideoWriter(str(video), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    for index in range(8):
+        writer.write(texture(index, 48, 64))
+    writer.release()
+    film = read_video(video)
+
+    def curve(folder: Path) -> None:
+        curve = Curve(folder)
+        for step in range(40):
+            curve.add({"step": float(step), "loss": 1.0 / (step + 1), "psnr_local": 20.0})
+        curve.write()
+
+    def run_folder(folder: Path) -> None:
+        with RunFolder(folder) as opened:
+            opened.start(Path("source"), Settings())
+
+    def shard(folder: Path) -> None:
+        arrays = (np.zeros((2, 3, 12, 16), np.uint8), np.stack([depth] * 2), np.ones((2, 4)), np.tile(np.eye(4), (2, 1, 1)))
+        write_shard(folder / "shard.safetensors", *arrays, kind="room", ordered=False)
+
+    return {
+        "write_baked": lambda folder: write_baked(folder / "baked.safetensors", baked),
+        "save_model": lambda folder: save_model(folder / "weights.safetensors", model),
+        "save_checkpoint": lambda folder: save_checkpoint(folder, 3, model, adam, {}, 2, Caution()),
+        "Curve.write": curve,
+        "write_shard": shard,
+        "save_stereo": lambda folder: save_stereo(folder / "depths.safetensors", ["a"], [StereoDepth(depth, depth, camera)]),
+        "write_comparison": lambda folder: write_comparison(folder, made(), shown, meshes, 0.075),
+        "write_tradeoff": lambda folder: write_tradeoff(folder, tradeoff),
+        "write_strips": lambda folder: write_strips(folder, shown),
+        "write_picture": lambda folder: write_picture(folder / "a.png", texture(0, 48, 64)),
+        "simulate": lambda folder: simulate(scene, folder / f"film{next(numbers)}", workers=1),
+        "select_frames": lambda folder: select_frames(film, folder / f"video{next(numbers)}", CaptureSettings(max_frames=4)),
+        "RunFolder": run_folder,
+    }  # fmt: skip
+
+
+# Modules with writers of files that no user keeps, or that the tests of their own part put on a full disk.
+ELSEWHERE = {
+    "toolkit/files.py": "what all others write through",
+    "toolkit/poses/database.py": "COLMAP's own files: tests/poses puts their folder on a full disk",
+    "toolkit/poses/job.py": "as above",
+    "toolkit/poses/sfm.py": "as above",
+    "toolkit/poses/worker.py": "as above",
+    "toolkit/evaluate/budget.py": "a cache: what cannot be written is not remembered",
+    "toolkit/simulate/demo.py": "one video, for people, through `atomic_path`",
+    "toolkit/evaluate/tradeoff_plots.py": "draws into memory",
+    "toolkit/evaluate/plots.py": "draws into memory",
+    "pipelines/doctor.py": "a probe in a temporary folder",
+}
