@@ -221,6 +221,7 @@ def _machine(settings: Any) -> dict[str, Any]:
 def table(
     files: Annotated[list[Path], typer.Argument(help="results.json of a benchmark, or tradeoff.json.", show_default=False)],
     into: Annotated[Path, typer.Option(help="Markdown page; what stands between the table's marks is replaced.", show_default=False)],
+    data: Annotated[Path | None, typer.Option(help="Folder of the captures; in commands it is shown as DATA.", show_default=False)] = None,
     name: Annotated[
         str | None, typer.Option(help="Name of the table; default: of the folder that the file lies in.", show_default=False)
     ] = None,
@@ -228,16 +229,16 @@ def table(
     """Put measured tables into a Markdown page, between marks, so that no number in it is typed."""
     from toolkit.errors import InputError
     from toolkit.evaluate.suites import suite_of
-    from toolkit.evaluate.suites.tables import put_between_marks, suite_table
+    from toolkit.evaluate.suites.tables import portable, put_between_marks, suite_table
     from toolkit.evaluate.tradeoff_page import tradeoff_data
     from toolkit.evaluate.tradeoff_table import tradeoff_table
     from toolkit.files import read_json
 
     for path in files:
-        data = read_json(path)
+        measured = read_json(path)
         title = name or path.resolve().parent.name
         try:
-            found = data if data["rows"] is not None else {}
+            found = {**measured, "command": portable(str(measured["command"]), data and data.resolve()), "rows": list(measured["rows"])}
             text = suite_table(suite_of(found["suite"]), found) if "suite" in found else tradeoff_table(tradeoff_data(found), title)
         except (KeyError, TypeError, AttributeError) as error:
             raise InputError(

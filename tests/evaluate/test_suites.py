@@ -10,7 +10,7 @@ import pytest
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 from toolkit.evaluate.suites import SUITES, suite_of
-from toolkit.evaluate.suites.tables import put_between_marks, suite_table
+from toolkit.evaluate.suites.tables import portable, put_between_marks, suite_table
 
 
 def capture_of(count: int, split: bool = False) -> Capture:
@@ -97,6 +97,12 @@ def test_reported_numbers_are_marked_as_such() -> None:
     assert "26.19" not in text  # of a variant that was not run
     assert "not made: no / pictures" in text and "Not as in the paper" in text and "load 3.0" in text
     assert len({line.count("|") for line in text.splitlines() if line.startswith("|")}) == 1
+
+
+def test_commands_lose_the_places_of_this_machine() -> None:
+    command = "fieldfuse tradeoff /data/sets/fox --out /tmp/x/fox --times 1,3 --config /home/me/a.yaml"
+    assert portable(command, Path("/data")) == "fieldfuse tradeoff DATA/sets/fox --out runs/fox --times 1,3 --config a.yaml"
+    assert portable("fieldfuse bench dtu sets/dtu --out 'my runs'", None) == "fieldfuse bench dtu sets/dtu --out 'my runs'"
 
 
 def test_tables_are_put_between_their_marks(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -70,6 +71,18 @@ def machine_line(machine: dict[str, Any]) -> str:
         f"Measured {machine.get('measured', '')} on {machine.get('cores')} cores with {machine.get('threads')} threads,"
         f" {machine.get('device', 'cpu')}{busy}:"
     )
+
+
+def portable(command: str, data: Path | None) -> str:
+    """A command without this machine's places: what lies in the folder `data` becomes DATA/…, other absolute paths their last part."""
+    words_of = shlex.split(command)
+    for index, word in enumerate(words_of):
+        if data is not None and Path(word).is_absolute() and Path(word).is_relative_to(data):
+            words_of[index] = (Path("DATA") / Path(word).relative_to(data)).as_posix()
+        elif Path(word).is_absolute():
+            before = words_of[index - 1] if index else ""
+            words_of[index] = f"runs/{Path(word).name}" if before in ("--out", "-o") else Path(word).name
+    return shlex.join(words_of)
 
 
 def put_between_marks(page: Path, name: str, text: str) -> None:
