@@ -123,7 +123,9 @@ def plan(axes: Iterable[str], times: Sequence[float], seeds: int, surface: str |
     both = [time for time in ladder if DECODER_TIMES[0] <= time <= DECODER_TIMES[1]] or [base]
     out = _fields(axes, ladder, base, both, 0)
     if surface is not None:
-        out[1:1] = _surfaces(axes, surface)
+        first, *others = _surfaces(axes, surface)
+        out[1:1] = [first]
+        out[len(ladder) + 1 : len(ladder) + 1] = others
     if "keyframes" in axes:
         out += [Wanted("direct", {"keyframes": share, "views": 1.0}, ("keyframes",)) for share in (1.0, *KEY_FRAMES)]
     for seed in range(1, seeds):

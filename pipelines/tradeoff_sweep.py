@@ -38,21 +38,22 @@ def sweep(job: Job, wanted: Sequence[Wanted], stereo_seconds: float, budget: flo
     Raises:
         Interrupted: the user asked to stop; `swept` has what was finished.
     """
-    began, beside, base_voxel = time.monotonic(), FIRST_GUESS, None
+    began, base_voxel = time.monotonic(), None
+    beside = {True: FIRST_GUESS, False: FIRST_GUESS}  # seconds that a surface (True) or a field takes beside its fitting time
     for one in wanted:
         spec = job_spec(job, one, stereo_seconds, base_voxel)
         rows = known_rows(job, one, spec)
         if rows is not None:
             swept.reused += 1
         else:
-            expected = float(one.wanted.get("iterations", 0.0)) + beside
+            expected = float(one.wanted.get("iterations", 0.0)) + beside[one.is_surface]
             if budget is not None and time.monotonic() - began + expected > budget:
                 swept.left_out.append(one.name)
                 continue
             start = time.monotonic()
             rows = measure(job, one, spec, expected)
             spent = time.monotonic() - start - float(one.wanted.get("iterations", 0.0))
-            beside = max(spent, 0.7 * beside)
+            beside[one.is_surface] = max(spent, 0.7 * beside[one.is_surface])
         swept.rows += [finish(one, row) for row in rows]
         if one.is_surface and one.wanted["voxel_size"] == 1 and rows[0]["error"] is None:
             base_voxel = rows[0]["setting"]["working_voxel"]

@@ -115,6 +115,12 @@ def points_of(rows: Iterable[dict[str, Any]]) -> list[Point]:
     return out
 
 
+def in_order(points: Sequence[Point]) -> list[Point]:
+    """By method, then by time: as tables list them."""
+    methods = list(METHODS)
+    return sorted(points, key=lambda point: (methods.index(point.method), point.mean.get("seconds", 0.0)))
+
+
 def pareto(points: Sequence[Point], cost: str = "seconds", measure: str = "psnr") -> list[Point]:
     """Points that no other is both cheaper and at least as good as, the cheapest first; their quality rises from each to the next.
 
@@ -147,7 +153,8 @@ def series(points: Sequence[Point]) -> list[tuple[str, list[Point]]]:
         for point in points:
             if axis in point.axes and point.value(axis) is not None:
                 groups.setdefault(_others(point, axis), []).append(point)
-        out += [(axis, _sorted(axis, same)) for same in groups.values() if len(same) > 1]
+        found = [(axis, _sorted(axis, same)) for same in groups.values() if len(same) > 1]
+        out += sorted(found, key=lambda one: one[1][0].value("iterations") or 0.0) if axis == "decoder" else found
     return out
 
 

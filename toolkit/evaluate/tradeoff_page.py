@@ -14,7 +14,7 @@ from toolkit.evaluate import words
 from toolkit.evaluate.page import flat, short_name, subtitle
 from toolkit.evaluate.report import CAPTURE, POSES, STAGE, plain
 from toolkit.evaluate.templates import template
-from toolkit.evaluate.tradeoff import AXES, COSTS, MEASURES, METHODS, NUMBERS, Point, checked_row, pareto, points_of
+from toolkit.evaluate.tradeoff import AXES, COSTS, MEASURES, METHODS, NUMBERS, Point, checked_row, in_order, pareto, points_of
 from toolkit.evaluate.tradeoff_plots import quality_plot
 from toolkit.evaluate.tradeoff_text import AXIS_TITLES, Step, front_sentence, sentence, setting_text, steps
 from toolkit.files import atomic_path, write_json
@@ -125,7 +125,7 @@ def render_tradeoff(data: dict[str, Any], points: Sequence[Point], plots: dict[t
         sentences=[text for cost in COSTS if (text := front_sentence(points, cost, "psnr", unit)) is not None],
         sections=[(name, shown) for name, shown in sections if shown],
         steps=step_groups(steps(points), unit),
-        rows=[point_row(point, fronts, unit) for point in points],
+        rows=[point_row(point, fronts, unit) for point in in_order(points)],
         failed=[row for row in data["rows"] if row["error"] is not None],
         methods=METHODS,
         depth="depth_error" in {key for point in points for key in point.mean},

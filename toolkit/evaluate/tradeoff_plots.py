@@ -84,7 +84,9 @@ def _method(axes: Axes, method: str, curve: Sequence[Point], points: Sequence[Po
     if curve:
         x, y = ([point.mean[key] for point in curve] for key in (cost, measure))
         dx, dy = ([point.spread.get(key, 0.0) for point in curve] for key in (cost, measure))
+        joined = "-" if x in (sorted(x), sorted(x, reverse=True)) else "none"  # a line back and forth would say nothing
         shown: dict[str, Any] = {
+            "linestyle": joined,
             "color": colour,
             "marker": marker,
             "markersize": 5,

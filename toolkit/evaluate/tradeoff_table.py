@@ -6,7 +6,7 @@ from typing import Any
 
 from toolkit.evaluate import words
 from toolkit.evaluate.suites.tables import machine_line
-from toolkit.evaluate.tradeoff import METHODS, Point, pareto, points_of
+from toolkit.evaluate.tradeoff import METHODS, Point, in_order, pareto, points_of
 from toolkit.evaluate.tradeoff_text import front_sentence, sentence, setting_text, steps
 
 
@@ -19,7 +19,7 @@ def tradeoff_table(data: dict[str, Any], name: str) -> str:
     lines += [f"{text}\n" for cost in ("seconds", "memory_mb") if (text := front_sentence(points, cost, "psnr", unit)) is not None]
     head = ["method", "setting", "time", "memory", "on disk", "PSNR", "SSIM", "LPIPS", *(["depth error"] if depth else []), "unbeaten in"]
     lines += ["| " + " | ".join(head) + " |", "| " + " | ".join(["---"] * len(head)) + " |"]
-    lines += ["| " + " | ".join(_cells(point, fronts, depth, unit)) + " |" for point in points if not point.shown_otherwise]
+    lines += ["| " + " | ".join(_cells(point, fronts, depth, unit)) + " |" for point in in_order(points) if not point.shown_otherwise]
     lines += ["", *(f"- {sentence(step, unit)}" for step in steps(points))]
     return "\n".join(lines).rstrip() + "\n"
 

@@ -68,8 +68,8 @@ def machine_line(machine: dict[str, Any]) -> str:
     load = machine.get("load")
     busy = "" if load is None else f", load {load:.1f} (where it is above the cores, times are upper bounds)"
     return (
-        f"Measured {machine.get('measured', '')} on {machine.get('cores')} cores with {machine.get('threads')} threads,"
-        f" {machine.get('device', 'cpu')}{busy}:"
+        f"Measured {machine.get('measured', '')} on a machine of {machine.get('cores')} cores, threads: {machine.get('threads')},"
+        f" device: {machine.get('device', 'cpu')}{busy}:"
     )
 
 
@@ -97,7 +97,8 @@ def put_between_marks(page: Path, name: str, text: str) -> None:
     try:
         old = page.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the page {page} ({error}); give a Markdown file") from error
+        reason = getattr(error, "strerror", None) or "it is not text in UTF-8"
+        raise InputError(f"cannot read the page {page} ({reason}); give a Markdown file") from error
     block = f"{begin}\n{text.strip()}\n{end}"
     if (begin in old) != (end in old) or old.count(begin) > 1 or old.count(end) > 1:
         raise InputError(f"{page} must hold both marks of {name!r} once, or neither: {begin} and {end}")
