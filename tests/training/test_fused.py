@@ -92,7 +92,7 @@ def test_gradients_agree(shell: float, threads: int, monkeypatch: pytest.MonkeyP
         counts[thread] = used  # type: ignore[index]
 
     counts: dict[int, int] = {}
-    monkeypatch.setattr("toolkit.training.fused.kernels.adam_pass", keep_sums)
+    monkeypatch.setattr("toolkit.training.fused.moves.adam_pass", keep_sums)
     engine.step_on(picks.numpy(), np.zeros(300, np.float32), RATES)
     for thread, used in counts.items():
         rows = torch.from_numpy(engine.touched[thread, :used].astype(np.int64))

@@ -100,7 +100,7 @@ def gradients(engine: FusedPerSampleOptimiser, picks: torch.Tensor, monkeypatch:
         counts[thread] = used
 
     with monkeypatch.context() as patch:
-        patch.setattr("toolkit.training.fused.kernels.adam_pass", keep_sums)
+        patch.setattr("toolkit.training.fused.moves.adam_pass", keep_sums)
         engine.step_on(picks.numpy(), np.zeros(len(picks), np.float32), RATES)
     assert len(counts) == engine.threads
     dense = [torch.zeros_like(field.density_rows), torch.zeros_like(field.feature_rows)]

@@ -14,6 +14,7 @@ from numba import njit, types
 from numba.extending import intrinsic
 
 from toolkit.render import kernels as K
+from toolkit.render.kernels_march import brick_distance
 
 F, ZERO, HALF, ONE, TWO = K.F, K.ZERO, K.HALF, K.ONE, K.TWO
 LEVELS = 255  # steps of a quantised value
@@ -151,7 +152,7 @@ def baked_march(
             n = max(max(abs(yx), abs(yy)), max(abs(yz), ONE))
             if n > far:
                 break
-            s1 = s + step * min(max(n * n * rise, ONE), K._STRETCH)
+            s1 = s + step * min(max(n * n * rise, ONE), K.STRETCH)
         if not known:
             q = ONE
             if n > ONE:
@@ -165,7 +166,7 @@ def baked_march(
         if n1 > ONE:
             q = (extent - shell / n1) / n1
         p1x, p1y, p1z = yx * q + extent, yy * q + extent, yz * q + extent
-        gap = K.brick_distance(baked.bricks, HALF * (p0x + p1x), HALF * (p0y + p1y), HALF * (p0z + p1z), per_brick)
+        gap = brick_distance(baked.bricks, HALF * (p0x + p1x), HALF * (p0y + p1y), HALF * (p0z + p1z), per_brick)
         if gap > 1:
             known = gap == 2
             p0x, p0y, p0z = p1x, p1y, p1z
@@ -177,7 +178,7 @@ def baked_march(
                     for _skip in range(gap - 2):
                         yx, yy, yz = ox + s * dx, oy + s * dy, oz + s * dz
                         n = max(max(abs(yx), abs(yy)), max(abs(yz), ONE))
-                        s += step * min(max(n * n * rise, ONE), K._STRETCH)
+                        s += step * min(max(n * n * rise, ONE), K.STRETCH)
             continue
         if s1 > near:
             cx, cy, cz = p1x - p0x, p1y - p0y, p1z - p0z

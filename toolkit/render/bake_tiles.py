@@ -10,6 +10,7 @@ from numba import njit
 
 from toolkit.render import kernels as K
 from toolkit.render.bake_kernels import VW, VX, VY, VZ, baked_march
+from toolkit.render.kernels_decode import decode, encode_direction
 
 F, ZERO, HALF, ONE = K.F, K.ZERO, K.HALF, K.ONE
 MOST_KEPT = 512  # samples of one ray that are coloured
@@ -88,8 +89,8 @@ def render_tiles(
                 share = ONE / total
                 for k in range(channels):
                     given[k] = baked.low[k] + baked.scale[k] * (given[k] * share)
-                K.encode_direction(dx, dy, dz, given[channels:])
-                K.decode(space, decoder, given, h1, h2, colour)
+                encode_direction(dx, dy, dz, given[channels:])
+                decode(space, decoder, given, h1, h2, colour)
                 for k in range(3):
                     out[pixel, k] = min(max(colour[k] * opacity + (ONE - opacity) * background[k], ZERO), ONE)
     return looked, coloured, walked

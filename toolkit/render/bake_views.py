@@ -16,6 +16,7 @@ from toolkit.render import kernels as K
 from toolkit.render.compiled import make_space, make_volume
 from toolkit.render.composite import STOP
 from toolkit.render.field import Field
+from toolkit.render.kernels_march import march_ray
 
 SEEN = 0.01  # largest weight below which a voxel is left out
 MOST_RAYS = 3_000_000  # of all views together; of more pixels a regular part is looked at
@@ -43,7 +44,7 @@ def mark_pass(space: Any, volume: Any, cameras: Any, poses: Any, first: Any, las
             dz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]
             scale = K.ONE / np.sqrt(dx * dx + dy * dy + dz * dz)
             dx, dy, dz = dx * scale, dy * scale, dz * scale
-            K.march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, K.TWO, marks, cells, rows, values, result)
+            march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, K.TWO, marks, cells, rows, values, result)
 
 
 def seen_voxels(

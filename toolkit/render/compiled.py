@@ -13,6 +13,9 @@ from toolkit.networks.decoder import Deferred
 from toolkit.render import kernels as K
 from toolkit.render.composite import STOP, THRESHOLD
 from toolkit.render.field import Field
+from toolkit.render.kernels_decode import decode, encode_direction
+from toolkit.render.kernels_lookup import gather_row
+from toolkit.render.kernels_march import march_ray
 from toolkit.volume.topology import VOXELS
 
 Tensor = torch.Tensor
@@ -106,12 +109,12 @@ def render_pass(
     for ray in range(len(origins)):
         ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
         dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-        kept = K.march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, threshold, marks, cells, rows, values, result)
+        kept = march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, threshold, marks, cells, rows, values, result)
         for c in range(channels):
             given[c] = K.ZERO
         opacity = K.ZERO
         for i in range(kept):
-            K.gather_row(space.width, volume.feature, rows, values, weights, features, i)
+            gather_row(space.width, volume.feature, rows, values, weights, features, i)
             weight = values[i, K.WEIGHT]
             opacity += weight
             for c in range(channels):
@@ -123,8 +126,8 @@ def render_pass(
             continue
         for c in range(channels):
             given[c] /= max(opacity, K.F(1e-6))
-        K.encode_direction(dx, dy, dz, given[channels:])
-        K.decode(space, decoder, given, h1, h2, colour)
+        encode_direction(dx, dy, dz, given[channels:])
+        decode(space, decoder, given, h1, h2, colour)
         for k in range(3):
             out[ray, k] = min(max(colour[k] * opacity + (K.ONE - opacity) * background[k], K.ZERO), K.ONE)
 

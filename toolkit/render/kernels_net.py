@@ -10,6 +10,8 @@ from numba import njit
 
 from toolkit.networks.decoder import FREQUENCIES
 from toolkit.render import kernels as K
+from toolkit.render.kernels_decode import sigmoid
+from toolkit.render.kernels_lookup import gather_feature
 from toolkit.render.kernels_matrix import TILE, product
 
 F, ZERO, HALF, ONE, TWO = K.F, K.ZERO, K.HALF, K.ONE, K.TWO
@@ -100,7 +102,7 @@ def decode_densities(space: Any, volume: Any, net: Net, tape: Tape, first: Any, 
     """Complete raw densities of samples first … first + count, of which the trilinear part is known: add the decoder's."""
     for i in range(first, first + count):
         x, y, z = tape.values[i, K.X], tape.values[i, K.Y], tape.values[i, K.Z]
-        K.gather_feature(space.width, volume.feature, tape.rows[i], x, y, z, tape.corners[i], tape.given[i])
+        gather_feature(space.width, volume.feature, tape.rows[i], x, y, z, tape.corners[i], tape.given[i])
         encode(space.width, tape.given[i])
     product(tape.given, first, count, net.w1, tape.h1)
     rectify(tape.h1, first, count, net.b1)
@@ -126,4 +128,4 @@ def decode_colours(net: Net, tape: Tape, count: Any) -> None:
             b += own[j] * net.w4[1, j]
             c += own[j] * net.w4[2, j]
         given = tape.given[i]
-        tape.colour[i, 0], tape.colour[i, 1], tape.colour[i, 2] = K.sigmoid(given[0] + a), K.sigmoid(given[1] + b), K.sigmoid(given[2] + c)
+        tape.colour[i, 0], tape.colour[i, 1], tape.colour[i, 2] = sigmoid(given[0] + a), sigmoid(given[1] + b), sigmoid(given[2] + c)

@@ -13,6 +13,9 @@ import numpy as np
 from numba import njit
 
 from toolkit.render import kernels as K
+from toolkit.render.kernels_decode import encode_direction
+from toolkit.render.kernels_lookup import corner_rows, raw_density
+from toolkit.render.kernels_march import brick_distance, mark, mark_surface
 from toolkit.render.kernels_matrix import TILE
 from toolkit.render.kernels_net import MOST, Net, Tape, decode_densities
 
@@ -47,18 +50,18 @@ def settle(
     for i in range(first, first + count):
         values = tape.values[i]
         raw, begin, span = values[K.RAW], values[BEGIN], values[SPAN]
-        tau = math.exp(min(raw, K._RAW_MAX)) * K._UNITS * values[K.TAU]
+        tau = math.exp(min(raw, K.RAW_MAX)) * K.UNITS * values[K.TAU]
         transmittance = light[1]
         light[0] += tau
         light[3] += ONE
         after = F(math.exp(-light[0]))
         weight = transmittance - after
-        if tau < K._THIN:
-            weight = transmittance * tau * (ONE - tau * HALF * (ONE - tau * K._THIRD))
+        if tau < K.THIN:
+            weight = transmittance * tau * (ONE - tau * HALF * (ONE - tau * K.THIRD))
         if transmittance > HALF and after <= HALF:
             light[2] = begin + span * (math.log(TWO * transmittance) / max(tau, F(1e-12)))
         if marking:
-            K.mark(marks, cells[i - first], weight)
+            mark(marks, cells[i - first], weight)
             if weight > light[4]:
                 light[4], strongest_cell = weight, cells[i - first]
         light[1] = after
@@ -148,7 +151,7 @@ def march_ray(
             n = max(max(abs(yx), abs(yy)), max(abs(yz), ONE))
             if n > far:
                 break
-            s1 = s + step * min(max(n * n * rise, ONE), K._STRETCH)
+            s1 = s + step * min(max(n * n * rise, ONE), K.STRETCH)
         if not known:
             q = ONE if n <= ONE else (extent - shell / n) / n
             p0x, p0y, p0z = yx * q + extent, yy * q + extent, yz * q + extent
@@ -159,7 +162,7 @@ def march_ray(
             if n > ONE:
                 q = (extent - shell / n) / n
         p1x, p1y, p1z = yx * q + extent, yy * q + extent, yz * q + extent
-        gap = K.brick_distance(volume.bricks, HALF * (p0x + p1x), HALF * (p0y + p1y), HALF * (p0z + p1z), per_brick)
+        gap = brick_distance(volume.bricks, HALF * (p0x + p1x), HALF * (p0y + p1y), HALF * (p0z + p1z), per_brick)
         if gap > 1:
             # What is `gap` bricks away cannot be next to the middle of any of the following gap - 2 steps.
             known = gap == 2
@@ -173,7 +176,7 @@ def march_ray(
                     for _ in range(gap - 2):
                         yx, yy, yz = ox + s * dx, oy + s * dy, oz + s * dz
                         n = max(max(abs(yx), abs(yy)), max(abs(yz), ONE))
-                        s += step * min(max(n * n * rise, ONE), K._STRETCH)
+                        s += step * min(max(n * n * rise, ONE), K.STRETCH)
             continue
         if s1 > near:
             cx, cy, cz = p1x - p0x, p1y - p0y, p1z - p0z
@@ -198,11 +201,11 @@ def march_ray(
                 cells[waiting] = cell
                 at = first + kept + waiting
                 values, rows = tape.values[at], tape.rows[at]
-                K.corner_rows(volume.upper, cell, rows)
+                corner_rows(volume.upper, cell, rows)
                 for corner in range(8):
                     K.prefetch(volume.feature, np.int64(rows[corner]))
                 values[K.X], values[K.Y], values[K.Z] = x - F(i), y - F(j), z - F(k)
-                values[K.RAW] = K.raw_density(volume, cell, x - F(i), y - F(j), z - F(k))
+                values[K.RAW] = raw_density(volume, cell, x - F(i), y - F(j), z - F(k))
                 values[K.TAU] = length
                 values[K.PLACE] = (F(step_index) + where) * unit
                 values[BEGIN], values[SPAN] = (s + (s1 - s) * F(index) * per_fine) * half, (s1 - s) * per_fine * half
@@ -223,10 +226,10 @@ def march_ray(
         more, cell = settle(space, volume, net, tape, first + kept, waiting, stop, threshold, marks, cells, light)
         kept += more
         strongest_cell = cell if cell >= 0 else strongest_cell
-    if marks.shape[0] > 0 and light[1] < K._SOLID:
-        K.mark_surface(marks, strongest_cell)
+    if marks.shape[0] > 0 and light[1] < K.SOLID:
+        mark_surface(marks, strongest_cell)
     directions = np.empty(9, np.float32)
-    K.encode_direction(dx, dy, dz, directions)
+    encode_direction(dx, dy, dz, directions)
     hidden = len(net.density)
     for i in range(first, first + kept):
         for j in range(9):

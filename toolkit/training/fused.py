@@ -15,7 +15,9 @@ from toolkit.render.compiled import decoder_arrays, make_space, make_volume, ren
 from toolkit.render.composite import STOP, THRESHOLD
 from toolkit.render.field import Field
 from toolkit.training import fused_kernels as kernels
+from toolkit.training import fused_moves as moves
 from toolkit.training.finite import broken, refuse
+from toolkit.training.fused_order import hit_codes, remember_depths
 from toolkit.training.rays import PixelPool
 from toolkit.training.step import Rates
 
@@ -73,7 +75,7 @@ class FusedOptimiser:
         self.field = field
         self.space, self.volume = make_space(field), make_volume(field)
         self.background = field.background.numpy().astype(np.float32)
-        kernels.fade(self.marks)
+        moves.fade(self.marks)
 
     @property
     def seen(self) -> torch.Tensor:
@@ -113,7 +115,7 @@ class FusedOptimiser:
         """One step on the pixels `picks` (B,) with the rays' lattices moved by `jitter` (B,)."""
         rays = len(picks)
         codes, tiles = np.empty(rays, np.uint32), np.empty(rays, np.int32)
-        kernels.hit_codes(self.space, self.pixels, picks, self.guess, self.tiles, codes, tiles)
+        hit_codes(self.space, self.pixels, picks, self.guess, self.tiles, codes, tiles)
         order = np.argsort(codes)
         picks, jitter = picks[order], jitter[order]
         losses = kernels.Losses(*(np.float32(v) for v in (rates.distortion, rates.opacity, rates.colour_threshold, STOP)))
@@ -123,7 +125,7 @@ class FusedOptimiser:
 
         def gradients(thread: int) -> tuple[int, float, int, tuple[Array, ...], str | None]:
             part = slice(cuts[thread], cuts[thread + 1])
-            kernels.forget(self.index, thread, self.touched[thread, : self.used[thread]])
+            moves.forget(self.index, thread, self.touched[thread, : self.used[thread]])
             self.used[thread], error, looked = self._gradients(thread, part, picks, jitter, losses, depths)
             weights = self._weight_gradients(thread, part)
             return self.used[thread], error, looked, weights, self._broken(thread, error, weights)
@@ -136,11 +138,11 @@ class FusedOptimiser:
             state = (self.space.width, self.volume, self.index, self.density_records, self.feature_records)
             sums = (self.touched, self.density_sums, self.feature_sums)
             state_of_thread = (thread, self.used[thread], self.records[thread])
-            self.records[thread] = kernels.adam_pass(*state, *sums, *state_of_thread, self.scales, step_sizes, *_CONSTANTS)
+            self.records[thread] = moves.adam_pass(*state, *sums, *state_of_thread, self.scales, step_sizes, *_CONSTANTS)
             if thread == self.threads - 1:
                 self._move_decoder(rates.decoder, [result[3] for result in results])
             if thread == 0:
-                kernels.remember_depths(tiles[order], depths, self.guess)
+                remember_depths(tiles[order], depths, self.guess)
 
         self._each(move)
         return sum(result[1] for result in results) / (3 * rays), sum(result[2] for result in results)
@@ -157,7 +159,7 @@ class FusedOptimiser:
         density, feature = (sums[thread, : self.used[thread]] for sums in (self.density_sums, self.feature_sums))
         own = [("a weight of the decoder", weight) for weight in (self._weights() if thread == 0 else ())]
         small = [*own, *(("the gradient of the decoder", gradient) for gradient in weights)]
-        size = error + kernels.magnitude(density) + kernels.magnitude(feature.reshape(-1)) + sum(float(np.abs(v).sum()) for _, v in small)
+        size = error + moves.magnitude(density) + moves.magnitude(feature.reshape(-1)) + sum(float(np.abs(v).sum()) for _, v in small)
         if math.isfinite(size):
             return None
         return broken(error, [("the gradient of the densities", density), ("the gradient of the features", feature), *small])
@@ -219,5 +221,5 @@ class FusedOptimiser:
         scale = np.float32(rate * np.sqrt(1 - BETAS[1] ** n) / (1 - BETAS[0] ** n))
         for weight, (first, second), *own in zip(self._weights(), self.moments, *parts, strict=True):
             gradient = np.ascontiguousarray(sum(own[1:], own[0]))
-            kernels.adam_dense(weight.reshape(-1), gradient.reshape(-1), first.reshape(-1), second.reshape(-1), scale, *_CONSTANTS)
+            moves.adam_dense(weight.reshape(-1), gradient.reshape(-1), first.reshape(-1), second.reshape(-1), scale, *_CONSTANTS)
         self._turn_decoder()

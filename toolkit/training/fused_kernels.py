@@ -1,4 +1,4 @@
-"""One optimisation step on a batch of rays, compiled: march, decode, composite, loss, all gradients, and the lazy Adam that uses them.
+"""A batch of rays of one optimisation step, compiled: march, decode, composite, loss, and all gradients.
 
 The gradients are those of `step.Optimiser` (torch, the reference), written out per ray; the equations stand there.
 """
@@ -11,10 +11,11 @@ import numpy as np
 from numba import njit
 
 from toolkit.render import kernels as K
+from toolkit.render.kernels_decode import decode, encode_direction, multiply
+from toolkit.render.kernels_lookup import gather_row
+from toolkit.render.kernels_march import march_ray
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
-COUNT, FIRST, SECOND = 0, 1, 2  # columns of a row's density record: steps, both moments
-AHEAD = 8  # rows for which memory is asked before they are needed
 
 
 class Pixels(NamedTuple):
@@ -78,10 +79,10 @@ def _decoder_backward(space: Any, decoder: Any, h1: Any, h2: Any, g_logit: Any, 
     for j in range(hidden):
         total = a * decoder.w3[0, j] + b * decoder.w3[1, j] + c * decoder.w3[2, j]
         g2[j] = total if h2[j] > ZERO else ZERO
-    K.multiply(space.hidden, space.hidden, decoder.w2, g2, g1)
+    multiply(space.hidden, space.hidden, decoder.w2, g2, g1)
     for i in range(hidden):
         g1[i] = g1[i] if h1[i] > ZERO else ZERO
-    K.multiply(space.width, space.hidden, decoder.w1, g1, g_given)
+    multiply(space.width, space.hidden, decoder.w1, g1, g_given)
     g_given[0] += a
     g_given[1] += b
     g_given[2] += c
@@ -135,7 +136,7 @@ def gradient_pass(
     for number in range(len(picks)):
         pick = picks[number]
         pixel_ray(pixels, pick, ray)
-        kept = K.march_ray(
+        kept = march_ray(
             space,
             volume,
             ray[0],
@@ -163,7 +164,7 @@ def gradient_pass(
             given[c] = ZERO
         opacity = ZERO
         for i in range(kept):
-            K.gather_row(space.width, volume.feature, rows, values, weights, features, i)
+            gather_row(space.width, volume.feature, rows, values, weights, features, i)
             for corner in range(8):
                 K.prefetch(index, np.int64(rows[i, corner]))
             weight = values[i, K.WEIGHT]
@@ -173,8 +174,8 @@ def gradient_pass(
         scale = ONE / max(opacity, F(1e-6))
         for c in range(channels):
             given[c] *= scale
-        K.encode_direction(ray[3], ray[4], ray[5], given[channels:])
-        K.decode(space, decoder, given, h1, h2, colour)
+        encode_direction(ray[3], ray[4], ray[5], given[channels:])
+        decode(space, decoder, given, h1, h2, colour)
         # loss: mean over rays and channels of the squared error
         g_opacity = -(ONE - opacity) * opacity_loss
         for k in range(3):
@@ -204,7 +205,7 @@ def gradient_pass(
             weight, place = values[i, K.WEIGHT], values[i, K.PLACE]
             after, after_place = total - before - weight, total_place - before_place - weight * place
             pull = place * (before - after) - (before_place - after_place)
-            g_weight[i] = g + TWO * distortion * (pull + weight * spread * K._THIRD)
+            g_weight[i] = g + TWO * distortion * (pull + weight * spread * K.THIRD)
             before += weight
             before_place += weight * place
         # ∂L/∂τ_i = T_i e^{-τ_i} g_i - Σ_{j>i} w_j g_j, far to near; then to the lattice
@@ -213,7 +214,7 @@ def gradient_pass(
             i = kept - 1 - back
             weight, raw = values[i, K.WEIGHT], values[i, K.RAW]
             g_raw = (values[i, K.AFTER] * g_weight[i] - behind) * values[i, K.TAU]
-            if raw >= K._RAW_MAX:
+            if raw >= K.RAW_MAX:
                 g_raw = ZERO
             behind += weight * g_weight[i]
             for corner in range(8):
@@ -235,171 +236,6 @@ def gradient_pass(
                 for c in range(channels):
                     feature_sums[at, c] += share * g_given[c]
     return used, error, looked
-
-
-@njit(**K.OPTIONS)
-def adam_pass(
-    width: Any,
-    volume: Any,
-    index: Any,
-    density_records: Any,
-    feature_records: Any,
-    touched: Any,
-    density_sums: Any,
-    feature_sums: Any,
-    thread: Any,
-    used: Any,
-    records: Any,
-    scales: Any,
-    rates: Any,
-    b1: Any,
-    b2: Any,
-    epsilon: Any,
-) -> Any:
-    """Lazy Adam on rows that thread `thread` touched. A row that several touched is moved by the first of them, with the sum in their
-    order, so that the result depends on the number of threads alone.
-
-    Args:
-        index: (M · 512 + 1, threads + 1) int32; column 0 is a row's Adam record, −1: it has none yet.
-        density_records: (K, 3) float32; feature_records: (K, 2 C) float32, first moments, then second.
-        touched, density_sums, feature_sums: (threads, …) of all `Gradients`.
-        records: how many this thread has given to rows so far; threads take turns in the order of records, so that none asks another.
-        scales: (S,) float32 bias correction sqrt(1 - b2^n) / (1 - b1^n) for n steps; the last one beyond.
-        rates: (2,) float32 of density and features.
-
-    Returns:
-        `records` after this pass.
-    """
-    channels = len(width)
-    density, feature = volume.density, volume.feature
-    c1, c2 = ONE - b1, ONE - b2
-    threads = index.shape[1] - 1
-    for at in range(used):
-        if at + AHEAD < used:
-            later = np.int64(touched[thread, at + AHEAD])
-            record = np.int64(index[later, 0])
-            K.prefetch(feature_records, record)
-            K.prefetch_half(feature_records, record)
-            K.prefetch(density_records, record)
-            K.prefetch(feature, later)
-        row = touched[thread, at]
-        mine = True
-        for other in range(threads):
-            if other == thread:
-                continue
-            twin = index[row, other + 1]
-            if twin >= 0:
-                if other < thread:
-                    mine = False
-                    break
-                density_sums[thread, at] += density_sums[other, twin]
-                for c in range(channels):
-                    feature_sums[thread, at, c] += feature_sums[other, twin, c]
-        if not mine:
-            continue
-        place = np.int64(index[row, 0])
-        if place < 0:
-            place = records * threads + thread
-            index[row, 0] = place
-            records += 1
-        steps = density_records[place, COUNT] + ONE
-        scale = scales[min(int(steps), len(scales) - 1)]
-        g = density_sums[thread, at]
-        m = b1 * density_records[place, FIRST] + c1 * g
-        v = b2 * density_records[place, SECOND] + c2 * g * g
-        density_records[place, COUNT], density_records[place, FIRST], density_records[place, SECOND] = steps, m, v
-        density[row] -= rates[0] * scale * m / (np.sqrt(v) + epsilon)
-        step = rates[1] * scale
-        for c in range(channels):
-            g = feature_sums[thread, at, c]
-            m = b1 * feature_records[place, c] + c1 * g
-            v = b2 * feature_records[place, channels + c] + c2 * g * g
-            feature_records[place, c], feature_records[place, channels + c] = m, v
-            feature[row, c] -= step * m / (np.sqrt(v) + epsilon)
-    return records
-
-
-@njit(**K.OPTIONS)
-def magnitude(values: Any) -> Any:
-    """Sum of the absolute values of (N,) float32: NaN or infinite where one of them is, or where they are huge."""
-    total = ZERO
-    for at in range(len(values)):
-        total += abs(values[at])
-    return total
-
-
-@njit(**K.OPTIONS)
-def forget(index: Any, thread: Any, touched: Any) -> None:
-    """Make `index` good for the next batch."""
-    for at in range(len(touched)):
-        index[touched[at], thread + 1] = -1
-
-
-@njit(**K.OPTIONS)
-def fade(marks: Any) -> None:
-    """Halve weights and visits of all marks (threads, M · 512)."""
-    for thread in range(marks.shape[0]):
-        own = marks[thread]
-        for row in range(len(own)):
-            own[row] = (own[row] >> np.uint16(1)) & np.uint16(0xFFF7) & np.uint16(0x7FFF)
-
-
-@njit(**K.OPTIONS)
-def _spread_bits(value: Any) -> Any:
-    """10 bits → every third bit."""
-    v = np.uint32(value)
-    v = (v | (v << np.uint32(16))) & np.uint32(0x030000FF)
-    v = (v | (v << np.uint32(8))) & np.uint32(0x0300F00F)
-    v = (v | (v << np.uint32(4))) & np.uint32(0x030C30C3)
-    return (v | (v << np.uint32(2))) & np.uint32(0x09249249)
-
-
-@njit(**K.OPTIONS)
-def hit_codes(space: Any, pixels: Any, picks: Any, guess: Any, grid: Any, codes: Any, tiles: Any) -> None:
-    """Morton codes of where rays are expected to hit: rays that look at the same place come one after the other, so that the memory
-    which they share is still in the cache.
-
-    Args:
-        guess: (V · gh · gw,) float32 distances last seen from each view, in tiles of `cell` pixels; 0: unknown.
-        grid: ints gh, gw, cell.
-        codes: (B,) uint32 and tiles: (B,) int32, a pixel's place in `guess`: filled here.
-    """
-    ray = np.empty(6, np.float32)
-    top = F(1023)
-    high, wide, cell = np.int32(grid[0]), np.int32(grid[1]), np.int32(grid[2])
-    for index in range(len(picks)):
-        if index + AHEAD < len(picks):
-            later = picks[index + AHEAD]
-            K.prefetch(pixels.place, later)
-            K.prefetch(pixels.source, later)
-            K.prefetch(pixels.colour, later)
-        pick = picks[index]
-        pixel_ray(pixels, pick, ray)
-        view, place = pixels.source[pick], pixels.place[pick]
-        width = np.int32(pixels.camera[view, 4])
-        row = place // width
-        column = place - row * width
-        tile = (view * high + row // cell) * wide + column // cell
-        tiles[index] = tile
-        t = guess[tile] / space.half
-        x = (ray[0] - space.cx) / space.half + t * ray[3]
-        y = (ray[1] - space.cy) / space.half + t * ray[4]
-        z = (ray[2] - space.cz) / space.half + t * ray[5]
-        n = max(max(abs(x), abs(y)), max(abs(z), ONE))
-        q = (space.extent - space.shell / n) / n * (top / (TWO * space.extent))
-        centre = top * K.HALF
-        i = int(min(max(x * q + centre, ZERO), top))
-        j = int(min(max(y * q + centre, ZERO), top))
-        k = int(min(max(z * q + centre, ZERO), top))
-        codes[index] = _spread_bits(i) | (_spread_bits(j) << np.uint32(1)) | (_spread_bits(k) << np.uint32(2))
-
-
-@njit(**K.OPTIONS)
-def remember_depths(tiles: Any, depths: Any, guess: Any) -> None:
-    """Write the distances (B,) that a batch saw into `guess`, at its tiles (B,)."""
-    for index in range(len(tiles)):
-        if depths[index] > ZERO:
-            guess[tiles[index]] = depths[index]
 
 
 @njit(**K.OPTIONS)
@@ -430,13 +266,3 @@ def add_products(columns: Any, inputs: Any, gradients: Any, weight: Any, bias: A
                 weight[i, j] += a * gradients[ray, j]
         for j in range(outputs):
             bias[j] += gradients[ray, j]
-
-
-@njit(**K.OPTIONS)
-def adam_dense(values: Any, gradient: Any, first: Any, second: Any, rate: Any, b1: Any, b2: Any, epsilon: Any) -> None:
-    """Adam on all of `values`, (N,) like the others; the bias correction is part of `rate`."""
-    for i in range(len(values)):
-        g = gradient[i]
-        first[i] = b1 * first[i] + (ONE - b1) * g
-        second[i] = b2 * second[i] + (ONE - b2) * g * g
-        values[i] -= rate * first[i] / (np.sqrt(second[i]) + epsilon)

@@ -149,7 +149,7 @@ def ray_backward(
         g_logit[i, 2] = weight * g_blue * c * (ONE - c)
         after, after_place = total - before - weight, total_place - before_place - weight * place
         pull = place * (before - after) - (before_place - after_place)
-        g_raw[i] = g_red * a + g_green * b + g_blue * c + constant + TWO * distortion * (pull + weight * spread * K._THIRD)
+        g_raw[i] = g_red * a + g_green * b + g_blue * c + constant + TWO * distortion * (pull + weight * spread * K.THIRD)
         before += weight
         before_place += weight * place
     # so far ∂L/∂w; ∂L/∂τ_i = T_i e^{-τ_i} g_i - Σ_{j>i} w_j g_j, far to near
@@ -158,7 +158,7 @@ def ray_backward(
         i = last - 1 - back
         values = tape.values[i]
         g = g_raw[i]
-        g_raw[i] = (values[K.AFTER] * g - behind) * values[K.TAU] if values[K.RAW] < K._RAW_MAX else ZERO
+        g_raw[i] = (values[K.AFTER] * g - behind) * values[K.TAU] if values[K.RAW] < K.RAW_MAX else ZERO
         behind += values[K.WEIGHT] * g
     return red * red + green * green + blue * blue
 

@@ -1,0 +1,131 @@
+"""What follows the gradients of a step, compiled: lazy Adam on the rows that were touched, Adam on the decoder, and clean-up."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from toolkit.render import kernels as K
+
+ZERO, ONE = K.ZERO, K.ONE
+COUNT, FIRST, SECOND = 0, 1, 2  # columns of a row's density record: steps, both moments
+AHEAD = 8  # rows for which memory is asked before they are needed
+
+
+@njit(**K.OPTIONS)
+def adam_pass(
+    width: Any,
+    volume: Any,
+    index: Any,
+    density_records: Any,
+    feature_records: Any,
+    touched: Any,
+    density_sums: Any,
+    feature_sums: Any,
+    thread: Any,
+    used: Any,
+    records: Any,
+    scales: Any,
+    rates: Any,
+    b1: Any,
+    b2: Any,
+    epsilon: Any,
+) -> Any:
+    """Lazy Adam on rows that thread `thread` touched. A row that several touched is moved by the first of them, with the sum in their
+    order, so that the result depends on the number of threads alone.
+
+    Args:
+        index: (M · 512 + 1, threads + 1) int32; column 0 is a row's Adam record, −1: it has none yet.
+        density_records: (K, 3) float32; feature_records: (K, 2 C) float32, first moments, then second.
+        touched, density_sums, feature_sums: (threads, …) of all `Gradients`.
+        records: how many this thread has given to rows so far; threads take turns in the order of records, so that none asks another.
+        scales: (S,) float32 bias correction sqrt(1 - b2^n) / (1 - b1^n) for n steps; the last one beyond.
+        rates: (2,) float32 of density and features.
+
+    Returns:
+        `records` after this pass.
+    """
+    channels = len(width)
+    density, feature = volume.density, volume.feature
+    c1, c2 = ONE - b1, ONE - b2
+    threads = index.shape[1] - 1
+    for at in range(used):
+        if at + AHEAD < used:
+            later = np.int64(touched[thread, at + AHEAD])
+            record = np.int64(index[later, 0])
+            K.prefetch(feature_records, record)
+            K.prefetch_half(feature_records, record)
+            K.prefetch(density_records, record)
+            K.prefetch(feature, later)
+        row = touched[thread, at]
+        mine = True
+        for other in range(threads):
+            if other == thread:
+                continue
+            twin = index[row, other + 1]
+            if twin >= 0:
+                if other < thread:
+                    mine = False
+                    break
+                density_sums[thread, at] += density_sums[other, twin]
+                for c in range(channels):
+                    feature_sums[thread, at, c] += feature_sums[other, twin, c]
+        if not mine:
+            continue
+        place = np.int64(index[row, 0])
+        if place < 0:
+            place = records * threads + thread
+            index[row, 0] = place
+            records += 1
+        steps = density_records[place, COUNT] + ONE
+        scale = scales[min(int(steps), len(scales) - 1)]
+        g = density_sums[thread, at]
+        m = b1 * density_records[place, FIRST] + c1 * g
+        v = b2 * density_records[place, SECOND] + c2 * g * g
+        density_records[place, COUNT], density_records[place, FIRST], density_records[place, SECOND] = steps, m, v
+        density[row] -= rates[0] * scale * m / (np.sqrt(v) + epsilon)
+        step = rates[1] * scale
+        for c in range(channels):
+            g = feature_sums[thread, at, c]
+            m = b1 * feature_records[place, c] + c1 * g
+            v = b2 * feature_records[place, channels + c] + c2 * g * g
+            feature_records[place, c], feature_records[place, channels + c] = m, v
+            feature[row, c] -= step * m / (np.sqrt(v) + epsilon)
+    return records
+
+
+@njit(**K.OPTIONS)
+def adam_dense(values: Any, gradient: Any, first: Any, second: Any, rate: Any, b1: Any, b2: Any, epsilon: Any) -> None:
+    """Adam on all of `values`, (N,) like the others; the bias correction is part of `rate`."""
+    for i in range(len(values)):
+        g = gradient[i]
+        first[i] = b1 * first[i] + (ONE - b1) * g
+        second[i] = b2 * second[i] + (ONE - b2) * g * g
+        values[i] -= rate * first[i] / (np.sqrt(second[i]) + epsilon)
+
+
+@njit(**K.OPTIONS)
+def forget(index: Any, thread: Any, touched: Any) -> None:
+    """Make `index` good for the next batch."""
+    for at in range(len(touched)):
+        index[touched[at], thread + 1] = -1
+
+
+@njit(**K.OPTIONS)
+def fade(marks: Any) -> None:
+    """Halve weights and visits of all marks (threads, M · 512)."""
+    for thread in range(marks.shape[0]):
+        own = marks[thread]
+        for row in range(len(own)):
+            own[row] = (own[row] >> np.uint16(1)) & np.uint16(0xFFF7) & np.uint16(0x7FFF)
+
+
+@njit(**K.OPTIONS)
+def magnitude(values: Any) -> Any:
+    """Sum of the absolute values of (N,) float32: NaN or infinite where one of them is, or where they are huge."""
+    total = ZERO
+    for at in range(len(values)):
+        total += abs(values[at])
+    return total
