@@ -40,14 +40,16 @@ def uses_network(job: Job, views: Views) -> bool:
     Raises:
         InputError: the settings contradict each other.
     """
-    from toolkit.training.network_start import FEW_VIEWS
+    from toolkit.training.start import FEW_VIEWS
 
     settings = job.settings
     if settings.field.init == "classical" and not settings.fit.finetune:
         raise InputError("without fine-tuning the networks' field is the result, so init cannot be 'classical'; drop one of the two")
     if settings.field.init != "auto":
         return settings.field.init == "network"
-    return not settings.fit.finetune or int(np.count_nonzero(~np.asarray(views.test))) <= FEW_VIEWS
+    if job.plan is not None and settings.fit.finetune:
+        return False  # the seconds of the whole run are planned, and the networks' are not among them
+    return not settings.fit.finetune or int(np.count_nonzero(~np.asarray(views.test))) < FEW_VIEWS
 
 
 def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:

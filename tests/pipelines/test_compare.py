@@ -24,7 +24,7 @@ from toolkit.files import read_json, write_json
 from toolkit.tsdf.mesh import Mesh
 
 Capsys = pytest.CaptureFixture[str]
-PAIRS = ["fit.budget=3", "field.resolution=32", "export.mesh_views=8"]
+PAIRS = ["init=classical", "fit.budget=3", "field.resolution=32", "export.mesh_views=8"]
 SMALL = ["--holdout", "4", "--threads", "1", *(word for pair in PAIRS for word in ("--set", pair))]
 
 

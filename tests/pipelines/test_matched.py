@@ -59,6 +59,6 @@ def test_a_surface_from_pictures_alone(tmp_path: Path, capsys: Capsys) -> None:
 def test_without_being_asked_nothing_is_matched(tmp_path: Path, capsys: Capsys) -> None:
     make_corner(tmp_path / "corner", 6)
     out = tmp_path / "out"
-    options = ["--holdout", "3", "--quiet", "--set", "fit.budget=1", "--set", "field.resolution=32"]
+    options = ["--holdout", "3", "--quiet", "--set", "init=classical", "--set", "fit.budget=1", "--set", "field.resolution=32"]
     assert call(capsys, "run", tmp_path / "corner", "--out", out, *options, "--set", "export.formats=[]").code == 0
     assert not (out / "stereo").exists() and read_json(out / "report.json")["evaluation"]["tsdf"] is None

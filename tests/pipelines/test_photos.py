@@ -18,7 +18,7 @@ from tests.pipelines.made import CAMERA, call, circle, command, environment, loo
 
 Capsys = pytest.CaptureFixture[str]
 PHOTO = CAMERA.scaled(288, 216)
-SHORT = ["--budget", "2", "--threads", "1", "--image-size", "96", "--set", "export.formats=[cameras]", "--quiet"]
+SHORT = ["--budget", "2", "--threads", "1", "--image-size", "96", "--init", "classical", "--set", "export.formats=[cameras]", "--quiet"]
 
 
 def as_json(text: str) -> dict[str, Any]:

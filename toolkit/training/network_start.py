@@ -23,7 +23,6 @@ from toolkit.volume.edit import resample
 Tensor = torch.Tensor
 THIN = -4.5  # raw density of what is see-through or unknown, as in the classical start
 THICK = 2.0  # largest raw density of the start
-FEW_VIEWS = 12  # training views up to which the networks' start beats the classical one (docs/few_views.md)
 RESOLUTION = 64  # level of the fit at which the networks' field comes in
 
 
