@@ -115,10 +115,12 @@ def tradeoff_run(
         if surface == "tsdf_stereo":
             match_pictures(job, scene, views)
         stereo = job.stages.records["stereo"].seconds if "stereo" in job.stages.records else 0.0
-        swept = Swept([], [])
+        swept, wanted = Swept([], []), plan(chosen, ladder, seeds, surface)
         try:
-            sweep(job, plan(chosen, ladder, seeds, surface), stereo, budget, swept)
+            sweep(job, wanted, stereo, budget, swept)
         finally:
+            done = {(row["id"], row["seed"]) for row in swept.rows}
+            swept.left_out = [one.name for one in wanted if (one.id, one.seed) not in done]
             # What was measured is shown, however the sweep ends.
             data = put(
                 job, swept, capture, poses, scene, views, [f"The axis {name} was not varied: {why}." for name, why in why_not.items()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -107,7 +108,8 @@ def measure(job: Job, one: Wanted, spec: dict[str, Any], expected: float) -> lis
     path = place(job, one)
     path.parent.mkdir(parents=True, exist_ok=True)
     ask, answer, log = (
-        path.with_name(f".tmp-{name}-{one.name}.{suffix}") for name, suffix in (("job", "json"), ("answer", "json"), ("log", "txt"))
+        path.with_name(f".tmp-{os.getpid()}-{name}-{one.name}.{suffix}")
+        for name, suffix in (("job", "json"), ("answer", "json"), ("log", "txt"))
     )
     try:
         write_json(ask, {**spec, "answer": str(answer)})
