@@ -4,20 +4,12 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from pipelines.baking import SEEN
 from pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
-
-if TYPE_CHECKING:
-    from pipelines.job import Job
-    from toolkit.capture.types import Views
-    from toolkit.poses.scene import Scene
-    from toolkit.render.bake import BakedField
-    from toolkit.render.field import Field
-
-SEEN = 0.01  # see --seen
 
 
 def bake(
@@ -63,6 +55,7 @@ def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: floa
     import numpy as np
     import torch
 
+    from pipelines.baking import default_place, write
     from pipelines.console import make_progress
     from pipelines.job import open_job
     from pipelines.reconstruct import BEFORE, stand
@@ -101,40 +94,3 @@ def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: floa
         "psnr": None if mean is None else round(float(mean[0]), 3),
         "loss": None if mean is None else round(float(mean[0] - mean[1]), 3),
     }
-
-
-def default_place(job: Job) -> Path:
-    """Where a run's baked field lies."""
-    return job.folder / "exports" / "baked.safetensors"
-
-
-def write(job: Job, field: Field, views: Views, scene: Scene, seen: float, place: Path) -> BakedField:
-    """Bake `field` (on the CPU) into the file `place` and open that.
-
-    Raises:
-        InputError: a decoder that cannot be baked.
-        OutputError: the file cannot be written.
-    """
-    import numpy as np
-    import torch
-
-    from toolkit.render.bake import bake as quantise
-    from toolkit.render.bake_file import read_baked, write_baked
-    from toolkit.render.bake_views import seen_voxels
-
-    keep, train = None, np.flatnonzero(~views.test)
-    if seen > 0:
-        lenses = [views.intrinsics[i] for i in train]
-        keep = seen_voxels(field, lenses, views.world_from_camera[train], seen, torch.get_num_threads(), job.progress)
-    write_baked(place, quantise(field, keep), scene.working_from_input)
-    return read_baked(place)
-
-
-def baked_of(job: Job, field: Field, views: Views, scene: Scene) -> BakedField:
-    """The run's baked field; made first where there is none, or one of an earlier fit."""
-    from toolkit.render.bake_file import read_baked
-
-    place, source = default_place(job), job.folder / "field.safetensors"
-    if place.is_file() and source.is_file() and place.stat().st_mtime_ns >= source.stat().st_mtime_ns:
-        return read_baked(place)
-    return write(job, field.to("cpu"), views, scene, SEEN, place)

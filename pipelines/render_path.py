@@ -3,32 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.bake import baked_of
 from pipelines.console import make_progress
 from pipelines.job import Job, open_job
+from pipelines.pictures import Camera, camera_of, orbit_cameras, pictures
 from pipelines.reconstruct import BEFORE, stand
-from pipelines.rendered import file_name, to_picture, write_png
+from pipelines.rendered import file_name, write_png
 from pipelines.steps_results import fit_radiance_field
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture import nerf_json
 from toolkit.errors import InputError
 from toolkit.files import read_json
-from toolkit.progress import Progress
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Views
-    from toolkit.poses.scene import Scene
-    from toolkit.render.field import Field
-
-Camera = Callable[[Intrinsics, Array], Any]  # lens, pose → a `Rendered`
 
 VIDEO = (".mp4",)
 MAX_CAMERAS = 100_000
@@ -83,16 +75,6 @@ def render_run(
     return {"pictures": len(names), "width": lenses[0].width, "height": lenses[0].height, "seconds": round(seconds, 3), "to": str(place)}
 
 
-def camera_of(job: Job, field: Field, views: Views, scene: Scene, baked: bool) -> Camera:
-    """What takes pictures of the field, or of its baked copy."""
-    from toolkit.render.bake_image import BakedRenderer
-    from toolkit.render.image import make_renderer, render_view
-
-    if baked:
-        return BakedRenderer(baked_of(job, field, views, scene)).render
-    return partial(render_view, field, view=make_renderer(field))
-
-
 def write(job: Job, camera: Camera, names: list[str], lenses: list[Intrinsics], poses: Array, to: Path, fps: float) -> None:
     """Render every camera and write it as it comes."""
     frames = pictures(camera, lenses, poses, job.progress)
@@ -107,14 +89,6 @@ def write(job: Job, camera: Camera, names: list[str], lenses: list[Intrinsics], 
         write_png(to / f"{index:04d}_{file_name(Path(name).stem)}.png", frame)
 
 
-def pictures(camera: Camera, lenses: list[Intrinsics], poses: Array, progress: Progress) -> Iterator[Array]:
-    """(H, W, 3) uint8 for each camera (working frame), one at a time."""
-    for index, (lens, pose) in enumerate(zip(lenses, poses, strict=True)):
-        progress.check()
-        progress.update(index, len(lenses))
-        yield to_picture(camera(lens, pose)).rgb
-
-
 def sized(lens: Intrinsics, long_side: int | None) -> Intrinsics:
     """The camera for pictures with this long side, pinhole."""
     lens = lens.pinhole()
@@ -122,11 +96,6 @@ def sized(lens: Intrinsics, long_side: int | None) -> Intrinsics:
         return lens
     factor = long_side / max(lens.width, lens.height)
     return lens.scaled(max(1, round(lens.width * factor)), max(1, round(lens.height * factor)))
-
-
-def even(lens: Intrinsics) -> Intrinsics:
-    """The camera without its last odd row and column: video formats store colour at half the size."""
-    return replace(lens, width=max(2, lens.width // 2 * 2), height=max(2, lens.height // 2 * 2))
 
 
 def test_cameras(views: Views) -> tuple[list[str], list[Intrinsics], Array]:
@@ -139,15 +108,6 @@ def test_cameras(views: Views) -> tuple[list[str], list[Intrinsics], Array]:
     if len(indices) == 0:
         raise InputError("this run has no held-out views to render; use --views orbit, or run again with --holdout 8")
     return [views.names[i] for i in indices], [views.intrinsics[i] for i in indices], views.world_from_camera[indices]
-
-
-def orbit_cameras(views: Views, scene: Scene, frames: int) -> tuple[list[str], list[Intrinsics], Array]:
-    """A closed path around what the training cameras look at."""
-    from toolkit.render.paths import orbit
-
-    poses = orbit(views.world_from_camera, scene.centre, frames)
-    lens = even(views.intrinsics[0])
-    return [f"orbit_{index:03d}" for index in range(len(poses))], [lens] * len(poses), poses
 
 
 def read_cameras(path: Path) -> tuple[list[str], list[Intrinsics], Array]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.job import Job
-from pipelines.render_path import camera_of, orbit_cameras, pictures
+from pipelines.pictures import camera_of, orbit_cameras, pictures
 from pipelines.rendered import Pictures, to_picture
 from pipelines.summary import put_cameras
 from toolkit.camera import Intrinsics, Similarity

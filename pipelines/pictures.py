@@ -1,0 +1,53 @@
+"""Pictures of a field along a path of cameras, one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from pipelines.baking import baked_of
+from pipelines.rendered import to_picture
+from toolkit.camera import Array, Intrinsics
+from toolkit.progress import Progress
+
+if TYPE_CHECKING:
+    from pipelines.job import Job
+    from toolkit.capture.types import Views
+    from toolkit.poses.scene import Scene
+    from toolkit.render.field import Field
+
+Camera = Callable[[Intrinsics, Array], Any]  # lens, pose → a `Rendered`
+
+
+def camera_of(job: Job, field: Field, views: Views, scene: Scene, baked: bool) -> Camera:
+    """What takes pictures of the field, or of its baked copy."""
+    from toolkit.render.bake_image import BakedRenderer
+    from toolkit.render.image import make_renderer, render_view
+
+    if baked:
+        return BakedRenderer(baked_of(job, field, views, scene)).render
+    return partial(render_view, field, view=make_renderer(field))
+
+
+def pictures(camera: Camera, lenses: list[Intrinsics], poses: Array, progress: Progress) -> Iterator[Array]:
+    """(H, W, 3) uint8 for each camera (working frame), one at a time."""
+    for index, (lens, pose) in enumerate(zip(lenses, poses, strict=True)):
+        progress.check()
+        progress.update(index, len(lenses))
+        yield to_picture(camera(lens, pose)).rgb
+
+
+def even(lens: Intrinsics) -> Intrinsics:
+    """The camera without its last odd row and column: video formats store colour at half the size."""
+    return replace(lens, width=max(2, lens.width // 2 * 2), height=max(2, lens.height // 2 * 2))
+
+
+def orbit_cameras(views: Views, scene: Scene, frames: int) -> tuple[list[str], list[Intrinsics], Array]:
+    """A closed path around what the training cameras look at."""
+    from toolkit.render.paths import orbit
+
+    poses = orbit(views.world_from_camera, scene.centre, frames)
+    lens = even(views.intrinsics[0])
+    return [f"orbit_{index:03d}" for index in range(len(poses))], [lens] * len(poses), poses
