@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 def info(
     target: Annotated[Path, typer.Argument(metavar="SOURCE", help="A source, or the folder of an earlier run.", show_default=False)],
     fast: Annotated[bool, typer.Option("--fast", help="Read headers only; pictures are not looked at for damage.")] = False,
+    effects: Annotated[bool, typer.Option("--effects", help="Look for effects of camera and light, with the evidence of each.")] = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -23,11 +24,19 @@ def info(
     from pipelines.folder import is_run_folder
 
     data = run_facts(target) if is_run_folder(target) else source_facts(target, fast, quiet or json)
+    if effects:
+        from pipelines.effects_table import effects_facts
+
+        data["effects"] = effects_facts(target, quiet or json)
     if json:
         import json as writer
 
         typer.echo(writer.dumps(data, indent=1))
     else:
+        if effects:
+            from pipelines.effects_table import show
+
+            show(data.pop("effects"))
         for key, value in data.items():
             for line in lines(key, value):
                 typer.echo(line)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pipelines.console import ConsoleProgress
 from pipelines.job import Job, open_job
 from pipelines.steps_capture import choose_frames, choose_keyframes, find_camera_poses, find_capture, make_views, measure_scene
+from pipelines.steps_effects import find_effects, refine
 from pipelines.steps_network import make_network_field, render_network_views, uses_network
 from pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views, score_pictures, wants_tsdf
 from pipelines.steps_stereo import reuse_matched
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from toolkit.poses.result import PoseResult
     from toolkit.poses.scene import Scene
 
-BEFORE = ("capture", "frames", "poses", "scene", "keyframes", "views")  # what every result stands on
+BEFORE = ("capture", "frames", "poses", "effects", "scene", "keyframes", "views")  # what every result stands on
 RESULTS = ("tsdf", "field", "render", "export")
 FOR_FIELD = ("network", "direct")  # made with the field
 ALL = frozenset(RESULTS)
@@ -55,8 +56,10 @@ def stand(job: Job) -> tuple[Capture, PoseResult, Capture, Scene, Views]:
     capture = choose_frames(job, capture)
     poses = find_camera_poses(job, capture)
     posed = limited(poses.apply(capture), job.settings.capture.holdout, job.settings.views.limit)
+    corrections = find_effects(job, posed)
+    poses, posed = refine(poses, corrections), corrections.on_capture(posed)
     scene = measure_scene(job, posed)
-    return capture, poses, posed, scene, make_views(job, posed, scene)
+    return capture, poses, posed, scene, make_views(job, posed, scene, corrections)
 
 
 def reconstruct_poses(job: Job) -> dict[str, Any]:

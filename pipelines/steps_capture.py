@@ -14,6 +14,7 @@ from toolkit.files import fingerprint, read_json, write_json
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Capture, Views
+    from toolkit.effects.correct import Corrections
     from toolkit.keyframes import KeyFrames
     from toolkit.poses.result import PoseResult
     from toolkit.poses.scene import Scene
@@ -124,7 +125,8 @@ def measure_scene(job: Job, posed: Capture) -> Scene:
         return describe_scene(posed, job.progress)
 
     uses = limit_of(job)
-    return job.stages.run("scene", make=make, save=save, load=lambda: Scene.from_dict(read_json(path)), uses=uses, after=["poses"])
+    after = last_of(job, "poses", "effects")
+    return job.stages.run("scene", make=make, save=save, load=lambda: Scene.from_dict(read_json(path)), uses=uses, after=after)
 
 
 def limit_of(job: Job) -> list[int] | None:
@@ -179,8 +181,8 @@ def choose_keyframes(job: Job, scene: Scene, views: Views) -> KeyFrames:
     return job.keys
 
 
-def make_views(job: Job, posed: Capture, scene: Scene) -> Views:
-    """Pictures undistorted and resized once, in the working frame, test views marked."""
+def make_views(job: Job, posed: Capture, scene: Scene, corrections: Corrections | None = None) -> Views:
+    """Pictures undistorted and resized once, in the working frame, test views marked, with `corrections` of colour."""
     from toolkit.capture.prepare import prepare_views
     from toolkit.capture.views_file import load_views, save_views
 
@@ -191,13 +193,18 @@ def make_views(job: Job, posed: Capture, scene: Scene) -> Views:
         return [path]
 
     settings = job.settings.capture
+
+    def make() -> Views:
+        views = prepare_views(posed, scene.working_from_input, settings, job.progress)
+        return views if corrections is None else corrections.on_views(views)
+
     return job.stages.run(
         "views",
-        make=lambda: prepare_views(posed, scene.working_from_input, settings, job.progress),
+        make=make,
         save=save,
         load=lambda: load_views(path),
         uses=[settings.image_size, settings.holdout, limit_of(job), pixel_state(posed)],
-        after=["poses", "scene"],
+        after=last_of(job, "poses", "effects", "scene"),
     )
 
 

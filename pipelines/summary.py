@@ -13,6 +13,7 @@ import numpy as np
 from pipelines.folder import command_line
 from pipelines.job import Job
 from pipelines.rendered import Pictures
+from pipelines.steps_effects import effects_part, effects_warnings
 from pipelines.steps_results import fit_notes
 from toolkit import __version__
 from toolkit.config import settings_dict
@@ -109,7 +110,7 @@ def unique(texts: list[str]) -> list[str]:
 
 def warnings_of(job: Job, capture: Capture, poses: PoseResult, scene: Scene, views: Views) -> list[str]:
     """Everything that a reader of the numbers has to know."""
-    texts = [*capture.warnings, *poses.warnings, *scene.warnings, *fit_notes(job)]
+    texts = [*capture.warnings, *poses.warnings, *effects_warnings(job), *scene.warnings, *fit_notes(job)]
     if not np.any(views.test):
         texts.append(NO_TEST_VIEWS)
     elif poses.source == "sfm":
@@ -172,6 +173,7 @@ def put_report(
         **base_data(job, capture, poses),
         "warnings": warnings_of(job, capture, poses, scene, views) + notes,
         "scene": scene.to_dict(),
+        "effects": effects_part(job, None if field is None else field.space.shell > 0),
         "views": {
             "total": len(views),
             "test": int(np.sum(views.test)),

@@ -95,6 +95,13 @@ class ExportSettings:
 
 
 @dataclass
+class EffectsSettings:
+    mode: str = "auto"  # auto: correct what the evidence shows | off: look for nothing
+    on: list[str] = default(default_factory=list)  # effects to correct whatever the evidence says
+    off: list[str] = default(default_factory=list)  # effects to leave as they are
+
+
+@dataclass
 class Settings:
     """Everything that a run can be told. `budget`, `image_size` and friends of the command line land here too."""
 
@@ -112,10 +119,12 @@ class Settings:
     fit: FitSettings = default(default_factory=FitSettings)
     tsdf: TsdfSettings = default(default_factory=TsdfSettings)
     export: ExportSettings = default(default_factory=ExportSettings)
+    effects: EffectsSettings = default(default_factory=EffectsSettings)
 
 
 # Flags of the command line that have a home in a group: both names work in --set.
 SHORT_NAMES = {
+    "effects": "effects.mode",
     "image_size": "capture.image_size",
     "holdout": "capture.holdout",
     "budget": "fit.budget",
@@ -124,6 +133,7 @@ SHORT_NAMES = {
     "init": "field.init",
     "finetune": "fit.finetune",
 }
+EFFECTS = ("exposure", "vignetting", "distortion", "rolling_shutter", "view_dependence", "background", "motion_blur", "poses")
 CHOICES = {
     "preset": ("fast", "balanced", "quality"),
     "engine": ("auto", "numba", "torch"),
@@ -135,6 +145,7 @@ CHOICES = {
     "field.init": ("auto", "network", "classical"),
     "keyframes.method": ("parallax", "uniform"),
     "tsdf.enabled": ("auto", "on", "off"),
+    "effects.mode": ("auto", "off"),
 }
 
 
@@ -166,6 +177,7 @@ def _flatten(data: Any, where: str, prefix: str = "") -> list[tuple[str, Any]]:
         raise InputError(f"{where}: settings must be `key: value` pairs")
     pairs: list[tuple[str, Any]] = []
     for key, value in data.items():
+        key = {True: "on", False: "off"}[key] if isinstance(key, bool) else key  # YAML reads a bare on and off as true and false
         name = f"{prefix}{key}"
         pairs += _flatten(value, where, f"{name}.") if isinstance(value, dict) else [(name, value)]
     return pairs
@@ -271,6 +283,15 @@ def _check_ranges(settings: Settings) -> None:
     for name, value in positive.items():
         if value is not None and not 0 < value < 1e9:
             raise InputError(f"{name} is {value:g}; it must be a positive number")
+    for key, names in (("effects.on", settings.effects.on), ("effects.off", settings.effects.off)):
+        for effect in names:
+            if effect not in EFFECTS:
+                near = difflib.get_close_matches(effect, EFFECTS, n=1)
+                hint = f" (did you mean {near[0]!r}?)" if near else ""
+                raise InputError(f"{key}: there is no effect {effect!r}{hint}; known are {', '.join(EFFECTS)}")
+    both = sorted(set(settings.effects.on) & set(settings.effects.off))
+    if both:
+        raise InputError(f"effects.on and effects.off both name {both[0]!r}; it can be in one of them")
     if settings.capture.holdout < 0 or settings.capture.holdout == 1:
         raise InputError(f"holdout is {settings.capture.holdout}; it must be 0 (no test views) or at least 2")
     if not 1 <= settings.network.levels <= 4:

@@ -231,3 +231,31 @@ def rotation(vectors: Array) -> Array:
     cross = _cross(vectors)
     small = np.maximum(angle, 1e-12)
     return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + (1 - np.cos(angle)) / small**2 * (cross @ cross))
+
+
+def resect(problem: Problem, frame: int, steps: int = 10) -> Array:
+    """(4, 4) the pose of one frame against points that stay where they are."""
+    keep = problem.frame == frame
+    alone = replace(
+        problem,
+        poses=problem.poses[[frame]],
+        frame=np.zeros(int(keep.sum()), dtype=np.int64),
+        point=problem.point[keep],
+        place=problem.place[keep],
+        row=problem.row[keep],
+        focal=problem.focal[[frame]],
+        motion=problem.motion[[frame]],
+    )
+    left = residuals(alone)
+    for _ in range(steps):
+        width = TUNING * max(scatter(left), 1e-3)
+        _, slope, _, _ = _slopes(alone, frozenset({POSES}))
+        weight = np.minimum(1, width / np.maximum(np.linalg.norm(left, axis=1), 1e-12))
+        matrix = np.einsum("o,oac,oad->cd", weight, slope, slope)
+        step = -np.linalg.solve(matrix + 1e-9 * np.trace(matrix) * np.eye(6), np.einsum("o,oac,oa->c", weight, slope, left))
+        moved = _with(alone, step, frozenset({POSES}))
+        new = residuals(moved)
+        if not _cost(new, width) < _cost(left, width):
+            break
+        alone, left = moved, new
+    return np.asarray(alone.poses[0])

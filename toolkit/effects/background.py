@@ -84,38 +84,45 @@ def _clouds(effect: Background, azimuth: Tensor, elevation: Tensor) -> Tensor:
     return torch.sigmoid(1.5 * total - 0.5)
 
 
-THRESHOLD = 0.02  # share of what is seen
+THRESHOLD = 0.008  # share of what is seen
 BEYOND = 10.0  # times as far as the scene usually is
-TELLS = 2.0  # working pixels of parallax that a point at that distance would still show
-STRAIGHT = 1.5  # working pixels: rays that differ less are parallel
+NOISE = 0.2  # working pixels: deviation of one observation
+CONSISTENT = 2.0  # working pixels that an observation of one point may be off
+FEWEST = 50
 
 
 def evidence(directions: Array, centres: Array, point: Array, focal: Array, usual: float) -> Evidence:
-    """Share of the points, among those whose distance can be told, that lie far beyond everything else: parallax does not reach them.
+    """Share of the points, among those whose distance can be told, that lie far beyond everything else: parallax hardly reaches them.
+
+    With m the mean direction of a point's rays and a_o how far camera o stands aside of their middle, across m, a point at the distance
+    1 / rho is seen along m − rho · a_o: rho is found by least squares, and told where two of its deviations are below the half of
+    1 / (BEYOND · usual).
 
     Args:
-        directions: (O, 3) unit rays in the world. centres: (O, 3) where they start. focal: (O,) working pixels. point: (O,) ascending.
-        usual: median depth of the points that show parallax.
+        directions: (O, 3) unit rays in the world. centres: (O, 3) where they start. focal: (O,) working pixels. point: (O,) from 0, every
+            number there. usual: median depth of the points that show parallax.
     """
     count = int(point.max(initial=-1)) + 1
     seen = np.maximum(np.bincount(point, minlength=count), 1)
     total = np.stack([np.bincount(point, column, count) for column in directions.T], axis=1)
     mean = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
     middle = np.stack([np.bincount(point, column, count) for column in centres.T], axis=1) / seen[:, None]
-    off = np.linalg.norm(directions - mean[point], axis=1) * focal
     aside = centres - middle[point]
-    aside -= (aside * mean[point]).sum(1, keepdims=True) * mean[point]
-    baseline = np.zeros(count)
-    np.maximum.at(baseline, point, np.linalg.norm(aside, axis=1) * focal)
+    aside = aside - (aside * mean[point]).sum(1, keepdims=True) * mean[point]
+    off = directions - mean[point]
+    baseline = np.maximum(np.bincount(point, (aside**2).sum(1), count), 1e-30)
+    rho = -np.bincount(point, (off * aside).sum(1), count) / baseline
     worst = np.zeros(count)
-    np.maximum.at(worst, point, off)
-    tells = baseline > TELLS * BEYOND * usual
-    far = tells & (worst < STRAIGHT) & (worst < 0.5 * baseline / (BEYOND * usual) + 0.5)
-    share = float(far.sum() / max(int(tells.sum()), 1)) if int(tells.sum()) >= 50 else 0.0
+    np.maximum.at(worst, point, np.linalg.norm(off + rho[point, None] * aside, axis=1) * focal)
+    deviation = NOISE / (np.sqrt(baseline) * np.maximum(np.bincount(point, focal, count) / seen, 1e-9))
+    least = 1 / max(BEYOND * usual, 1e-12)
+    tells = (2 * deviation < 0.5 * least) & (worst < CONSISTENT)
+    far = tells & (rho < least) & (rho > -2 * least)
+    share = float(far.sum() / max(int(tells.sum()), 1)) if int(tells.sum()) >= FEWEST else 0.0
     return Evidence(
         "background",
         share,
         THRESHOLD,
         f"{100 * share:.1f}% of the points lie more than {BEYOND:g} times as far as the scene usually is; "
-        f"{100 * THRESHOLD:g}% or more speak for a distant background",
+        f"{100 * THRESHOLD:.1f}% or more speak for a distant background",
     )

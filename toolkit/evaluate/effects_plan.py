@@ -23,7 +23,7 @@ EFFECTS = ("exposure", "vignetting", "distortion", "rolling_shutter", "highlight
 BLUR_SAMPLES = {"weak": 3, "medium": 5, "strong": 9}  # of the shutter's time: fewer than usual, for pictures this small
 # The effect's own presets change hardly a pixel here (38 dB and more between with and without): lamps are small and paths short.
 HIGHLIGHTS = {"weak": (1.0, 0.12), "medium": (1.5, 0.25), "strong": (2.0, 0.4)}  # strength, coat
-SHOWS = 0.03  # share of the pixels that highlights or a background change by more than `CHANGE`; else the scene is drawn anew
+SHOWS = 0.06  # share of the pixels that highlights or a background change by more than `CHANGE`; else the scene is drawn anew
 CHANGE = 8  # of 255
 TRIES = 12
 POSE_ERROR = {"weak": (0.08, 0.001), "medium": (0.3, 0.004), "strong": (0.8, 0.012)}  # degrees, and share of the way to what is seen

@@ -10,6 +10,7 @@ import numpy as np
 from toolkit.camera import Array
 from toolkit.capture.types import Views
 from toolkit.errors import InputError
+from toolkit.evaluate.affine import right_half_psnr
 from toolkit.evaluate.depth import KEYS as DEPTH_KEYS
 from toolkit.evaluate.depth import depth_metrics
 from toolkit.evaluate.images import lpips, psnr, ssim
@@ -26,7 +27,7 @@ class RenderedView(Protocol):
     def depth(self) -> Array: ...  # (H, W) along z, working units, 0 = missing
 
 
-MEANS = ("psnr", "ssim", "lpips", "depth_abs_err", "psnr_masked", "coverage")
+MEANS = ("psnr", "ssim", "lpips", "depth_abs_err", "psnr_corrected", "psnr_masked", "coverage")
 
 
 def entry(values: list[Any] | None, index: int) -> Any:
@@ -50,7 +51,8 @@ def on_background(rendered: RenderedView, views: Views) -> Array:
 
 
 def score_view(rendered: RenderedView, views: Views, index: int) -> dict[str, Any]:
-    """Scores of one view: `name`, `psnr`, `ssim`, `lpips`, `depth_abs_err`, `depth` (all depth metrics or None), `psnr_masked`, `coverage`.
+    """Scores of one view: `name`, `psnr`, `ssim`, `lpips`, `depth_abs_err`, `depth` (all depth metrics or None), `psnr_corrected`,
+    `psnr_masked`, `coverage`.
 
     The last two are for renders with a mask: PSNR where there is surface, and its share of the valid pixels; else None.
 
@@ -66,6 +68,7 @@ def score_view(rendered: RenderedView, views: Views, index: int) -> dict[str, An
         "ssim": ssim(rgb, truth, valid),
         "lpips": lpips(rgb, truth, valid),
         "depth_abs_err": None,
+        "psnr_corrected": right_half_psnr(rgb, truth, valid),
         "psnr_masked": None,
         "coverage": None,
         "depth": None,

@@ -1,0 +1,63 @@
+"""The evidence of effects as a table: for `fieldfuse info SOURCE --effects`, where nothing is reconstructed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+
+def effects_facts(target: Path, quiet: bool) -> dict[str, Any]:
+    """What an earlier run found, or what its pictures and given poses show now.
+
+    Raises:
+        InputError: a source without poses: shared points cannot be told from wrong matches without them.
+    """
+    from pipelines.console import make_progress
+    from pipelines.folder import is_run_folder
+    from toolkit.capture import open_capture
+    from toolkit.effects.survey import survey
+    from toolkit.errors import InputError
+    from toolkit.files import read_json
+
+    if is_run_folder(target):
+        if not (target / "effects.json").is_file():
+            raise InputError(f"{target} holds no effects.json; run the job again without effects=off")
+        return {key: value for key, value in read_json(target / "effects.json").items() if key != "corrections"}
+    capture = open_capture(target)
+    posed = [frame for frame in capture.frames if frame.world_from_camera is not None and frame.intrinsics is not None]
+    if len(posed) < 3:
+        raise InputError(
+            f"{target} comes without camera poses, which the evidence needs; find them first: fieldfuse poses {target} --out DIR, "
+            "then fieldfuse info DIR/exports/cameras/transforms.json --effects"
+        )
+    progress = make_progress(quiet)
+    with progress.listening():
+        progress.begin("effects")
+        found = survey(capture.with_frames(posed), progress=progress)
+    progress.finish("effects", found.seconds, False)
+    return {
+        "effects": [finding.to_dict() for finding in found.findings.values()],
+        "seconds": round(found.seconds, 3),
+        "looked_at": found.facts,
+    }
+
+
+def show(data: dict[str, Any]) -> None:
+    """The table on standard output, one effect a row."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("effect", "there", "number", "threshold", "held out", "evidence"):
+        table.add_column(column, justify="right" if column in ("number", "threshold", "held out") else "left", overflow="fold")
+    for entry in data["effects"]:
+        held = entry.get("held_out")
+        change = "" if held is None else f"{held['before']:.3f} → {held['after']:.3f} {held['unit']}"
+        there = "yes" if entry["there"] else "no"
+        table.add_row(entry["effect"], there, f"{entry['number']:.3f}", f"{entry['threshold']:g}", change, entry["reason"])
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=180)
+    console.print(table)
+    about = data["looked_at"]
+    console.print(f"{about['frames']} pictures and {about['points']} shared points looked at in {data['seconds']:.1f} s")

@@ -1,0 +1,94 @@
+"""The stage that looks for effects in the training pictures and decides what is taken out of them before anything is fitted."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipelines.job import Job, set_seeds
+from pipelines.steps_capture import pixel_state
+from toolkit.effects.correct import Corrections
+from toolkit.files import read_json, write_json
+
+if TYPE_CHECKING:
+    from toolkit.capture.types import Capture
+    from toolkit.poses.result import PoseResult
+
+NAME = "effects.json"
+
+
+def find_effects(job: Job, posed: Capture) -> Corrections:
+    """What is to be corrected; `effects.json` tells the evidence, the decisions and what they cost. With `effects: off` nothing is read."""
+    from toolkit.effects.decide import asleep, decide
+
+    settings, field = job.settings.effects, job.settings.field
+    for wish, names in (("on", settings.on), ("off", settings.off)):
+        if "background" in names and field.background == "auto":
+            field.background = wish
+    if asleep(settings):
+        return Corrections()
+    path = job.folder / NAME
+    holdout = job.settings.capture.holdout
+
+    def make() -> dict[str, Any]:
+        from toolkit.capture.prepare import held_out
+
+        set_seeds(job.settings.seed)
+        return decide(posed, held_out(posed, holdout), settings, job.progress).to_dict()
+
+    def save(data: dict[str, Any]) -> list[Path]:
+        write_json(path, data)
+        return [path]
+
+    data = job.stages.run(
+        "effects",
+        make=make,
+        save=save,
+        load=lambda: read_json(path),
+        uses=[asdict(settings), holdout, [frame.name for frame in posed.frames], pixel_state(posed)],
+        after=["poses"],
+    )
+    return Corrections.from_dict(data.get("corrections", {}) if isinstance(data, dict) else {})
+
+
+def refine(poses: PoseResult, corrections: Corrections) -> PoseResult:
+    """The poses with what was refined; they are what is exported."""
+    import numpy as np
+
+    from toolkit.effects.correct import bent
+
+    if not corrections.geometric:
+        return poses
+    cameras = poses.intrinsics if corrections.lens is None else [bent(camera, corrections.lens) for camera in poses.intrinsics]
+    moved = [corrections.poses.get(name, pose) for name, pose in zip(poses.names, poses.world_from_camera, strict=True)]
+    return replace(poses, intrinsics=cameras, world_from_camera=np.array(moved))
+
+
+def effects_part(job: Job, background: bool | None) -> dict[str, Any] | None:
+    """The report's part `effects`: decisions without the corrections' many numbers; None when nothing was looked for."""
+    if "effects" not in job.stages.records:
+        return None
+    data = read_json(job.folder / NAME)
+    effects = data["effects"]
+    for entry in effects:
+        if entry["effect"] == "background" and background is not None:
+            entry["on"] = background
+            entry["note"] = "space beyond the region of interest is modelled" if background else "nothing beyond the region is modelled"
+    return {"effects": effects, "seconds": data["seconds"], "looked_at": data["looked_at"]}
+
+
+def effects_warnings(job: Job) -> list[str]:
+    """What a user has to know: effects that are there and cannot be corrected."""
+    part = effects_part(job, None)
+    if part is None:
+        return []
+    told = {
+        "rolling_shutter": "the pictures' rows were read one after the other while the camera moved",
+        "motion_blur": "some pictures are blurred",
+    }
+    return [
+        f"{told[entry['effect']]}: {entry['reason']}"
+        for entry in part["effects"]
+        if entry["there"] and not entry["on"] and entry["effect"] in told and entry["wish"] != "off"
+    ]

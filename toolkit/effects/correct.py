@@ -1,0 +1,163 @@
+"""What is taken out of a capture before anything is fitted to it, as plain data: colours, the lens, errors of poses, blurred frames.
+
+Gains have geometric mean 1 over the training pictures, the vignetting is 1 in the middle, refined poses are those that lie closest to the
+given ones under a similarity: every freedom that pictures cannot tell is fixed. Where nothing is to be corrected, the very same objects
+come back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from toolkit.camera import OPENCV, PINHOLE, Array, Intrinsics, distort
+from toolkit.capture.types import Capture, Views
+from toolkit.effects.sightings import LINEAR
+from toolkit.errors import InputError
+
+Gain = tuple[float, float, float]  # of red, green and blue
+
+CLIPPED = 254  # of 255: such a pixel may have been brighter
+DARKER = 1.02  # a clipped pixel that is divided by more than this has no known colour
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """By the frames' names, where each frame has its own."""
+
+    gain: dict[str, Gain] = field(default_factory=dict)
+    corner: float | None = None  # light left at half a diagonal
+    lens: tuple[float, float] | None = None  # k1, k2 beyond the given lens
+    poses: dict[str, Array] = field(default_factory=dict)  # (4, 4) world_from_camera
+    left_out: tuple[str, ...] = ()  # frames that are not fitted
+
+    @property
+    def geometric(self) -> bool:
+        return self.lens is not None or bool(self.poses)
+
+    @property
+    def photometric(self) -> bool:
+        return self.corner is not None or bool(self.gain) or bool(self.left_out)
+
+    def on_capture(self, capture: Capture) -> Capture:
+        """The capture with the refined lens and poses."""
+        if not self.geometric:
+            return capture
+        frames = []
+        for frame in capture.frames:
+            camera = frame.intrinsics if self.lens is None or frame.intrinsics is None else bent(frame.intrinsics, self.lens)
+            frames.append(replace(frame, intrinsics=camera, world_from_camera=self.poses.get(frame.name, frame.world_from_camera)))
+        return capture.with_frames(frames)
+
+    def on_views(self, views: Views) -> Views:
+        """The views in canonical colour.
+
+        Not valid any more are clipped pixels that become darker (their colour is not known), and all of a frame that is left out.
+        """
+        if not self.photometric:
+            return views
+        images: list[Array] = []
+        valid: list[Array | None] = list(views.valid) if views.valid else [None] * len(views)
+        for index, name in enumerate(views.names):
+            image, lost = canonical(views.images[index], views.intrinsics[index], self.gain.get(name), self.corner)
+            images.append(image)
+            if lost is not None and lost.any():
+                before = valid[index]
+                valid[index] = ~lost if before is None else before & ~lost
+            if name in self.left_out and not views.test[index]:
+                valid[index] = np.zeros(image.shape[:2], dtype=bool)
+        return replace(views, images=images, valid=valid)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "gain": {name: [round(value, 6) for value in gain] for name, gain in self.gain.items()},
+            "corner": self.corner,
+            "lens": None if self.lens is None else list(self.lens),
+            "poses": {name: pose.tolist() for name, pose in self.poses.items()},
+            "left_out": list(self.left_out),
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Corrections:
+        """The reverse of `to_dict`.
+
+        Raises:
+            InputError: the data does not hold what `to_dict` writes.
+        """
+        try:
+            gain = {str(name): tuple(float(value) for value in values) for name, values in data["gain"].items()}
+            poses = {str(name): np.array(pose, dtype=np.float64).reshape(4, 4) for name, pose in data["poses"].items()}
+            corner = None if data["corner"] is None else float(data["corner"])
+            lens = None if data["lens"] is None else (float(data["lens"][0]), float(data["lens"][1]))
+            numbers = [*(value for values in gain.values() for value in values), *([] if corner is None else [corner])]
+            if any(len(values) != 3 for values in gain.values()) or any(not 0 < value < 1e6 for value in numbers):
+                raise ValueError("a gain is not a positive number for each channel")
+            if any(not np.isfinite(pose).all() for pose in poses.values()) or (lens is not None and not np.isfinite(lens).all()):
+                raise ValueError("a pose or the lens is not finite")
+            exact = {name: (values[0], values[1], values[2]) for name, values in gain.items()}
+            return cls(exact, corner, lens, poses, tuple(str(name) for name in data["left_out"]))
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+            raise InputError(f"effects.json is not what the effects stage writes ({error}); remove it and run again") from error
+
+
+def canonical(image: Array, camera: Intrinsics, gain: Gain | None, corner: float | None) -> tuple[Array, Array | None]:
+    """(H, W, 3) uint8 sRGB with gains and vignetting divided out in linear light, and (H, W) bool where the result is not known."""
+    if gain is None and corner is None:
+        return image, None
+    factor = np.array(gain or (1.0, 1.0, 1.0), dtype=np.float32)
+    clipped: Array = np.asarray((image >= CLIPPED).any(2))
+    if corner is None:
+        table = np.stack([_stored(LINEAR / factor[channel]) for channel in range(3)], axis=1)  # (256, 3)
+        out = np.stack([table[image[..., channel], channel] for channel in range(3)], axis=2)
+        return out, clipped if factor.max() > DARKER else None
+    share = (1 + (corner**-0.5 - 1) * _square_radius(camera)) ** -2
+    divisor = share[..., None] * factor
+    return _stored(LINEAR[image] / divisor), clipped & (divisor.max(2) > DARKER)
+
+
+def _square_radius(camera: Intrinsics) -> Array:
+    """(H, W) squared distance from the principal point in half diagonals, as in `vignetting.radii`."""
+    x = np.arange(camera.width, dtype=np.float32) + 0.5 - camera.cx
+    y = np.arange(camera.height, dtype=np.float32) + 0.5 - camera.cy
+    return np.asarray((x[None] ** 2 + y[:, None] ** 2) / (0.25 * (camera.width**2 + camera.height**2)), dtype=np.float32)
+
+
+STEPS = 4096
+
+
+def _stored(linear: Array) -> Array:
+    """Linear light → uint8 sRGB, through a table that is fine enough for 8 bits: steps of the square root, which is nearly even in sRGB."""
+    root = np.sqrt(np.clip(linear, 0, 1))
+    return ENCODED[(root * (STEPS - 1) + 0.5).astype(np.int32)]
+
+
+def _encoded() -> Array:
+    light = (np.arange(STEPS) / (STEPS - 1)) ** 2
+    stored = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.round(255 * stored).astype(np.uint8)
+
+
+ENCODED = _encoded()  # (STEPS,)
+
+
+def correctable(camera: Intrinsics) -> bool:
+    """Whether more of a lens can be told to this camera: a pinhole, or the polynomial without its rational part."""
+    return camera.lens == PINHOLE or (camera.lens == OPENCV and not any(camera.distortion[5:]))
+
+
+def bent(camera: Intrinsics, lens: tuple[float, float]) -> Intrinsics:
+    """The camera with k1, k2 applied to ideal points before its own lens; what is both is fitted over the picture by least squares."""
+    k1, k2 = lens
+    if not camera.distorted:
+        return replace(camera, lens=OPENCV, distortion=(k1, k2, 0.0, 0.0))
+    given = (*camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+    radial = replace(camera, distortion=(given[0], given[1], 0.0, 0.0, given[4]))
+    reach = float(np.hypot(max(camera.cx, camera.width - camera.cx) / camera.fx, max(camera.cy, camera.height - camera.cy) / camera.fy))
+    r = np.linspace(0, reach, 200)[1:]
+    inner = r * (1 + r**2 * (k1 + r**2 * k2))
+    outer = distort(radial, np.stack([inner, np.zeros_like(inner)], axis=1))[:, 0]
+    terms = np.stack([r**3, r**5, r**7], axis=1)
+    a, b, c = np.linalg.lstsq(terms, outer - r, rcond=None)[0]
+    return replace(camera, distortion=(float(a), float(b), given[2], given[3], float(c)))

@@ -1,0 +1,143 @@
+"""From evidence and the user's wishes to what is corrected."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from toolkit.camera import Array
+from toolkit.capture.types import Capture
+from toolkit.config import EffectsSettings
+from toolkit.effects import light, vignetting
+from toolkit.effects.adjust import LENS, POSES, ROWS, adjust
+from toolkit.effects.correct import Corrections, correctable
+from toolkit.effects.light import EXPOSURE, VIGNETTING
+from toolkit.effects.motion_blur import BLURRED
+from toolkit.effects.refine import refined_poses
+from toolkit.effects.sightings import gather
+from toolkit.effects.survey import BLUR, FAR, VIEWS, Finding, Survey, survey
+from toolkit.progress import SILENT, Progress
+
+MOST_LEFT_OUT = 0.1  # of the training frames
+TOLD_ONLY = {
+    ROWS: "only told, not corrected",
+    VIEWS: "the decoder always sees the direction of view",
+    FAR: "whether space beyond the region is modelled is decided with the scene (field.background)",
+}
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One effect: what was found, what was wished, what is done."""
+
+    finding: Finding
+    wish: str  # auto, on or off
+    on: bool  # corrected
+    note: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        return {**self.finding.to_dict(), "wish": self.wish, "on": self.on, "note": self.note}
+
+
+@dataclass(frozen=True)
+class Decided:
+    """All decisions of a capture, what they come to, and what they cost."""
+
+    decisions: tuple[Decision, ...]
+    corrections: Corrections
+    seconds: float
+    facts: dict[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "effects": [decision.to_dict() for decision in self.decisions],
+            "seconds": round(self.seconds, 3),
+            "looked_at": self.facts,
+            "corrections": self.corrections.to_dict(),
+        }
+
+
+def wish(settings: EffectsSettings, effect: str) -> str:
+    """`on`, `off` or `auto` for one effect."""
+    if effect in settings.on:
+        return "on"
+    return "off" if effect in settings.off or settings.mode == "off" else "auto"
+
+
+def asleep(settings: EffectsSettings) -> bool:
+    """True when nothing is to be looked for."""
+    return settings.mode == "off" and not settings.on
+
+
+def decide(capture: Capture, test: Array, settings: EffectsSettings, progress: Progress = SILENT) -> Decided:
+    """Look at the training frames of a posed capture, decide, and work out the corrections of all frames.
+
+    Args:
+        test: (N,) bool: held-out frames. They enter nothing that training frames get; afterwards they are brought to the same colours and
+            poses by the points that training frames found.
+
+    Raises:
+        InputError: a picture cannot be read.
+    """
+    began = time.monotonic()
+    train = [int(index) for index in np.flatnonzero(~test)]
+    found = survey(capture, train, progress)
+    decisions = [_decision(finding, wish(settings, name), capture, found) for name, finding in found.findings.items()]
+    on = frozenset(decision.finding.effect for decision in decisions if decision.on)
+    corrections = _corrections(capture, test, found, on, progress)
+    return Decided(tuple(decisions), corrections, time.monotonic() - began, found.facts)
+
+
+def _decision(finding: Finding, wished: str, capture: Capture, found: Survey) -> Decision:
+    name = finding.effect
+    wanted = wished == "on" or (wished == "auto" and finding.there)
+    if name in TOLD_ONLY:
+        return Decision(finding, wished, False, TOLD_ONLY[name])
+    if not wanted:
+        return Decision(finding, wished, False, "there, and switched off" if finding.there and wished == "off" else "")
+    if found.explained is None:
+        return Decision(finding, wished, False, "cannot be worked out: too few points are shared between pictures")
+    if capture.alpha and name in (EXPOSURE, VIGNETTING):
+        return Decision(finding, wished, False, "not corrected where pictures have alpha: their background is known")
+    cameras = {frame.intrinsics for frame in capture.frames}
+    if name == LENS and (len({(c.width, c.height) for c in cameras if c}) > 1 or not all(c and correctable(c) for c in cameras)):
+        return Decision(finding, wished, False, "not corrected: the pictures have different cameras, or a lens of another kind")
+    return Decision(finding, wished, True, "" if finding.there else "switched on by hand, nothing speaks for it")
+
+
+def _corrections(capture: Capture, test: Array, found: Survey, on: frozenset[str], progress: Progress) -> Corrections:
+    """Per-frame corrections need every frame: then all are looked at, and only then."""
+    seen, corner = found.seen, found.light.corner if found.light is not None and VIGNETTING in on else None
+    lens = None
+    if found.explained is not None and LENS in on:
+        explained = found.explained
+        lens = (explained.problem if LENS in explained.kept else adjust(explained.problem, explained.kept | {LENS}).problem).lens
+    if seen is None or not on & {EXPOSURE, POSES, BLUR}:
+        return Corrections(corner=corner, lens=lens)
+    gain: dict[str, tuple[float, float, float]] = {}
+    poses: dict[str, Array] = {}
+    left_out: tuple[str, ...] = ()
+    if BLUR in on:
+        left_out = _blurred(seen.names, found.sharpness)
+    if on & {EXPOSURE, POSES}:
+        every = gather(capture, range(len(capture.frames)), progress)
+        if EXPOSURE in on:
+            tracks = every.tracks()
+            flat = tracks if corner is None else vignetting.corrected(tracks, corner)
+            gains = light.frame_gains(flat, len(every.names), ~test)
+            gain = {name: (float(r), float(g), float(b)) for name, (r, g, b) in zip(every.names, gains, strict=True)}
+        if POSES in on:
+            kept = found.explained.kept if found.explained is not None else frozenset[str]()
+            moved, beyond = refined_poses(every, ~test, kept | on)
+            poses = dict(zip(every.names, moved, strict=True))
+            lens = beyond if LENS in on else None
+    return Corrections(gain, corner, lens, poses, left_out)
+
+
+def _blurred(names: list[str], sharpness: Array) -> tuple[str, ...]:
+    """The most blurred frames, a tenth of those looked at at most."""
+    order = np.argsort(sharpness, kind="stable")[: int(MOST_LEFT_OUT * len(names))]
+    return tuple(names[index] for index in order if sharpness[index] < BLURRED)
