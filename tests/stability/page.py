@@ -1,6 +1,6 @@
 """`docs/stability.md`: the parts between `<!-- NAME -->` and `<!-- /NAME -->` are written by programs, the rest by people.
 
-`python -m tests.stability.page docs/stability.md` runs every case of the self-test and replaces the part `cases`.
+`python -m tests.stability.page docs/stability.md` runs every case of the self-test and replaces the parts `kernels` and `cases`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.evaluate.selftest.case import Outcome, all_cases, run_cases
+from toolkit.evaluate.selftest.case import Measure, Outcome, all_cases, run_cases
 
 
 def replace_part(page: Path, name: str, lines: list[str]) -> None:
@@ -54,6 +54,32 @@ def case_lines(outcomes: list[Outcome]) -> list[str]:
     return out
 
 
+def kernel_lines(outcomes: list[Outcome]) -> list[str]:
+    """A table: each kernel's worst errors that are relative (by the reference's size, or by its largest entry), values and gradients."""
+    groups: dict[str, list[Measure]] = {}
+    for outcome in outcomes:
+        groups.setdefault(outcome.case.group, []).extend(outcome.measures)
+    out = ["| kernel | worst relative error, float32 | of a gradient | in lower precision |", "| --- | --- | --- | --- |"]
+    for group, measures in groups.items():
+        known = [measure for measure in measures if _relative(measure)]
+        low = [measure for measure in known if re.search(r"bfloat16|float16|autocast", measure.quantity)]
+        slopes = [measure for measure in known if measure not in low and "gradient" in measure.quantity]
+        values = [measure for measure in known if measure not in low and measure not in slopes]
+        if known:
+            out.append(f"| {group} | {_worst(values)} | {_worst(slopes)} | {_worst(low)} |")
+    return out
+
+
+def _relative(measure: Measure) -> bool:
+    """Errors by a size, and those of values of about 1; not counts, lengths in steps or decibels, nor bounds of zero or above a tenth."""
+    counted = r"in steps|in voxels|in pixels|dB|not finite|is not|lost|wrong|share|metres|PSNR|float64 can|rounding|orthonormal|that meet"
+    return 0 < measure.bound < 0.1 and not re.search(counted, measure.quantity)
+
+
+def _worst(measures: list[Measure]) -> str:
+    return number(max(measure.error for measure in measures)) if measures else "–"
+
+
 def _share(error: float, bound: float) -> float:
     return error / bound if bound > 0 else error
 
@@ -63,6 +89,7 @@ def main() -> int:
     with np.errstate(all="ignore"):
         outcomes = run_cases(all_cases(), lambda outcome: sys.stderr.write(f"{outcome.seconds:6.1f} s  {outcome.case.title}\n"))
     replace_part(page, "cases", case_lines(outcomes))
+    replace_part(page, "kernels", kernel_lines(outcomes))
     return 0 if all(outcome.good for outcome in outcomes) else 1
 
 

@@ -53,7 +53,7 @@ def evidence(mean: Tensor, variance: Tensor, count: Tensor, footprint: Tensor, s
     squashed = variance / (1 + variance)
     logarithm = (torch.log(variance + LOG_FLOOR) / 4 + 1) * several
     disparity = torch.log2(step + 0.05) * several[:, 0]
-    flags = torch.stack([several[:, 0], 1 / count.to(mean.dtype), torch.log2(footprint) / 4, disparity / 4], 1)
+    flags = torch.stack([several[:, 0], 1 / count.clamp_min(1).to(mean.dtype), torch.log2(footprint) / 4, disparity / 4], 1)
     return torch.cat([mean, squashed * several, logarithm, flags], 1)
 
 

@@ -24,6 +24,7 @@ MODULES = (
     "volume",
     "edit",
     "network",
+    "network_views",
     "engines",
     "place",
     "place_files",

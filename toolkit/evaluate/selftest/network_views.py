@@ -1,0 +1,180 @@
+"""Networks, continued: voxels seen by awkward views, gradients under lower precision, gates that are stuck, state that survives pruning."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from toolkit.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite, relative
+from toolkit.evaluate.selftest.edit import aimed_rays, small_field
+from toolkit.evaluate.selftest.lookup import scattered_blocks
+from toolkit.evaluate.selftest.network import GROUP
+from toolkit.networks.aggregate import aggregate, evidence
+from toolkit.networks.block_conv import block_conv3d
+from toolkit.networks.cameras import Cameras
+from toolkit.networks.decoder import make_decoder
+from toolkit.networks.gru import FusionGRU
+from toolkit.networks.unproject import project
+from toolkit.training.nerfusion.health import saturation
+from toolkit.training.step import Optimiser, Rates
+from toolkit.volume.topology import Topology
+
+WIDTH, HEIGHT, FOCAL = 64, 48, 50.0
+LOW = 16  # roundings of the lower precision that a gradient through a few layers may carry
+TURNS = 8  # times that, behind the sines and cosines of the paper's decoder
+
+
+def awkward_views() -> dict[str, Tensor]:
+    """(4, 4) poses, each looking along +z at the origin unless it is told otherwise."""
+    ahead = torch.eye(4)
+    ahead[2, 3] = -3
+    behind = torch.eye(4)
+    behind[2, 3] = 3
+    infinity = torch.eye(4)
+    infinity[2, 3] = -1e5
+    inside = torch.eye(4)
+    beside = torch.eye(4)
+    beside[0, 3], beside[2, 3] = 1e5, -3
+    return {"ahead": ahead, "ahead again": ahead.clone(), "behind": behind, "at infinity": infinity, "inside": inside, "beside": beside}
+
+
+@case(GROUP, "views at infinity, behind, inside, identical, at the border of the picture")
+def seen_by_views(folder: Path) -> list[Measure]:
+    poses = awkward_views()
+    count = len(poses)
+    cameras = Cameras.same_size(
+        torch.tensor([[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]]).repeat(count, 1), torch.stack([*poses.values()]), WIDTH, HEIGHT
+    )
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(400, 3, generator=generator) * 2 - 1
+    edge = torch.tensor([[3 * 32 / FOCAL, 0, 0], [-3 * 32 / FOCAL, 0, 0], [0, 3 * 24 / FOCAL, 0], [0, -3 * 24 / FOCAL, 0]])  # on the border
+    points = torch.cat([points, edge, edge * 1.0001, torch.zeros(1, 3)])
+    found = project(points, torch.full((len(points),), 0.05), cameras, 0.1, 10.0)
+    wrong, worst = 0, 0.0
+    for index, pose in enumerate(poses.values()):
+        local = points.double() - pose[:3, 3].double()
+        depth = local[:, 2]
+        pixels = local[:, :2] / depth[:, None] * FOCAL + torch.tensor([WIDTH / 2, HEIGHT / 2])
+        margin = torch.minimum(pixels, torch.tensor([WIDTH, HEIGHT]) - pixels).amin(1)
+        seen = (depth > 0.1) & (depth <= 10) & (margin >= 0)
+        sure = (margin.abs() > 1e-3) & ((depth - 0.1).abs() > 1e-6)
+        wrong += int((found.visible[index] != seen)[sure].sum())
+        both = seen & found.visible[index]
+        worst = max(worst, relative(found.pixels[index][both], pixels[both], 1.0))
+    values = torch.randn(count, len(points), 4, generator=generator).requires_grad_(True)
+    mean, variance, views = aggregate(values, found.visible)
+    read = evidence(mean, variance, views, torch.full((len(points),), 3.0), torch.zeros(len(points)))
+    (mean.sum() + variance.sum()).backward()
+    assert values.grad is not None
+    return [
+        Measure("voxels seen by the wrong views", float(wrong), 0.0),
+        Measure("pixels, relative", worst, 4e-6),
+        Measure("seen from infinity, from behind or from beside", float(found.visible[[2, 3, 5]].sum()), 0.0),
+        Measure("identical views that differ", absolute(found.pixels[0], found.pixels[1]), 0.0),
+        Measure("negative variances", float((variance < 0).sum()), 0.0),
+        Measure("gradients of what no view sees", float(values.grad[~found.visible].abs().sum()), 0.0),
+        Measure("values that are not finite", not_finite(found.pixels, found.footprint, mean, variance, read, values.grad), 0.0),
+    ]
+
+
+@case(GROUP, "gradients under bfloat16 and float16 autocast against float64")
+def reduced_gradients(folder: Path) -> list[Measure]:
+    out = []
+    directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
+    features = torch.randn(200, 8)
+    topology = scattered_blocks(6, 1, 1)
+    rows, weight = torch.randn(topology.zero_row, 4), torch.randn(4, 4, 3, 3, 3) * 0.1
+    pull = torch.randn(topology.zero_row, 4)
+    views, visible = torch.randn(3, 100, 4), torch.rand(3, 100) < 0.7
+    visible[0] |= ~visible.any(0)
+    for kind in (torch.bfloat16, torch.float16):
+        name, bound = str(kind).removeprefix("torch."), LOW * float(torch.finfo(kind).eps)
+        for decoder in ("deferred", "per_sample"):
+            torch.manual_seed(1)
+            net = make_decoder(decoder, 8, 32)
+            double = make_decoder(decoder, 8, 32).double()
+            double.load_state_dict({key: value.double() for key, value in net.state_dict().items()})
+            low, exact = features.clone().requires_grad_(True), features.double().requires_grad_(True)
+            with torch.autocast("cpu", dtype=kind):
+                got = net(low, directions)
+            want = double(exact, directions.double())
+            (got if decoder == "deferred" else got[1]).float().sum().backward()
+            (want if decoder == "deferred" else want[1]).sum().backward()
+            assert low.grad is not None and exact.grad is not None
+            steep = 1 if decoder == "deferred" else TURNS  # the paper's encoding multiplies what is rounded by up to 16 π
+            out.append(Measure(f"decoder {decoder}, {name}, by the largest", by_size(low.grad, exact.grad), steep * bound))
+        low, exact = rows.clone().requires_grad_(True), rows.double().requires_grad_(True)
+        with torch.autocast("cpu", dtype=kind):
+            block_conv3d(low, topology, weight).float().mul(pull).sum().backward()
+        block_conv3d(exact, topology, weight.double()).mul(pull.double()).sum().backward()
+        assert low.grad is not None and exact.grad is not None
+        out.append(Measure(f"block convolution, {name}, by the largest", by_size(low.grad, exact.grad), bound))
+        low, exact = views.clone().requires_grad_(True), views.double().requires_grad_(True)
+        with torch.autocast("cpu", dtype=kind):
+            mean, variance, _ = aggregate(low, visible)
+        (mean.float().sum() + variance.float().sum()).backward()
+        sums = aggregate(exact, visible)
+        (sums[0].sum() + sums[1].sum()).backward()
+        assert low.grad is not None and exact.grad is not None
+        out.append(Measure(f"aggregation, {name}, by the largest", by_size(low.grad, exact.grad), bound))
+    return out
+
+
+@case(GROUP, "recurrent fusion: stuck gates are reported, open ones pass a gradient")
+def stuck_gates(folder: Path) -> list[Measure]:
+    """A gate at its end passes hardly any gradient: what counts is that its share is measured and shown (`GateWatch`)."""
+    topology = Topology(torch.zeros((1, 3), dtype=torch.int64))
+    inside = torch.ones(512, dtype=torch.bool)
+    out = []
+    for name, bias, wanted in (("open", 0.0, 0.0), ("stuck", 1e3, 1.0), ("shut", -1e3, 1.0)):
+        torch.manual_seed(0)
+        gru = FusionGRU(4, 8)
+        seen: list[float] = []
+        hook = gru.update.register_forward_hook(lambda module, given, answer, seen=seen: seen.append(saturation(torch.sigmoid(answer))))
+        last = [parameter for key, parameter in gru.update.named_parameters() if key.endswith("bias")][-1]
+        last.data.fill_(bias)
+        raw = torch.randn(513, 4).requires_grad_(True)
+        state = gru(torch.full((513, 4), 0.3), torch.ones(512), torch.tanh(raw), raw, topology, inside)
+        state[:-1].sum().backward()
+        hook.remove()
+        assert raw.grad is not None
+        out.append(Measure(f"{name}: share of saturated gates, off by", abs(seen[0] - wanted), 0.05))
+        out.append(Measure(f"{name}: values that are not finite", not_finite(state, raw.grad), 0.0))
+        if name == "open":
+            out.append(Measure("open: no gradient", float(raw.grad.abs().sum() == 0), 0.0))
+    return out
+
+
+@case("prune and split", "the optimiser's state survives pruning, and starts afresh at a split")
+def optimiser_state(folder: Path) -> list[Measure]:
+    from toolkit.training.levels import finer, pruned
+    from toolkit.training.rays import Batch
+    from toolkit.volume.host import TorchHost
+
+    field = small_field(3, 0.4)
+    origins, directions = aimed_rays(200, 2)
+    batch = Batch(origins, directions, torch.rand(200, 3), torch.zeros(200, dtype=torch.int64))
+    rates, generator = Rates(0.05, 0.02, 1e-3, 0.01), torch.Generator().manual_seed(0)
+    optimiser = Optimiser(replace(field, density_rows=field.density_rows.clone(), feature_rows=field.feature_rows.clone()))
+    for _ in range(3):
+        optimiser.step(batch, rates, generator)
+    before = [optimiser.density.state.clone(), optimiser.feature.state.clone(), optimiser.field.density_rows.clone()]
+    keep = torch.rand(len(field.occupied), generator=generator) < 0.5
+    optimiser.go_on_with(pruned(optimiser.field, keep))
+    after = [optimiser.density.state, optimiser.feature.state, optimiser.field.density_rows]
+    lost = sum(absolute(new, old) for new, old in zip(after, before, strict=True))
+    optimiser.step(batch, rates, generator)
+    grown = finer(optimiser.field, optimiser.field.occupied, 2 * field.resolution, TorchHost())
+    optimiser.renew_rows(grown)
+    fresh = float(optimiser.density.state.abs().sum() + optimiser.feature.state.abs().sum())
+    optimiser.step(batch, rates, generator)
+    decoder = [value for state in optimiser.decoder.state.values() for value in state.values()]
+    return [
+        Measure("rows' moments changed by pruning", lost, 0.0),
+        Measure("rows' moments left at a split", fresh, 0.0),
+        Measure("decoder's moments lost", float(len(decoder) == 0), 0.0),
+        Measure("values that are not finite", not_finite(*after, grown.density_rows, grown.feature_rows, *decoder), 0.0),
+    ]
