@@ -101,7 +101,10 @@ def put_cameras(folder: Path, poses: PoseResult, posed: Capture) -> None:
 
     root = posed.frames[0].image.parent.parent if posed.kind == "video" else posed.root
     files = [frame.image.relative_to(root).as_posix() if frame.image.is_relative_to(root) else str(frame.image) for frame in posed.frames]
-    write_cameras(folder, files, poses.intrinsics, poses.world_from_camera, poses.points)
+    # Those of the frames that take part, which may be fewer than have a pose.
+    intrinsics = [frame.intrinsics for frame in posed.frames if frame.intrinsics is not None]
+    world_from_camera = np.array([frame.world_from_camera for frame in posed.frames])
+    write_cameras(folder, files, intrinsics, world_from_camera, poses.points)
 
 
 def unique(texts: list[str]) -> list[str]:
