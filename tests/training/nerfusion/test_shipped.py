@@ -37,5 +37,6 @@ def test_shipped_weights_load_and_see_depth() -> None:
     assert model.config == ModelConfig()
     torch.manual_seed(0)
     trained, untrained = measured(model), measured(NerfusionModel().eval())
-    assert trained["depth_likelihood"] > untrained["depth_likelihood"] + 0.7, (trained, untrained)
-    assert trained["psnr_local"] > untrained["psnr_local"] + 2, (trained, untrained)
+    assert trained["depth_likelihood"] > untrained["depth_likelihood"] + 1.0, (trained, untrained)
+    # Untrained networks begin with the views' agreement and their mean colours, so they are no straw man.
+    assert trained["depth_error"] < 0.75 * untrained["depth_error"], (trained, untrained)
