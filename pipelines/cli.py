@@ -15,6 +15,7 @@ import typer
 from pipelines import (
     bake,
     bench,
+    bench_effects,
     compare,
     evaluate,
     export,
@@ -115,6 +116,7 @@ for _command in (
     simulate.simulate,
 ):
     app.command()(_command)
+bench.app.command("effects")(bench_effects.effects)
 bench.app.command("few-views")(few_views.few_views)
 bench.app.command("ablations")(few_views.ablations)
 app.add_typer(bench.app, name="bench")
