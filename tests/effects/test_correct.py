@@ -1,0 +1,99 @@
+"""Corrections: what is off changes no bit, what is on undoes the simulator's own forward model, and all of it survives its file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from toolkit.camera import FISHEYE, OPENCV, Intrinsics, distort
+from toolkit.capture.types import Capture, Frame, Views
+from toolkit.effects import transfer, vignetting
+from toolkit.effects.correct import Corrections, bent, canonical, correctable
+from toolkit.errors import InputError
+
+CAMERA = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
+
+
+def picture(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(20, 190, (48, 64, 3), dtype=np.uint8)
+
+
+def views() -> Views:
+    images = [picture(index) for index in range(3)]
+    return Views(["a", "b", "c"], images, [CAMERA] * 3, np.tile(np.eye(4), (3, 1, 1)), np.array([True, False, False]), background=None)
+
+
+def test_nothing_to_correct_gives_the_very_same_objects() -> None:
+    before = views()
+    capture = Capture("transforms", root=Path(), frames=())
+    assert Corrections().on_views(before) is before
+    assert Corrections().on_capture(capture) is capture
+    image, lost = canonical(before.images[0], CAMERA, None, None)
+    assert image is before.images[0] and lost is None
+
+
+def test_gain_and_vignetting_are_undone() -> None:
+    linear = transfer.decode(torch.from_numpy(picture().astype(np.float32) / 255))
+    gain = (1.3, 1.1, 0.8)
+    dimmed = vignetting.forward(vignetting.Vignetting(0.5), linear, vignetting.radii(CAMERA)) * torch.tensor(gain)
+    stored = transfer.to_bytes(transfer.encode(dimmed)).numpy()
+    back, lost = canonical(stored, CAMERA, gain, 0.5)
+    assert np.abs(back.astype(int) - picture())[~lost].max() <= 3  # 8 bits twice, brightened by 2 in the corner
+    even, _ = canonical(transfer.to_bytes(transfer.encode(linear * torch.tensor(gain))).numpy(), CAMERA, gain, None)
+    assert np.abs(even.astype(int) - picture()).max() <= 2
+
+
+def test_clipped_pixels_that_become_darker_are_not_valid() -> None:
+    before = views()
+    before.images[1][:] = 255
+    after = Corrections(gain={"b": (2.0, 2.0, 2.0), "c": (0.5, 0.5, 0.5)}).on_views(before)
+    assert after.valid[1] is not None and not after.valid[1].any()
+    assert after.valid[0] is None and after.valid[2] is None
+    assert after.images[0] is before.images[0]
+
+
+def test_frames_that_are_left_out_are_not_valid_but_for_test_views() -> None:
+    after = Corrections(left_out=("a", "b")).on_views(views())
+    assert after.valid[0] is None
+    assert after.valid[1] is not None and not after.valid[1].any()
+
+
+def test_a_lens_is_added_to_what_is_given() -> None:
+    pinhole = bent(CAMERA, (-0.1, 0.02))
+    assert pinhole.lens == OPENCV and pinhole.distortion == (-0.1, 0.02, 0.0, 0.0)
+    given = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0, OPENCV, (0.05, -0.01, 0.001, -0.002))
+    both = bent(given, (-0.1, 0.02))
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 2))
+    r2 = (points**2).sum(1, keepdims=True)
+    np.testing.assert_allclose(distort(both, points), distort(given, points * (1 - 0.1 * r2 + 0.02 * r2**2)), atol=2e-4)
+    assert correctable(CAMERA) and correctable(given)
+    assert not correctable(Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0, FISHEYE, (0.1, 0.0, 0.0, 0.0)))
+
+
+def test_poses_and_lens_go_into_the_capture() -> None:
+    frame = Frame("a", image=Path("a.png"), intrinsics=CAMERA, world_from_camera=np.eye(4))
+    capture = Capture("transforms", root=Path(), frames=(frame,))
+    moved = np.eye(4)
+    moved[0, 3] = 2.0
+    after = Corrections(lens=(-0.1, 0.0), poses={"a": moved}).on_capture(capture).frames[0]
+    assert after.world_from_camera is not None and after.world_from_camera[0, 3] == 2.0
+    assert after.intrinsics is not None and after.intrinsics.distortion[0] == -0.1
+
+
+def test_corrections_survive_their_file_and_damaged_ones_are_refused() -> None:
+    whole = Corrections({"a": (1.0, 1.1, 0.9)}, 0.6, (-0.1, 0.02), {"a": np.eye(4)}, ("b",))
+    again = Corrections.from_dict(whole.to_dict())
+    assert again.to_dict() == whole.to_dict() and again.gain == whole.gain
+    for damage in (
+        {"gain": {"a": [0.0, 1, 1]}},
+        {"gain": {"a": [1, 1]}},
+        {"corner": "x"},
+        {"poses": {"a": [1]}},
+        {"lens": [1]},
+        {"left_out": 3},
+    ):
+        with pytest.raises(InputError, match=r"effects\.json"):
+            Corrections.from_dict({**whole.to_dict(), **damage})

@@ -1,0 +1,146 @@
+"""Evidence and decisions on made-up points: each effect alone is found and nothing else; nothing is found where nothing is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.effects.seen import CAMERA, FRAMES, made
+from toolkit.effects import background, geometry, light, motion_blur, view_dependence
+from toolkit.effects.adjust import POSES, adjust, residuals, scatter
+from toolkit.effects.refine import aligned, refined_poses
+from toolkit.effects.survey import ORDER, look
+
+
+def drift(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    stops = rng.normal(0, 0.3, FRAMES)
+    return np.exp2((stops - stops.mean())[:, None] + np.array([[0.05, 0.0, -0.05]]) * np.sin(np.arange(FRAMES))[:, None])
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_nothing_is_found_where_nothing_is(seed: int) -> None:
+    found = look(made(seed))
+    assert found.there == frozenset(), [finding.reason for finding in found.findings.values() if finding.there]
+    assert tuple(found.findings) == ORDER
+
+
+@pytest.mark.parametrize(
+    ("effect", "arguments"),
+    [
+        ("distortion", {"lens": (-0.12, 0.03)}),
+        ("rolling_shutter", {"rows": 0.3}),
+        ("poses", {"pose_error": 0.004}),
+        ("exposure", {"gain": drift(3)}),
+        ("vignetting", {"corner": 0.6}),
+        ("background", {"far": 0.1}),
+    ],
+)
+def test_each_effect_alone_is_found_and_nothing_else(effect: str, arguments: dict) -> None:
+    for seed in (4, 5):
+        found = look(made(seed, **arguments))
+        assert found.there == {effect}, [finding.reason for finding in found.findings.values() if finding.there]
+        finding = found.findings[effect]
+        assert finding.number > finding.threshold
+        if finding.before is not None and finding.after is not None:
+            assert finding.after < 0.8 * finding.before
+
+
+def test_two_at_once() -> None:
+    found = look(made(6, lens=(-0.2, 0.05), pose_error=0.004, gain=drift(6), corner=0.5))
+    assert found.there == {"distortion", "poses", "exposure", "vignetting"}
+    assert found.explained is not None
+    assert found.explained.problem.lens == pytest.approx((-0.2, 0.05), abs=0.02)
+
+
+def test_lens_and_light_are_measured() -> None:
+    lens = geometry.explain(made(7, lens=(-0.12, 0.03)))
+    assert lens is not None and lens.problem.lens[0] == pytest.approx(-0.12, abs=0.015)
+    seen = made(7, gain=drift(7), corner=0.6)
+    found = light.explain(seen.tracks(), FRAMES)
+    assert found.corner == pytest.approx(0.6, abs=0.03)
+    np.testing.assert_allclose(np.log2(found.gain), np.log2(drift(7)) - np.log2(drift(7)).mean(0), atol=0.03)
+
+
+def test_gains_of_training_frames_have_mean_one_and_do_not_hang_on_the_others() -> None:
+    seen, test = made(8, gain=drift(8)), np.arange(FRAMES) % 8 == 0
+    gain = light.frame_gains(seen.tracks(), FRAMES, ~test)
+    np.testing.assert_allclose(np.log2(gain[~test]).mean(0), 0, atol=1e-9)
+    changed = replace(seen, linear=np.where(test[seen.frame, None], 0.5 * seen.linear, seen.linear))
+    other = light.frame_gains(changed.tracks(), FRAMES, ~test)
+    np.testing.assert_array_equal(other[~test], gain[~test])
+    np.testing.assert_allclose(other[test], 0.5 * gain[test], rtol=0.02)
+
+
+def test_refined_poses_are_better_and_stay_in_the_given_frame() -> None:
+    true, wrong = made(9, noise=0.05), made(9, noise=0.05, pose_error=0.004)
+    train = np.arange(FRAMES) % 8 != 0
+    poses, lens = refined_poses(wrong, train, frozenset({POSES}))
+    assert lens == (0.0, 0.0)
+
+    def off(one: np.ndarray) -> float:
+        """Radians between cameras' turns, once all are brought into one frame."""
+        moved = aligned(one, true.poses, np.ones(FRAMES, dtype=bool))
+        cosines = (np.einsum("fij,fij->f", moved[:, :3, :3], true.poses[:, :3, :3]) - 1) / 2
+        return float(np.sqrt(np.mean(np.arccos(np.clip(cosines, -1, 1)) ** 2)))
+
+    assert off(poses) < 0.2 * off(wrong.poses)
+    np.testing.assert_allclose(aligned(poses[train], wrong.poses[train], np.ones(train.sum(), dtype=bool)), poses[train], atol=1e-6)
+
+
+def test_held_out_frames_move_nothing_of_the_others() -> None:
+    seen, train = made(10, pose_error=0.004), np.arange(FRAMES) % 8 != 0
+    before, _ = refined_poses(seen, train, frozenset({POSES}))
+    rng = np.random.default_rng(0)
+    moved = np.where(train[seen.frame, None], seen.pixel, seen.pixel + rng.normal(0, 1.0, seen.pixel.shape))
+    after, _ = refined_poses(replace(seen, pixel=moved), train, frozenset({POSES}))
+    assert np.abs(after[train] - before[train]).max() < 2e-3
+    assert np.abs(after[~train] - before[~train]).max() > 0
+
+
+def test_adjusting_points_alone_lowers_the_residual_to_the_noise() -> None:
+    problem, _ = geometry.open_problem(made(11, noise=0.2))
+    rng = np.random.default_rng(1)
+    shaken = replace(problem, points=problem.points + rng.normal(0, 0.02, problem.points.shape))
+    fitted = adjust(shaken)
+    assert scatter(residuals(shaken)) > 1.0
+    assert fitted.scatter < 0.25
+
+
+def test_neighbours_that_change_together_speak_for_view_dependence() -> None:
+    rng = np.random.default_rng(2)
+    frame, place = np.repeat(np.arange(10), 150), rng.uniform(0, 200, (1500, 2))
+    noise = rng.normal(0, 0.03, 1500)
+    alone = view_dependence.evidence(noise, frame, place)
+    spot = 0.2 * np.exp(-(((place - 100) / 30) ** 2).sum(1))
+    together = view_dependence.evidence(noise + spot, frame, place)
+    assert not alone.found and together.found, (alone.reason, together.reason)
+    few = view_dependence.evidence(noise[:5], frame[:5], place[:5])
+    assert not few.found and "too few" in few.reason
+
+
+def test_frames_that_are_less_sharp_than_others_are_told() -> None:
+    rng = np.random.default_rng(3)
+    frame, point = (index.ravel() for index in np.meshgrid(np.arange(12), np.arange(200)))
+    depth = np.exp(rng.normal(0, 0.3, len(frame)))
+    slope = 0.01 * depth * np.exp2(rng.normal(0, 0.2, len(frame)) + 0.5 * rng.normal(0, 1, 200)[point])
+    even = motion_blur.evidence(slope, depth, frame, point, 12)
+    blurred = motion_blur.evidence(np.where(frame == 5, 0.4, 1.0) * slope, depth, frame, point, 12)
+    assert not even.found and blurred.found, (even.reason, blurred.reason)
+    assert int(np.argmin(blurred.parameters["sharpness"])) == 5
+
+
+def test_too_little_to_tell() -> None:
+    seen = made(12, points=20)
+    found = look(seen)
+    assert found.there == frozenset() and all("too few" in finding.reason for finding in found.findings.values())
+    empty = background.evidence(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros(0), 1.0)
+    assert not empty.found
+
+
+def test_readout_is_told_in_shares_of_a_step() -> None:
+    found = geometry.explain(made(13, rows=0.4, noise=0.05))
+    assert found is not None and "rolling_shutter" in found.kept
+    assert CAMERA.height == 240 and np.abs(found.problem.motion[:, :3]).max() > 0.005
