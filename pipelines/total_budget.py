@@ -37,6 +37,7 @@ class TotalBudget:
         self.work: model.Work | None = None
         self.choice: model.Choice | None = None
         self.predicted: dict[str, float] = {}
+        self.export_planned = 0.0  # seconds, when it was decided how much is exported
         self.again = False  # an earlier run of the same plan has decided everything
         self.name = ""
 
@@ -89,17 +90,19 @@ class TotalBudget:
 
     def choose_exports(self, job: Job) -> None:
         """Decide how much is rendered for mesh and video, at the pace that the test views were rendered at."""
-        assert self.work is not None and self.choice is not None
+        assert self.work is not None and self.choice is not None and self.speed is not None
         export = job.settings.export
         if not self.again:
             rays = model.amounts(self.work, self.choice)["render"]
             spent = job.stages.records["render"].seconds
             after = sum(self.predicted.get(stage, 0.0) for stage in ("evaluate", "report")) * self._pace(job)
-            factor = self.speed.factors.get("export", 1.0) if self.speed is not None else 1.0
-            a_ray = factor * spent / rays if rays else self._predicted_ray()
-            left = self.asked - self.elapsed() - after
+            factor = self.speed.factors.get("export", 1.0)
+            fixed = factor * model.EXPORT_FIXED * self.speed.units["features"]
+            a_ray = factor * model.EXPORT_RAY * (spent / rays if rays else self._predicted_ray())
+            left = self.asked - self.elapsed() - after - fixed
             views, frames = model.exports_for(self.work, self.choice, left, a_ray)
             self.choice.mesh_views, self.choice.video_frames = min(views, export.mesh_views), min(frames, export.video_frames)
+            self.export_planned = fixed + model.export_rays(self.work, self.choice) * a_ray
             self._keep(job)
         assert self.choice.mesh_views is not None and self.choice.video_frames is not None
         export.mesh_views = self.choice.mesh_views
@@ -149,6 +152,9 @@ class TotalBudget:
                 real, predicted = told["stages"].get(name, {}).get("real"), self.predicted.get(name)
                 if real and predicted and max(real, predicted) > WORTH_LEARNING and name != "export":
                     self.speed.learn(name, predicted, real)
+            made = told["stages"].get("export", {}).get("real")
+            if made and self.export_planned > WORTH_LEARNING:
+                self.speed.learn("export", self.export_planned, made)
             if abs(told["real_seconds"] - self.asked) > 2 * model.AGREES * self.asked:
                 model.remember(self.name, None)  # so far off that the machine must have changed: measured again next time
             else:

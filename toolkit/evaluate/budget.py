@@ -21,6 +21,8 @@ SURFACE = 3.0  # occupied voxels of a lattice of n a side, in n²
 FIT_SHARE = 0.35  # of the seconds, at least, that the fit should have when pictures are chosen
 LEAST_FIT = 2.0  # seconds
 EXPORT_SHARE = 0.25  # of the seconds, at most, that are planned for exports
+EXPORT_FIXED = 25.0  # pictures' worth of features: making, cleaning and writing meshes, whatever is rendered for them
+EXPORT_RAY = 1.2  # of the time of a test view's ray: fusing depth and writing video frames come on top
 MESH_SHARE = 0.6  # of the exports' seconds, the rest is the video's
 FRAME_COUNTS = (100, 75, 50, 36, 24)  # of a video
 MESH_VIEWS, VIDEO_FRAMES = (12, 60), (24, 90)  # fewest and most
@@ -31,16 +33,16 @@ FACTOR_RANGE = (0.05, 20.0)
 
 # Stage → (kind of the self-test's unit, how many of them a unit of this stage's work takes). Measured once; factors learn the rest.
 COST = {
-    "capture": ("decode", 1.0),
+    "capture": ("decode", 3.0),
     "frames": ("decode", 2.0),
     "poses": ("features", 1.3),
     "scene": ("features", 1.0),
-    "views": ("decode", 2.5),
-    "tsdf": ("decode", 4.0),
+    "views": ("decode", 7.0),
+    "tsdf": ("decode", 80.0),
     "render": ("ray", 1.5),
     "export": ("ray", 1.5),
     "evaluate": ("score", 1.0),
-    "report": ("decode", 6.0),
+    "report": ("decode", 40.0),
 }
 KINDS = ("decode", "features", "ray", "fit", "score")
 
