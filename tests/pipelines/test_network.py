@@ -1,0 +1,172 @@
+"""Runs that start from the networks or end with them, runs on few pictures, and the tables that compare such runs."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pipelines.few_views import numbers, part_of, wanted
+from tests.pipelines.made import call, command, environment, make_room
+from toolkit.errors import InputError
+from toolkit.files import read_json
+
+Capsys = pytest.CaptureFixture[str]
+FAST = [
+    "--budget",
+    1.5,
+    "--threads",
+    1,
+    "--set",
+    "field.resolution=64",
+    "--set",
+    "export.formats=[cameras]",
+    "--set",
+    "network.voxels=12",
+    "--set",
+    "tsdf.enabled=off",
+    "--set",
+    "keyframes.most=5",
+]
+
+
+def stages(data: dict[str, Any]) -> dict[str, bool]:
+    return {stage["name"]: stage["cached"] for stage in data["stages"]}
+
+
+def run(capsys: Capsys, room: Path, out: Path, *more: object) -> dict[str, Any]:
+    answer = call(capsys, "run", room, "--out", out, *FAST, *more, "--json")
+    assert answer.code == 0, answer.err
+    data = json.loads(answer.out)
+    assert isinstance(data, dict)
+    return data | {"said": answer.err}
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("network") / "room"
+    make_room(folder, 12, depth=True)
+    return folder
+
+
+def test_few_pictures_start_from_the_networks_and_the_report_says_what_they_gave(room: Path, tmp_path: Path, capsys: Capsys) -> None:
+    out = tmp_path / "out"
+    data = run(capsys, room, out)
+    assert {"keyframes", "network", "direct", "field", "render"} <= set(stages(data))
+    network, field = data["evaluation"]["network"], data["evaluation"]["field"]
+    assert network["views"] == field["views"] == 2 and network["key_frames"] >= 3
+    assert 0 < network["encode_seconds"] < network["seconds"] and network["first_preview_seconds"] > 0
+    assert field["psnr"] > network["psnr"] > data["evaluation"]["nearest_image"]["psnr"]
+    picture = cv2.imread(str(out / "preview.png"))
+    assert picture.shape == (72, 3 * 96, 3) and np.ptp(picture[:, 96:192]) > 20
+    assert "preview.png shows what 3 key frames" in data["said"]
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "Networks alone" in page and "nothing fitted" in page
+    # The same again reuses all; other settings of the fit leave the networks' field as it is; other key frames do not.
+    assert all(stages(run(capsys, room, out)).values())
+    cached = stages(run(capsys, room, out, "--budget", 1))
+    assert cached["network"] and cached["direct"] and not cached["field"]
+    cached = stages(run(capsys, room, out, "--budget", 1, "--set", "keyframes.method=uniform", "--set", "keyframes.every=2"))
+    assert cached["views"] and not (cached["keyframes"] or cached["network"] or cached["direct"] or cached["field"])
+    chosen = read_json(out / "keyframes.json")
+    assert chosen["keyframes"] == ["001", "003", "005", "007", "010"]
+
+
+def test_without_fine_tuning_the_networks_field_is_the_result_until_it_is_fitted(room: Path, tmp_path: Path, capsys: Capsys) -> None:
+    out = tmp_path / "out"
+    data = run(capsys, room, out, "--no-finetune")
+    assert data["timeline"] == [] and "network" not in data["evaluation"]
+    assert any("nothing was fitted" in text for text in data["warnings"])
+    direct = data["evaluation"]["field"]["psnr"]
+    assert direct > data["evaluation"]["nearest_image"]["psnr"]
+    answer = call(capsys, "finetune", out, "--budget", 1.5, "--json", "--quiet")
+    assert answer.code == 0, answer.err
+    data = json.loads(answer.out)
+    assert stages(data)["network"] and not stages(data)["field"]
+    assert data["evaluation"]["field"]["psnr"] > direct and data["evaluation"]["network"]["psnr"] == pytest.approx(direct, abs=0.1)
+    assert data["field"]["resolution"] == 64 and not any("nothing was fitted" in text for text in data["warnings"])
+
+
+def test_the_classical_start_asks_no_network(room: Path, tmp_path: Path, capsys: Capsys) -> None:
+    data = run(capsys, room, tmp_path / "out", "--init", "classical")
+    assert "network" not in stages(data) and "network" not in data["evaluation"] and not (tmp_path / "out" / "preview.png").exists()
+
+
+def test_contradictions_and_missing_networks_are_said(room: Path, tmp_path: Path, capsys: Capsys) -> None:
+    answer = call(capsys, "run", room, "--out", tmp_path / "a", *FAST, "--init", "classical", "--no-finetune", "--quiet")
+    assert answer.code == 2 and "fine-tuning" in answer.sentence()
+    answer = call(capsys, "run", room, "--out", tmp_path / "b", *FAST, "--set", "network.weights=nowhere.safetensors", "--quiet")
+    assert answer.code == 2 and "nowhere.safetensors" in answer.sentence()
+    for pair in ("views.limit=0", "network.levels=9", "keyframes.most=-1", "init=magic"):
+        assert call(capsys, "run", room, "--out", tmp_path / "c", "--set", pair, "--quiet").code == 2, pair
+
+
+def test_a_limit_leaves_the_held_out_views_alone(room: Path, tmp_path: Path, capsys: Capsys) -> None:
+    data = run(capsys, room, tmp_path / "out", "--set", "views.limit=3", "--init", "classical")
+    assert data["views"]["total"] == 5 and data["views"]["test"] == 2
+    assert [view["name"] for view in data["evaluation"]["field"]["per_view"]] == ["000", "008"]
+    cached = stages(run(capsys, room, tmp_path / "out", "--set", "views.limit=4", "--init", "classical"))
+    assert cached["poses"] and not cached["scene"] and not cached["views"]
+
+
+def test_a_run_killed_among_the_key_frames_goes_on(room: Path, tmp_path: Path, capsys: Capsys) -> None:
+    out = tmp_path / "out"
+    arguments = [*FAST, "--set", "keyframes.method=uniform", "--set", "keyframes.every=1"]
+    process = subprocess.Popen(
+        command("run", room, "--out", out, *arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()
+    )
+    end = time.monotonic() + 90
+    while not (out / "preview.png").exists():
+        assert process.poll() is None and time.monotonic() < end, process.communicate()[1]
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert cv2.imread(str(out / "preview.png")) is not None, "a preview is whole at any moment"
+    cached = stages(run(capsys, room, out, *arguments[len(FAST) :]))
+    assert cached["keyframes"] and not list(out.rglob(".tmp-*"))
+
+
+def test_tables_of_few_views_go_on_where_they_stopped(room: Path, tmp_path: Path, capsys: Capsys) -> None:
+    out = tmp_path / "table"
+    settings = ["--set", "field.resolution=32", "--set", "network.voxels=12", "--image-size", 48]
+    first = call(capsys, "bench", "few-views", room, "--out", out, "--views", "3", "--budgets", "0.5", "--starts", "classical", *settings)
+    assert first.code == 0, first.err
+    kept = read_json(out / "few_views.json")["rows"]
+    assert [row["start"] for row in kept] == ["nearest", "classical"]
+    answer = call(capsys, "bench", "few-views", room, "--out", out, "--views", "3,all", "--budgets", "0.5", *settings)
+    assert answer.code == 0, answer.err
+    rows = read_json(out / "few_views.json")["rows"]
+    assert rows[:2] == kept and {(row["views"], row["start"]) for row in rows} == {
+        (count, start) for count in (3, 10) for start in ("nearest", "direct", "network", "classical")
+    }
+    assert all(5 < row["psnr"] < 60 for row in rows)
+    lines = (out / "few_views.md").read_text().splitlines()
+    assert len(lines) == 4 and lines[2].startswith("| 3 |") and "classical start, 0.5 s" in lines[0] and lines[0] in answer.out
+
+
+def test_parts_of_the_networks_can_be_switched_off(room: Path, tmp_path: Path, capsys: Capsys) -> None:
+    settings = ["--set", "network.voxels=12", "--image-size", 48, "--views", "4"]
+    answer = call(capsys, "bench", "ablations", room, "--out", tmp_path / "table", *settings, "--quiet")
+    assert answer.code == 0, answer.err
+    rows = {row["part"]: row for row in read_json(tmp_path / "table" / "ablations.json")["rows"]}
+    assert list(rows) == ["whole", "no variance", "no direction code", "mean instead of GRU", "no pruning"]
+    others = [row["psnr"] for name, row in rows.items() if name != "whole"]
+    assert all(value != rows["whole"]["psnr"] for value in others) and len(set(others)) == 4
+
+
+def test_lists_of_numbers() -> None:
+    assert numbers("30, 120", "budgets") == [30.0, 120.0] and wanted("3,all") == ["3", "all"] and part_of("direct") == ["direct"]
+    for text in ("", "x", "-1", "nan"):
+        with pytest.raises(InputError, match="--budgets"):
+            numbers(text, "budgets")
+    with pytest.raises(InputError, match="'0'"):
+        wanted("0")
+    with pytest.raises(InputError, match="magic"):
+        part_of("magic")
