@@ -24,7 +24,7 @@ OPTIONS = ("--budget", "1", "--threads", "1", "--holdout", "4", "--set", "field.
            "--quiet")  # fmt: skip
 PATIENCE = 600.0  # seconds after which a run counts as hung, on the busiest machine
 TICK = 0.008  # seconds that the fit's clock advances at each look: some hundred looks a run, on any machine
-STAGES = ("capture", "poses", "scene", "views", "keyframes", "tsdf", "field", "render", "export", "evaluate")
+STAGES = ("capture", "poses", "effects", "scene", "views", "keyframes", "tsdf", "field", "render", "export", "evaluate")
 VARYING = ("key", "made", "after", "outputs", "cached", "started", "created", "command")
 
 

@@ -12,6 +12,7 @@ from safetensors.numpy import load_file, save_file
 from toolkit.capture.storage import capture_from_dict, capture_to_dict
 from toolkit.capture.types import Capture
 from toolkit.config import load_settings
+from toolkit.effects.correct import Corrections
 from toolkit.errors import InputError
 from toolkit.evaluate.selftest.edit import small_field
 from toolkit.render.bake import bake
@@ -47,3 +48,9 @@ def test_a_baked_field_before_a_background_that_is_no_colour(value: str, tmp_pat
     save_file(load_file(str(path)), str(path), metadata={METADATA_KEY: json.dumps(about)})
     with pytest.raises(InputError, match="background is not a colour"):
         read_baked(path)
+
+
+def test_numbers_of_400_digits_among_corrections() -> None:
+    data = {**Corrections().to_dict(), "corner": 10**400}
+    with pytest.raises(InputError, match=r"effects\.json is not"):
+        Corrections.from_dict(data)

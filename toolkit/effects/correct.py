@@ -98,7 +98,7 @@ class Corrections:
                 raise ValueError("a pose or the lens is not finite")
             exact = {name: (values[0], values[1], values[2]) for name, values in gain.items()}
             return cls(exact, corner, lens, poses, tuple(str(name) for name in data["left_out"]))
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
             raise InputError(f"effects.json is not what the effects stage writes ({error}); remove it and run again") from error
 
 
