@@ -84,11 +84,13 @@ def _clouds(effect: Background, azimuth: Tensor, elevation: Tensor) -> Tensor:
     return torch.sigmoid(1.5 * total - 0.5)
 
 
-THRESHOLD = 0.008  # share of what is seen
+THRESHOLD = 0.004  # share of what is seen
 BEYOND = 10.0  # times as far as the scene usually is
 NOISE = 0.2  # working pixels: deviation of one observation
-CONSISTENT = 2.0  # working pixels that an observation of one point may be off
-FEWEST = 50
+CONSISTENT = 0.8  # working pixels that an observation of one point may be off
+FEWEST = 50  # points whose distance can be told
+LEAST = 3  # far ones: fewer may be wrong matches
+VIEWS = 4  # that show a point, so that a wrong match hardly fits
 
 
 def evidence(directions: Array, centres: Array, point: Array, focal: Array, usual: float) -> Evidence:
@@ -116,13 +118,14 @@ def evidence(directions: Array, centres: Array, point: Array, focal: Array, usua
     np.maximum.at(worst, point, np.linalg.norm(off + rho[point, None] * aside, axis=1) * focal)
     deviation = NOISE / (np.sqrt(baseline) * np.maximum(np.bincount(point, focal, count) / seen, 1e-9))
     least = 1 / max(BEYOND * usual, 1e-12)
-    tells = (2 * deviation < 0.5 * least) & (worst < CONSISTENT)
-    far = tells & (rho < least) & (rho > -2 * least)
-    share = float(far.sum() / max(int(tells.sum()), 1)) if int(tells.sum()) >= FEWEST else 0.0
+    tells = (2 * deviation < 0.5 * least) & (worst < CONSISTENT) & (seen >= VIEWS)
+    far = tells & (np.abs(rho) < 0.5 * least)
+    enough = int(tells.sum()) >= FEWEST and int(far.sum()) >= LEAST
+    share = float(far.sum() / int(tells.sum())) if enough else 0.0
     return Evidence(
         "background",
         share,
         THRESHOLD,
-        f"{100 * share:.1f}% of the points lie more than {BEYOND:g} times as far as the scene usually is; "
+        f"{100 * share:.1f}% of the points lie more than {2 * BEYOND:g} times as far as the scene usually is; "
         f"{100 * THRESHOLD:.1f}% or more speak for a distant background",
     )

@@ -39,7 +39,7 @@ class Decision:
     note: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        return {**self.finding.to_dict(), "wish": self.wish, "on": self.on, "note": self.note}
+        return {**self.finding.to_dict(), "wish": self.wish, "on": bool(self.on), "note": self.note}
 
 
 @dataclass(frozen=True)

@@ -44,13 +44,13 @@ class Finding:
     def to_dict(self) -> dict[str, Any]:
         out: dict[str, Any] = {
             "effect": self.effect,
-            "number": round(self.number, 4),
+            "number": round(float(self.number), 4),
             "threshold": self.threshold,
-            "there": self.there,
+            "there": bool(self.there),  # NumPy's own truth values are not JSON
             "reason": self.reason,
         }
         if self.before is not None and self.after is not None:
-            out["held_out"] = {"before": round(self.before, 4), "after": round(self.after, 4), "unit": self.unit}
+            out["held_out"] = {"before": round(float(self.before), 4), "after": round(float(self.after), 4), "unit": self.unit}
         return out
 
 
