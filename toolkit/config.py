@@ -164,7 +164,7 @@ def _set(config: DictConfig, key: str, value: Any, where: str) -> None:
         near = difflib.get_close_matches(key, known + list(SHORT_NAMES), n=1, cutoff=0.3)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise InputError(f"{where}: there is no setting {key!r}{hint}")
-    if isinstance(value, bool) and "on" in CHOICES.get(full, ()):
+    if isinstance(value, bool) and "off" in CHOICES.get(full, ()):
         value = "on" if value else "off"  # YAML reads a bare on and off as true and false
     try:
         OmegaConf.update(config, full, value)

@@ -61,7 +61,7 @@ def evidence(slope: Array, depth: Array, frame: Array, point: Array, frames: int
         `parameters["sharpness"]`: (frames,) factors of two of the energy, mean 0; 0 where nothing is told.
     """
     used = (slope > 1e-5) & (depth > 0)
-    if int(used.sum()) < FEWEST:
+    if int(used.sum()) < FEWEST or len(np.unique(frame[used])) < TREND:
         return Evidence("motion_blur", 0.0, THRESHOLD, "too few points are shared between pictures to compare their sharpness")
     number = np.unique(point[used], return_inverse=True)[1]
     tracks = Tracks(np.zeros((int(used.sum()), 3)), frame[used], number, np.zeros(int(used.sum())))
@@ -76,9 +76,8 @@ def evidence(slope: Array, depth: Array, frame: Array, point: Array, frames: int
     seen = np.bincount(tracks.frame, weight, frames)
     told = seen > 0
     values = constants[told, 0]
-    if len(values) >= TREND:
-        steps = np.linspace(-1, 1, len(values))
-        values = values - np.polynomial.Polynomial.fit(steps, values, 2)(steps)
+    steps = np.linspace(-1, 1, len(values))
+    values = values - np.polynomial.Polynomial.fit(steps, values, 2)(steps)
     chance = float((float((weight * left[:, 0] ** 2).sum() / weight.sum()) / np.maximum(seen[told], 1)).mean())
     deviation = float(np.sqrt(max(float(np.mean(values**2)) - chance, 0.0)))
     sharpness = np.zeros(frames)

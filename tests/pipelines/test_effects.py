@@ -1,0 +1,84 @@
+"""The effects stage of a run: what it decides, what it writes, and that nothing changes where nothing is found or wanted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from toolkit.capture import open_capture
+from toolkit.capture.prepare import held_out
+from toolkit.config import load_settings
+from toolkit.effects.decide import asleep, decide, wish
+from toolkit.errors import InputError
+from toolkit.simulate.settings import scene_file
+from toolkit.simulate.simulate import simulate
+
+SCENE = {
+    "scene": "room",
+    "seed": 3,
+    "side": 1,
+    "camera": {"width": 176, "height": 132},
+    "path": {"kind": "walk", "frames": 9, "fps": 5, "speed": 0.5, "shake": 4},
+}
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    root = tmp_path_factory.mktemp("effects")
+    listed = {"clean": [], "drift": ["exposure:strong", "vignetting:strong"]}
+    for name, effects in listed.items():
+        simulate(scene_file(SCENE, "test"), root / name, effects=effects, workers=1)
+    return {name: root / name for name in listed}
+
+
+def test_a_clean_capture_gets_no_correction(captures: dict[str, Path]) -> None:
+    capture = open_capture(captures["clean"])
+    got = decide(capture, held_out(capture, 8), load_settings().effects)
+    assert not any(decision.on for decision in got.decisions)
+    assert not got.corrections.geometric and not got.corrections.photometric
+    assert got.corrections.on_capture(capture) is capture
+
+
+def test_drift_and_vignetting_are_corrected_and_off_is_off(captures: dict[str, Path]) -> None:
+    capture = open_capture(captures["drift"])
+    test = held_out(capture, 8)
+    got = decide(capture, test, load_settings().effects)
+    on = {decision.finding.effect for decision in got.decisions if decision.on}
+    assert on == {"exposure", "vignetting"}
+    gains = np.array([got.corrections.gain[frame.name] for frame in capture.frames])
+    np.testing.assert_allclose(np.log2(gains[~test]).mean(0), 0, atol=1e-4)
+    assert got.corrections.corner == pytest.approx(0.35, abs=0.1)
+    without = decide(capture, test, load_settings(pairs=["effects.off=[vignetting]"]).effects)
+    assert without.corrections.corner is None and without.corrections.gain
+
+
+def test_settings() -> None:
+    off = load_settings(pairs=["effects=off"]).effects
+    assert asleep(off) and wish(off, "poses") == "off"
+    some = load_settings(pairs=["effects=off", "effects.on=[exposure]"]).effects
+    assert not asleep(some) and wish(some, "exposure") == "on" and wish(some, "poses") == "off"
+    with pytest.raises(InputError, match="did you mean 'exposure'"):
+        load_settings(pairs=["effects.on=[exposur]"])
+    with pytest.raises(InputError, match="both name"):
+        load_settings(pairs=["effects.on=[poses]", "effects.off=[poses]"])
+
+
+def test_settings_files_may_say_on_and_off_bare(tmp_path: Path) -> None:
+    file = tmp_path / "settings.yaml"
+    file.write_text("effects: {on: [exposure], off: [poses]}\n")
+    got = load_settings(file=file).effects
+    assert got.on == ["exposure"] and got.off == ["poses"]
+    file.write_text("effects: off\n")
+    assert load_settings(file=file).effects.mode == "off"
+
+
+def test_info_prints_the_evidence(captures: dict[str, Path]) -> None:
+    from pipelines.cli import app
+
+    shown = CliRunner().invoke(app, ["info", str(captures["drift"]), "--effects", "--fast", "--quiet"])
+    assert shown.exit_code == 0, shown.output
+    assert "exposure" in shown.output and "shared points looked at" in shown.output
+    assert not list(captures["drift"].glob("effects.json"))
