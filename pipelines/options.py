@@ -28,7 +28,9 @@ Engine = Annotated[str | None, typer.Option(help="auto (default): numba on the C
 Decoder = Annotated[str | None, typer.Option(help="deferred (default) or per_sample (the paper's).", show_default=False)]
 Init = Annotated[
     str | None,
-    typer.Option(help="Start of the fit: network, classical, or auto (default): the networks' when pictures are few.", show_default=False),
+    typer.Option(
+        help="Start of the fit: network, classical, or auto (default): networks' if few pictures, no background.", show_default=False
+    ),
 ]
 Finetune = Annotated[
     bool | None,

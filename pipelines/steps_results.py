@@ -85,7 +85,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     settings = job.settings
     path, times, told = job.folder / "field.safetensors", job.folder / "timeline.json", job.folder / FIT_NOTES
     notes: list[str] = []
-    made = make_network_field(job, views, scene) if uses_network(job, views) else None
+    made = make_network_field(job, views, scene) if uses_network(job, views, scene) else None
     start = job.stages.record("field") if go_on and job.stages.usable("field") and not job.other_field else None
 
     def load() -> Fitted:

@@ -63,7 +63,7 @@ class FieldSettings:
     hidden: int = 64  # width of the decoder
     background: str = "auto"  # auto | on | off: contract what lies outside the region of interest
     resolution: int | None = None  # voxels along the longest side of the volume; None: by preset and picture size
-    init: str = "auto"  # auto (by the number of training views) | network | classical
+    init: str = "auto"  # auto (network: few training views and no background) | network | classical
 
 
 @dataclass

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -14,12 +15,16 @@ import numpy as np
 import pytest
 
 from pipelines.few_views import numbers, part_of, wanted
+from pipelines.steps_network import uses_network
 from tests.pipelines.made import call, command, environment, make_room
+from toolkit.config import load_settings
 from toolkit.errors import InputError
 from toolkit.files import read_json
 
 Capsys = pytest.CaptureFixture[str]
 FAST = [
+    "--init",
+    "network",
     "--budget",
     1.5,
     "--threads",
@@ -159,6 +164,18 @@ def test_parts_of_the_networks_can_be_switched_off(room: Path, tmp_path: Path, c
     assert list(rows) == ["whole", "no variance", "no direction code", "mean instead of GRU", "no pruning"]
     others = [row["psnr"] for name, row in rows.items() if name != "whole"]
     assert all(value != rows["whole"]["psnr"] for value in others) and len(set(others)) == 4
+
+
+@pytest.mark.parametrize(("count", "background", "used"), [(23, False, True), (24, False, False), (5, True, False)])
+def test_which_start_is_automatic(count: int, background: bool, used: bool) -> None:
+    settings = load_settings()
+    views, scene = SimpleNamespace(test=np.zeros(count, bool)), SimpleNamespace(has_background=background)
+    job = SimpleNamespace(settings=settings, plan=None)
+    assert uses_network(job, views, scene) is used  # type: ignore[arg-type]
+    job.plan = object()
+    assert not uses_network(job, views, scene)  # type: ignore[arg-type]
+    settings.fit.finetune = False
+    assert uses_network(job, views, scene)  # type: ignore[arg-type]
 
 
 def test_lists_of_numbers() -> None:

@@ -28,8 +28,8 @@ PIXELS = 2.0  # of the training views, a voxel in the middle of the scene
 OBJECT_PIXELS = 1.3  # the same where alpha cuts the object out: fewer voxels are in play, so they may be finer
 SEEN_BY = 3  # training views that must see a voxel: fewer cannot tell its depth …
 # … but with fewer views than FEW_VIEWS most places are seen by one or two. What is left out there is missing from every picture: with
-# 3 to 12 views it cost up to 9 dB on validation views, while with all of them nothing was gained or lost. With so few the fit also
-# starts from the networks.
+# 3 to 12 views it cost up to 9 dB on validation views, while with all of them nothing was gained or lost. With so few the fit may
+# also start from the networks.
 FEW_VIEWS = 24
 
 
