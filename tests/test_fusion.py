@@ -39,8 +39,10 @@ def opinionated(seed: int = 0) -> NerfusionModel:
     """A model whose densities differ widely from place to place, as a trained one's do."""
     model = small_model(seed).eval()
     with torch.no_grad():
-        model.to_field.density.weight.mul_(6)
-        model.to_field.density.bias.fill_(0.0)
+        model.to_field.density.weight.zero_()
+        model.to_field.agreement.weight.zero_()  # pictures of noise agree nowhere: another latent tells, up to exp(3) thick
+        model.to_field.agreement.weight[:, 5] = 1.5
+        model.to_field.density.bias.fill_(0.5)
     return model
 
 
