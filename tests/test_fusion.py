@@ -85,7 +85,7 @@ def test_a_finer_level_knows_only_where_the_coarse_one_is_not_see_through() -> N
 def test_the_finer_levels_cells_are_allowed_by_the_coarser_ones_and_pruning_forgets_the_others() -> None:
     views, keys = captured()
     model = opinionated(3)
-    fusion = Fusion(model, Lattice(SPACE, 32), FusionOptions(3, 0.2, FAR, 0.7))
+    fusion = Fusion(model, Lattice(SPACE, 32), FusionOptions(3, 0.2, FAR, 0.9))
     assert [store.lattice.resolution for store in fusion.stores] == [8, 16, 32]
     for key in keys.indices:
         cameras = Cameras.of([INTRINSICS], views.world_from_camera[key : key + 1])
