@@ -13,8 +13,27 @@ from tests.training.test_fit import ticking
 from tests.training.test_not_finite import spoiling
 from toolkit.files import read_json
 
-OPTIONS = ("--budget", "1", "--threads", "1", "--holdout", "4", "--set", "field.resolution=16", "--engine", "torch", "--quiet",
-           "--set", "tsdf.enabled=off", "--set", "field.init=classical", "--set", "export.formats=[cameras]", "--set", "export.mesh_views=3")  # fmt: skip
+OPTIONS = (
+    "--budget",
+    "1",
+    "--threads",
+    "1",
+    "--holdout",
+    "4",
+    "--set",
+    "field.resolution=16",
+    "--engine",
+    "torch",
+    "--quiet",
+    "--set",
+    "tsdf.enabled=off",
+    "--set",
+    "field.init=classical",
+    "--set",
+    "export.formats=[cameras]",
+    "--set",
+    "export.mesh_views=3",
+)
 
 
 def test_a_step_that_was_not_finite_is_told_in_the_report(
