@@ -42,7 +42,7 @@ def test_posed_captures_are_measured_and_their_table_written(tmp_path: Path, cap
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_the_networks_alone(tmp_path: Path, capsys: Capsys) -> None:
-    make_room(tmp_path / "room", 4)
+    make_room(tmp_path / "room", 10)
     answer = call(
         capsys,
         "bench",
