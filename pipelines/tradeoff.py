@@ -111,9 +111,14 @@ def tradeoff_run(
         capture, poses, posed, scene, views = stand(job)
         if not views.test.any():
             raise InputError("what accuracy costs is measured on pictures kept for testing, and there is none; give --holdout 8")
-        surface = "tsdf" if posed.has_depth else "tsdf_stereo"
+        surface: str | None = "tsdf" if posed.has_depth else "tsdf_stereo"
+        refused = [f"The axis {name} was not varied: {why}." for name, why in why_not.items()]
         if surface == "tsdf_stereo":
-            match_pictures(job, scene, views)
+            try:
+                match_pictures(job, scene, views)
+            except InputError as error:  # a camera that only moves forward leaves nothing to match; the field can still be measured
+                surface = None
+                refused.append(f"No surface was made: {error}.")
         stereo = job.stages.records["stereo"].seconds if "stereo" in job.stages.records else 0.0
         swept, wanted = Swept([], []), plan(chosen, ladder, seeds, surface)
         try:
@@ -122,9 +127,7 @@ def tradeoff_run(
             done = {(row["id"], row["seed"]) for row in swept.rows}
             swept.left_out = [one.name for one in wanted if (one.id, one.seed) not in done]
             # What was measured is shown, however the sweep ends.
-            data = put(
-                job, swept, capture, poses, scene, views, [f"The axis {name} was not varied: {why}." for name, why in why_not.items()]
-            )
+            data = put(job, swept, capture, poses, scene, views, refused)
     return data
 
 
