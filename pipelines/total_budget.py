@@ -24,6 +24,7 @@ LONGEST_START = 60.0  # seconds; a process that is older was not started for thi
 NOT_FITTED = ("capture", "frames", "poses", "scene", "views", "tsdf", "render", "export", "evaluate", "report")
 TOO_FEW = " The smallest choice needs about {:.0f} s on this machine as busy as it is; give more, or expect that."
 WORTH_LEARNING = 0.3  # seconds; shorter stages say little
+EFFECTS_FROM = 45.0  # seconds of a whole run from which on effects are looked for
 
 
 class TotalBudget:
@@ -58,6 +59,8 @@ class TotalBudget:
             self.speed = self_test(settings)
             job.progress.finish("self-test", time.monotonic() - start, False)
             model.remember(self.name, self.speed)
+        if self.asked < EFFECTS_FROM and settings.effects.mode == "auto" and not settings.effects.on:
+            settings.effects.mode = "off"  # looking for them can take most of so short a run
         self.work = work_of(capture, settings)
         kept = self._kept(job)
         if kept is not None:
