@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
@@ -15,10 +17,12 @@ from toolkit.config import load_settings
 from toolkit.effects.correct import Corrections
 from toolkit.errors import InputError
 from toolkit.evaluate.selftest.edit import small_field
+from toolkit.export.mesh import mesh_facts
 from toolkit.render.bake import bake
 from toolkit.render.bake_file import METADATA_KEY, read_baked, write_baked
 from toolkit.simulate.settings import read_scene_file
 from toolkit.training.nerfusion.settings import load_train_settings
+from toolkit.tsdf.mesh import Mesh
 
 
 def test_numbers_of_400_digits_in_a_stored_capture() -> None:
@@ -54,3 +58,27 @@ def test_numbers_of_400_digits_among_corrections() -> None:
     data = {**Corrections().to_dict(), "corner": 10**400}
     with pytest.raises(InputError, match=r"effects\.json is not"):
         Corrections.from_dict(data)
+
+
+def test_a_surface_does_not_depend_on_the_order_in_which_threads_came_to_its_parts() -> None:
+    """Open3D's threads number vertices and triangles as they come; sums over them, and so `facts.json`, differed between equal runs."""
+    rng = np.random.default_rng(5)
+    sphere = trimesh.creation.icosphere(4)
+    vertices = np.asarray(sphere.vertices, np.float32).astype(np.float64)
+    colours = rng.integers(0, 256, vertices.shape, dtype=np.uint8)
+    shuffled = []
+    for _ in range(12):
+        places, turns = rng.permutation(len(vertices)), rng.integers(0, 3, (len(sphere.faces), 1))
+        rank = np.argsort(places)
+        triangles = np.take_along_axis(rank[sphere.faces], (turns + np.arange(3)) % 3, axis=1)[rng.permutation(len(sphere.faces))]
+        shuffled.append(Mesh.create(vertices[places], triangles, colours[places], vertices[places]))
+    assert len({mesh.areas().cumsum()[-1] for mesh in shuffled}) > 1  # what went wrong: a sum that depends on the order
+    ordered = [mesh.ordered() for mesh in shuffled]
+    facts = [mesh_facts(mesh) for mesh in ordered]
+    assert all(fact == facts[0] for fact in facts) and facts[0]["watertight"] and facts[0]["triangles"] == len(sphere.faces)
+    for mesh in ordered[1:]:
+        for name in ("vertices", "triangles", "colours", "normals"):
+            assert np.array_equal(getattr(mesh, name), getattr(ordered[0], name))
+    corners = [mesh.vertices[mesh.triangles] for mesh in (shuffled[0], ordered[0])]
+    outward = [np.einsum("tj,tj->t", np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]), c.mean(1)) for c in corners]
+    assert all((side > 0).all() for side in outward)  # no triangle was turned over

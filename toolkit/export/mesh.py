@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ def mesh_facts(mesh: Mesh) -> dict[str, Any]:
         "triangles": len(mesh.triangles),
         "watertight": bool(len(mesh.triangles)) and bool(to_trimesh(mesh).is_watertight),
         "components": int(components.max()) + 1 if len(components) else 0,
-        "area": float(mesh.areas().sum()),
+        "area": math.fsum(mesh.areas().tolist()),
         "bounds": mesh.bounds().tolist(),
     }
 

@@ -90,6 +90,22 @@ class Mesh:
             mesh = replace(mesh, triangles=mesh.triangles[keep[label]])
         return mesh.compacted()
 
+    def ordered(self) -> Mesh:
+        """The same mesh, vertices and triangles in an order that only their values decide.
+
+        Open3D's threads number vertices and triangles as they come to them, so that one volume gives its mesh in another order each time,
+        and with it other sums, other files and another decimation.
+        """
+        order = places(self.vertices, self.colours, self.normals)
+        number = np.empty(len(order), np.int32)
+        number[order] = np.arange(len(order), dtype=np.int32)
+        triangles = number[self.triangles]
+        first = np.argmin(triangles, axis=1)[:, None] if len(triangles) else np.zeros((0, 1), np.int64)
+        triangles = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)
+        triangles = triangles[np.lexsort(triangles.T[::-1])]
+        normals = None if self.normals is None else self.normals[order]
+        return Mesh(self.vertices[order], triangles, self.colours[order], normals)
+
     def compacted(self) -> Mesh:
         """Without vertices that no triangle uses; the order of the others is kept."""
         used = np.zeros(len(self.vertices), bool)
@@ -125,6 +141,16 @@ class Mesh:
             np.asarray(mesh.vertex_colors) if mesh.has_vertex_colors() else None,
             np.asarray(mesh.vertex_normals) if mesh.has_vertex_normals() else None,
         )
+
+
+def places(positions: Array, *others: Array | None) -> Array:
+    """(N,) int64 indices that sort (N, 3) `positions` by x, then y, then z; `others` (N, C) decide between equal ones."""
+    order = np.lexsort(positions.T[::-1])
+    told = positions[order]
+    if len(told) > 1 and (told[1:] == told[:-1]).all(axis=1).any():
+        columns = np.concatenate([positions, *(np.asarray(other, np.float64) for other in others if other is not None)], axis=1)
+        order = np.lexsort(columns.T[::-1])
+    return np.asarray(order)
 
 
 def as_bytes(colours: Array) -> Array:

@@ -8,6 +8,7 @@ What Open3D 0.20 does and this file takes care of:
 - A frame without valid depth raises; the weight threshold is exclusive, so 3 needs four observations.
 - `VoxelBlockGrid.ray_cast` can hang on the CPU, leaves tiles empty, and its depth is off by up to a voxel: views are rendered by ray
   casting the extracted mesh.
+- Its threads, which do not ask OMP_NUM_THREADS, number points and triangles as they come to them: both are put into order.
 - The table grows when the keys passed would not fit, present or not, and growth copies everything: room is made beforehand, and keys are
   passed in pieces that fit.
 """
@@ -26,7 +27,7 @@ from toolkit import memory
 from toolkit.camera import Array, Intrinsics, invert
 from toolkit.errors import InputError
 from toolkit.tsdf.frames import DepthFrame
-from toolkit.tsdf.mesh import Mesh, as_bytes
+from toolkit.tsdf.mesh import Mesh, as_bytes, places
 from toolkit.tsdf.view import MeshView, SurfaceCaster
 
 BLOCK = 8
@@ -56,7 +57,6 @@ def default_weight_threshold(sightings: float) -> float:
     simulated room).
     """
     return 0.5 if sightings <= 50 else 1.5
-
 
 
 class TsdfVolume:
@@ -169,10 +169,10 @@ class TsdfVolume:
         vertex = mesh.vertex
         return Mesh.create(
             vertex.positions.numpy(), mesh.triangle.indices.numpy(), as_bytes(vertex.colors.numpy()), _unit(vertex.normals.numpy())
-        )
+        ).ordered()
 
     def points(self, weight_threshold: float | None = None) -> Points:
-        """Surface points where the distance changes sign along a lattice edge, in the working frame; their order is not fixed.
+        """Surface points where the distance changes sign along a lattice edge, in the working frame, by x, y, z.
 
         Raises:
             InputError: no frame with valid depth was fused.
@@ -183,7 +183,10 @@ class TsdfVolume:
         if "positions" not in cloud.point or len(cloud.point.positions) == 0:
             return Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)))
         point = cloud.point
-        return Points(point.positions.numpy().astype(np.float64), as_bytes(point.colors.numpy()), _unit(point.normals.numpy()))
+        points, colours = point.positions.numpy().astype(np.float64), as_bytes(point.colors.numpy())
+        normals = _unit(point.normals.numpy())
+        order = places(points, colours, normals)
+        return Points(points[order], colours[order], normals[order])
 
     def render(self, intrinsics: Intrinsics, world_from_camera: Array) -> MeshView:
         """Colour, depth and mask as a camera sees the surface. The surface is extracted once and again after new frames.
@@ -253,9 +256,7 @@ class TsdfVolume:
 
     def require_frames(self) -> None:
         if self.frames == 0:
-            raise InputError(
-                f"no frame has valid depth between 0 and {self.depth_max:g} to fuse; check the depth maps and tsdf.depth_max"
-            )
+            raise InputError(f"no frame has valid depth between 0 and {self.depth_max:g} to fuse; check the depth maps and tsdf.depth_max")
 
 
 def too_fine(voxel_size: float, blocks: int, max_blocks: int) -> InputError:
