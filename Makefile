@@ -41,7 +41,7 @@ test: lint
 
 stability: $(VENV)/.installed-test
 	$(BIN)/python -m tests.stability.page docs/stability.md
-	$(BIN)/python -m tests.stability.kills --kills 50 --page docs/stability.md
+	$(BIN)/python -m tests.stability.kills --kills 50 --state .kills-state.json --page docs/stability.md
 
 fuzz: $(VENV)/.installed-test
 	$(BIN)/python -m tests.stability.fuzz --inputs 100000 --state .fuzz-state.json --page docs/stability.md

@@ -1,7 +1,8 @@
 """kill -9 at random moments of a small real run, again and again: `python -m tests.stability.kills --kills 50`.
 
 Half of the moments are drawn in time, half among the changes that the run makes to files, where a kill can do the most harm. After each
-kill no file may be damaged; a run that is let go on must end with the same files as one that was never killed.
+kill no file may be damaged; a run that is let go on must end with the same files as one that was never killed. Every third run starts from
+the networks. With `--state FILE` a survey that was ended (by `--seconds`, say) is taken up where it was left, if the code is the same.
 """
 
 from __future__ import annotations
@@ -13,14 +14,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from tests.pipelines.made import environment
 from tests.stability.page import replace_part
-from tests.stability.runs import ROOT, command, corrupt, differences, launch, leftovers, make_source
+from tests.stability.runs import NETWORK, ROOT, command, corrupt, differences, launch, leftovers, make_source
+from toolkit.files import fingerprint, read_json, write_json
 
 EACH = 5  # kills before a run is left alone
+NETWORK_EVERY = 3  # of so many runs one starts from the networks
 
 
 @dataclass
@@ -28,48 +31,97 @@ class Survey:
     """How often a run was killed, and what was wrong afterwards."""
 
     kills: int = 0
-    late: int = 0  # the run had ended before the moment came
+    late: int = 0  # moments that came when the run had ended
     runs: int = 0
+    from_networks: int = 0  # runs that started from the networks
     seconds: float = 0.0
     wrong: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
         survived = "all survived" if not self.wrong else f"{len(self.wrong)} problems"
-        return [
-            f"{self.kills} kills in {self.runs} runs, {survived}; {self.seconds:.0f} s.",
-        ]
+        started = f", {self.from_networks} of which started from the networks" if self.from_networks else ""
+        return [f"{self.kills} kills in {self.runs} runs{started}: {survived}; {self.seconds:.0f} s."]
 
 
-def kill_runs(folder: Path, kills: int, seed: int, each: int = EACH, seconds: float = 1e9) -> Survey:
-    """Kill until `kills` are counted or the time is over."""
-    draw, survey, began = random.Random(seed), Survey(), time.monotonic()
-    source, whole = make_source(folder / "room"), folder / "whole"
-    first = launch({}, source, whole)
+def kill_runs(
+    folder: Path,
+    kills: int,
+    seed: int,
+    each: int = EACH,
+    seconds: float = 1e9,
+    network_every: int = NETWORK_EVERY,
+    state: Path | None = None,
+) -> Survey:
+    """Kill until `kills` are counted or the time is over; run n draws from `seed` and n alone.
+
+    Args:
+        network_every: each so-manieth run starts from the networks; 0: none.
+        state: kept after each run, and gone on from.
+    """
+    survey, code = Survey(), fingerprint([seed, each, network_every, *_sources()])
+    if state is not None and state.is_file() and read_json(state).get("code") == code:
+        survey = Survey(**read_json(state)["survey"])
+    source, began, before = make_source(folder / "room"), time.monotonic(), survey.seconds
+    whole: dict[bool, tuple[Path, float]] = {}
+    while survey.kills < kills and time.monotonic() - began < seconds:
+        number = survey.runs
+        networks = network_every > 0 and number % network_every == network_every - 1
+        if networks not in whole:
+            whole[networks] = _undisturbed(source, folder / f"whole{networks:d}", networks)
+        _one_run(
+            survey,
+            random.Random(f"{seed} {number}"),
+            source,
+            folder / f"run{number}",
+            *whole[networks],
+            networks,
+            min(each, kills - survey.kills),
+        )
+        survey.seconds = before + time.monotonic() - began
+        if state is not None:
+            write_json(state, {"code": code, "survey": asdict(survey)})
+    return survey
+
+
+def _undisturbed(source: Path, out: Path, networks: bool) -> tuple[Path, float]:
+    """A run that nothing happens to, and how long it took."""
+    began = time.monotonic()
+    first = launch({}, source, out, *options(networks))
     if first.returncode != 0:
         raise RuntimeError(f"the run does not even end when nobody disturbs it: {first.stderr[-2000:]}")
-    alone = time.monotonic() - began
-    changes = count_changes(whole)
-    while survey.kills < kills and time.monotonic() - began < seconds:
-        out = folder / f"run{survey.runs}"
-        for _ in range(min(each, kills - survey.kills)):
-            if draw.random() < 0.5:
-                done = launch({"event": draw.randint(1, changes), "signal": "SIGKILL"}, source, out).returncode
-            else:
-                done = killed_after(draw.uniform(0, alone), source, out)
-            survey.kills += done == -signal.SIGKILL
-            survey.late += done == 0
-            survey.wrong += [f"after kill {survey.kills}: {text}" for text in (corrupt(out) if out.exists() else [])]
-            if done not in (0, -signal.SIGKILL):
-                survey.wrong.append(f"after kill {survey.kills}: the run ended with {done}")
-            if done == 0:
-                break
-        last = launch({}, source, out)
-        if last.returncode != 0:
-            survey.wrong.append(f"run {survey.runs} did not go on: {last.stderr[-500:]}")
-        survey.wrong += [f"run {survey.runs}: {text}" for text in differences(whole, out) + leftovers(out) + corrupt(out)]
-        survey.runs += 1
-    survey.seconds = time.monotonic() - began
-    return survey
+    return out, time.monotonic() - began
+
+
+def _one_run(survey: Survey, draw: random.Random, source: Path, out: Path, whole: Path, alone: float, networks: bool, kills: int) -> None:
+    """Kill one run up to `kills` times, let it go on, and compare it with the `whole` one, which took `alone` seconds."""
+    more, changes = options(networks), count_changes(whole)
+    for _ in range(kills):
+        if draw.random() < 0.5:
+            done = launch({"event": draw.randint(1, changes), "signal": "SIGKILL"}, source, out, *more).returncode
+        else:
+            done = killed_after(draw.uniform(0, alone), source, out, *more)
+        survey.kills += done == -signal.SIGKILL
+        survey.late += done == 0
+        survey.wrong += [f"after kill {survey.kills}: {text}" for text in (corrupt(out) if out.exists() else [])]
+        if done not in (0, -signal.SIGKILL):
+            survey.wrong.append(f"after kill {survey.kills}: the run ended with {done}")
+        if done == 0:
+            break
+    last = launch({}, source, out, *more)
+    if last.returncode != 0:
+        survey.wrong.append(f"run {survey.runs} did not go on: {last.stderr[-500:]}")
+    survey.wrong += [f"run {survey.runs}: {text}" for text in differences(whole, out) + leftovers(out) + corrupt(out)]
+    survey.runs += 1
+    survey.from_networks += networks
+
+
+def options(networks: bool) -> tuple[str, ...]:
+    return NETWORK if networks else ()
+
+
+def _sources() -> list[str]:
+    """What the runs are made of."""
+    return [fingerprint(path) for part in ("toolkit", "pipelines", "tests/stability") for path in sorted((ROOT / part).rglob("*.py"))]
 
 
 def count_changes(folder: Path) -> int:
@@ -77,8 +129,10 @@ def count_changes(folder: Path) -> int:
     return 2 * sum(path.is_file() for path in folder.rglob("*")) + 10
 
 
-def killed_after(seconds: float, source: Path, out: Path) -> int:
-    process = subprocess.Popen(command({}, source, out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment(), cwd=ROOT)
+def killed_after(seconds: float, source: Path, out: Path, *more: str) -> int:
+    process = subprocess.Popen(
+        command({}, source, out, *more), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment(), cwd=ROOT
+    )
     try:
         return process.wait(timeout=seconds)
     except subprocess.TimeoutExpired:
@@ -91,10 +145,11 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=1e9)
+    parser.add_argument("--state", type=Path)
     parser.add_argument("--page", type=Path)
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="fieldfuse-kills-") as folder:
-        survey = kill_runs(Path(folder), chosen.kills, chosen.seed, seconds=chosen.seconds)
+        survey = kill_runs(Path(folder), chosen.kills, chosen.seed, seconds=chosen.seconds, state=chosen.state)
     for text in survey.wrong:
         sys.stdout.write(text + "\n")
     sys.stdout.write("\n".join(survey.lines()) + f"\n{survey.late} moments came too late\n")
