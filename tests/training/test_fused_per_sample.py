@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from tests.render.made import random_field, random_rays
-from tests.training.test_fused import made_views, torch_gradients
+from tests.training.gradients import clear_of_zero, exact_gradients, torch_gradients
+from tests.training.test_fused import made_views
 from toolkit.networks.decoder import PerSample
 from toolkit.networks.encoding import positional
 from toolkit.render import kernels_net
@@ -116,47 +117,42 @@ def gradients(engine: FusedPerSampleOptimiser, picks: torch.Tensor, monkeypatch:
     return [*dense, *(parameter.detach() for parameter in decoder.parameters())]
 
 
-def clear_of_zero(field: Field, pool: PixelPool, picks: torch.Tensor, margin: float) -> torch.Tensor:
-    """Which of the rays `picks` have no sample with a hidden unit whose input lies within `margin` of zero."""
-    assert isinstance(field.decoder, PerSample)
-    nearest: list[float] = []
-    layers = [field.decoder.body[0], field.decoder.body[2], field.decoder.colour[0]]
-    hooks = [
-        layer.register_forward_hook(lambda _m, _i, out: nearest.append(float(out.abs().min()) if out.numel() else 1.0)) for layer in layers
-    ]
-    clear = []
-    for pick in picks:
-        nearest.clear()
-        batch = pool.take(pick[None])
-        render_rays(field, batch.origins, batch.directions)
-        clear.append(min(nearest, default=1.0) > margin)
-    for hook in hooks:
-        hook.remove()
-    return torch.tensor(clear)
+# Largest error of the largest gradient, and share of the values that rays touch within 1e-4 of it; worst of twelve random fields with and
+# without a shell: densities 7e-4 and 0.9995, features 1e-3 and 0.9994, first layer 2e-4 and 0.991, all others 9e-5 and 1. A place within a
+# voxel is worth few digits in float32, and features and the weights behind them are found at sines of it, up to 16π times as steep: the
+# torch engine is as far from float64 as that too (features 5e-4, 0.9995).
+BOUNDS = {"density_rows": (1e-3, 0.999), "feature_rows": (1.5e-3, 0.999), "body.0.weight": (5e-4, 0.99)}
+CLEAR = 2e-3  # the same steepness puts a hidden unit whose input is nearer to zero on the other side of its ReLU
 
 
-@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize(("seed", "threads"), [(0, 1), (1, 3), (2, 1)])
 @pytest.mark.parametrize("shell", [0.0, 1.0])
-def test_gradients_agree(shell: float, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where rounding cannot put a hidden unit on the other side of its ReLU, gradients agree within 1e-4 of the largest; at a voxel's
-    border, where a place in it is worth few digits, within 1e-3."""
-    field = made_field(shell, 0.5, -3.5)
+def test_gradients_agree(shell: float, seed: int, threads: int, every_sample: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compiled, torch, and torch in float64, on rays of which rounding cannot put a hidden unit on the other side of its ReLU."""
+    field = random_field(shell, 32, "per_sample", keep=0.5, raw=-3.5, seed=seed)
     pool = PixelPool(made_views())
-    picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(0))[:400]
-    # In float32 the reference's own angles are off by 1e-5, and places in a voxel by as much, which the encoding multiplies by 16.
-    monkeypatch.setattr("toolkit.networks.decoder.positional", lambda values, count: positional(values.double(), count).float())
-    picks = picks[clear_of_zero(field, pool, picks, 5e-4)]
+    picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(seed))[:600]
+    picks = picks[clear_of_zero(field, pool.take(picks), CLEAR)]
     assert len(picks) > 60
-    expected = torch_gradients(field, pool, picks, RATES, monkeypatch)  # undoes the patches
-    monkeypatch.setattr("toolkit.training.fused.STOP", 0.0)
-    monkeypatch.setattr("toolkit.training.fused_per_sample.NEGLIGIBLE", -1.0)
-    got = gradients(FusedPerSampleOptimiser(field, pool, threads=threads), picks, monkeypatch)
-    for wanted, value in zip(expected, got, strict=True):
+    exact = exact_gradients(field, pool.take(picks), RATES)
+    with monkeypatch.context() as patch:
+        # In float32 the reference's own angles are off by 1e-5.
+        patch.setattr("toolkit.networks.decoder.positional", lambda values, count: positional(values.double(), count).float())
+        reference = torch_gradients(field, pool.take(picks), RATES)
+    compiled = gradients(FusedPerSampleOptimiser(field, pool, threads=threads), picks, monkeypatch)
+    names = ["density_rows", "feature_rows", *(name for name, _ in field.decoder.named_parameters())]
+    for name, wanted, of_torch, of_ours in zip(names, exact, reference, compiled, strict=True):
         scale = float(wanted.abs().max())
         assert scale > 0
-        torch.testing.assert_close(value, wanted, atol=1e-3 * scale, rtol=1e-3)
-        assert float((value - wanted).norm()) < 5e-4 * float(wanted.norm())
-        assert float(((value - wanted).abs() <= 1e-4 * scale).float().mean()) > 0.995
+        most, share = BOUNDS.get(name, (1e-4, 1.0))
+        for one, other in ((of_ours, of_torch), (of_ours, wanted), (of_torch, wanted)):
+            error = (one.double() - other.double()).abs() / scale
+            touched = (one != 0) | (other != 0)
+            assert float(error.max()) <= most, name
+            assert float((error[touched] <= 1e-4).double().mean()) >= share, name
+            # Of all values of the lattice, those that no ray touches included.
+            assert wanted.numel() <= 10_000 or float((error <= 1e-4).double().mean()) >= 0.9995, name
+            assert float((one.double() - other.double()).norm()) < 5e-4 * float(wanted.norm()), name
 
 
 def test_what_is_left_out_has_no_weight(monkeypatch: pytest.MonkeyPatch, every_sample: None) -> None:
