@@ -25,7 +25,7 @@ from toolkit.networks.cameras import Cameras
 from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
 from toolkit.networks.lattice import LatentVolume, Lattice
 from toolkit.networks.model import NerfusionModel
-from toolkit.networks.refine import adopt, children, merged, part, solid_cells, split_volume
+from toolkit.networks.refine import adopt, children, merged, part, solid_cells, split_volume, surface_cells
 from toolkit.networks.store import GlobalStore
 from toolkit.networks.unproject import EncodedView
 from toolkit.progress import SILENT, Progress
@@ -110,11 +110,12 @@ class Fusion:
     def add(self, views: Sequence[EncodedView], cameras: Cameras) -> None:
         """Fuse one key frame (first) and its neighbours."""
         options = self.options
-        keys = self._keys[visible_blocks(*self._balls, cameras, options.near, options.far)]
+        keys = self._keys[visible_blocks(*self._balls, cameras[0], options.near, options.far)]
         topology, finer = Topology(keys), None
+        swept = self.model.sweep(views, cameras, options.near, options.far) if options.near > 0 else None
         for level, store in enumerate(self.stores):
             wanted = None if finer is None else finer.known
-            local = self.model.local_volume(views, cameras, store.lattice, topology, wanted, options.near, options.far)
+            local = self.model.local_volume(views, cameras, store.lattice, topology, wanted, options.near, options.far, swept)
             before = store.part(local.topology)
             if finer is not None:
                 before = adopt(before, part(finer, local.topology))
@@ -123,7 +124,7 @@ class Fusion:
             if level + 1 < options.levels:
                 # What was known before but is not seen now still makes cells whole.
                 here = merged(before, after, local.known)
-                finer = split_volume(here, solid_cells(here, self.model.thickness(here), options.gamma))
+                finer = split_volume(here, surface_cells(here, local.weight, self.model.thickness(here), options.gamma))
                 topology = finer.topology
 
     @property

@@ -1,13 +1,14 @@
 """The GRU that fuses a local volume into the global one (NeRFusion, section 3.2, eq. 3).
 
-    z = σ(M_z([H, V]) − log n)      r = σ(M_r([H, V]))
+    z = σ(M_z([H, V]) + log(w / n))      r = σ(M_r([H, V]))
     T = tanh(V_raw + M_t([r ∘ H, V]))
     H' = (1 − z) ∘ H + z ∘ T
 
-H is the global volume, V = tanh(V_raw) the local one, n the number of key frames that a voxel was in before. What differs from the
-paper are the two known terms: with M_z = M_t = 0 (the start) this is the running mean of the local volumes, the fusion that needs no
-learning, and z = 1 where nothing was known. n is capped, so that late frames still count. H stays within (−1, 1) for ever: it is
-always a mixture of values of tanh.
+H is the global volume, V = tanh(V_raw) the local one, w its weight and n the sum of the weights so far. What differs from the paper are
+the two known terms: with M_z = M_t = 0 (the start) this is w V + n H over w + n, the weighted running mean of the local volumes, the
+fusion that needs no learning, and z = 1 where nothing was known. A local volume weighs little where its key frame does not see; without
+that, each more key frame wrote its ignorance over what others knew. n is capped, so that late frames still count. H stays within (−1, 1)
+for ever: it is always a mixture of values of tanh.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ from torch import Tensor, nn
 
 from toolkit.networks.block_conv import BlockConv3d
 from toolkit.volume.topology import Topology
+
+LEAST = 1e-3  # of a local volume's weight
+MOST = 16  # cap on n
 
 
 class _Gate(nn.Module):
@@ -46,17 +50,19 @@ class FusionGRU(nn.Module):
         most: cap on n.
     """
 
-    def __init__(self, channels: int, hidden: int, layers: int = 3, most: int = 16) -> None:
+    def __init__(self, channels: int, hidden: int, layers: int = 3, most: int = MOST) -> None:
         super().__init__()
         self.update, self.reset, self.candidate = (_Gate(channels, hidden, layers) for _ in range(3))
         self.most = most
 
-    def forward(self, state: Tensor, count: Tensor, local: Tensor, raw: Tensor, topology: Topology, inside: Tensor) -> Tensor:
+    def forward(
+        self, state: Tensor, count: Tensor, local: Tensor, raw: Tensor, weight: Tensor, topology: Topology, inside: Tensor
+    ) -> Tensor:
         """H' on the local volume's rows.
 
         Args:
             state: (M · 512 + 1, C) H, zero outside the local volume and where nothing is known.
-            count: (M · 512,) n.
+            count, weight: (M · 512,) n and w.
             local, raw: (M · 512 + 1, C) V and V_raw.
             inside: (M · 512,) bool, the voxels of the local volume.
 
@@ -64,7 +70,7 @@ class FusionGRU(nn.Module):
             (M · 512 + 1, C), zero outside.
         """
         both = torch.cat([state, local], 1)
-        known = torch.log(count.clamp_max(self.most))  # −∞ where nothing is known: z = 1
+        known = torch.log(count.clamp_max(self.most)) - torch.log(weight.clamp_min(LEAST))  # −∞ where nothing is known: z = 1
         known = torch.cat([known, known.new_full((1,), -torch.inf)])[:, None]
         z = torch.sigmoid(self.update(both, topology, inside) - known)
         r = torch.sigmoid(self.reset(both, topology, inside))
@@ -72,14 +78,23 @@ class FusionGRU(nn.Module):
         return (1 - z) * state + z * candidate
 
 
-class RunningMean(nn.Module):
-    """The fusion without learning, for the ablation: the mean of the local volumes, n capped as in the GRU."""
+def mean_gate(count: Tensor, weight: Tensor, most: int = MOST) -> Tensor:
+    """(M · 512,) n and w → (M · 512 + 1, 1) the z of the weighted running mean; the last row's is one."""
+    weight = weight.clamp_min(LEAST)
+    z = weight / (weight + count.clamp_max(most))
+    return torch.cat([z, z.new_ones(1)])[:, None]
 
-    def __init__(self, most: int = 16) -> None:
+
+class RunningMean(nn.Module):
+    """The fusion without learning, for the ablation: the weighted mean of the local volumes, n capped as in the GRU."""
+
+    def __init__(self, most: int = MOST) -> None:
         super().__init__()
         self.most = most
 
-    def forward(self, state: Tensor, count: Tensor, local: Tensor, raw: Tensor, topology: Topology, inside: Tensor) -> Tensor:
+    def forward(
+        self, state: Tensor, count: Tensor, local: Tensor, raw: Tensor, weight: Tensor, topology: Topology, inside: Tensor
+    ) -> Tensor:
         """See `FusionGRU.forward`."""
-        z = 1 / (1 + torch.cat([count, count.new_zeros(1)]).clamp_max(self.most))[:, None]
+        z = mean_gate(count, weight, self.most)
         return (1 - z) * state + z * local

@@ -5,10 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from toolkit.networks.local import AGREEMENT, COLOUR_SCALE
+from toolkit.networks.local import COLOUR_SCALE, INSIDE
 
-START = -3.0  # log optical thickness of a voxel at the start: thin enough that every voxel along a ray is tried
-SCALE = 3.0  # the density output's gain, so that latents of ±1 span fog and walls
+START = -0.5  # log optical thickness of a voxel on the surface at the start
+SCALE = 3.0  # the density output's gain
+STEEP = 2.0  # of the start: latents of ±0.93 are a voxel of exp(−7.6) and one of exp(3.6)
 
 
 class FieldHead(nn.Module):
@@ -24,15 +25,15 @@ class FieldHead(nn.Module):
         nn.init.zeros_(first.bias)
         self.body = nn.Sequential(first, nn.ReLU())
         self.density = nn.Linear(hidden, 1)
-        self.agreement = nn.Linear(channels, 1, bias=False)  # density starts where the views agree
+        self.inside = nn.Linear(channels, 1, bias=False)  # density starts behind the surface
         self.features = nn.Linear(hidden, features)
         self.skip = nn.Linear(channels, features, bias=False)
         nn.init.kaiming_normal_(self.density.weight, nonlinearity="linear")
         nn.init.zeros_(self.density.bias)
         with torch.no_grad():
             self.density.weight.mul_(0.1)
-            nn.init.zeros_(self.agreement.weight)
-            self.agreement.weight[:, AGREEMENT] = 1.0
+            nn.init.zeros_(self.inside.weight)
+            self.inside.weight[:, INSIDE] = STEEP
             self.features.weight.mul_(0.1)
             nn.init.zeros_(self.features.bias)
             nn.init.zeros_(self.skip.weight)
@@ -48,4 +49,4 @@ class FieldHead(nn.Module):
         return self._thickness(latent, self.body(latent))
 
     def _thickness(self, latent: Tensor, hidden: Tensor) -> Tensor:
-        return START + SCALE * (self.density(hidden) + self.agreement(latent)).squeeze(1)
+        return START + SCALE * (self.density(hidden) + self.inside(latent)).squeeze(1)

@@ -72,7 +72,8 @@ class LatentVolume:
         lattice: where the corners are.
         topology: blocks.
         rows: (M · 512 + 1, C) features in (−1, 1), zero where `count` is zero and in the last row.
-        count: (M · 512,) float32: key frames (a global volume) or views (a local one) that told of the corner; 0: nothing is known.
+        count: (M · 512,) float32: weights of the key frames (a global volume) or number of views (a local one) that told of the corner;
+            0: nothing is known.
     """
 
     lattice: Lattice
@@ -92,9 +93,16 @@ class LatentVolume:
 
 @dataclass(frozen=True)
 class LocalVolume(LatentVolume):
-    """What a few neighbouring views tell: `rows` = tanh(`raw`), `count` = views that see the corner."""
+    """What a few neighbouring views tell: `rows` = tanh(`raw`), `count` = views that see the corner.
+
+    Attributes:
+        weight: (M · 512,) in (0, 1] where the corner is known: how much the key frame can say of it.
+        active: (M,) bool, blocks about surfaces. The networks work on these alone; the others hold what the known terms say.
+    """
 
     raw: Tensor  # (M · 512 + 1, C)
+    weight: Tensor
+    active: Tensor
 
     def detached(self) -> LocalVolume:
         return replace(self, rows=self.rows.detach(), raw=self.raw.detach())

@@ -11,8 +11,13 @@ from toolkit.networks.block_conv import BlockConv3d
 from toolkit.volume.topology import Topology
 
 COLOUR_SCALE = 4.0  # a latent colour of ±1 is a colour logit of ±4
-AGREEMENT = 3  # the latent that starts as how well the views agree
+INSIDE = 3  # the latent that starts as how far behind the surface the voxel lies
 MOST = 0.93  # latent colours are kept inside this, so that tanh is not driven to its ends
+
+
+def inside_latent(signed: Tensor) -> Tensor:
+    """(N,) signed distances in [−1, 1], positive in front of the surface → p with tanh p = −signed, within what `MOST` allows."""
+    return torch.atanh((-signed).clamp(-MOST, MOST))
 
 
 def colour_latent(colour: Tensor) -> Tensor:
@@ -24,10 +29,10 @@ def colour_latent(colour: Tensor) -> Tensor:
 class LocalReconstruction(nn.Module):
     """Per-voxel projection to few channels, then `layers` sparse 3×3×3 convolutions with ReLU between them.
 
-    The views' mean colour is added to the first three outputs, which by convention are the voxel's colour, and how well their colours
-    agree to the fourth, from which the head's density starts: so a local volume carries the pictures' colours and a rough geometry from
-    the first step on, and the network learns what to change. Without the second, colours alone do not find surfaces: a fog of mean colours
-    is a minimum of its own.
+    The views' mean colour is added to the first three outputs, which by convention are the voxel's colour, and the distance behind the
+    surface that the plane sweep expects to the fourth, from which the head's density starts: so a local volume carries the pictures'
+    colours and a geometry from the first step on, and the network learns what to change. Without the second, colours alone do not find
+    surfaces: a fog of mean colours is a minimum of its own.
     """
 
     def __init__(self, inputs: int, hidden: int, channels: int, layers: int = 5) -> None:
@@ -42,15 +47,14 @@ class LocalReconstruction(nn.Module):
         nn.init.kaiming_normal_(last.weight, nonlinearity="linear")
         with torch.no_grad():
             last.weight.mul_(0.5)  # mostly within tanh's straight part
-            last.weight[: AGREEMENT + 1].mul_(0.1)  # they start as what is added to them
-        self.agreement = nn.Parameter(torch.ones(1))  # gain of what is added to the fourth output
+            last.weight[: INSIDE + 1].mul_(0.1)  # they start as what is added to them
 
     def forward(self, rows: Tensor, start: Tensor, topology: Topology, seen: Tensor) -> Tensor:
         """Raw local volume, before tanh.
 
         Args:
             rows: (M · 512 + 1, hidden) projected evidence (`project`, with ReLU), zero where nothing is seen.
-            start: (M · 512 + 1, 4) latent mean colours, and how well the views agree, zero where nothing is seen.
+            start: (M · 512 + 1, channels) latent mean colours and distance behind the surface, then zeros; zero where nothing is seen.
             seen: (M · 512,) bool.
 
         Returns:
@@ -58,5 +62,4 @@ class LocalReconstruction(nn.Module):
         """
         for number, convolution in enumerate(self.convolutions):
             rows = convolution(torch.relu(rows) if number else rows, topology, seen)
-        first = rows[:, : AGREEMENT + 1] + torch.cat([start[:, :AGREEMENT], self.agreement * start[:, AGREEMENT:]], 1)
-        return torch.cat([first, rows[:, AGREEMENT + 1 :]], 1)
+        return rows + start

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from toolkit.networks.aggregate import CUES, FLAGS, aggregate, agreement, direction_spread, evidence
@@ -25,12 +26,14 @@ from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
 from toolkit.networks.decoder import make_decoder
 from toolkit.networks.direction import DirectionCode
 from toolkit.networks.encoder import STRIDE, ImageEncoder, Sampled, padded
-from toolkit.networks.gru import FusionGRU, RunningMean
+from toolkit.networks.gru import FusionGRU, RunningMean, mean_gate
 from toolkit.networks.head import FieldHead
 from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume, empty_volume
-from toolkit.networks.local import LocalReconstruction, colour_latent
+from toolkit.networks.local import INSIDE, LocalReconstruction, colour_latent, inside_latent
+from toolkit.networks.matching import describe
 from toolkit.networks.pyramid import Pyramid
 from toolkit.networks.refine import with_blocks
+from toolkit.networks.sweep import Sighted, Sweep, sweep
 from toolkit.networks.unproject import EncodedView, look_up, project
 from toolkit.volume.topology import VOXELS, Topology
 
@@ -39,6 +42,11 @@ COLOURS = 3
 COLOUR_GAIN = 4.0  # pictures' RGB as numbers of about unit deviation
 LEVELS = 3  # of the feature maps
 COLOUR_LEVELS = 5
+SIGHTED = 3  # numbers that the plane sweep says of a voxel
+TRUNCATION = 2.0  # voxels about the surface within which distances are told apart
+HIDDEN = 0.02  # voxels that are open with less likelihood are not known
+BLIND = 0.1  # weight of a local volume where no depth stands out
+FREE = 0.9  # signed distances beyond which a voxel is free space for sure
 
 
 @dataclass(frozen=True)
@@ -51,7 +59,7 @@ class ModelConfig:
     direction: int = 16  # of the direction code; 0: off (ablation)
     hidden: int = 16  # of J between its first and last layer
     channels: int = 16  # of local and global volumes
-    gru_hidden: int = 16
+    gru_hidden: int = 8
     features: int = 16  # of the radiance field
     head_hidden: int = 32
     decoder: str = "deferred"  # deferred | per_sample (the paper's)
@@ -69,7 +77,7 @@ class NerfusionModel(nn.Module):
         self.encoder = ImageEncoder(config.image_channels, config.encoder)
         self.sample = Sampled(config.image_channels, self.encoder.widths[0], config.sampled)
         self.direction = DirectionCode(config.direction) if config.direction else None
-        inputs = 3 * (config.sampled + config.direction + 2 * COLOURS) + FLAGS + CUES
+        inputs = 3 * (config.sampled + config.direction + 2 * COLOURS) + FLAGS + CUES + SIGHTED
         self.local = LocalReconstruction(inputs, config.hidden, config.channels)
         self.fusion: FusionGRU | RunningMean = FusionGRU(config.channels, config.gru_hidden) if config.fusion == "gru" else RunningMean()
         self.to_field = FieldHead(config.channels, config.head_hidden, config.features)
@@ -90,15 +98,19 @@ class NerfusionModel(nn.Module):
             cameras: V cameras for exactly these pictures.
         """
         maps = self.sample(*self.encoder.maps(images))
-        whole = padded((images - 0.5) * COLOUR_GAIN)
+        whole, described = padded((images - 0.5) * COLOUR_GAIN), describe(images)
         views = []
         for index in range(len(images)):
             features = Pyramid.of(maps[index], STRIDE, LEVELS)
             if self.direction is not None:
                 codes = self.direction(cameras.directions(index, features.pixels()))
                 features = features.with_columns(codes.to(features.rows.dtype))
-            views.append(EncodedView(features, Pyramid.of(whole[index], 1, COLOUR_LEVELS)))
+            views.append(EncodedView(features, Pyramid.of(whole[index], 1, COLOUR_LEVELS), described[index]))
         return views
+
+    def sweep(self, views: Sequence[EncodedView], cameras: Cameras, near: float, far: float) -> Sweep:
+        """Where along the pixels of the key frame (first) the surface is likely to be; asked once for all lattices. Not differentiable."""
+        return sweep([view.described for view in views], cameras, near, far)
 
     def local_volume(
         self,
@@ -109,53 +121,73 @@ class NerfusionModel(nn.Module):
         wanted: Tensor | None = None,
         near: float = 0.0,
         far: float = math.inf,
+        swept: Sweep | None = None,
     ) -> LocalVolume:
-        """The local volume of a key frame and its neighbours (section 3.1). Any number of views ≥ 1, in any order.
+        """The local volume of a key frame and its neighbours (section 3.1). Any number of views ≥ 1, the neighbours in any order.
 
         Args:
             views, cameras: K of each.
             topology: blocks to work on; None: every block that a view can see.
             wanted: (M · 512,) bool, corners of these blocks to work on; None: all.
             near, far: depths along z within which views are asked, working units.
+            swept: `sweep` of these views; None: made here.
 
         Returns:
-            a volume of those of the blocks in which a view sees a corner.
+            a volume of those of the blocks in which the key frame sees a corner.
         """
         if topology is None:
             keys = all_blocks(lattice, cameras.intrinsics.device)
-            topology = Topology(keys[visible_blocks(*block_balls(lattice, keys), cameras, near, far)])
+            topology = Topology(keys[visible_blocks(*block_balls(lattice, keys), cameras[0], near, far)])
+        if swept is None:
+            swept = self.sweep(views, cameras, *_depths(lattice, topology, cameras, near, far))
         rows = torch.arange(topology.zero_row, device=topology.device) if wanted is None else wanted.nonzero().view(-1)
-        parts = [self._observe(views, cameras, lattice, topology, part, near, far) for part in rows.split(CHUNK)]
-        where, projected, starts, counts = (torch.cat(values) for values in zip(*parts, strict=True))
+        parts = [self._observe(views, cameras, lattice, topology, part, near, far, swept) for part in rows.split(CHUNK)]
+        where, projected, starts, counts, weights = (torch.cat(values) for values in zip(*parts, strict=True))
         topology, where = _without_empty_blocks(topology, where)
         config, size = self.config, topology.zero_row
         count = torch.zeros(size, device=topology.device).index_copy(0, where, counts)
+        weight = torch.zeros(size, device=topology.device).index_copy(0, where, weights)
+        start = starts.new_zeros((size + 1, config.channels)).index_copy(0, where, F.pad(starts, (0, config.channels - starts.shape[1])))
+        # Convolutions cost most, and free space needs none.
+        active = torch.zeros(topology.blocks, dtype=torch.bool, device=topology.device)
+        active[where[starts[:, INSIDE] > inside_latent(starts.new_tensor([FREE]))].div(VOXELS, rounding_mode="floor")] = True
         latent = projected.new_zeros((size + 1, config.hidden)).index_copy(0, where, projected)
-        start = starts.new_zeros((size + 1, starts.shape[1])).index_copy(0, where, starts)
-        raw = self.local(latent, start, topology, count > 0)
-        return LocalVolume(lattice, topology, torch.tanh(raw), count, raw)
+        busy, place = _blocks(topology, active)
+        raw = start.index_copy(0, place, self.local(latent[place], start[place], busy, count[place[:-1]] > 0))
+        return LocalVolume(lattice, topology, torch.tanh(raw), count, raw, weight, active)
 
     def _observe(
-        self, views: Sequence[EncodedView], cameras: Cameras, lattice: Lattice, topology: Topology, rows: Tensor, near: float, far: float
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Of the corners `rows`: those that a view sees, their evidence projected to few channels, what latents start from (mean colour,
-        how well the views agree), and view count."""
+        self,
+        views: Sequence[EncodedView],
+        cameras: Cameras,
+        lattice: Lattice,
+        topology: Topology,
+        rows: Tensor,
+        near: float,
+        far: float,
+        swept: Sweep,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Of the corners `rows`: those that the key frame sees, their evidence projected to few channels, what latents start from (mean
+        colour, distance behind the surface), view count and weight."""
         contracted = lattice.contracted(topology.keys, rows)
         points, size = lattice.working(contracted)
         projection = project(points, size, cameras, near, far)
-        seen = projection.visible.any(0)
+        seen = projection.visible[0]
         if lattice.space.shell == 0:
             seen &= (contracted.abs() <= contracted.new_tensor(lattice.space.box) + 1.01 * lattice.voxel).all(1)
-        kept = seen.nonzero().view(-1)
-        rows, points, projection = rows[kept], points[kept], projection[kept]
+        sighted = swept.look(points, TRUNCATION * size)
+        kept = (seen & (sighted.open > HIDDEN)).nonzero().view(-1)
+        rows, points, projection, sighted = rows[kept], points[kept], projection[kept], sighted[kept]
         visible = projection.visible
         footprint = torch.exp((torch.log(projection.footprint) * visible).sum(0) / visible.sum(0).clamp_min(1))
         step = footprint * direction_spread(points, cameras.positions, visible)
         mean, variance, count = aggregate(look_up(views, projection, step), visible, self.config.variance)
         cues = agreement(variance, count, (slice(self.config.sampled), slice(-2 * COLOURS, -COLOURS)))
-        projected = torch.relu(self.local.project(torch.cat([evidence(mean, variance, count, footprint, step), cues], 1)))
+        swept_cues = torch.stack([sighted.signed, sighted.open, sighted.sure], 1)
+        projected = torch.relu(self.local.project(torch.cat([evidence(mean, variance, count, footprint, step), cues, swept_cues], 1)))
         colour = colour_latent((mean[:, -COLOURS:] / COLOUR_GAIN + 0.5).clamp(0, 1))
-        return rows, projected, torch.cat([colour, -cues[:, 1:]], 1), count.to(torch.float32)
+        start = torch.cat([colour, inside_latent(sighted.signed)[:, None]], 1)
+        return rows, projected, start, count.to(torch.float32), _weight(sighted)
 
     def start(self, lattice: Lattice) -> LatentVolume:
         """The global volume before the first key frame."""
@@ -180,8 +212,13 @@ class NerfusionModel(nn.Module):
         inside = local.known
         count = part.count * inside
         mask = torch.cat([count > 0, inside.new_zeros(1)])[:, None]
-        rows = self.fusion(part.rows * mask, count, local.rows, local.raw, local.topology, inside)
-        return replace(part, rows=rows, count=count + inside)
+        before = part.rows * mask
+        z = mean_gate(count, local.weight)
+        rows = (1 - z) * before + z * local.rows
+        busy, place = _blocks(local.topology, local.active)
+        inner = place[:-1]
+        after = self.fusion(before[place], count[inner], local.rows[place], local.raw[place], local.weight[inner], busy, inside[inner])
+        return replace(part, rows=rows.index_copy(0, place, after), count=count + local.weight)
 
     def thickness(self, volume: LatentVolume) -> Tensor:
         """(M · 512 + 1,) the first of what `head` gives, alone."""
@@ -202,6 +239,28 @@ class NerfusionModel(nn.Module):
             torch.zeros(size, device=known.device).index_copy(0, known, thickness.float()),
             torch.zeros((size, features.shape[1]), device=known.device).index_copy(0, known, features.float()),
         )
+
+
+def _weight(sighted: Sighted) -> Tensor:
+    """How much a key frame can say of voxels: little of what is hidden, and where the pictures fit at no depth better than at others."""
+    return sighted.open.clamp_min(HIDDEN) * (BLIND + (1 - BLIND) * sighted.sure)
+
+
+def _depths(lattice: Lattice, topology: Topology, cameras: Cameras, near: float, far: float) -> tuple[float, float]:
+    """`near` and `far`, or where the blocks begin and end along the key frame's axis, whichever is narrower."""
+    if topology.blocks == 0:
+        return 1.0, 2.0
+    centres, radii = block_balls(lattice, topology.keys)
+    depth = cameras[0].local(centres)[0, :, 2]
+    last = min(far, float((depth + radii).amax()))
+    first = max(near, float((depth - radii).amin()), 0.0)
+    return (first, last) if last > first else (near or 1.0, 2 * (near or 1.0))
+
+
+def _blocks(topology: Topology, kept: Tensor) -> tuple[Topology, Tensor]:
+    """The blocks of the mask (M,) alone, and their rows, the zero row last (the same way back)."""
+    rows = kept.repeat_interleave(VOXELS).nonzero().view(-1)
+    return Topology(topology.keys[kept]), torch.cat([rows, rows.new_tensor([topology.zero_row])])
 
 
 def _without_empty_blocks(topology: Topology, rows: Tensor) -> tuple[Topology, Tensor]:

@@ -12,7 +12,8 @@ from toolkit.networks.lattice import LatentVolume, cells
 from toolkit.volume.edit import corner_nodes, split
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
 
-INHERITED = 1.0  # key frames that a latent taken over from the coarse volume counts for
+INHERITED = 0.25  # weight of a latent taken over from the coarse volume
+SEEN = 0.1  # weight from which on a key frame sees a voxel
 
 
 def solid(thickness: Tensor, gamma: float) -> Tensor:
@@ -34,10 +35,19 @@ def solid_cells(volume: LatentVolume, thickness: Tensor, gamma: float | None) ->
     return whole if gamma is None else whole & cells(volume.topology, known & solid(thickness, gamma), every=False)
 
 
+def surface_cells(volume: LatentVolume, weight: Tensor, thickness: Tensor, gamma: float) -> Tensor:
+    """(M · 512,) bool: solid cells that a key frame sees, so those about surfaces and not what lies hidden behind them.
+
+    Args:
+        weight: (M · 512,) of its local volume on the same blocks.
+    """
+    return solid_cells(volume, thickness, gamma) & cells(volume.topology, weight >= SEEN, every=False)
+
+
 def split_volume(volume: LatentVolume, kept: Tensor) -> LatentVolume:
     """The cells `kept` (M · 512,) on the lattice of half the voxel size, latents interpolated; not differentiable.
 
-    Known are exactly the corners of the kept cells' children. They count as one key frame, so that what is seen finer soon prevails.
+    Known are exactly the corners of the kept cells' children. They count little, so that what is seen finer prevails.
     """
     topology, occupied, (rows,) = split(volume.topology, kept, [volume.rows.detach()])
     return LatentVolume(volume.lattice.finer(), topology, rows, corner_nodes(topology, occupied).float() * INHERITED)

@@ -11,13 +11,17 @@ from torch import Tensor
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.pyramid import Pyramid
 
+MARGIN = 1.0
+
 
 @dataclass(frozen=True)
 class EncodedView:
-    """What is looked up of a view: `features` (image features and direction codes) and `colours` (RGB in [−2, 2])."""
+    """What is looked up of a view: `features` (image features and direction codes), `colours` (RGB in [−2, 2]), and what it is compared
+    with others by (`matching.describe`)."""
 
     features: Pyramid
     colours: Pyramid
+    described: Tensor
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,8 @@ class Projection:
 def project(points: Tensor, size: Tensor, cameras: Cameras, near: float, far: float) -> Projection:
     """Project voxels into all views.
 
-    A view sees a voxel when its depth lies in (near, far] and its pixel inside the picture. What hides it is not known here.
+    A view sees a voxel when its depth lies in (near, far] and its pixel inside the picture or less than `MARGIN` voxels beside it, so that
+    cells that reach over the border are whole. What hides a voxel is not known here.
 
     Args:
         points: (N, 3) working frame.
@@ -54,9 +59,10 @@ def project(points: Tensor, size: Tensor, cameras: Cameras, near: float, far: fl
     safe = torch.where(deep, depth, torch.ones_like(depth))
     focal, middle = cameras.intrinsics[:, None, :2], cameras.intrinsics[:, None, 2:]
     pixels = local[..., :2] / safe[..., None] * focal + middle
-    inside = ((pixels >= 0) & (pixels <= cameras.size[:, None])).all(2)
-    visible = deep & inside
-    footprint = torch.where(visible, size * focal.mean(2) / safe, torch.ones_like(safe))
+    footprint = size * focal.mean(2) / safe
+    margin = (MARGIN * footprint)[..., None]
+    visible = deep & ((pixels >= -margin) & (pixels <= cameras.size[:, None] + margin)).all(2)
+    footprint = torch.where(visible, footprint, torch.ones_like(safe))
     return Projection(torch.where(visible[..., None], pixels, torch.zeros_like(pixels)), visible, footprint)
 
 

@@ -14,7 +14,7 @@ import torch
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume, cells
 from toolkit.networks.model import NerfusionModel
-from toolkit.networks.refine import adopt, children, solid_cells, split_volume
+from toolkit.networks.refine import adopt, children, solid_cells, split_volume, surface_cells
 from toolkit.networks.unproject import EncodedView
 from toolkit.volume.topology import VOXELS
 
@@ -49,30 +49,27 @@ class Recurrence:
 
     def add(self, model: NerfusionModel, views: Sequence[EncodedView], cameras: Cameras) -> tuple[Recurrence, LocalVolume]:
         """The state after one more key frame, and its local volume on the coarsest lattice."""
-        local = model.local_volume(views, cameras, self.volumes[0].lattice, near=self.near, far=self.far)
+        swept = model.sweep(views, cameras, self.near, self.far)
+        local = model.local_volume(views, cameras, self.volumes[0].lattice, near=self.near, far=self.far, swept=swept)
         volumes = [model.fuse(self.volumes[0], local)]
-        newest: LatentVolume = local
+        newest = local
         for before in self.volumes[1:]:
-            if newest.topology.blocks == 0:
-                volumes.append(before)
-                continue
             part = _on_blocks_of(volumes[-1], newest)
-            finer = split_volume(part, self._kept(model, part))
+            finer = split_volume(part, self._kept(model, part, newest.weight))
             if finer.topology.blocks == 0:
-                volumes.append(before)
-                newest = finer
-                continue
+                volumes += self.volumes[len(volumes) :]
+                break
             state = adopt(before, finer)
-            closer = model.local_volume(views, cameras, finer.lattice, finer.topology, finer.known, self.near, self.far)
+            closer = model.local_volume(views, cameras, finer.lattice, finer.topology, finer.known, self.near, self.far, swept)
             volumes.append(model.fuse(state, closer))
             newest = closer
         return Recurrence(tuple(volumes), self.near, self.far, self.gamma, self.most), local
 
     @torch.no_grad()
-    def _kept(self, model: NerfusionModel, part: LatentVolume) -> Tensor:
+    def _kept(self, model: NerfusionModel, part: LatentVolume, weight: Tensor) -> Tensor:
         """(M · 512,) bool, cells that are looked at finer."""
         thickness = model.thickness(part)
-        kept = solid_cells(part, thickness, self.gamma)
+        kept = surface_cells(part, weight, thickness, self.gamma)
         if int(kept.sum()) > self.most:
             # A cell is as thick as its thickest corner; the threshold that leaves `most` of them is that quantile of its values.
             values = torch.where(part.known, thickness[:-1], torch.full_like(thickness[:-1], -torch.inf))

@@ -1,0 +1,185 @@
+"""A plane sweep along the pixels of a key view: where the surface is likely to be, read off at voxels.
+
+A voxel is large against the step in depth that its views can tell apart, so that what they show at its corner alone says little about
+surfaces between corners. The sweep asks at even steps of inverse depth of about a pixel, and a voxel reads from it in closed form how far
+in front of or behind the surface it lies on average, and how likely it is not hidden. The paper's networks have to find both in mean and
+variance of features; these are known terms beside them, which the networks learn to correct.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from toolkit.networks.cameras import Cameras
+from toolkit.networks.matching import difference, distribution, together
+
+SPACING = 2  # pixels of the compared pictures between those whose depth is asked for
+STEP = 1.0  # pixels that the view which moves most moves by from plane to plane
+PLANES = (16, 128)  # fewest and most
+RANGE = 50.0  # farthest by nearest depth, where the caller does not bound them
+PEAK = 2  # planes on either side of the likeliest one that count as the same depth
+
+
+@dataclass(frozen=True)
+class Sighted:
+    """What a sweep says of N voxels.
+
+    Attributes:
+        signed: (N,) in [−1, 1]: expected distance from the voxel to the surface behind it in units of the truncation, cut at ±1 before the
+            mean is taken; positive in front of the surface.
+        open: (N,) in [0, 1]: likelihood that nothing more than a truncation in front of the voxel hides it.
+        sure: (N,) in [0, 1]: how much of the pixel's likelihood lies about one depth.
+    """
+
+    signed: Tensor
+    open: Tensor
+    sure: Tensor
+
+    def __getitem__(self, kept: Tensor) -> Sighted:
+        """The voxels at `kept`."""
+        return Sighted(self.signed[kept], self.open[kept], self.sure[kept])
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The likelihood of surface along the pixels of one camera.
+
+    Attributes:
+        camera: one.
+        table: (3, D, h, w) over inverse depths, farthest first: the likelihood that the surface is nearer, its integral over inverse depth,
+            and `sure`.
+        lowest, step: inverse depth of the first entry, and between entries.
+    """
+
+    camera: Cameras
+    table: Tensor
+    lowest: float
+    step: float
+
+    def look(self, points: Tensor, truncation: Tensor) -> Sighted:
+        """Read at voxels (N, 3) of the working frame, with a truncation (N,) in working units each.
+
+        Voxels outside the picture read its border.
+        """
+        local = self.camera.local(points)[0]
+        depth = local[:, 2].clamp_min(1e-6)
+        focal, middle = self.camera.intrinsics[0, :2], self.camera.intrinsics[0, 2:]
+        pixel = (local[:, :2] / depth[:, None] * focal + middle) / self.camera.size[0] * 2 - 1  # (N, 2) in [−1, 1] inside
+        inverse = 1 / depth
+        half = inverse * (truncation / depth).clamp_max(0.9)  # the truncation as a difference of inverse depths
+        near, far = self._read(pixel, inverse + half), self._read(pixel, inverse - half)
+        # E[clamp(x, −1, 1)] of x = (inverse − surface) / half, by parts, from the integral of the likelihood.
+        signed = 1 - (near[1] - far[1]) / half
+        return Sighted(signed.clamp(-1, 1), (1 - near[0]).clamp(0, 1), near[2].clamp(0, 1))
+
+    def _read(self, pixel: Tensor, inverse: Tensor) -> Tensor:
+        """(3, N) entries; beyond the farthest plane everything is hidden, before the nearest nothing is."""
+        count = self.table.shape[1]
+        place = (inverse - self.lowest) / self.step
+        w = (place + 0.5) / count * 2 - 1
+        grid = torch.cat([pixel, w[:, None]], 1)[None, None, None]
+        found = F.grid_sample(self.table[None], grid, padding_mode="border", align_corners=False)[0, :, 0, 0]
+        beyond = (-place).clamp_min(0) * self.step  # of the integral, where the likelihood to be hidden is one
+        return torch.stack([found[0], found[1] - beyond, found[2]])
+
+
+@torch.no_grad()
+def sweep(described: Sequence[Tensor], cameras: Cameras, near: float, far: float) -> Sweep:
+    """Compare the first view with all others at planes between `near` and `far` along its axis; the others may come in any order.
+
+    Args:
+        described: K times (21, h, w) of `matching.describe`.
+        cameras: K.
+        near, far: 0 and ∞ where unknown.
+
+    Raises:
+        ValueError: neither is known.
+    """
+    near, far = _bounded(near, far)
+    low, high = 1 / far, 1 / near
+    inverses = torch.linspace(low, high, _planes(described, cameras, near, far), device=cameras.intrinsics.device)
+    rays, own, shape = _pixels(described[0], cameras)
+    costs, visible = [], []
+    for view in range(1, len(cameras)):
+        found, seen = _warped(described[view], cameras[view], cameras, rays, inverses)
+        costs.append(difference(own[None], found))
+        visible.append(seen)
+    if costs:
+        cost = together(torch.stack(costs), torch.stack(visible))
+    else:
+        cost = rays.new_zeros((len(inverses), len(rays)))
+    likely = distribution(cost.view(len(inverses), *shape))
+    step = float(inverses[1] - inverses[0])
+    return Sweep(cameras[0], _table(likely, step), low, step)
+
+
+def _table(likely: Tensor, step: float) -> Tensor:
+    """(D, h, w) likelihoods, farthest first → what `Sweep` keeps."""
+    nearer = likely.flip(0).cumsum(0).flip(0) - 0.5 * likely  # the surface lies anywhere about its plane
+    middle = 0.5 * (nearer[1:] + nearer[:-1]) * step
+    integral = torch.cat([torch.zeros_like(nearer[:1]), middle.cumsum(0)])
+    width = min(2 * PEAK + 1, len(likely))
+    peaks = F.avg_pool1d(likely.permute(1, 2, 0).flatten(0, 1)[:, None], width, 1) * width
+    sure = peaks.amax((1, 2)).view(1, *likely.shape[1:]).expand_as(likely)
+    return torch.stack([nearer, integral, sure])
+
+
+def _bounded(near: float, far: float) -> tuple[float, float]:
+    """A range of depths with both ends."""
+    if not (near > 0 or math.isfinite(far)):
+        raise ValueError("a sweep needs a nearest or a farthest depth")
+    return (near if near > 0 else far / RANGE), (far if math.isfinite(far) else RANGE * near)
+
+
+def _pixels(described: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor, tuple[int, int]]:
+    """Rays (P, 3) of unit depth through every `SPACING`-th pixel of the first view, their descriptors (P, 21), and the grid's shape."""
+    height, width = described.shape[1:]
+    shape = (max(1, height // SPACING), max(1, width // SPACING))
+    # Cells of equal size cover the picture, so that reading the table needs its borders alone.
+    v = (torch.arange(shape[0], device=described.device) + 0.5) / shape[0] * 2 - 1
+    u = (torch.arange(shape[1], device=described.device) + 0.5) / shape[1] * 2 - 1
+    grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)  # (h, w, 2)
+    own = F.grid_sample(described[None], grid[None], padding_mode="border", align_corners=False)[0].flatten(1).T
+    focal, middle = cameras.intrinsics[0, :2], cameras.intrinsics[0, 2:]
+    flat = ((grid.view(-1, 2) + 1) / 2 * cameras.size[0] - middle) / focal
+    return torch.cat([flat, torch.ones_like(flat[:, :1])], 1), own, shape
+
+
+def _warped(described: Tensor, other: Cameras, cameras: Cameras, rays: Tensor, inverses: Tensor) -> tuple[Tensor, Tensor]:
+    """(D, P, 21) what the other view shows of each pixel of the first at each plane, and (D, P) bool whether it sees it."""
+    turn = cameras.world_from_camera[0, :3, :3].T @ other.world_from_camera[0, :3, :3]  # rows: axes of the first camera in the other
+    shift = (cameras.positions[0] - other.positions[0]) @ other.world_from_camera[0, :3, :3]
+    local = (rays @ turn)[None] + inverses[:, None, None] * shift  # of the point divided by its depth: no far plane is too far
+    deep = local[..., 2] > 1e-4
+    depth = torch.where(deep, local[..., 2], torch.ones_like(local[..., 2]))
+    pixel = local[..., :2] / depth[..., None] * other.intrinsics[0, :2] + other.intrinsics[0, 2:]
+    grid = pixel / other.size[0] * 2 - 1
+    visible = deep & (grid.abs() <= 1).all(-1)
+    found = F.grid_sample(described[None], grid.clamp(-2, 2)[None], padding_mode="border", align_corners=False)[0]
+    return found.permute(1, 2, 0), visible
+
+
+def _planes(described: Sequence[Tensor], cameras: Cameras, near: float, far: float) -> int:
+    """How many planes: pictures of the view that moves most move by `STEP` from one to the next at nine places of the first."""
+    rays, _, _ = _pixels(described[0][:, :3, :3], cameras)
+    spots = torch.cartesian_prod(torch.tensor([0.1, 0.5, 0.9]), torch.tensor([0.1, 0.5, 0.9])).to(rays)
+    flat = (spots * cameras.size[0] - cameras.intrinsics[0, 2:]) / cameras.intrinsics[0, :2]
+    rays = torch.cat([flat, torch.ones_like(flat[:, :1])], 1)
+    most = 0.0
+    for view in range(1, len(cameras)):
+        turn = cameras.world_from_camera[0, :3, :3].T @ cameras.world_from_camera[view, :3, :3]
+        shift = (cameras.positions[0] - cameras.positions[view]) @ cameras.world_from_camera[view, :3, :3]
+        ends = [rays @ turn + shift / depth for depth in (near, far)]
+        front = (ends[0][:, 2] > 0.05) & (ends[1][:, 2] > 0.05)
+        if not bool(front.any()):
+            continue
+        one, two = ((end[front, :2] / end[front, 2:]) * cameras.intrinsics[view, :2] for end in ends)
+        scale = described[view].shape[2] / float(cameras.size[view, 0])
+        most = max(most, float((one - two).norm(dim=1).median()) * scale)
+    return int(min(max(math.ceil(most / STEP) + 1, PLANES[0]), PLANES[1]))
