@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-torch.set_num_threads(2)
+torch.set_num_threads(1)  # the tensors are small, and two threads that share one core wait for each other
 
 
 def shared_data(name: str) -> Path:

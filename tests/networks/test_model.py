@@ -94,10 +94,13 @@ def test_outside_the_local_volume_every_bit_stays() -> None:
     assert not after.rows[old:-1][~touched[old:]].any() and not after.rows[-1].any()
 
 
-def test_the_same_frame_a_thousand_times_does_not_drift() -> None:
+# Eight seeds: with gates twice as strong as at the start the state moves by 0.002 at the most after step 100. Three times as strong, where
+# the candidate's answer to the state comes near to one, voxels wander before they settle: by 0.16 in the mean, single values by 1.05.
+@pytest.mark.parametrize(("gain", "most", "mean"), [(2.0, 0.05, 0.005), (3.0, 1.2, 0.2)])
+def test_the_same_frame_a_thousand_times_does_not_drift(gain: float, most: float, mean: float) -> None:
     model = small_model(2).eval()
     for parameter in model.fusion.parameters():
-        parameter.data.mul_(3.0)
+        parameter.data.mul_(gain)
     seen_by = cameras(1)
     pose = seen_by.world_from_camera.clone()
     pose[:, 2, 3] = -1.1
@@ -106,15 +109,19 @@ def test_the_same_frame_a_thousand_times_does_not_drift() -> None:
     with torch.no_grad():
         one = model.local_volume(model.encode(pictures(1), seen_by), seen_by, small, Topology(torch.tensor([[0, 0, 0]])), near=0.1)
         assert int(one.known.sum()) > 20
-        state, moves = model.start(small), []
+        state, moves, early = model.start(small), [], None
         for step in range(1000):
             after = model.fuse(state, one)
             if step >= 1:
                 moves.append(float((after.rows - state.rows).abs().max()))
             state = after
+            early = state.rows if step == 99 else early
     assert bool(torch.isfinite(state.rows).all()) and float(state.rows.abs().max()) <= 1
     assert float(state.count.max()) == 1000
-    assert moves[-1] < 1e-2 and moves[-1] < 0.1 * moves[0], "it settles"
+    assert early is not None
+    drift = (state.rows - early)[:-1][one.known].abs()
+    assert float(drift.max()) < most and float(drift.mean()) < mean
+    assert moves[-1] < 2e-3 and moves[-1] < 0.1 * moves[0], "it settles"
 
 
 def test_two_equal_local_volumes_fuse_to_themselves_at_the_start_of_training() -> None:

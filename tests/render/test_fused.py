@@ -87,8 +87,8 @@ def wall_rays(images: torch.Tensor, world: np.ndarray) -> tuple[torch.Tensor, to
 
 
 @cache
-def learnt() -> tuple[list[float], list[float]]:
-    """A wall seen by three cameras, 40 steps from pictures alone: losses and relative depth errors of the steps."""
+def learnt() -> tuple[list[float], list[float], float]:
+    """A wall seen by three cameras, 60 steps from pictures alone: losses and relative depth errors of the steps; the colours' variance."""
     torch.manual_seed(0)
     model = small_model(1)
     depth = 2.1
@@ -103,7 +103,7 @@ def learnt() -> tuple[list[float], list[float]]:
     optimiser = torch.optim.Adam(model.parameters(), lr=5e-3)
     generator = torch.Generator().manual_seed(2)
     losses, errors = [], []
-    for _ in range(40):
+    for _ in range(60):
         pick = torch.randint(len(origins), (256,), generator=generator)
         local = model.local_volume(model.encode(images, seen_by), seen_by, where, near=1.0, far=2.8)
         field = make_field(model, local, torch.full((3,), 0.5))
@@ -115,17 +115,21 @@ def learnt() -> tuple[list[float], list[float]]:
         optimiser.step()
         losses.append(float(loss.detach()))
         errors.append(float(((seen.distance.detach() * cosine[pick]) / depth - 1).abs().median()))
-    return losses, errors
+    return losses, errors, float(colour.var(0).mean())
 
 
 def test_a_small_volume_learns_from_its_pictures() -> None:
-    losses, _ = learnt()
+    """Four starts left 6 to 10% of the first loss, and 2 to 3% of the colours' variance."""
+    losses, _, variance = learnt()
     first, last = np.mean(losses[:5]), np.mean(losses[-5:])
-    assert last < 0.65 * first, f"the loss fell from {first:.4f} to {last:.4f} only"
+    assert last < 0.2 * first, f"the loss fell from {first:.4f} to {last:.4f} only"
+    assert last < 0.05 * variance, f"{last / variance:.1%} of what the colours vary is not told"
 
 
 def test_what_is_rendered_moves_to_where_the_wall_is() -> None:
-    _, errors = learnt()
+    """Four starts began 4.6 to 6.1% off and ended 2.6 to 4.0% off; a voxel is 2.4% of the wall's depth."""
+    _, errors, _ = learnt()
     first, last = np.mean(errors[:5]), np.mean(errors[-5:])
     assert first < 0.1, f"at the start views that agree already tell roughly where the wall is, not {first:.1%} off"
     assert last < 0.85 * first, f"colours alone moved the wall from {first:.1%} to {last:.1%}"
+    assert last < 0.048, f"the wall is {last:.1%} off, more than two voxels"
