@@ -112,7 +112,8 @@ class Fusion:
         options = self.options
         keys = self._keys[visible_blocks(*self._balls, cameras[0], options.near, options.far)]
         topology, finer = Topology(keys), None
-        swept = self.model.sweep(views, cameras, options.near, options.far) if options.near > 0 else None
+        bounded = options.near > 0 or math.isfinite(options.far)
+        swept = self.model.sweep(views, cameras, options.near, options.far) if bounded else None
         for level, store in enumerate(self.stores):
             wanted = None if finer is None else finer.known
             local = self.model.local_volume(views, cameras, store.lattice, topology, wanted, options.near, options.far, swept)
@@ -124,7 +125,7 @@ class Fusion:
             if level + 1 < options.levels:
                 # What was known before but is not seen now still makes cells whole.
                 here = merged(before, after, local.known)
-                finer = split_volume(here, surface_cells(here, local.weight, self.model.thickness(here), options.gamma))
+                finer = split_volume(here, surface_cells(here, local.known, self.model.thickness(here), options.gamma))
                 topology = finer.topology
 
     @property

@@ -31,7 +31,8 @@ def inputs(topology: Topology, seed: int, share: float = 0.6) -> dict[str, torch
     raw = torch.randn((size + 1, CHANNELS), generator=generator) * mask
     known = torch.cat([count > 0, inside.new_zeros(1)])[:, None]
     state = torch.tanh(torch.randn((size + 1, CHANNELS), generator=generator)) * known
-    return {"state": state, "count": count, "local": torch.tanh(raw), "raw": raw, "inside": inside}
+    weight = (0.01 + 0.99 * torch.rand(size, generator=generator)) * inside
+    return {"state": state, "count": count, "local": torch.tanh(raw), "raw": raw, "weight": weight, "inside": inside}
 
 
 def test_the_start_is_close_to_the_running_mean_of_what_was_seen() -> None:
@@ -43,6 +44,9 @@ def test_the_start_is_close_to_the_running_mean_of_what_was_seen() -> None:
     mean = RunningMean()(**given, topology=topology)
     first = torch.cat([(given["count"] == 0) & given["inside"], torch.zeros(1, dtype=torch.bool)])
     assert float((out - mean).abs().mean()) < 0.1
+    z = (given["weight"] / (given["weight"] + given["count"]))[:, None]
+    by_hand = ((1 - z) * given["state"][:-1] + z * given["local"][:-1])[given["inside"]]
+    torch.testing.assert_close(mean[:-1][given["inside"]], by_hand, atol=1e-6, rtol=1e-5)
     assert float((out - given["local"])[first].abs().mean()) < 0.15, "what was never seen before takes the local volume"
     for gate in (gru.update, gru.candidate):
         gate.convolutions[-1].weight.data.zero_()
@@ -75,8 +79,8 @@ def test_against_dense_convolutions() -> None:
         return x
 
     state, local, raw = dense(given["state"]), dense(given["local"]), dense(given["raw"])
-    count = dense_of(given["count"][:, None], topology, low, 3)
-    z = torch.sigmoid(gate(gru.update, torch.cat([state, local], 1)) - torch.log(count))
+    count, weight = (dense_of(given[name][:, None], topology, low, 3) for name in ("count", "weight"))
+    z = torch.sigmoid(gate(gru.update, torch.cat([state, local], 1)) + torch.log(weight / count))
     r = torch.sigmoid(gate(gru.reset, torch.cat([state, local], 1)))
     candidate = torch.tanh(raw + gate(gru.candidate, torch.cat([r * state, local], 1)))
     expected = rows_of((1 - z) * state + z * candidate, topology, low)
@@ -95,7 +99,7 @@ def test_ten_thousand_steps_stay_bounded() -> None:
     with torch.no_grad():
         for step in range(10_000):
             given["state"] = gru(**given, topology=topology)
-            given["count"] = given["count"] + given["inside"]
+            given["count"] = given["count"] + given["weight"]
             if step % 1000 == 999:  # now and then something else is seen, without measure
                 given["raw"] = torch.randn_like(given["raw"]) * 10 * mask
                 given["local"] = torch.tanh(given["raw"])
@@ -121,13 +125,11 @@ def test_local_network_against_dense_convolutions() -> None:
     seen = torch.rand(topology.zero_row, generator=generator) < 0.5
     mask = torch.cat([seen, seen.new_zeros(1)])[:, None]
     rows = torch.relu(torch.randn((len(mask), 6), generator=generator, dtype=torch.float64)) * mask
-    start = torch.randn((len(mask), 4), generator=generator, dtype=torch.float64) * mask
-    network.agreement.data.fill_(1.5)
+    start = torch.randn((len(mask), CHANNELS), generator=generator, dtype=torch.float64) * mask
     x, present = dense_of(rows[:-1], topology, low, 3), dense_of(seen.double()[:, None], topology, low, 3)
     for number, layer in enumerate(network.convolutions):
         x = F.conv3d(torch.relu(x) if number else x, layer.weight, layer.bias, padding=1) * present
-    expected = rows_of(x, topology, low)
-    expected[:, :4] += start[:-1] * torch.tensor([1, 1, 1, 1.5])
+    expected = rows_of(x, topology, low) + start[:-1]
     found = network(rows, start, topology, seen)
     torch.testing.assert_close(found[:-1], expected, atol=1e-10, rtol=1e-8)
     assert not found[-1].any() and not found[:-1][~seen].any()

@@ -30,11 +30,11 @@ def by_place(volume: LatentVolume) -> dict[tuple[int, int, int], torch.Tensor]:
 
 
 @settings(max_examples=6, deadline=None)
-@given(st.permutations(range(4)), st.sampled_from([0.0, 1.0]))
-def test_the_order_of_views_does_not_matter(order: list[int], shell: float) -> None:
+@given(st.permutations(range(1, 4)), st.sampled_from([0.0, 1.0]))
+def test_the_order_of_neighbours_does_not_matter(order: list[int], shell: float) -> None:
     model = small_model().eval()
     with torch.no_grad():
-        one, two = local(model, [0, 1, 2, 3], shell=shell), local(model, list(order), shell=shell)
+        one, two = local(model, [0, 1, 2, 3], shell=shell), local(model, [0, *order], shell=shell)
     assert torch.equal(one.topology.keys, two.topology.keys) and torch.equal(one.count, two.count)
     torch.testing.assert_close(one.rows, two.rows, atol=1e-4, rtol=1e-3)
 
@@ -70,8 +70,10 @@ def test_only_asked_voxels_are_filled() -> None:
     seen_by = cameras(4)[[0, 1]]
     views = model.encode(pictures(4)[[0, 1]], seen_by)
     part = model.local_volume(views, seen_by, lattice(), whole.topology, wanted, near=0.3, far=3.5)
-    assert torch.equal(part.topology.keys, whole.topology.keys) and torch.equal(part.count, whole.count * wanted)
-    assert not part.rows[:-1][~wanted].any()
+    place = (whole.topology.find(part.topology.keys)[:, None] * VOXELS + torch.arange(VOXELS)).view(-1)
+    asked = whole.count * wanted
+    assert torch.equal(part.count, asked[place]) and float(part.count.sum()) == float(asked.sum())
+    assert not part.rows[:-1][~wanted[place]].any()
 
 
 def test_outside_the_local_volume_every_bit_stays() -> None:
@@ -117,7 +119,7 @@ def test_the_same_frame_a_thousand_times_does_not_drift(gain: float, most: float
             state = after
             early = state.rows if step == 99 else early
     assert bool(torch.isfinite(state.rows).all()) and float(state.rows.abs().max()) <= 1
-    assert float(state.count.max()) == 1000
+    torch.testing.assert_close(state.count, 1000 * one.weight * one.known, rtol=1e-3, atol=0.0)
     assert early is not None
     drift = (state.rows - early)[:-1][one.known].abs()
     assert float(drift.max()) < most and float(drift.mean()) < mean

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tests.networks.made import lattice
 from toolkit.networks.lattice import LatentVolume, cells, empty_volume
-from toolkit.networks.refine import adopt, children, part, solid_cells, split_volume
+from toolkit.networks.refine import INHERITED, adopt, children, part, solid_cells, split_volume
 from toolkit.networks.store import GlobalStore
 from toolkit.volume.lookup import corners, gather
 from toolkit.volume.topology import VOXELS, Topology
@@ -71,7 +71,7 @@ def test_splitting_keeps_the_function_inside_what_is_kept() -> None:
     made = volume(3, 0.95, 1.0)
     kept = solid_cells(made, torch.zeros(len(made.rows)), None) & (torch.rand(len(made.count)) < 0.3)
     finer = split_volume(made, kept)
-    assert finer.lattice.resolution == 2 * made.lattice.resolution and float(finer.count.max()) == 1
+    assert finer.lattice.resolution == 2 * made.lattice.resolution and float(finer.count.max()) == INHERITED
     cell = kept.nonzero().view(-1)[:50]
     fine_cell = children(made.topology, kept, finer.topology)
     assert int(fine_cell.sum()) == 8 * int(kept.sum())

@@ -9,7 +9,7 @@ from toolkit.networks.cameras import Cameras
 from toolkit.networks.lattice import Lattice
 from toolkit.volume.topology import BLOCK
 
-SLACK = 1.05  # blocks of the contracted shell are bent: their ball grows by this much
+SLACK = 1.25  # balls grow by this much: views tell of a voxel beside their pictures, and blocks of the contracted shell are bent
 
 
 def all_blocks(lattice: Lattice, device: torch.device | str = "cpu") -> Tensor:

@@ -139,7 +139,8 @@ class NerfusionModel(nn.Module):
             keys = all_blocks(lattice, cameras.intrinsics.device)
             topology = Topology(keys[visible_blocks(*block_balls(lattice, keys), cameras[0], near, far)])
         if swept is None:
-            swept = self.sweep(views, cameras, *_depths(lattice, topology, cameras, near, far))
+            bounded = near > 0 or math.isfinite(far)
+            swept = self.sweep(views, cameras, *((near, far) if bounded else _depths(lattice, topology, cameras)))
         rows = torch.arange(topology.zero_row, device=topology.device) if wanted is None else wanted.nonzero().view(-1)
         parts = [self._observe(views, cameras, lattice, topology, part, near, far, swept) for part in rows.split(CHUNK)]
         where, projected, starts, counts, weights = (torch.cat(values) for values in zip(*parts, strict=True))
@@ -246,15 +247,13 @@ def _weight(sighted: Sighted) -> Tensor:
     return sighted.open.clamp_min(HIDDEN) * (BLIND + (1 - BLIND) * sighted.sure)
 
 
-def _depths(lattice: Lattice, topology: Topology, cameras: Cameras, near: float, far: float) -> tuple[float, float]:
-    """`near` and `far`, or where the blocks begin and end along the key frame's axis, whichever is narrower."""
+def _depths(lattice: Lattice, topology: Topology, cameras: Cameras) -> tuple[float, float]:
+    """Where the blocks begin (0: at the camera) and end along the key frame's axis."""
     if topology.blocks == 0:
         return 1.0, 2.0
     centres, radii = block_balls(lattice, topology.keys)
     depth = cameras[0].local(centres)[0, :, 2]
-    last = min(far, float((depth + radii).amax()))
-    first = max(near, float((depth - radii).amin()), 0.0)
-    return (first, last) if last > first else (near or 1.0, 2 * (near or 1.0))
+    return max(float((depth - radii).amin()), 0.0), max(float((depth + radii).amax()), 1e-6)
 
 
 def _blocks(topology: Topology, kept: Tensor) -> tuple[Topology, Tensor]:

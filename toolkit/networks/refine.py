@@ -13,7 +13,6 @@ from toolkit.volume.edit import corner_nodes, split
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
 
 INHERITED = 0.25  # weight of a latent taken over from the coarse volume
-SEEN = 0.1  # weight from which on a key frame sees a voxel
 
 
 def solid(thickness: Tensor, gamma: float) -> Tensor:
@@ -35,13 +34,13 @@ def solid_cells(volume: LatentVolume, thickness: Tensor, gamma: float | None) ->
     return whole if gamma is None else whole & cells(volume.topology, known & solid(thickness, gamma), every=False)
 
 
-def surface_cells(volume: LatentVolume, weight: Tensor, thickness: Tensor, gamma: float) -> Tensor:
+def surface_cells(volume: LatentVolume, seen: Tensor, thickness: Tensor, gamma: float) -> Tensor:
     """(M · 512,) bool: solid cells that a key frame sees, so those about surfaces and not what lies hidden behind them.
 
     Args:
-        weight: (M · 512,) of its local volume on the same blocks.
+        seen: (M · 512,) bool, corners that its local volume knows, on the same blocks.
     """
-    return solid_cells(volume, thickness, gamma) & cells(volume.topology, weight >= SEEN, every=False)
+    return solid_cells(volume, thickness, gamma) & cells(volume.topology, seen, every=False)
 
 
 def split_volume(volume: LatentVolume, kept: Tensor) -> LatentVolume:

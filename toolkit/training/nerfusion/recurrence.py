@@ -55,7 +55,7 @@ class Recurrence:
         newest = local
         for before in self.volumes[1:]:
             part = _on_blocks_of(volumes[-1], newest)
-            finer = split_volume(part, self._kept(model, part, newest.weight))
+            finer = split_volume(part, self._kept(model, part, newest.known))
             if finer.topology.blocks == 0:
                 volumes += self.volumes[len(volumes) :]
                 break
@@ -66,10 +66,10 @@ class Recurrence:
         return Recurrence(tuple(volumes), self.near, self.far, self.gamma, self.most), local
 
     @torch.no_grad()
-    def _kept(self, model: NerfusionModel, part: LatentVolume, weight: Tensor) -> Tensor:
+    def _kept(self, model: NerfusionModel, part: LatentVolume, seen: Tensor) -> Tensor:
         """(M · 512,) bool, cells that are looked at finer."""
         thickness = model.thickness(part)
-        kept = surface_cells(part, weight, thickness, self.gamma)
+        kept = surface_cells(part, seen, thickness, self.gamma)
         if int(kept.sum()) > self.most:
             # A cell is as thick as its thickest corner; the threshold that leaves `most` of them is that quantile of its values.
             values = torch.where(part.known, thickness[:-1], torch.full_like(thickness[:-1], -torch.inf))
