@@ -5,6 +5,7 @@ from __future__ import annotations
 import json as writer
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -154,7 +155,7 @@ def run_variant(suite: Suite, variant: Variant, source: Path, place: Path, optio
 
 def render_directly(job: Job, views: Views, scene: Scene) -> Pictures:
     """The stage `direct`: the networks' field, not fitted, at the test views."""
-    from pipelines.direct_field import direct_field
+    from pipelines.direct_field import direct_field, weights_state
     from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture
     from toolkit.render.image import render_view
 
@@ -177,7 +178,8 @@ def render_directly(job: Job, views: Views, scene: Scene) -> Pictures:
         save_pictures(kept, pictures)
         return [kept]
 
-    return job.stages.run("direct", make, save, lambda: load_pictures(kept), uses=job.settings.device, after=["scene", "views"])
+    uses = [asdict(job.settings.network), weights_state(job.settings), job.settings.field.background, job.settings.device]
+    return job.stages.run("direct", make, save, lambda: load_pictures(kept), uses=uses, after=["scene", "views"])
 
 
 def put(suite: Suite, rows: list[dict[str, Any]], out: Path, options: dict[str, Any]) -> dict[str, Any]:

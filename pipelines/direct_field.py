@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,22 +15,43 @@ if TYPE_CHECKING:
     from toolkit.render.field import Field
 
 
-def direct_field(settings: Settings, views: Views, scene: Scene, progress: Progress, share: float = 1.0) -> tuple[Field, int]:
+def weights_of(settings: Settings) -> Path:
+    """The file of the networks that the settings name, else the shipped one."""
+    from toolkit.training.from_network import SHIPPED
+
+    return Path(settings.network.weights) if settings.network.weights else SHIPPED
+
+
+def weights_state(settings: Settings) -> str:
+    """Changes with the weights, so that results of earlier ones are not reused."""
+    from toolkit.files import fingerprint
+
+    return fingerprint(weights_of(settings))
+
+
+def direct_field(
+    settings: Settings, views: Views, scene: Scene, progress: Progress, share: float = 1.0, voxel_factor: float = 1.0
+) -> tuple[Field, int]:
     """Fuse the key frames (about `share` of them, evenly spread) of the training views into a field; and how many they were.
+
+    Args:
+        voxel_factor: voxels this many times as large as `network.voxels` asks for.
 
     Raises:
         InputError: there is no training view, or no weights.
         Interrupted: the user asked to stop.
     """
     from toolkit.keyframes import KeyFrames, select_keyframes
-    from toolkit.training.from_network import Inference, load_networks
+    from toolkit.training.from_network import Inference, NetworkOptions, load_networks
 
     train = np.flatnonzero(~np.asarray(views.test))
     keys = select_keyframes(views.world_from_camera[train], [views.intrinsics[index] for index in train], scene.median_depth)
     if share < 1:
         kept = np.unique(np.linspace(0, len(keys.indices) - 1, max(1, round(share * len(keys.indices)))).round().astype(int))
         keys = KeyFrames(keys.indices[kept], keys.neighbours[kept])
-    inference = Inference(load_networks(device=settings.device), views, scene, keys, settings.field.background)
+    options = NetworkOptions(settings.network.voxels / voxel_factor, settings.network.levels)
+    model = load_networks(weights_of(settings), settings.device)
+    inference = Inference(model, views, scene, keys, settings.field.background, options)
     for _ in inference.frames(progress):
         pass
     return inference.field(), len(keys.indices)

@@ -201,7 +201,7 @@ def vary(ground: Ground, fitted: Field, kept: Field, path: Path, changed: dict[s
 
 
 def make_direct(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dict[str, Any]]:
-    """The networks' field of some of the key frames, not fitted."""
+    """The networks' field of some of the key frames, or with other voxels, not fitted."""
     from pipelines.direct_field import direct_field
     from toolkit.progress import SILENT
     from toolkit.render.field import Field
@@ -209,7 +209,7 @@ def make_direct(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dic
     settings, share = ground.settings, float(spec["wanted"]["keyframes"])
     path = scratch / "field.safetensors"
     with Cost(ground) as cost:
-        made, count = direct_field(settings, ground.chosen, ground.scene, SILENT, share)
+        made, count = direct_field(settings, ground.chosen, ground.scene, SILENT, share, float(spec["wanted"]["voxel_size"]))
         cost.lap("fuse")
         made.save(path, ground.scene.working_from_input)
         cost.lap("save")

@@ -12,7 +12,8 @@ TIMES = (3.0, 10.0, 30.0, 60.0, 120.0, 300.0, 900.0)
 BASE_TIME = 30.0  # the largest of the times up to this is the default that single steps start from
 SURFACE_VOXELS = (4.0, 2.0, 1.0, 0.5)  # of the automatic voxel size, for surfaces …
 FIELD_VOXELS = (2.0, 1.4, 0.7)  # … and for fields, beside the automatic one
-KEY_FRAMES = (0.25, 0.5)  # of the key frames that the networks fuse, beside all of them
+KEY_FRAMES = (0.1, 0.25, 0.5)  # of the key frames that the networks fuse, beside all of them
+DIRECT_VOXELS = (2.0, 0.7)  # of the networks' automatic voxel size, beside that
 SHARES = (0.25, 0.5)  # of the training views, beside all of them
 SAMPLES = (2, 8)  # in a brick of four voxels along a ray, beside 4
 PRECISIONS = ("uint8", "float32")  # of the stored field, beside float16
@@ -126,8 +127,7 @@ def plan(axes: Iterable[str], times: Sequence[float], seeds: int, surface: str |
         first, *others = _surfaces(axes, surface)
         out[1:1] = [first]
         out[len(ladder) + 1 : len(ladder) + 1] = others
-    if "keyframes" in axes:
-        out += [Wanted("direct", {"keyframes": share, "views": 1.0}, ("keyframes",)) for share in (1.0, *KEY_FRAMES)]
+    out += _direct(axes)
     for seed in range(1, seeds):
         out += _fields(axes, ladder, base, both, seed)
     return out
@@ -150,6 +150,18 @@ def _fields(axes: list[str], ladder: list[float], base: float, both: list[float]
         out += [one(base, "deferred", ["views"], views=share) for share in SHARES]
     if "decoder" in axes:
         out += [one(time, "per_sample", ["decoder", "iterations"]) for time in both]
+    return out
+
+
+def _direct(axes: list[str]) -> list[Wanted]:
+    """The networks alone: a curve over key frames, and one over voxel sizes with all of them."""
+    if "keyframes" not in axes:
+        return []
+    both = tuple(axis for axis in ("voxel_size", "keyframes") if axis in axes)
+    out = [Wanted("direct", {"keyframes": 1.0, "views": 1.0, "voxel_size": 1.0}, both)]
+    out += [Wanted("direct", {"keyframes": share, "views": 1.0, "voxel_size": 1.0}, ("keyframes",)) for share in KEY_FRAMES]
+    if "voxel_size" in axes:
+        out += [Wanted("direct", {"keyframes": 1.0, "views": 1.0, "voxel_size": factor}, ("voxel_size",)) for factor in DIRECT_VOXELS]
     return out
 
 

@@ -11,7 +11,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from pipelines.direct_field import weights_state
 from pipelines.job import Job
+from pipelines.kept import MEASURED_POINT, read_kept
 from pipelines.tradeoff_plan import Wanted, point_id
 from toolkit.config import settings_dict
 from toolkit.errors import InputError
@@ -68,6 +70,8 @@ def job_spec(job: Job, one: Wanted, stereo_seconds: float, base_voxel: float | N
     }
     if one.is_surface:
         own: list[Any] = [asdict(settings.tsdf), base_voxel]
+    elif one.method == "direct":
+        own = [asdict(settings.network), weights_state(settings), settings.field.background, settings.device]
     else:
         own = [asdict(settings.field), asdict(replace(settings.fit, budget=None)), settings.engine, settings.device]
     uses = [made, own, settings.threads]
@@ -91,12 +95,16 @@ def place(job: Job, one: Wanted) -> Path:
 
 def known_rows(job: Job, one: Wanted, spec: dict[str, Any]) -> list[dict[str, Any]] | None:
     """The rows of an earlier sweep, if they are of this very point and not the remains of a crash."""
-    path = place(job, one)
+    return rows_at(place(job, one), spec["key"])
+
+
+def rows_at(path: Path, key: str) -> list[dict[str, Any]] | None:
+    """The rows at `path`, if they were kept under this key and are whole."""
     if not path.is_file():
         return None
     try:
-        kept = read_json(path)
-        if kept["key"] == spec["key"] and not kept["crashed"] and kept["rows"]:
+        kept = read_kept(path, MEASURED_POINT)
+        if kept["key"] == key and not kept["crashed"] and kept["rows"]:
             return [dict(row) for row in kept["rows"]]
     except (InputError, KeyError, TypeError, ValueError):
         pass

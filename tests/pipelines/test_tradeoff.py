@@ -11,6 +11,7 @@ from pipelines.tradeoff_plan import base_time, chosen_axes, chosen_times, plan
 from tests.pipelines.made import call
 from tests.pipelines.test_matched import make_corner
 from toolkit.errors import InputError
+from toolkit.evaluate.tradeoff import checked_row, points_of, series
 from toolkit.files import read_json, write_json
 
 Capsys = pytest.CaptureFixture[str]
@@ -39,6 +40,24 @@ def test_only_what_is_asked_for() -> None:
     ]
     assert [one.id for one in plan(["iterations"], [3.0, 10.0], 1, None)] == ["field-10s", "field-3s"]
     assert base_time([60.0, 120.0]) == 60 and base_time([10.0, 29.0]) == 29
+
+
+def test_direct_inference_is_a_curve_over_key_frames_and_one_over_voxels() -> None:
+    direct = [one for one in plan(["voxel_size", "keyframes"], [30.0], 3, "tsdf") if one.method == "direct"]
+    assert [one.id for one in direct[:4]] == ["direct", "direct-keyframes0.1", "direct-keyframes0.25", "direct-keyframes0.5"]
+    assert direct[0].axes == ("voxel_size", "keyframes") and len(direct) == 6  # once for all seeds: it draws no random numbers
+    rows = [
+        checked_row(
+            {"id": one.id, "method": "direct", "axes": list(one.axes), "error": None, "psnr": 15.0, "seconds": 1.0}
+            | {"setting": {"keyframes": round(12 * one.wanted["keyframes"]), "voxel_size": one.wanted["voxel_size"], "wanted": one.wanted}}
+        )
+        for one in direct
+    ]
+    lines = {axis: [point.id for point in line] for axis, line in series(points_of(rows))}
+    assert lines["keyframes"] == ["direct-keyframes0.1", "direct-keyframes0.25", "direct-keyframes0.5", "direct"]
+    assert lines["voxel_size"] == ["direct-voxel2.0", "direct", "direct-voxel0.7"]
+    only = [one.id for one in plan(["keyframes"], [30.0], 1, None) if one.method == "direct"]
+    assert only == ["direct", "direct-keyframes0.1", "direct-keyframes0.25", "direct-keyframes0.5"]
 
 
 def test_axes_and_times_are_checked() -> None:
