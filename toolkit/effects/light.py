@@ -13,7 +13,8 @@ from toolkit.effects.evidence import BRIGHTEST, DARKEST, ROUNDS, Evidence, Track
 
 EXPOSURE, VIGNETTING = "exposure", "vignetting"
 HELD_OUT = 4  # every so manieth point is kept out of the fits
-MARGIN = {EXPOSURE: 0.35, VIGNETTING: 0.25}  # least relative fall of the held-out deviation: less did not pay on real pictures
+MARGIN = {EXPOSURE: 0.35, VIGNETTING: 0.18}  # least relative fall of the held-out deviation: less did not pay on real pictures
+UNCLIPPED = 0.6  # linear light of a patch below which hardly a pixel of it is clipped, so that its mean tells how light changes
 LEAST = 0.0015  # stops by which it has to fall at least
 
 
@@ -122,7 +123,7 @@ def frame_gains(tracks: Tracks, frames: int, train: Array) -> Array:
 
 def left_over(tracks: Tracks, frames: int) -> tuple[Array, Array]:
     """Stops (O,) by which observations differ from their points, all frames' gains taken out; and which of them could be used (O,) bool."""
-    bright = ((tracks.linear > DARKEST) & (tracks.linear < BRIGHTEST)).all(1)
+    bright = ((tracks.linear > DARKEST) & (tracks.linear < UNCLIPPED)).all(1)
     counts = np.bincount(tracks.point[bright], minlength=int(tracks.point.max(initial=-1)) + 1)
     use = bright & (counts[tracks.point] > 2)
     out = np.zeros(len(tracks.frame))

@@ -42,13 +42,14 @@ def forward(pictures: list[Tensor]) -> Tensor:
     return total / len(pictures)
 
 
-THRESHOLD = 0.06  # factors of two of the slopes' energy
+THRESHOLD = 0.041  # factors of two of the slopes' energy
 BLURRED = -0.7  # factors of two below the others: such a frame is worth less than it costs
 FEWEST = 100
+DARKEST, BRIGHTEST = 0.02, 0.6  # linear light of a patch: noise and clipping change slopes too, and exposure decides how much
 TREND = 8  # frames from which on a slow trend is told from blur, which comes and goes
 
 
-def evidence(slope: Array, depth: Array, frame: Array, point: Array, frames: int) -> Evidence:
+def evidence(slope: Array, depth: Array, frame: Array, point: Array, frames: int, linear: Array | None = None) -> Evidence:
     """Whether the same points are sharper in some frames than in others.
 
     The slopes' energy at an observation is the point's own, times the frame's sharpness, times a power of the depth (from nearby, slopes a
@@ -56,11 +57,14 @@ def evidence(slope: Array, depth: Array, frame: Array, point: Array, frames: int
 
     Args:
         slope: (O,) mean square of the slopes of log light round the observation. depth: (O,) along z. frame, point: (O,).
+        linear: (O, 3) light of the patch, as it was stored; what is dark or bright is left out. None: nothing is.
 
     Returns:
         `parameters["sharpness"]`: (frames,) factors of two of the energy, mean 0; 0 where nothing is told.
     """
     used = (slope > 1e-5) & (depth > 0)
+    if linear is not None:
+        used &= ((linear > DARKEST) & (linear < BRIGHTEST)).all(1)
     if int(used.sum()) < FEWEST or len(np.unique(frame[used])) < TREND:
         return Evidence("motion_blur", 0.0, THRESHOLD, "too few points are shared between pictures to compare their sharpness")
     number = np.unique(point[used], return_inverse=True)[1]

@@ -47,6 +47,7 @@ class Sightings:
     slope: Array  # (O, 3) mean of gx², gx·gy, gy² around it, of log light, in working pixels
     size: Array  # (O,) working pixels: deviation of the blob that was found
     sharpness: Array  # (F,) root mean square of the slopes of log light at the points
+    pictures: tuple[Array, ...] = ()  # (F) working pictures, (h, w) uint8 grey
 
     @property
     def points(self) -> int:
@@ -130,6 +131,7 @@ def gather(capture: Capture, chosen: Sequence[int], progress: Progress = SILENT)
         frame=owner[node],
         point=point,
         sharpness=np.array([look.sharpness for look in seen]),
+        pictures=tuple(look.grey for look in seen),
         **columns,
     )
 
@@ -172,6 +174,7 @@ class _Look:
     size: Array  # (N,)
     scale: float
     sharpness: float
+    grey: Array  # (h, w) uint8
 
 
 def _look(picture: Array, camera: Intrinsics) -> _Look:
@@ -184,7 +187,7 @@ def _look(picture: Array, camera: Intrinsics) -> _Look:
     keypoints, descriptors = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.012).detectAndCompute(grey, None)
     if descriptors is None or len(keypoints) == 0:
         empty = np.zeros((0, 3))
-        return _Look(np.zeros((0, 2)), np.zeros((0, 128), np.float32), empty, empty, np.zeros(0), scale * width / camera.width, 0.0)
+        return _Look(np.zeros((0, 2)), np.zeros((0, 128), np.float32), empty, empty, np.zeros(0), scale * width / camera.width, 0.0, grey)
     at = np.array([k.pt for k in keypoints], dtype=np.float32)  # whole-number pixel centres
     size = 0.5 * np.array([k.size for k in keypoints], dtype=np.float32)
     log = np.log2(np.maximum(LINEAR[grey], LINEAR[8]))
@@ -206,6 +209,7 @@ def _look(picture: Array, camera: Intrinsics) -> _Look:
         size=size[keep].astype(np.float64),
         scale=scale * width / camera.width,
         sharpness=float(np.sqrt((slope[keep][:, 0] + slope[keep][:, 2]).mean())) if keep.any() else 0.0,
+        grey=grey,
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from toolkit.camera import Array
 from toolkit.capture.types import Capture
-from toolkit.effects import background, geometry, light, motion_blur, view_dependence
+from toolkit.effects import background, beyond, geometry, light, motion_blur, view_dependence
 from toolkit.effects.adjust import LENS, POSES, ROWS, Problem, predict
 from toolkit.effects.evidence import Evidence
 from toolkit.effects.light import EXPOSURE, VIGNETTING
@@ -108,14 +108,14 @@ def look(seen: Sightings, began: float | None = None) -> Survey:
     depth = np.zeros(len(kept.frame))
     order = np.argsort(explained.observation, kind="stable")
     depth[:] = predict(explained.problem)[0][order, 2]
-    blur = motion_blur.evidence(kept.slope[:, 0] + kept.slope[:, 2], depth, kept.frame, kept.point, frames)
+    blur = motion_blur.evidence(kept.slope[:, 0] + kept.slope[:, 2], depth, kept.frame, kept.point, frames, kept.linear)
     usual = float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
     findings = {
         **{name: _of_light(found, name) for name in (EXPOSURE, VIGNETTING)},
         LENS: _lens(explained),
         ROWS: _rows(explained, seen),
         VIEWS: _plain(dependence),
-        FAR: _plain(_far(seen, explained.problem, usual)),
+        FAR: _far(seen, explained.problem, usual),
         BLUR: _plain(blur),
         POSES: _poses(explained),
     }
@@ -168,12 +168,16 @@ def _poses(found: geometry.Explained) -> Finding:
     return Finding(POSES, max(_gain(choice), 0.0), geometry.MARGIN[POSES], reason, choice.kept, choice.before, choice.after, PIXELS)
 
 
-def _far(seen: Sightings, problem: Problem, usual: float) -> Evidence:
-    """Also the points that no two rays of which meet: those the problem does not have."""
+def _far(seen: Sightings, problem: Problem, usual: float) -> Finding:
+    """By patches of the pictures; without pictures by points, also those no two rays of which meet (the problem does not have these)."""
+    if seen.pictures:
+        found = beyond.far(seen, problem, usual)
+        said = found.evidence
+        return Finding(FAR, said.number, said.threshold, said.reason, found.found, found.before, found.after, "stops")
     ideal = seen.ideal()
     known = np.isfinite(ideal).all(1)
     poses = problem.poses[seen.frame[known]]
     rays = np.einsum("oij,oj->oi", poses[:, :3, :3], np.concatenate([ideal[known], np.ones((int(known.sum()), 1))], axis=1))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     number = np.unique(seen.point[known], return_inverse=True)[1]
-    return background.evidence(rays, poses[:, :3, 3], number, seen.focal[seen.frame[known]], usual)
+    return _plain(background.evidence(rays, poses[:, :3, 3], number, seen.focal[seen.frame[known]], usual))
