@@ -229,21 +229,33 @@ def table(
     ] = None,
 ) -> None:
     """Put measured tables into a Markdown page, between marks, so that no number in it is typed."""
+    from toolkit.evaluate.suites.tables import put_between_marks
+
+    for path in files:
+        title = name or path.resolve().parent.name
+        put_between_marks(into, title, measured_text(path, title, data))
+
+
+def measured_text(path: Path, title: str, data: Path | None) -> str:
+    """The results at `path` as Markdown; `data` is shown as DATA in the command.
+
+    Raises:
+        InputError: the file holds no results.
+    """
+    from pipelines.kept import TRADEOFF, read_kept
     from toolkit.errors import InputError
     from toolkit.evaluate.suites import suite_of
-    from toolkit.evaluate.suites.tables import portable, put_between_marks, suite_table
+    from toolkit.evaluate.suites.tables import portable, suite_table
     from toolkit.evaluate.tradeoff_page import tradeoff_data
     from toolkit.evaluate.tradeoff_table import tradeoff_table
     from toolkit.files import read_json
 
-    for path in files:
-        measured = read_json(path)
-        title = name or path.resolve().parent.name
-        try:
-            found = {**measured, "command": portable(str(measured["command"]), data and data.resolve()), "rows": list(measured["rows"])}
-            text = suite_table(suite_of(found["suite"]), found) if "suite" in found else tradeoff_table(tradeoff_data(found), title)
-        except (KeyError, TypeError, AttributeError) as error:
-            raise InputError(
-                f"{path} holds no results of a benchmark or a trade-off ({error}); give results.json or tradeoff.json"
-            ) from error
-        put_between_marks(into, title, text)
+    measured = read_json(path)
+    try:
+        found = {**measured, "command": portable(str(measured["command"]), data and data.resolve()), "rows": list(measured["rows"])}
+        if "suite" in found:
+            return suite_table(suite_of(found["suite"]), found)
+        read_kept(path, TRADEOFF)
+        return tradeoff_table(tradeoff_data(found), title)
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        raise InputError(f"{path} holds no results of a benchmark or a trade-off ({error}); give results.json or tradeoff.json") from error

@@ -14,15 +14,15 @@ def effects_facts(target: Path, quiet: bool) -> dict[str, Any]:
     """
     from pipelines.console import make_progress
     from pipelines.folder import is_run_folder
+    from pipelines.kept import EFFECTS, read_kept
     from toolkit.capture import open_capture
     from toolkit.effects.survey import survey
     from toolkit.errors import InputError
-    from toolkit.files import read_json
 
     if is_run_folder(target):
         if not (target / "effects.json").is_file():
             raise InputError(f"{target} holds no effects.json; run the job again without effects=off")
-        return {key: value for key, value in read_json(target / "effects.json").items() if key != "corrections"}
+        return {key: value for key, value in read_kept(target / "effects.json", EFFECTS).items() if key != "corrections"}
     capture = open_capture(target)
     posed = [frame for frame in capture.frames if frame.world_from_camera is not None and frame.intrinsics is not None]
     if len(posed) < 3:

@@ -37,15 +37,15 @@ def few_views(
 
     Rows that OUT/few_views.json has already are not measured again, so an interrupted table goes on when the command is repeated.
     """
+    from pipelines.kept import FEW_VIEWS, read_kept
     from toolkit.evaluate.few_views import few_views_rows, few_views_table
-    from toolkit.files import read_json
     from toolkit.training.from_network import load_networks
 
     seconds, measured = numbers(budgets, "budgets"), part_of(starts)
     counts = [None if part == ALL else int(part) for part in wanted(views)]
     with _job(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as (job, posed):
         path = job.folder.path / f"{FILE}.json"
-        rows: list[dict[str, Any]] = read_json(path)["rows"] if path.is_file() else []
+        rows: list[dict[str, Any]] = read_kept(path, FEW_VIEWS)["rows"] if path.is_file() else []
         model = load_networks(job.settings.network.weights, job.settings.device)
         for count in counts:
             ground = ground_of(job, posed, count)

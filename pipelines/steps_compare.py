@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.job import Job
+from pipelines.kept import COMPARED, read_kept
 from pipelines.rendered import Pictures
 from toolkit.errors import InputError
-from toolkit.files import read_json, write_json
+from toolkit.files import write_json
 
 if TYPE_CHECKING:
     from toolkit.camera import Array
@@ -80,7 +81,7 @@ def measure(job: Job, all_of_it: Compared) -> dict[str, Any]:
             "matching": measure_matching(job, all_of_it),
         },
         save=save,
-        load=lambda: read_json(path),
+        load=lambda: read_kept(path, COMPARED),
         uses=list(all_of_it.pictures),
         after=["views", "render", "export", *(name for name in all_of_it.pictures if name != "field")],
     )

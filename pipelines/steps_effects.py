@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.job import Job, set_seeds
+from pipelines.kept import EFFECTS, read_kept
 from pipelines.steps_capture import pixel_state
 from toolkit.effects.correct import Corrections
-from toolkit.files import read_json, write_json
+from toolkit.files import write_json
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Capture
@@ -45,7 +46,7 @@ def find_effects(job: Job, posed: Capture) -> Corrections:
         "effects",
         make=make,
         save=save,
-        load=lambda: read_json(path),
+        load=lambda: read_kept(path, EFFECTS),
         uses=[asdict(settings), holdout, [frame.name for frame in posed.frames], pixel_state(posed)],
         after=["poses"],
     )
@@ -69,7 +70,7 @@ def effects_part(job: Job, background: bool | None) -> dict[str, Any] | None:
     """The report's part `effects`: decisions without the corrections' many numbers; None when nothing was looked for."""
     if "effects" not in job.stages.records:
         return None
-    data = read_json(job.folder / NAME)
+    data = read_kept(job.folder / NAME, EFFECTS)
     effects = data["effects"]
     for entry in effects:
         if entry["effect"] == "background" and background is not None:

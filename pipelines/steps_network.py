@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.job import Job, set_seeds
+from pipelines.kept import NETWORK, read_kept
 from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture, write_png, write_pngs
 from pipelines.steps_capture import choose_keyframes
 from toolkit.errors import InputError
-from toolkit.files import fingerprint, read_json, write_json
+from toolkit.files import fingerprint, write_json
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Views
@@ -93,7 +94,7 @@ def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
         return [path, about, job.folder / PREVIEW]
 
     def load() -> NetworkField:
-        return NetworkField(Field.load(path).to(settings.device), read_json(about))
+        return NetworkField(Field.load(path).to(settings.device), read_kept(about, NETWORK))
 
     uses = [asdict(settings.network), fingerprint(weights), settings.field.background, settings.device, settings.seed]
     value = job.stages.run("network", make, save, load, uses=uses, after=["scene", "views", "keyframes"])

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.job import Job, set_seeds
+from pipelines.kept import EVALUATION, EXPORT_FACTS, NOTES, TIMELINE, read_kept
 from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture, write_pngs
 from pipelines.steps_capture import last_of, pixel_state
-from toolkit.files import read_json, write_json
+from toolkit.files import write_json
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Capture, Views
@@ -89,7 +90,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     start = job.stages.record("field") if go_on and job.stages.usable("field") and not job.other_field else None
 
     def load() -> Fitted:
-        return Field.load(path).to(settings.device), read_json(times)
+        return Field.load(path).to(settings.device), read_kept(times, TIMELINE)
 
     def make() -> Fitted:
         set_seeds(settings.seed)
@@ -132,7 +133,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
 def fit_notes(job: Job) -> list[str]:
     """What the fit of this run's field had to say."""
     record = job.stages.records.get("field")
-    return [str(text) for text in read_json(job.folder / FIT_NOTES)] if record is not None and FIT_NOTES in record.outputs else []
+    return list(read_kept(job.folder / FIT_NOTES, NOTES)) if record is not None and FIT_NOTES in record.outputs else []
 
 
 def render_test_views(job: Job, field: Field, views: Views) -> Pictures:
@@ -180,7 +181,7 @@ def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, sc
         "export",
         make=make,
         save=save,
-        load=lambda: read_json(facts_path),
+        load=lambda: read_kept(facts_path, EXPORT_FACTS),
         uses=asdict(job.settings.export),
         after=["field", "poses", "scene", "views"],
     )
@@ -210,7 +211,7 @@ def score_pictures(job: Job, views: Views, pictures: dict[str, Pictures]) -> dic
         "evaluate",
         make=make,
         save=save,
-        load=lambda: read_json(path),
+        load=lambda: read_kept(path, EVALUATION),
         uses=sorted(pictures),
         after=["views", *last_of(job, "tsdf", "render", "direct")],
     )

@@ -15,6 +15,8 @@ import torch
 from tests.capture.layouts import LAYOUTS
 from tests.capture.made import eyes, render, save_picture
 from tests.stability.fuzz.models import make_models, make_training, read_baked_field, read_models, read_training
+from tests.stability.fuzz.results import FILES as RESULT_FILES
+from tests.stability.fuzz.results import MEASURED, make_measured, make_results, read_measured, read_results
 from toolkit.camera import Intrinsics, Similarity
 from toolkit.capture import open_capture
 from toolkit.capture.checks import check_capture
@@ -249,6 +251,8 @@ TARGETS: tuple[Target, ...] = (
     Target("photos", PHOTOS, make_photos, read_photo_folder, 3.0),
     Target("videos", ("a.avi", "b.mp4", "c.webm"), make_videos, read_one_video, 1.5),
     Target("run json", RUN_FILES, make_runs, read_json_files, 2.0),
+    Target("results", RESULT_FILES, make_results, read_results, 2.5),
+    Target("measured", MEASURED, make_measured, read_measured, 2.5),
     Target("field", ("field.safetensors", "other.safetensors"), make_runs, read_fields, 3.0),
     Target("tensors", ("views.safetensors", "field.pictures.safetensors", "tsdf.safetensors"), make_runs, read_tensors, 1.5),
     Target("baked", ("bounded.safetensors", "background.safetensors"), make_models, read_baked_field, 2.0),

@@ -46,9 +46,10 @@ class Watch:
             self.escapes.append(f"{event} {arguments!r:.200}")
         elif event == "exec":
             code = arguments[0]
-            # The program's own modules, and typing's evaluation of its own annotations, are no code of the file's.
+            # The program's own modules, typing's evaluation of its own annotations, and the package's page templates are no code of the file's.
             own = str(getattr(code, "co_filename", "")).startswith((*self.allowed, "<frozen"))
-            if not own and Path(sys._getframe(1).f_code.co_filename).name != "typing.py":
+            caller = sys._getframe(1).f_code.co_filename
+            if not own and Path(caller).name != "typing.py" and not caller.endswith("/jinja2/environment.py"):
                 self.escapes.append(f"exec of {code!r:.200}")
         elif event == "open":
             path, mode, flags = arguments
