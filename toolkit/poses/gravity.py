@@ -13,7 +13,7 @@ NEAR = 60.0  # degrees that an estimate may lie off the mean up vector of the ca
 TURNED = 0.01  # least share of the x axes' second direction: about 6° of turning
 UNDECIDED = 0.15  # length of a mean of unit vectors below which it points nowhere
 SHORT = 0.5  # and below which it does not overrule the x axes
-GAIN = 0.9  # the turned footprint must shrink to this share to be worth turning
+STEEP = 0.7  # cosine between a camera's axis and up above which that axis tells no heading
 
 
 def up_direction(world_from_camera: Array, given: tuple[float, float, float] | None = None) -> tuple[Array, str]:
@@ -49,35 +49,44 @@ def up_direction(world_from_camera: Array, given: tuple[float, float, float] | N
     return up, reason
 
 
-def rotation_to_z(up: Array) -> Array:
-    """The least (3, 3) rotation that takes the unit vector `up` to +z."""
-    z = np.array([0.0, 0.0, 1.0])
-    cosine = float(up @ z)
-    if cosine < -1 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0])
-    v = np.cross(up, z)
-    skew = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    rotation: Array = np.eye(3) + skew + skew @ skew / (1 + cosine)
-    return rotation
-
-
 def turn_about_z(degrees: float) -> Array:
     """(3, 3)."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+def camera_frame(world_from_camera: Array, given: tuple[float, float, float] | None = None) -> tuple[Array, str]:
+    """(3, 3) rotation into a frame that the cameras alone decide, and the reason for its z, which is up (see `up_direction`).
+
+    Its x lies along the first camera's right, or along its view where it lies on its side. However a capture is turned, it is the same
+    there: what comes after looks at the same numbers, to rounding, and lays the same lattice.
+    """
+    up, reason = up_direction(world_from_camera, given)
+    right, ahead = world_from_camera[0, :3, 0], world_from_camera[0, :3, 2]
+    heading = right if abs(right @ up) < STEEP else ahead
+    x = heading - (heading @ up) * up
+    x = x / np.linalg.norm(x)
+    return np.stack([x, np.cross(up, x), up]), reason
+
+
 def tight_turn(points: Array, percents: tuple[float, float] = (0.5, 99.5)) -> float:
-    """Degrees to turn (P, 3) points about z for the smallest axis-aligned footprint, within ±45°; 0 when it gains less than a tenth.
+    """Degrees to turn (P, 3) points about z for the smallest axis-aligned footprint, within ±45°, to a tenth of a degree.
 
     The footprint spans percentiles, so that stray points do not decide.
     """
-    angles = np.arange(-45.0, 45.0, 1.5)
-    turned = np.einsum("aij,pj->api", np.stack([turn_about_z(float(a))[:2, :2] for a in angles]), points[:, :2])  # (angles, P, 2)
-    low, high = np.percentile(turned, percents, axis=1)
-    areas = np.prod(high - low, axis=1)
-    best = int(np.argmin(areas))
-    return float(angles[best]) if areas[best] < GAIN * areas[np.flatnonzero(angles == 0)[0]] else 0.0
+    coarse = np.arange(-45.0, 45.0, 1.5)
+    best = float(coarse[np.argmin(_footprints(points, coarse, percents))])
+    fine = best + np.arange(-1.4, 1.45, 0.1)
+    return float(fine[np.argmin(_footprints(points, fine, percents))])
+
+
+def _footprints(points: Array, degrees: Array, percents: tuple[float, float]) -> Array:
+    """(A,) areas of the axis-aligned footprints of points that are turned by each of the angles (A,)."""
+    areas = []
+    for angle in degrees:
+        low, high = np.percentile(points[:, :2] @ turn_about_z(float(angle))[:2, :2].T, percents, axis=0)
+        areas.append(float(np.prod(high - low)))
+    return np.array(areas)
 
 
 def _towards(vector: Array, other: Array) -> Array:

@@ -11,7 +11,7 @@ from toolkit.camera import Array, Similarity
 from toolkit.capture.types import Capture
 from toolkit.errors import InputError, PoseError
 from toolkit.poses.cloud import Cloud, cloud_of_depth, cloud_of_points
-from toolkit.poses.gravity import rotation_to_z, tight_turn, turn_about_z, up_direction
+from toolkit.poses.gravity import camera_frame, tight_turn, turn_about_z
 from toolkit.poses.hull import silhouette_cloud
 from toolkit.poses.points import triangulate
 from toolkit.poses.region import FORWARD, Layout, box, layout, points_of_interest
@@ -96,9 +96,11 @@ def describe_scene(capture: Capture, progress: Progress = SILENT) -> Scene:
     """
     if not capture.posed:
         raise PoseError(f"{capture.root}: not every frame has a pose and intrinsics; run the poses stage first")
-    # Inputs may lie far from their origin (6000 km in earth-centred frames): all that follows happens near zero.
-    origin = np.median([frame.world_from_camera[:3, 3] for frame in capture.frames if frame.world_from_camera is not None], axis=0)
-    near_zero = Similarity(1.0, np.eye(3), -origin)
+    # Inputs may lie far from their origin (6000 km in earth-centred frames), and turned in any way: all that follows happens near zero,
+    # in a frame that the cameras decide.
+    given = np.array([frame.world_from_camera for frame in capture.frames if frame.world_from_camera is not None])
+    rotation, reason = camera_frame(given, capture.up)
+    near_zero = Similarity(1.0, rotation, -(rotation @ given[0, :3, 3]))
     local = _moved(capture, near_zero)
     poses = np.array([frame.world_from_camera for frame in local.frames], dtype=np.float64)
     cloud = find_cloud(local, progress)
@@ -109,15 +111,13 @@ def describe_scene(capture: Capture, progress: Progress = SILENT) -> Scene:
         )
     depth = cloud.median_depth()
     scale = 1.0 if capture.metric else MEDIAN_DEPTH / depth
-    up, reason = up_direction(poses, capture.up)
-    rotation = rotation_to_z(up)
-    upright = Similarity(scale, rotation, np.zeros(3))
+    upright = Similarity(scale, np.eye(3), np.zeros(3))
     found = layout(upright.poses(poses), with_depth=cloud.source == "depth")
     points = upright.points(cloud.points)
     bounded = cloud.source in ("silhouettes", "depth")
     turn = turn_about_z(_turn(found, upright.poses(poses), points, cloud, bounded))
     centre, half, inside = _region(Layout(found.kind, turn @ found.focus, found.distance, found.nearest), points @ turn.T, cloud, bounded)
-    working = Similarity(scale, turn @ rotation, -centre)
+    working = Similarity(scale, turn, -centre)
     views = cloud.views
     beyond = float((views * ~inside).sum() / max(views.sum(), 1))
     depths = cloud.depth * scale

@@ -46,7 +46,7 @@ class Watch:
             self.escapes.append(f"{event} {arguments!r:.200}")
         elif event == "exec":
             code = arguments[0]
-            # The program's own modules, typing's evaluation of its own annotations, and the package's page templates are no code of the file's.
+            # No code of the file's: the program's own modules, typing's evaluation of its annotations, the package's page templates.
             own = str(getattr(code, "co_filename", "")).startswith((*self.allowed, "<frozen"))
             caller = sys._getframe(1).f_code.co_filename
             if not own and Path(caller).name != "typing.py" and not caller.endswith("/jinja2/environment.py"):
