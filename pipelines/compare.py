@@ -55,7 +55,7 @@ def compare(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Make the field and the TSDF surface, score both on the same test views, and put them side by side on one page.
+    """Make the field, fitted and not, and the TSDF surface, score all on the same test views, and put them side by side on one page.
 
     With the folder of an earlier run its results are used as they are. A capture with `ground_truth/mesh.ply` has its meshes measured.
     """
@@ -81,14 +81,14 @@ def compare_run(target: Path, out: Path | None, options: dict[str, Any], depth: 
     """
     from pipelines.comparison import put_comparison
     from pipelines.job import open_job
-    from pipelines.reconstruct import BEFORE, RESULTS, stand
-    from pipelines.steps_compare import SURFACES, Compared, choose_surfaces, measure
+    from pipelines.reconstruct import BEFORE, FOR_FIELD, RESULTS, stand
+    from pipelines.steps_compare import SURFACES, Compared, choose_surfaces, measure, not_fitted
     from pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views
     from toolkit.errors import InputError
     from toolkit.evaluate.compare_truth import find_truth
 
     start = time.monotonic()
-    with open_job(target, out, options, progress, (*BEFORE, *RESULTS, *SURFACES.values())) as job:
+    with open_job(target, out, options, progress, (*BEFORE, *FOR_FIELD, *RESULTS, *SURFACES.values())) as job:
         capture, poses, posed, scene, views = stand(job)
         if not views.test.any():
             raise InputError("a comparison needs pictures that were kept for testing; give --holdout 8")
@@ -96,7 +96,7 @@ def compare_run(target: Path, out: Path | None, options: dict[str, Any], depth: 
         surfaces = {SURFACES[kind]: kind for kind in choose_surfaces(depth, posed, truth)}
         pictures = {name: fuse_tsdf(job, posed, scene, views, name, kind) for name, kind in surfaces.items()}
         field, _ = fit_radiance_field(job, views, scene)
-        pictures = {"field": render_test_views(job, field, views), **pictures}
+        pictures = {"field": render_test_views(job, field, views), **not_fitted(job, views, scene), **pictures}
         facts = export_results(job, field, poses, posed, scene, views)
         everything = Compared(capture, poses, posed, scene, views, field, pictures, truth)
         found = measure(job, everything)

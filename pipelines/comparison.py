@@ -22,8 +22,21 @@ SHOWN_VIEWS = 8
 DEPTH_ERROR_TOP = 0.05  # share of the median depth that gets the brightest colour of a depth error
 LITTLE_DEPTH = 0.3  # share of the pixels
 MESH_SIDE = 480  # pixels of a mesh picture's long side
-TITLES = {"field": "Field", "tsdf": "TSDF", "tsdf_stereo": "TSDF of matched pictures", "tsdf_exact": "TSDF of exact depth"}
-NOTES = {"tsdf": "depth of the sensor", "tsdf_stereo": "depth by matching", "tsdf_exact": "perfect depth"}
+TITLES = {
+    "field": "Field",
+    "direct": "Field, not fitted",
+    "tsdf": "TSDF",
+    "tsdf_stereo": "TSDF of matched pictures",
+    "tsdf_exact": "TSDF of exact depth",
+}
+NOTES = {
+    "direct": "by the networks alone",
+    "tsdf": "depth of the sensor",
+    "tsdf_stereo": "depth by matching",
+    "tsdf_exact": "perfect depth",
+}
+OWN_STAGES = {"field": ("field", "render"), "direct": ("network", "direct"), "tsdf_stereo": ("stereo", "tsdf_stereo")}
+KEPT = {"field": "field.safetensors", "direct": "network.safetensors"}
 
 
 def put_comparison(
@@ -80,8 +93,8 @@ def little_depth(all_of_it: Compared) -> list[str]:
 def describe_method(job: Job, all_of_it: Compared, name: str, found: dict[str, Any], mesh_facts: dict[str, Any] | None) -> dict[str, Any]:
     """One of the comparison's `methods`."""
     stages = {stage["name"]: stage for stage in job.stages.summary()}
-    own = ["field", "render"] if name == "field" else [*(["stereo"] if name == "tsdf_stereo" else []), name]
-    path = job.folder / ("field.safetensors" if name == "field" else f"{name}/mesh.ply")
+    own = OWN_STAGES.get(name, (name,))
+    path = job.folder / KEPT.get(name, f"{name}/mesh.ply")
     facts = all_of_it.pictures[name].facts
     return {
         "key": name,

@@ -65,6 +65,21 @@ def choose_surfaces(wanted: str, posed: Capture, truth: GroundTruth | None) -> l
     return [kind for kind in SURFACES if kind in names]
 
 
+def not_fitted(job: Job, views: Views, scene: Scene) -> dict[str, Pictures]:
+    """The networks' field without any fitting, as a method of its own; nothing without weights, where it is not wanted
+    (`init=classical`), and where it is the field itself (`--no-finetune`)."""
+    from pipelines.direct_field import weights_of
+    from pipelines.steps_network import make_network_field, render_network_views
+
+    settings = job.settings
+    if settings.field.init == "classical" or not settings.fit.finetune or not weights_of(settings).is_file():
+        return {}
+    made = make_network_field(job, views, scene)
+    pictures = render_network_views(job, made, views)
+    pictures.facts["bytes"] = made.field.bytes
+    return {"direct": pictures}
+
+
 def measure(job: Job, all_of_it: Compared) -> dict[str, Any]:
     """The stage `compare`: scores, and geometry where there is a true mesh."""
     path = job.folder / "compare" / "scores.json"
@@ -174,6 +189,8 @@ def measure_meshes(job: Job, all_of_it: Compared) -> dict[str, Any]:
     wanted, share = seen_surface(truth, lenses, views.world_from_camera[training], voxel, region)
     out = {}
     for name in all_of_it.pictures:
+        if name == "direct":  # shown and not made into a mesh
+            continue
         found = geometry_metrics(meshes.get(name, Mesh.empty()), truth, wanted, voxel, region)
         lengths = {key: value / scale for key, value in found.items() if key.startswith(("accuracy", "completeness", "voxel")) and value}
         out[name] = {**found, **lengths}

@@ -64,7 +64,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from pipelines.console import make_progress
     from pipelines.options import gather
 
-    options = gather("fast", None, [*PAIRS, "export.formats=[ply]"], holdout=4, threads=1)
+    options = gather("fast", None, [*PAIRS[1:], "export.formats=[ply]"], holdout=4, threads=1)
     compare_run(folder / "corner", folder / "out", options, "auto", make_progress(quiet=True))
     return folder / "out"
 
@@ -72,14 +72,17 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_all_methods_are_scored_alike(compared: Path) -> None:
     data = read_json(compared / "compare.json")
     found = methods(data)
-    assert list(found) == ["field", "tsdf", "tsdf_stereo", "tsdf_exact"]
+    assert list(found) == ["field", "direct", "tsdf", "tsdf_stereo", "tsdf_exact"]
+    direct = found.pop("direct")
+    assert [stage["name"] for stage in direct["stages"]] == ["network", "direct"] and direct["geometry"] is None
+    assert direct["score"]["psnr"] > 5 and direct["disk_bytes"] > 1000 and direct["memory_bytes"] > 1000
     for key, method in found.items():
         assert method["score"]["views"] == 3 and method["score"]["psnr"] > 8
         assert method["seconds"] > 0 and method["peak_memory_mb"] > 50 and method["disk_bytes"] > 1000 and method["memory_bytes"] > 1000
         assert method["score"]["acc_5"] is not None and method["geometry"]["f_score_4"] is not None
         assert method["reference"] is (key == "tsdf_exact") or method["reference"] is None
     assert found["tsdf"]["score"]["on"]["tsdf"]["psnr"] > found["tsdf"]["score"]["psnr"]
-    assert set(found["field"]["score"]["on"]) == {"tsdf", "tsdf_stereo", "tsdf_exact"}
+    assert set(found["field"]["score"]["on"]) == {"tsdf", "tsdf_stereo", "tsdf_exact"} == set(direct["score"]["on"])
     assert data["truth"] == {"mesh": True, "depth": "exact", "seen_share": data["truth"]["seen_share"], "unit": "input units"}
     assert 0.1 < data["truth"]["seen_share"] < 0.9
 
@@ -115,7 +118,7 @@ def test_a_second_look_reuses_everything(compared: Path, capsys: Capsys) -> None
     assert all(stage["cached"] for stage in again["stages"])
     assert [method["score"] for method in again["methods"]] == [method["score"] for method in before["methods"]]
     only = json.loads(call(capsys, "compare", compared, "--depth", "matching", "--quiet", "--json").out)
-    assert list(methods(only)) == ["field", "tsdf_stereo"]
+    assert list(methods(only)) == ["field", "direct", "tsdf_stereo"]
 
 
 def test_pictures_alone(tmp_path: Path, capsys: Capsys) -> None:

@@ -124,12 +124,20 @@ def _percent(value: float | None) -> str:
 def _cost(methods: Sequence[dict[str, Any]]) -> list[Row]:
     return [
         *_row("Time to make it", methods, ("seconds",), words.duration, min, "with its test views, after the shared stages"),
+        *_stage_rows(methods),
         *_row("Time for its mesh besides", methods, ("mesh_seconds",), words.duration),
         *_row("Time to render a test view", methods, ("score", "seconds_per_view"), words.duration, min),
         *_row("Peak memory", methods, ("peak_memory_mb",), words.memory, min, "of the whole process during its stages"),
         *_row("Size on disk", methods, ("disk_bytes",), words.size, min, "what rendering needs"),
         *_row("Size in memory", methods, ("memory_bytes",), words.size, min),
     ]
+
+
+def _stage_rows(methods: Sequence[dict[str, Any]]) -> list[Row]:
+    """The seconds of each method's own stages."""
+    by_name = [{stage["name"]: stage["seconds"] for stage in method["stages"]} for method in methods]
+    names = dict.fromkeys(name for known in by_name for name in known)
+    return [Row(f"· stage {name}", "", [Cell(words.duration(known.get(name))) for known in by_name]) for name in names]
 
 
 def _pictures(methods: Sequence[dict[str, Any]], within: tuple[str, ...], share: str | None = None) -> list[Row]:
