@@ -40,8 +40,10 @@ def test_against_the_camera(seed: int) -> None:
     seen = project(torch.from_numpy(points).float(), torch.full((50,), 0.1), Cameras.of([INTRINSICS] * 3, world), near, far)
     for view in range(3):
         pixels, depth = project_one(INTRINSICS, world[view], points)
-        voxel = (0.1 * INTRINSICS.fx / np.where(depth > near, depth, 1.0))[:, None]  # pixels; a view tells of what is one beside its picture
-        inside = (depth > near) & (depth <= far) & np.all((pixels >= -voxel) & (pixels <= [WIDTH, HEIGHT] + voxel), axis=1)
+        # A view tells of what is a voxel beside its picture.
+        voxel = (0.1 * INTRINSICS.fx / np.where(depth > near, depth, 1.0))[:, None]  # pixels
+        past = pixels - np.array([WIDTH, HEIGHT])
+        inside = (depth > near) & (depth <= far) & np.all((pixels >= -voxel) & (past <= voxel), axis=1)
         assert np.array_equal(seen.visible[view].numpy(), inside)
         np.testing.assert_allclose(seen.pixels[view].numpy()[inside], pixels[inside], atol=2e-3)
         np.testing.assert_allclose(seen.footprint[view].numpy()[inside], 0.1 * INTRINSICS.fx / depth[inside], rtol=1e-4)

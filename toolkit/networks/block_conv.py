@@ -165,8 +165,6 @@ def _weight_gradient(rows: Tensor, gradient: Tensor, weight: Tensor, topology: T
         stop = min(start + chunk, topology.blocks)
         cubes = _cubes(gradient[start * VOXELS : stop * VOXELS])
         halo = _haloed(rows, topology, start, stop, buffer)
-        parts = torch.ops.aten.convolution_backward(
-            cubes, halo, shaped, None, _ONES, _ZEROS, _ONES, False, _ZEROS, 1, [False, True, False]
-        )
+        parts = torch.ops.aten.convolution_backward(cubes, halo, shaped, None, _ONES, _ZEROS, _ONES, False, _ZEROS, 1, [False, True, False])
         total += parts[1]
     return total

@@ -1,9 +1,9 @@
 """A plane sweep along the pixels of a key view: where the surface is likely to be, read off at voxels.
 
 A voxel is large against the step in depth that its views can tell apart, so that what they show at its corner alone says little about
-surfaces between corners. The sweep asks at even steps of inverse depth of about a pixel, and a voxel reads from it in closed form how far
-in front of or behind the surface it lies on average, and how likely it is not hidden. The paper's networks have to find both in mean and
-variance of features; these are known terms beside them, which the networks learn to correct.
+surfaces between corners. The sweep asks at even steps of inverse depth of less than a pixel, and a voxel reads from it in closed form how
+far in front of or behind the surface it lies on average, and how likely it is not hidden. The paper's networks have to find both in mean
+and variance of features; these are known terms beside them, which the networks learn to correct.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from toolkit.networks.cameras import Cameras
 from toolkit.networks.matching import difference, distribution, together
 
 SPACING = 2  # pixels of the compared pictures between those whose depth is asked for
-STEP = 1.0  # pixels that the view which moves most moves by from plane to plane
-PLANES = (16, 128)  # fewest and most
+STEP = 0.75  # pixels that the view which moves most moves by from plane to plane
+PLANES = (32, 128)  # fewest and most
 RANGE = 50.0  # farthest by nearest depth, where the caller does not bound them
 PEAK = 2  # planes on either side of the likeliest one that count as the same depth
 
@@ -110,10 +110,7 @@ def sweep(described: Sequence[Tensor], cameras: Cameras, near: float, far: float
         found, seen = _warped(described[view], cameras[view], cameras, rays, inverses)
         costs.append(difference(own[None], found))
         visible.append(seen)
-    if costs:
-        cost = together(torch.stack(costs), torch.stack(visible))
-    else:
-        cost = rays.new_zeros((len(inverses), len(rays)))
+    cost = together(torch.stack(costs), torch.stack(visible)) if costs else rays.new_zeros((len(inverses), len(rays)))
     likely = distribution(cost.view(len(inverses), *shape))
     step = float(inverses[1] - inverses[0])
     return Sweep(cameras[0], _table(likely, step), low, step)

@@ -1,0 +1,191 @@
+"""The plane sweep: against slow references, and on a wall whose place is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from tests.networks.made import cameras
+from toolkit.networks.cameras import Cameras
+from toolkit.networks.matching import LARGE, SIDE, SMALL, describe, difference, distribution, semi_global, together
+from toolkit.networks.sweep import PLANES, Sweep, _table, sweep
+
+WALL = 2.0
+
+
+def textured(size: int = 128, seed: int = 0) -> torch.Tensor:
+    """(3, size, size) smooth noise in [0, 1]."""
+    generator = torch.Generator().manual_seed(seed)
+    return F.interpolate(torch.rand((1, 3, size // 4, size // 4), generator=generator), (size, size), mode="bicubic")[0].clamp(0, 1)
+
+
+def wall(count: int = 3, depth: float = WALL, scale: float = 1.0) -> tuple[list[torch.Tensor], Cameras]:
+    """Descriptors of views of a textured wall across the first camera's axis, and the cameras, side by side."""
+    texture, width, height, focal = textured(), 96, 72, 90.0
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3] = scale * np.array([0.0, 0.15, -0.2, 0.1])[:count]
+    poses[:, 1, 3] = scale * np.array([0.0, 0.05, 0.05, -0.1])[:count]
+    seen_by = Cameras.same_size(
+        torch.tensor([[focal, focal, width / 2, height / 2]]).repeat(count, 1), torch.from_numpy(poses).float(), width, height
+    )
+    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    images = []
+    for view in range(count):
+        x = (u - width / 2) / focal * depth + poses[view, 0, 3] / scale
+        y = (v - height / 2) / focal * depth + poses[view, 1, 3] / scale
+        images.append(F.grid_sample(texture[None], torch.stack([x, y], -1)[None].float() / 1.6, align_corners=False)[0])
+    return list(describe(torch.stack(images))), seen_by
+
+
+def on_axis(depths: torch.Tensor) -> torch.Tensor:
+    """(N, 3) points straight ahead of the first camera."""
+    return torch.stack([torch.zeros_like(depths), torch.zeros_like(depths), depths], 1)
+
+
+def slow_paths(cost: np.ndarray) -> np.ndarray:
+    """Semi-global matching along four directions as its recurrence is written, one pixel and plane after the other."""
+    planes, height, width = cost.shape
+    total = np.zeros_like(cost)
+    for dy, dx in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        path = np.zeros_like(cost)
+        rows = range(height) if dy >= 0 else range(height - 1, -1, -1)
+        columns = range(width) if dx >= 0 else range(width - 1, -1, -1)
+        for y in rows:
+            for x in columns:
+                before = (y - dy, x - dx)
+                inside = 0 <= before[0] < height and 0 <= before[1] < width
+                for d in range(planes):
+                    if not inside:
+                        path[d, y, x] = cost[d, y, x]
+                        continue
+                    line = path[:, before[0], before[1]]
+                    ways = [line[d], line.min() + LARGE]
+                    ways += [line[d + k] + SMALL for k in (-1, 1) if 0 <= d + k < planes]
+                    path[d, y, x] = cost[d, y, x] + min(ways) - line.min()
+        total += path
+    return total / 4
+
+
+def test_semi_global_matching_against_its_recurrence() -> None:
+    cost = np.random.default_rng(0).random((7, 5, 6))
+    found = semi_global(torch.from_numpy(cost))
+    np.testing.assert_allclose(found.numpy(), slow_paths(cost), atol=1e-12)
+    likely = distribution(torch.from_numpy(cost))
+    torch.testing.assert_close(likely.sum(0), torch.ones_like(likely[0]))
+
+
+def test_what_a_voxel_reads_against_the_expectation_itself() -> None:
+    generator = torch.Generator().manual_seed(0)
+    planes, low, step = 60, 0.2, 0.02
+    likely = torch.softmax(3 * torch.randn((planes, 1, 1), generator=generator), 0)
+    one = Cameras.same_size(torch.tensor([[10.0, 10.0, 4.0, 3.0]]), torch.eye(4)[None], 8, 6)
+    made = Sweep(one, _table(likely, step), low, step)
+    depth = torch.tensor([0.9, 1.1, 1.5, 2.5, 4.0])
+    truncation = 0.25 * depth
+    found = made.look(on_axis(depth), truncation)
+    # The surface lies anywhere about its plane.
+    spread = torch.linspace(-0.5, 0.5, 201)[1:-1]
+    surface = (low + (torch.arange(planes)[:, None] + spread) * step).view(-1)
+    weight = (likely.view(-1, 1) / len(spread)).expand(planes, len(spread)).reshape(-1)
+    for k in range(len(depth)):
+        half = truncation[k] / depth[k] ** 2
+        expected = (weight * ((1 / depth[k] - surface) / half).clamp(-1, 1)).sum()
+        assert float(found.signed[k]) == pytest.approx(float(expected), abs=0.01)
+        assert float(found.open[k]) == pytest.approx(float(weight[surface < 1 / depth[k] + half].sum()), abs=0.02)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_a_wall_is_found_where_it_is(count: int, scale: float) -> None:
+    described, seen_by = wall(count, scale=scale)
+    made = sweep(described, seen_by, 0.7 * scale, 8.0 * scale)
+    assert PLANES[0] <= made.table.shape[1] <= PLANES[1]
+    likely = -torch.diff(made.table[0], dim=0)
+    inverse = made.lowest + (likely.argmax(0) + 0.5) * made.step
+    error = (inverse - 1 / (WALL * scale)).abs() / made.step  # planes; likelihoods between planes are told to half of one
+    assert float(error.median()) < 1 and float((error < 1.6).float().mean()) > 0.9
+    before, there, behind = 1.7 * scale, WALL * scale, 2.4 * scale
+    read = made.look(on_axis(torch.tensor([before, there, behind])), torch.full((3,), 0.15 * scale))
+    assert float(read.signed[0]) > 0.9 and abs(float(read.signed[1])) < 0.4 and float(read.signed[2]) < -0.9
+    assert float(read.open[0]) > 0.95 and float(read.open[1]) > 0.8 and float(read.open[2]) < 0.1
+    assert float(read.sure.min()) > 0.5
+
+
+def test_the_order_of_the_other_views_does_not_matter() -> None:
+    described, seen_by = wall(4)
+    order = [0, 3, 1, 2]
+    one = sweep(described, seen_by, 0.7, 8.0)
+    two = sweep([described[k] for k in order], seen_by[order], 0.7, 8.0)
+    torch.testing.assert_close(one.table, two.table, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("still", [False, True])
+def test_without_parallax_no_depth_is_likelier_than_another(still: bool) -> None:
+    described, seen_by = wall(3)
+    if still:  # three pictures from one place
+        seen_by = replace(seen_by, world_from_camera=torch.eye(4)[None].repeat(3, 1, 1))
+        described = [described[0]] * 3
+    else:
+        described, seen_by = described[:1], seen_by[0]
+    made = sweep(described, seen_by, 0.5, 8.0)
+    read = made.look(on_axis(torch.tensor([0.4, 0.9, 2.0, 9.0])), torch.full((4,), 0.1))
+    assert bool(torch.isfinite(made.table).all())
+    assert float(read.sure.max()) < 0.5, "nothing is sure"
+    assert float(read.open[0]) > 0.95 and float(read.open[3]) < 0.1 and bool((torch.diff(read.open) < 0).all())
+
+
+def test_extreme_places_read_finite_numbers() -> None:
+    described, seen_by = wall(3)
+    made = sweep(described, seen_by, 0.5, math.inf)
+    points = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [1e6, -1e6, 1.0], [0.0, 0.0, 1e9], [1e-9, 0.0, 1e-9]])
+    read = made.look(points, torch.full((5,), 0.1))
+    for value in (read.signed, read.open, read.sure):
+        assert bool(torch.isfinite(value).all()) and float(value.min()) >= -1 and float(value.max()) <= 1
+    with pytest.raises(ValueError, match="nearest or a farthest"):
+        sweep(described, seen_by, 0.0, math.inf)
+
+
+def test_descriptors_forgive_exposure_and_are_small() -> None:
+    images = torch.stack([textured(300)[:, :200], textured(300)[:, :200] * 0.6 + 0.1])
+    described = describe(images)
+    assert described.shape == (2, 21, 128, SIDE) and not described.requires_grad
+    flat = described.flatten(2).transpose(1, 2)
+    patches = flat[..., 3:]
+    apart = (patches[0] - patches[1]).square().mean()
+    other = (patches[0] - patches[0].roll(997, 0)).square().mean()
+    assert float(apart) < 0.05 * float(other)
+    assert float(difference(flat[0], flat[0]).max()) == 0
+
+
+def test_costs_go_together_in_any_order_and_say_when_nobody_sees() -> None:
+    costs, visible = torch.rand(3, 50), torch.rand(3, 50) < 0.6
+    found = together(costs, visible)
+    torch.testing.assert_close(found, together(costs[[2, 0, 1]], visible[[2, 0, 1]]))
+    none = ~visible.any(0)
+    assert bool(none.any()) and len(found[none].unique()) == 1
+    everywhere = torch.ones_like(visible)
+    torch.testing.assert_close(together(costs, everywhere), 0.5 * (costs.mean(0) + costs.min(0).values))
+
+
+def test_planes_follow_the_parallax() -> None:
+    few, many = (sweep(wall(2)[0], _apart(by), 0.7, 8.0).table.shape[1] for by in (0.05, 0.6))
+    assert few < many <= PLANES[1]
+
+
+def _apart(by: float) -> Cameras:
+    seen_by = wall(2)[1]
+    poses = seen_by.world_from_camera.clone()
+    poses[1, :2, 3] = torch.tensor([by, 0.0])
+    return replace(seen_by, world_from_camera=poses)
+
+
+def test_it_runs_on_cameras_of_the_other_tests() -> None:
+    seen_by = cameras(3)
+    described = list(describe(torch.rand(3, 3, int(seen_by.size[0, 1]), int(seen_by.size[0, 0]))))
+    made = sweep(described, seen_by, 0.3, 3.0)
+    assert bool((torch.diff(made.table[0], dim=0) <= 1e-6).all()), "what lies nearer is hidden less"
