@@ -35,6 +35,7 @@ BLUR = 1.0  # working pixels: poses are a little off
 CONTRAST = 2e-4  # squared stops: least of a
 SAME, BETTER, OWN = 0.25, 0.4, 0.15  # most of c(0) beside a, beside c nearer, and beside the patch's variance
 STEPS = np.array([1, 1.5, 2.2, 3.2, 4.6, 6.5, 9, 12.5, 17, 24, 33, 46, -1])  # of ρ₁: where else a patch may be
+CROSS = np.array([[0, 0], [HALF, 0], [0, HALF]])  # working pixels
 GAIN = 0.3  # least relative fall of the held-out error
 
 
@@ -101,15 +102,23 @@ def _look(seen: Sightings, problem: Problem, near: float, one: int, others: Arra
     pixels, patch = _patches(own)
     if not len(pixels):
         return 0, 0, np.zeros((0, 2))
-    rays = _rays(seen, problem, one, pixels.reshape(-1, 2))
+    # A patch is carried by its middle and one step across and down; between them the way is taken as even.
+    middle = pixels[:, pixels.shape[1] // 2]
+    around = pixels[0] - middle[0]  # (K, 2)
+    rays = _rays(seen, problem, one, (middle[:, None] + CROSS).reshape(-1, 2)).reshape(len(middle), 3, 3)
+
+    def carried(other: int, some: Array, nearness: float) -> Array:
+        """(n, K, 2) working pixels of picture `other` for patches with rays (n, 3, 3)."""
+        to = _carried(seen, problem, one, other, some.reshape(-1, 3), nearness).reshape(len(some), 3, 2)
+        across, down = (to[:, 1] - to[:, 0]) / HALF, (to[:, 2] - to[:, 0]) / HALF
+        return np.asarray(to[:, :1] + around[:, :1] * across[:, None] + around[:, 1:] * down[:, None])
+
     fit = np.arange(len(others)) % 2 == 0
-    at = np.full((len(others), len(pixels), pixels.shape[1], 2), np.nan)
     infinity, alike = np.full((len(others), len(pixels)), np.nan), np.full((len(others), len(pixels)), np.nan)
     for k, other in enumerate(others):
-        at[k] = _carried(seen, problem, one, int(other), rays, 0.0).reshape(pixels.shape)
-        infinity[k] = _difference(picture(int(other)), at[k], patch)
-        nearer = _carried(seen, problem, one, int(other), rays.reshape(*pixels.shape[:2], 3)[:, pixels.shape[1] // 2], near)
-        moved = pixels + (nearer - at[k][:, pixels.shape[1] // 2])[:, None]
+        there = carried(int(other), rays, 0.0)
+        infinity[k] = _difference(picture(int(other)), there, patch)
+        moved = pixels + (_carried(seen, problem, one, int(other), rays[:, 0], near) - there[:, there.shape[1] // 2])[:, None]
         alike[k] = np.where(np.isfinite(infinity[k]), _difference(own, moved, patch), np.nan)
     variance = (patch**2).mean(1)
     enough = (np.isfinite(infinity[fit]).sum(0) >= 2) & (np.isfinite(infinity[~fit]).sum(0) >= 2)
@@ -118,12 +127,10 @@ def _look(seen: Sightings, problem: Problem, near: float, one: int, others: Arra
     maybe = np.flatnonzero(tell & (zero < SAME * shift) & (zero < OWN * variance))
     if not len(maybe):
         return int(tell.sum()), 0, np.zeros((0, 2))
-    some = rays.reshape(*pixels.shape[:2], 3)[maybe]
     errors = np.full((len(STEPS), len(others), len(maybe)), np.nan)
     for k, other in enumerate(others):
         for n, step in enumerate(STEPS):
-            place = _carried(seen, problem, one, int(other), some.reshape(-1, 3), float(step) * near).reshape(*some.shape[:2], 2)
-            errors[n, k] = _difference(picture(int(other)), place, patch[maybe])
+            errors[n, k] = _difference(picture(int(other)), carried(int(other), rays[maybe], float(step) * near), patch[maybe])
     nearer_fit = np.stack([_middle(error[fit]) for error in errors])
     nearer_fit = np.where(np.isfinite(nearer_fit), nearer_fit, np.inf)
     best = nearer_fit.argmin(0)

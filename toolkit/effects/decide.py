@@ -17,7 +17,7 @@ from toolkit.effects.correct import Corrections, correctable
 from toolkit.effects.light import EXPOSURE, VIGNETTING
 from toolkit.effects.motion_blur import BLURRED
 from toolkit.effects.refine import refined_poses
-from toolkit.effects.sightings import gather
+from toolkit.effects.sightings import Look, gather
 from toolkit.effects.survey import BLUR, FAR, VIEWS, Finding, Survey, survey
 from toolkit.progress import SILENT, Progress
 
@@ -84,10 +84,11 @@ def decide(capture: Capture, test: Array, settings: EffectsSettings, progress: P
     """
     began = time.monotonic()
     train = [int(index) for index in np.flatnonzero(~test)]
-    found = survey(capture, train, progress)
+    known: dict[int, Look] = {}
+    found = survey(capture, train, progress, known=known, quick=not settings.on)
     decisions = [_decision(finding, wish(settings, name), capture, found) for name, finding in found.findings.items()]
     on = frozenset(decision.finding.effect for decision in decisions if decision.on)
-    corrections = _corrections(capture, test, found, on, progress)
+    corrections = _corrections(capture, test, found, on, progress, known)
     return Decided(tuple(decisions), corrections, time.monotonic() - began, found.facts)
 
 
@@ -108,7 +109,9 @@ def _decision(finding: Finding, wished: str, capture: Capture, found: Survey) ->
     return Decision(finding, wished, True, "" if finding.there else "switched on by hand, nothing speaks for it")
 
 
-def _corrections(capture: Capture, test: Array, found: Survey, on: frozenset[str], progress: Progress) -> Corrections:
+def _corrections(
+    capture: Capture, test: Array, found: Survey, on: frozenset[str], progress: Progress, known: dict[int, Look]
+) -> Corrections:
     """Per-frame corrections need every frame: then all are looked at, and only then."""
     seen, corner = found.seen, found.light.corner if found.light is not None and VIGNETTING in on else None
     lens = None
@@ -123,7 +126,7 @@ def _corrections(capture: Capture, test: Array, found: Survey, on: frozenset[str
     if BLUR in on:
         left_out = _blurred(seen.names, found.sharpness)
     if on & {EXPOSURE, POSES}:
-        every = gather(capture, range(len(capture.frames)), progress)
+        every = gather(capture, range(len(capture.frames)), progress, known=known)
         if EXPOSURE in on:
             tracks = every.tracks()
             flat = tracks if corner is None else vignetting.corrected(tracks, corner)

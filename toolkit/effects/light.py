@@ -14,7 +14,7 @@ from toolkit.effects.evidence import BRIGHTEST, DARKEST, ROUNDS, Evidence, Track
 EXPOSURE, VIGNETTING = "exposure", "vignetting"
 HELD_OUT = 4  # every so manieth point is kept out of the fits
 MARGIN = {EXPOSURE: 0.35, VIGNETTING: 0.18}  # least relative fall of the held-out deviation: less did not pay on real pictures
-UNCLIPPED = 0.6  # linear light of a patch below which hardly a pixel of it is clipped, so that its mean tells how light changes
+UNCLIPPED = 0.45  # linear light of a patch below which hardly a pixel of it is clipped, so that its mean tells how light changes
 LEAST = 0.0015  # stops by which it has to fall at least
 
 

@@ -32,6 +32,18 @@ FIRST = 0.8  # working pixels: the least of them
 
 
 @dataclass(frozen=True)
+class Effort:
+    """How closely pictures are looked at."""
+
+    long_side: int = LONG_SIDE
+    features: int = FEATURES
+    neighbours: int = NEIGHBOURS
+
+
+FULL, QUICK = Effort(), Effort(320, 450, 3)
+
+
+@dataclass(frozen=True)
 class Sightings:
     """F pictures, P points, O observations of them, sorted by point."""
 
@@ -89,8 +101,13 @@ class Sightings:
         return replace(self, point=np.unique(self.point[keep], return_inverse=True)[1], **parts)
 
 
-def gather(capture: Capture, chosen: Sequence[int], progress: Progress = SILENT) -> Sightings:
+def gather(
+    capture: Capture, chosen: Sequence[int], progress: Progress = SILENT, effort: Effort = FULL, known: dict[int, Look] | None = None
+) -> Sightings:
     """Look for points in the pictures `chosen` (indices into the frames, all posed), match each picture with a few that overlap.
+
+    Args:
+        known: what was found in pictures with the same effort before; what is found now is added.
 
     Raises:
         InputError: a picture cannot be read.
@@ -103,11 +120,16 @@ def gather(capture: Capture, chosen: Sequence[int], progress: Progress = SILENT)
     for number, frame in enumerate(frames):
         progress.check()
         progress.update(number, 2 * len(frames), f"looking for effects, picture {number + 1} of {len(frames)}")
-        seen.append(_look(load_image(frame, exif=exif), cameras[number]))
+        look = None if known is None else known.get(chosen[number])
+        if look is None:
+            look = _look(load_image(frame, exif=exif), cameras[number], effort)
+            if known is not None:
+                known[chosen[number]] = look
+        seen.append(look)
     starts = np.concatenate([[0], np.cumsum([len(look.pixel) for look in seen])])
     flat = [undistorted(camera, look.pixel) for camera, look in zip(cameras, seen, strict=True)]
     links = []
-    pairs = _pairs(poses, cameras)
+    pairs = _pairs(poses, cameras, effort.neighbours)
     for number, (i, j) in enumerate(pairs):
         progress.check()
         progress.update(len(frames) + len(frames) * number / len(pairs), 2 * len(frames), f"looking for effects, pair {number + 1}")
@@ -146,12 +168,12 @@ def choose(count: int, most: int) -> list[int]:
     return sorted({int(start) + step for start in starts for step in range(run)})
 
 
-def _pairs(poses: Array, cameras: list[Intrinsics]) -> list[tuple[int, int]]:
+def _pairs(poses: Array, cameras: list[Intrinsics], neighbours: int) -> list[tuple[int, int]]:
     """Each picture with those that overlap under good parallax, and with the next two."""
     if len(poses) < 2:
         return []
     depth = guessed_depth(poses)
-    partners = best_neighbours(poses, overlap(poses, cameras, depth), parallax(poses, depth), NEIGHBOURS)
+    partners = best_neighbours(poses, overlap(poses, cameras, depth), parallax(poses, depth), neighbours)
     out = {(min(i, int(j)), max(i, int(j))) for i in range(len(poses)) for j in partners[i]}
     return sorted(out | {(i, i + step) for step in (1, 2) for i in range(len(poses) - step)})
 
@@ -164,7 +186,7 @@ def _times(frames: list[Frame]) -> Array:
 
 
 @dataclass(frozen=True)
-class _Look:
+class Look:
     """What one picture shows."""
 
     pixel: Array  # (N, 2)
@@ -177,17 +199,17 @@ class _Look:
     grey: Array  # (h, w) uint8
 
 
-def _look(picture: Array, camera: Intrinsics) -> _Look:
+def _look(picture: Array, camera: Intrinsics, effort: Effort) -> Look:
     height, width = picture.shape[:2]
-    scale = min(1.0, LONG_SIDE / max(width, height))
+    scale = min(1.0, effort.long_side / max(width, height))
     small = np.ascontiguousarray(picture[..., :3])
     if scale < 1:
         small = np.asarray(cv2.resize(small, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA))
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
-    keypoints, descriptors = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.012).detectAndCompute(grey, None)
+    keypoints, descriptors = cv2.SIFT.create(nfeatures=effort.features, contrastThreshold=0.012).detectAndCompute(grey, None)
     if descriptors is None or len(keypoints) == 0:
         empty = np.zeros((0, 3))
-        return _Look(np.zeros((0, 2)), np.zeros((0, 128), np.float32), empty, empty, np.zeros(0), scale * width / camera.width, 0.0, grey)
+        return Look(np.zeros((0, 2)), np.zeros((0, 128), np.float32), empty, empty, np.zeros(0), scale * width / camera.width, 0.0, grey)
     at = np.array([k.pt for k in keypoints], dtype=np.float32)  # whole-number pixel centres
     size = 0.5 * np.array([k.size for k in keypoints], dtype=np.float32)
     log = np.log2(np.maximum(LINEAR[grey], LINEAR[8]))
@@ -201,7 +223,7 @@ def _look(picture: Array, camera: Intrinsics) -> _Look:
         solid = cv2.resize(picture[..., 3], (small.shape[1], small.shape[0]), interpolation=cv2.INTER_AREA) >= 250
         keep = solid[np.clip(np.rint(at[:, 1]).astype(int), 0, None), np.clip(np.rint(at[:, 0]).astype(int), 0, None)]
     slope = cv2.remap(slopes, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
-    return _Look(
+    return Look(
         pixel=pixel[keep],
         descriptor=rooted[keep],
         linear=_around(LINEAR[small], at[keep], size[keep]),

@@ -14,13 +14,15 @@ from toolkit.effects import background, beyond, geometry, light, motion_blur, vi
 from toolkit.effects.adjust import LENS, POSES, ROWS, Problem, predict
 from toolkit.effects.evidence import Evidence
 from toolkit.effects.light import EXPOSURE, VIGNETTING
-from toolkit.effects.sightings import Sightings, choose, gather
+from toolkit.effects.sightings import QUICK, Look, Sightings, choose, gather
 from toolkit.progress import SILENT, Progress
 
 PIXELS = "working pixels"
 BLUR, VIEWS, FAR = "motion_blur", "view_dependence", "background"
 ORDER = (EXPOSURE, VIGNETTING, LENS, ROWS, VIEWS, FAR, BLUR, POSES)
-MOST_FRAMES = 40  # that are looked at before anything speaks for an effect
+MOST_FRAMES = 40  # that are looked at closely
+FIRST_FRAMES = 16  # of a first, quick look; when nothing in it comes near to speaking for an effect, it is the last
+CLOSE = 0.6  # share of a threshold or margin from which on it does
 
 
 @dataclass(frozen=True)
@@ -71,21 +73,43 @@ class Survey:
         return frozenset(name for name, finding in self.findings.items() if finding.there)
 
 
-def survey(capture: Capture, indices: list[int] | None = None, progress: Progress = SILENT, most: int | None = MOST_FRAMES) -> Survey:
+def survey(
+    capture: Capture,
+    indices: list[int] | None = None,
+    progress: Progress = SILENT,
+    most: int | None = MOST_FRAMES,
+    known: dict[int, Look] | None = None,
+    quick: bool = True,
+) -> Survey:
     """Look at a posed capture.
 
     Args:
         indices: the frames that may be looked at (training frames); None: all.
         most: how many of them are; None: all.
+        known: what is found in pictures, for `gather`.
+        quick: begin with a quick look at few pictures, and end there when nothing speaks for any effect.
 
     Raises:
         InputError: a picture cannot be read.
     """
     began = time.monotonic()
     allowed = list(range(len(capture.frames))) if indices is None else list(indices)
+    if quick and len(allowed) > FIRST_FRAMES:
+        few = [allowed[k] for k in choose(len(allowed), FIRST_FRAMES)]
+        first = look(gather(capture, few, progress, QUICK), began)
+        if first.explained is not None and not any(near_to(finding) for finding in first.findings.values()):
+            return first
     chosen = allowed if most is None else [allowed[k] for k in choose(len(allowed), most)]
-    seen = gather(capture, chosen, progress)
-    return look(seen, began)
+    return look(gather(capture, chosen, progress, known=known), began)
+
+
+def near_to(finding: Finding) -> bool:
+    """Whether a closer look may find the effect: the number, and where points were kept out their gain, come near to what is asked."""
+    if finding.there:
+        return True
+    least = {EXPOSURE: light.MARGIN[EXPOSURE], VIGNETTING: light.MARGIN[VIGNETTING]}.get(finding.effect)
+    gain = 1.0 if least is None or not finding.before or finding.after is None else (1 - finding.after / finding.before) / least
+    return finding.number > CLOSE * finding.threshold and gain > CLOSE
 
 
 def look(seen: Sightings, began: float | None = None) -> Survey:

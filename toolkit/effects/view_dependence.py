@@ -14,7 +14,7 @@ import numpy as np
 from toolkit.camera import Array
 from toolkit.effects.evidence import Evidence
 
-THRESHOLD = 0.14  # share of the variance
+THRESHOLD = 0.11  # share of the variance
 LIMIT = 0.3  # stops: more is a wrong match, or the mirror image of a lamp that says enough at this value
 NEAREST, FARTHEST = 4.0, 24.0  # working pixels between neighbours: not the same blob twice, not another surface
 NEIGHBOURS = 3
