@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import IO, Any
 
+from toolkit.errors import FieldfuseError
 from toolkit.progress import Progress
 
 PLAIN_EVERY = 10.0  # seconds between two lines where there is no terminal
@@ -94,6 +95,13 @@ class ConsoleProgress(Progress):
         before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             yield
+        except FieldfuseError:
+            raise
+        except Exception as error:
+            # A library that is interrupted while it loads answers with an error of its own (Open3D: ImportError).
+            if asked > 1:
+                raise KeyboardInterrupt from error
+            raise
         finally:
             for number, old in before.items():
                 signal.signal(number, old)

@@ -7,14 +7,16 @@ depth along z. What other tools use is turned into this by the functions below, 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from toolkit.errors import InputError
+
+if TYPE_CHECKING:
+    import torch
 
 Array = NDArray[Any]
 
@@ -318,6 +320,8 @@ def rays(intrinsics: Intrinsics, world_from_camera: Array, pixels: Array) -> tup
     Returns:
         origins (N, 3) and unit directions (N, 3) float32, and (N,) float32 cosines: depth along z = distance × cosine.
     """
+    import torch  # here: more than a second, and whoever only reads cameras or finds poses needs none of it
+
     x = (pixels[:, 0] - intrinsics.cx) / intrinsics.fx
     y = (pixels[:, 1] - intrinsics.cy) / intrinsics.fy
     camera = np.stack([x, y, np.ones_like(x)], axis=1)

@@ -76,3 +76,17 @@ def test_first_signal_asks_second_ends(number: int) -> None:
         time.sleep(0.1)
     assert signal.getsignal(number) is before
     assert isinstance(progress.stream, io.StringIO) and "stopping" in progress.stream.getvalue()
+
+
+@pytest.mark.parametrize(("signals", "expected"), [(1, ImportError), (2, KeyboardInterrupt)])
+def test_a_library_that_hides_the_second_signal_does_not_make_it_an_error(signals: int, expected: type[BaseException]) -> None:
+    def load() -> None:
+        try:
+            for _ in range(signals):
+                signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise ImportError("initialization failed") from None
+        raise ImportError("no such library")
+
+    with pytest.raises(expected), ConsoleProgress().listening():
+        load()
