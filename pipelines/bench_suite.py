@@ -38,6 +38,8 @@ FitBudget = Annotated[float | None, typer.Option("--budget", help="Seconds of op
 
 def add_suites(app: typer.Typer) -> None:
     """One command a suite, and `table`."""
+    from pipelines.bench_table import table
+
     for name, text in HELP.items():
         app.command(name, help=text)(_command(name))
     app.command("table")(table)
@@ -218,44 +220,3 @@ def _machine(settings: Any) -> dict[str, Any]:
 
     about = machine(settings.threads or os.cpu_count() or 1)
     return {**about, "device": settings.device, "measured": time.strftime("%Y-%m-%d %H:%M")}
-
-
-def table(
-    files: Annotated[list[Path], typer.Argument(help="results.json of a benchmark, or tradeoff.json.", show_default=False)],
-    into: Annotated[Path, typer.Option(help="Markdown page; what stands between the table's marks is replaced.", show_default=False)],
-    data: Annotated[Path | None, typer.Option(help="Folder of the captures; in commands it is shown as DATA.", show_default=False)] = None,
-    name: Annotated[
-        str | None, typer.Option(help="Name of the table; default: of the folder that the file lies in.", show_default=False)
-    ] = None,
-) -> None:
-    """Put measured tables into a Markdown page, between marks, so that no number in it is typed."""
-    from toolkit.evaluate.suites.tables import put_between_marks
-
-    for path in files:
-        title = name or path.resolve().parent.name
-        put_between_marks(into, title, measured_text(path, title, data))
-
-
-def measured_text(path: Path, title: str, data: Path | None) -> str:
-    """The results at `path` as Markdown; `data` is shown as DATA in the command.
-
-    Raises:
-        InputError: the file holds no results.
-    """
-    from pipelines.kept import TRADEOFF, read_kept
-    from toolkit.errors import InputError
-    from toolkit.evaluate.suites import suite_of
-    from toolkit.evaluate.suites.tables import portable, suite_table
-    from toolkit.evaluate.tradeoff_page import tradeoff_data
-    from toolkit.evaluate.tradeoff_table import tradeoff_table
-    from toolkit.files import read_json
-
-    measured = read_json(path)
-    try:
-        found = {**measured, "command": portable(str(measured["command"]), data and data.resolve()), "rows": list(measured["rows"])}
-        if "suite" in found:
-            return suite_table(suite_of(found["suite"]), found)
-        read_kept(path, TRADEOFF)
-        return tradeoff_table(tradeoff_data(found), title)
-    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        raise InputError(f"{path} holds no results of a benchmark or a trade-off ({error}); give results.json or tradeoff.json") from error

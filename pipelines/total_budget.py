@@ -7,6 +7,7 @@ when everything before it is done, the exports when the field can be rendered.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import psutil
@@ -17,14 +18,14 @@ from toolkit.files import read_json, write_json
 if TYPE_CHECKING:
     from pipelines.job import Job
     from toolkit.capture.types import Capture, Views
+    from toolkit.config import Settings
     from toolkit.poses.scene import Scene
 
 FILE = "plan.json"
 LONGEST_START = 60.0  # seconds; a process that is older was not started for this command
-NOT_FITTED = ("capture", "frames", "poses", "scene", "views", "tsdf", "render", "export", "evaluate", "report")
+NOT_FITTED = ("capture", "frames", "poses", "effects", "scene", "views", "tsdf", "render", "export", "evaluate", "report")
 TOO_FEW = " The smallest choice needs about {:.0f} s on this machine as busy as it is; give more, or expect that."
 WORTH_LEARNING = 0.3  # seconds; shorter stages say little
-EFFECTS_FROM = 45.0  # seconds of a whole run from which on effects are looked for
 
 
 class TotalBudget:
@@ -59,23 +60,34 @@ class TotalBudget:
             self.speed = self_test(settings)
             job.progress.finish("self-test", time.monotonic() - start, False)
             model.remember(self.name, self.speed)
-        if self.asked < EFFECTS_FROM and settings.effects.mode == "auto" and not settings.effects.on:
-            settings.effects.mode = "off"  # looking for them can take most of so short a run
         self.work = work_of(capture, settings)
         kept = self._kept(job)
+        self._decide_effects(settings, kept)
         if kept is not None:
             self.choice, self.again = kept, True
         else:
             self.choice = model.choose(self.speed, self.work, self.asked - self.elapsed(), settings.capture.max_frames)
+            self.choice.effects = self.work.effects
         settings.capture.image_size = self.choice.image_size
         if self.choice.max_frames is not None:
             settings.capture.max_frames = self.choice.max_frames
         before = self.elapsed() - job.stages.records["capture"].seconds * (not job.stages.cached["capture"])
         parts = model.predict(self.speed, self.work, self.choice)
-        parts["export"] = model.EXPORT_SHARE * max(0.0, self.asked - before - sum(parts.values()))
+        parts["export"] = self._for_exports(job, self.asked - before - sum(parts.values()))
         parts["start"] = before
         parts["fit"] = model.fit_seconds(self.asked, 0.0, sum(parts.values()))
         self.predicted = parts
+
+    def _decide_effects(self, settings: Settings, kept: model.Choice | None) -> None:
+        """Looking for them is left out, unless some are asked for by name, when it would take most of so short a run."""
+        assert self.speed is not None and self.work is not None
+        if not self.work.effects or settings.effects.on:
+            return
+        looking = self.speed.seconds("effects", model.effects_work(self.work))
+        wanted = looking <= model.EFFECTS_SHARE * self.asked if kept is None or kept.effects is None else kept.effects
+        if not wanted:
+            settings.effects.mode = "off"
+            self.work = replace(self.work, effects=False)
 
     def choose_fit(self, job: Job, views: Views, scene: Scene) -> None:
         """Decide the fit's seconds and its finest lattice from what is left."""
@@ -84,7 +96,7 @@ class TotalBudget:
             pace = self._pace(job)
             after = sum(self.predicted.get(stage, 0.0) for stage in ("render", "evaluate", "report")) * pace
             left = self.asked - self.elapsed() - after
-            self.choice.fit_seconds = round(max(model.LEAST_FIT, left * (1 - model.EXPORT_SHARE)), 2)
+            self.choice.fit_seconds = round(max(model.LEAST_FIT, left - self._for_exports(job, left)), 2)
             self.choice.resolution = model.resolution_for(
                 self.choice.fit_seconds, self.speed.units["fit"] * pace, finest(job, views, scene)
             )
@@ -140,6 +152,8 @@ class TotalBudget:
         if chosen.max_frames is not None:
             parts.append(f"{chosen.max_frames} frames")
         parts.append("no video" if not chosen.video_frames else f"{chosen.video_frames} video frames")
+        if chosen.effects is False:
+            parts.append("effects not looked for")
         return (
             f"Of the {told['asked_seconds']:g} s asked for, {told['predicted_seconds']:.0f} s were predicted and"
             f" {told['real_seconds']:.0f} s spent until this page was written; chosen: {', '.join(parts)}."
@@ -153,8 +167,9 @@ class TotalBudget:
         if self.speed is not None and not told["reused"]:
             for name in NOT_FITTED:
                 real, predicted = told["stages"].get(name, {}).get("real"), self.predicted.get(name)
-                if real and predicted and max(real, predicted) > WORTH_LEARNING and name != "export":
+                if real and predicted and max(real, predicted) > WORTH_LEARNING and name not in ("export", "effects"):
                     self.speed.learn(name, predicted, real)
+            self._learn_effects(job, told["stages"].get("effects", {}).get("real"))
             made = told["stages"].get("export", {}).get("real")
             if made and self.export_planned > WORTH_LEARNING:
                 self.speed.learn("export", self.export_planned, made)
@@ -163,6 +178,24 @@ class TotalBudget:
             else:
                 model.remember(self.name, self.speed)
         return told
+
+    def _for_exports(self, job: Job, left: float) -> float:
+        """Seconds that are set aside for exports: a share of what is left, and no more than all of them can take."""
+        assert self.speed is not None and self.work is not None and self.choice is not None
+        export = job.settings.export
+        video = export.video_frames if "video" in export.formats else 0
+        most = model.most_export_seconds(self.speed, self.work, self.choice, export.mesh_views, video)
+        return min(model.EXPORT_SHARE * max(0.0, left), most)
+
+    def _learn_effects(self, job: Job, real: float | None) -> None:
+        """Looking for effects takes less when none is corrected: what is learnt is what a picture takes."""
+        assert self.speed is not None and self.work is not None
+        path = job.folder / "effects.json"
+        if not real or real < WORTH_LEARNING or not path.is_file():
+            return
+        made = read_json(path).get("corrections") or {}
+        every = bool(made.get("gain") or made.get("poses"))
+        self.speed.learn("effects", self.speed.seconds("effects", model.effects_work(self.work, self.choice, every)), real)
 
     def _pace(self, job: Job) -> float:
         """How much slower than predicted the stages were so far; other work on the machine slows the rest, too."""
@@ -214,7 +247,8 @@ def work_of(capture: Capture, settings: Any) -> model.Work:
     outlined = not posed or capture.has_depth or capture.alpha or (capture.points is not None and len(capture.points) > 0)
     total = int(capture.extra.get("frames") or len(capture.frames)) if video else frames
     depth = settings.tsdf.enabled != "off" and capture.has_depth
-    return model.Work(frames, width or 640, height or 480, test, posed, depth, bool(outlined), video, total)
+    effects = settings.effects.mode != "off" or bool(settings.effects.on)
+    return model.Work(frames, width or 640, height or 480, test, posed, depth, bool(outlined), video, total, effects)
 
 
 def finest(job: Job, views: Views, scene: Scene) -> int:

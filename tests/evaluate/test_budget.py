@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from toolkit.config import load_settings
 from toolkit.evaluate import budget as model
-from toolkit.evaluate.budget import Choice, Speed, Work
+from toolkit.evaluate.budget import KINDS, Choice, Speed, Work, amounts, effects_work, most_export_seconds
 from toolkit.evaluate.budget_probe import self_test
+from toolkit.evaluate.budget_table import budget_table
 from toolkit.files import write_json
 
 UNITS = {"decode": 0.02, "features": 0.1, "ray": 3e-6, "fit": 1e-5, "score": 5.0}
@@ -34,6 +36,7 @@ def test_a_video_gives_fewer_frames_when_time_is_short() -> None:
     assert few.max_frames is not None and many.max_frames == 150 and few.max_frames < 150
 
 
+@settings(deadline=None)
 @given(st.floats(10, 1000), st.integers(4, 400), st.integers(64, 4000), st.integers(64, 4000), st.booleans(), st.booleans(), st.booleans())
 def test_there_is_always_a_choice(seconds: float, frames: int, width: int, height: int, depth: bool, outlined: bool, video: bool) -> None:
     work = Work(frames, width, height, frames // 8, posed=not video, depth=depth, outlined=outlined, video=video, total=10 * frames)
@@ -101,3 +104,33 @@ def test_the_self_test_measures_every_kind() -> None:
     speed = self_test(load_settings("balanced", flags={"device": "cpu"}))
     assert set(speed.units) == set(model.KINDS)
     assert 1e-8 < speed.units["ray"] < 1e-3 and 1e-8 < speed.units["fit"] < 1e-2 and speed.units["features"] > 1e-3
+
+
+def test_looking_for_effects_is_modelled_by_pictures() -> None:
+    kitchen = Work(200, 640, 480, 25, posed=True, depth=True, outlined=True, effects=True)
+    assert effects_work(kitchen) == 240 and effects_work(kitchen, every=False) == 40
+    assert effects_work(Work(20, 640, 480, 3, posed=True, depth=False, outlined=False, effects=True), every=False) == 17
+    assert amounts(kitchen, Choice(320))["effects"] == 240
+    assert amounts(replace(kitchen, effects=False), Choice(320))["effects"] == 0
+    speed = Speed(dict.fromkeys(KINDS, 0.1))
+    speed.learn("effects", speed.seconds("effects", effects_work(kitchen)), 6.0)
+    assert 6.0 < speed.seconds("effects", 240) < 24.0  # a quarter of what was predicted is believed in part
+
+
+def test_exports_are_given_no_more_than_they_can_use() -> None:
+    speed = Speed(dict.fromkeys(KINDS, 1e-6))
+    little, much = (most_export_seconds(speed, FOX, Choice(240), *counts) for counts in ((12, 0), (60, 90)))
+    assert 0 < little < much < 1e3 * little
+    assert much == pytest.approx(25e-6 + 1.2 * 1.5e-6 * (60 + 90) * FOX.pixels(240))
+
+
+def test_runs_of_a_budget_become_one_table() -> None:
+    def run(source: str, asked: float, real: float, effects: bool) -> dict[str, object]:
+        choice = {"image_size": 240, "fit_seconds": 12.5, "resolution": 256, "video_frames": 0, "effects": effects}
+        told = {"asked_seconds": asked, "predicted_seconds": asked, "real_seconds": real, "stages": {}, "choice": choice}
+        return {"source": source, "budget": told, "evaluation": {"field": {"psnr": 27.25}}}
+
+    text = budget_table([run("/data/lego", 60, 63, True), run("/data/fox", 30, 36, False)], ["fieldfuse run a", "fieldfuse run b"])
+    rows = [line for line in text.splitlines() if line.startswith("| ")]
+    assert rows[2].startswith("| fox | 30 s | 30.0 s | 36.0 s | +20% | not looked for |") and rows[3].startswith("| lego | 60 s |")
+    assert "1 of 2 runs took what was predicted, within 15%" in text and "    fieldfuse run b" in text

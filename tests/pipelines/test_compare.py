@@ -110,6 +110,16 @@ def test_the_page_shows_them(compared: Path, tmp_path: Path) -> None:
     assert seen.pictures == len(shown) and not seen.broken and not seen.errors
 
 
+def test_its_table_goes_into_a_page(compared: Path, tmp_path: Path, capsys: Capsys) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("# Numbers\n", encoding="utf-8")
+    assert call(capsys, "bench", "table", compared / "compare.json", "--into", page, "--name", "corner").code == 0
+    text = page.read_text(encoding="utf-8")
+    head = "|  | Field | Field, not fitted | TSDF | TSDF of matched pictures | TSDF of exact depth |"
+    assert head in text and "F-score at 1 voxel" in text and "Depth by matching, training views" in text
+    assert all(line.count("|") == 7 for line in text.splitlines() if line.startswith("|"))
+
+
 def test_a_second_look_reuses_everything(compared: Path, capsys: Capsys) -> None:
     before = read_json(compared / "compare.json")
     answer = call(capsys, "compare", compared, "--quiet", "--json")

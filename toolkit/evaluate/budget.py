@@ -7,7 +7,7 @@ The fit takes what is left. What was learnt is kept in the user's cache folder u
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,8 @@ MESH_SHARE = 0.6  # of the exports' seconds, the rest is the video's
 FRAME_COUNTS = (100, 75, 50, 36, 24)  # of a video
 MESH_VIEWS, VIDEO_FRAMES = (12, 60), (24, 90)  # fewest and most
 SIFT_FRAMES = 100
+EFFECTS_LOOKED_AT = 40  # training pictures at most that are looked at for effects; all, when one is corrected picture by picture
+EFFECTS_SHARE = 0.4  # of the seconds, at most, that looking for effects may take
 AGREES = 0.15  # relative error of a prediction that is still good
 LEARNING = 0.7  # of what a run shows about a factor, the part that is believed
 FACTOR_RANGE = (0.05, 20.0)
@@ -36,6 +38,7 @@ COST = {
     "capture": ("decode", 3.0),
     "frames": ("decode", 2.0),
     "poses": ("features", 1.3),
+    "effects": ("features", 1.0),
     "scene": ("features", 1.0),
     "views": ("decode", 7.0),
     "tsdf": ("decode", 80.0),
@@ -64,6 +67,7 @@ class Work:
     outlined: bool  # depth, alpha or points tell where the scene is; nothing has to be triangulated
     video: bool = False
     total: int = 0
+    effects: bool = False  # they are looked for
 
     @property
     def megapixels(self) -> float:
@@ -85,6 +89,7 @@ class Choice:
     resolution: int | None = None
     mesh_views: int | None = None
     video_frames: int | None = None  # 0: no video
+    effects: bool | None = None  # whether they are looked for
 
     def to_dict(self) -> dict[str, Any]:
         return dict(vars(self))
@@ -118,6 +123,7 @@ def amounts(work: Work, choice: Choice) -> dict[str, float]:
         "capture": (0.0 if work.video else frames * work.megapixels),
         "frames": work.total * work.megapixels if work.video else 0.0,
         "poses": 0.0 if work.posed else sift_work(frames),
+        "effects": effects_work(work, choice) if work.effects else 0.0,
         "scene": 0.05 * frames * work.megapixels if work.outlined else float(min(frames, SIFT_FRAMES)),
         "views": frames * work.megapixels,
         "tsdf": (frames - test) * work.megapixels if work.depth else 0.0,
@@ -126,6 +132,13 @@ def amounts(work: Work, choice: Choice) -> dict[str, float]:
         "report": 1 + 0.2 * min(test, 12) * methods,
         "export": export_rays(work, choice),
     }
+
+
+def effects_work(work: Work, choice: Choice | None = None, every: bool = True) -> float:
+    """Pictures whose features are found and matched; `every`: all of them a second time, as when one is corrected."""
+    frames = min(work.frames, (choice.max_frames if choice is not None else None) or work.frames)
+    test = work.test * frames / max(work.frames, 1)
+    return min(frames - test, EFFECTS_LOOKED_AT) + (frames if every else 0)
 
 
 def sift_work(frames: int) -> float:
@@ -137,6 +150,13 @@ def export_rays(work: Work, choice: Choice, mesh_side: int = 400, video_side: in
     """Rays of the mesh's views and the video's."""
     shown = [(choice.mesh_views or 0, mesh_side), (choice.video_frames or 0, video_side)]
     return sum(count * work.pixels(min(side, choice.image_size)) for count, side in shown)
+
+
+def most_export_seconds(speed: Speed, work: Work, choice: Choice, mesh_views: int, video_frames: int) -> float:
+    """What exports take when nothing of them is left out: more than that they cannot use."""
+    whole = replace(choice, mesh_views=mesh_views, video_frames=video_frames)
+    a_ray = EXPORT_RAY * speed.seconds("render", 1.0)
+    return speed.factors.get("export", 1.0) * (EXPORT_FIXED * speed.units["features"] + export_rays(work, whole) * a_ray)
 
 
 def predict(speed: Speed, work: Work, choice: Choice) -> dict[str, float]:

@@ -1,0 +1,77 @@
+"""`fieldfuse bench table FILES --into PAGE`: measured numbers put into a Markdown page, so that none of them is typed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+Files = Annotated[
+    list[Path],
+    typer.Argument(help="results.json, tradeoff.json, compare.json; or report.json of runs with a total budget.", show_default=False),
+]
+
+
+def table(
+    files: Files,
+    into: Annotated[Path, typer.Option(help="Markdown page; what stands between the table's marks is replaced.", show_default=False)],
+    data: Annotated[Path | None, typer.Option(help="Folder of the captures; in commands it is shown as DATA.", show_default=False)] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the table; default: of the folder that the file lies in.", show_default=False)
+    ] = None,
+) -> None:
+    """Put measured tables into a Markdown page, between marks, so that no number in it is typed."""
+    from toolkit.errors import InputError
+    from toolkit.evaluate.suites.tables import put_between_marks
+    from toolkit.files import read_json
+
+    held = [(path, read_json(path)) for path in files]
+    planned = [found for _, found in held if isinstance(found, dict) and isinstance(found.get("budget"), dict)]
+    if planned and len(planned) == len(held):
+        from toolkit.evaluate.budget_table import budget_table
+
+        put_between_marks(into, name or "total-budget", _whole(files[0], lambda: budget_table(planned, _commands(planned, data))))
+        return
+    if name is not None and len(held) > 1:
+        raise InputError(f"--name {name} is for one table, and {len(held)} files are given; leave it out")
+    for path, found in held:
+        title = name or path.resolve().parent.name
+        put_between_marks(into, title, _whole(path, lambda found=found, title=title: _table(found, title, data)))  # type: ignore[misc]
+
+
+def _table(measured: Any, title: str, data: Path | None) -> str:
+    """The Markdown of one file's content."""
+    from toolkit.evaluate.compare_table import compare_table
+    from toolkit.evaluate.suites import suite_of
+    from toolkit.evaluate.suites.tables import suite_table
+    from toolkit.evaluate.tradeoff_page import tradeoff_data
+    from toolkit.evaluate.tradeoff_table import tradeoff_table
+
+    found = {**measured, "command": _commands([measured], data)[0]}
+    if "methods" in found:
+        return compare_table(found, title)
+    found["rows"] = list(measured["rows"])
+    return suite_table(suite_of(found["suite"]), found) if "suite" in found else tradeoff_table(tradeoff_data(found), title)
+
+
+def _commands(measured: list[Any], data: Path | None) -> list[str]:
+    from toolkit.evaluate.suites.tables import portable
+
+    return [portable(str(one["command"]), data and data.resolve()) for one in measured]
+
+
+def _whole(path: Path, make: Any) -> str:
+    """The text; a file of another form is refused.
+
+    Raises:
+        InputError: it does not hold measurements.
+    """
+    from toolkit.errors import InputError
+
+    try:
+        return str(make())
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{path} holds no results of a benchmark or a trade-off ({error}); give results.json, tradeoff.json or compare.json"
+        ) from error
