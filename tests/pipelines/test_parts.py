@@ -1,0 +1,116 @@
+"""Parts of the main job alone, and what another run in the same folder does again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+
+from tests.pipelines.made import call, make_room
+from tests.pipelines.short import FAST, stages
+from toolkit.errors import InputError
+from toolkit.files import read_json
+
+Capsys = pytest.CaptureFixture[str]
+
+
+def test_a_changed_picture_is_noticed(tmp_path: Path, capsys: Capsys) -> None:
+    make_room(tmp_path / "room", 6)
+    arguments = ["poses", tmp_path / "room", "--out", tmp_path / "room" / "out", "--quiet", "--json"]
+    assert call(capsys, *arguments).code == 0
+    assert all(stages(json.loads(call(capsys, *arguments).out)).values())  # its own folder inside the source changes nothing
+    picture = tmp_path / "room" / "images" / "002.png"
+    cv2.imwrite(str(picture), cv2.imread(str(picture))[::-1])
+    assert not any(stages(json.loads(call(capsys, *arguments).out)).values())
+
+
+def test_poses_alone(tmp_path: Path, capsys: Capsys) -> None:
+    make_room(tmp_path / "room", 6)
+    answer = call(capsys, "poses", tmp_path / "room", "--out", tmp_path / "out", "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    assert json.loads(answer.out)["poses"]["registered"] == 6
+    assert len(read_json(tmp_path / "out" / "exports" / "cameras" / "transforms.json")["frames"]) == 6
+    assert not (tmp_path / "out" / "views.safetensors").exists()
+
+
+def test_tsdf_alone_then_the_rest_in_the_same_folder(tmp_path: Path, capsys: Capsys) -> None:
+    make_room(tmp_path / "room", 10, depth=True)
+    out = tmp_path / "out"
+    answer = call(capsys, "tsdf", tmp_path / "room", "--out", out, "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    data = json.loads(answer.out)
+    assert data["evaluation"]["tsdf"]["psnr"] > 10 and data["evaluation"]["field"] is None
+    answer = call(
+        capsys,
+        "finetune",
+        out,
+        "--budget",
+        4,
+        "--threads",
+        1,
+        "--set",
+        "field.resolution=32",
+        "--set",
+        "export.formats=[points]",
+        "--quiet",
+        "--json",
+    )
+    assert answer.code == 0, answer.err
+    both = json.loads(answer.out)
+    assert both["evaluation"]["tsdf"] == data["evaluation"]["tsdf"] and both["evaluation"]["field"]["psnr"] > 10
+    assert stages(both)["tsdf"] and not stages(both)["field"]
+    answer = call(capsys, "export", out, "--formats", "ply", "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    assert (
+        stages(json.loads(answer.out))["field"]
+        and (out / "exports" / "mesh.ply").is_file()
+        and not (out / "exports" / "points.ply").exists()
+    )
+
+
+def test_a_changed_budget_redoes_the_field_and_what_follows(tmp_path: Path, capsys: Capsys) -> None:
+    make_room(tmp_path / "room", 10)
+    assert call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", *FAST, "--quiet").code == 0
+    answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", *FAST, "--budget", 0.1, "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    cached = stages(json.loads(answer.out))
+    assert {name for name, reused in cached.items() if not reused} == {"field", "render", "export", "evaluate"}
+
+
+def test_a_field_without_surface_is_exported_as_far_as_it_goes(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    def nothing_opaque(*_: object, **__: object) -> None:
+        raise InputError("no rendered view shows a surface")
+
+    monkeypatch.setattr("toolkit.export.surface.field_volume", nothing_opaque)
+    make_room(tmp_path / "room", 10)
+    out = tmp_path / "out"
+    answer = call(capsys, "run", tmp_path / "room", "--out", out, *FAST, "--set", "export.formats=[ply,cameras]", "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    assert any("meshes were left out" in warning for warning in json.loads(answer.out)["warnings"])
+    assert (out / "exports" / "cameras" / "transforms.json").is_file() and not (out / "exports" / "mesh.ply").exists()
+
+
+def test_without_held_out_pictures_there_are_no_scores(tmp_path: Path, capsys: Capsys) -> None:
+    make_room(tmp_path / "room", 10)
+    answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", *FAST, "--holdout", 0, "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    data = json.loads(answer.out)
+    assert data["evaluation"]["field"]["psnr"] is None and data["timeline"] == []
+    assert any("no picture was held out" in warning for warning in data["warnings"])
+    assert "no held-out views" in call(capsys, "render", tmp_path / "out", "--views", "test", "--quiet").sentence()
+
+
+def test_a_tampered_field_is_refused(tmp_path: Path, capsys: Capsys) -> None:
+    make_room(tmp_path / "room", 10)
+    out = tmp_path / "out"
+    assert call(capsys, "run", tmp_path / "room", "--out", out, *FAST, "--quiet").code == 0
+    path = out / "field.safetensors"
+    whole = path.read_bytes()
+    for spoilt in (whole[:8] + b"{" * 40 + whole[48:], (2**62).to_bytes(8, "little") + whole[8:], bytes(len(whole))):
+        path.write_bytes(spoilt)
+        for arguments in (["render", out], ["evaluate", out], ["export", out]):
+            answer = call(capsys, *arguments, "--quiet")
+            assert answer.code == 2, answer
+            assert "field.safetensors" in answer.sentence()

@@ -1,0 +1,51 @@
+"""How the program starts and how it fails: help in no time, no heavy library for it, no traceback."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.pipelines.made import call, environment, make_room, spawn
+
+Capsys = pytest.CaptureFixture[str]
+
+
+def test_help_is_quick() -> None:
+    answer = spawn("--help")
+    start_time = time.monotonic()
+    answer = spawn("run", "--help")
+    assert answer.returncode == 0 and "--budget" in answer.stdout
+    assert time.monotonic() - start_time < 2 * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
+def test_heavy_libraries_are_not_loaded_for_help() -> None:
+    heavy = {"torch", "open3d", "cv2", "numpy", "pycolmap", "trimesh"}
+    program = f"import sys, pipelines.cli; print(sorted({heavy} & set(sys.modules)))"
+    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment())
+    assert answer.stdout.strip() == "[]", answer.stdout + answer.stderr
+
+
+def test_unexpected_errors_leave_a_log_and_no_traceback(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_room(tmp_path / "room", 6)
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("a bolt is loose")
+
+    monkeypatch.setattr("toolkit.poses.given.given_poses", fail)
+    answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", "--quiet")
+    assert answer.code == 1
+    assert "error.log" in answer.sentence() and "RuntimeError" in answer.sentence()
+    assert "a bolt is loose" in (tmp_path / "out" / "error.log").read_text()
+
+
+def test_doctor_as_json(capsys: Capsys) -> None:
+    answer = call(capsys, "doctor", "--json")
+    checks = json.loads(answer.out)
+    assert {"python", "torch", "pycolmap"} <= {check["name"] for check in checks}
+    assert answer.code == int(any(check["status"] == "fail" for check in checks))
