@@ -96,9 +96,9 @@ def test_outside_the_local_volume_every_bit_stays() -> None:
     assert not after.rows[old:-1][~touched[old:]].any() and not after.rows[-1].any()
 
 
-# Eight seeds: with gates twice as strong as at the start the state moves by 0.002 at the most after step 100. Three times as strong, where
-# the candidate's answer to the state comes near to one, voxels wander before they settle: by 0.16 in the mean, single values by 1.05.
-@pytest.mark.parametrize(("gain", "most", "mean"), [(2.0, 0.05, 0.005), (3.0, 1.2, 0.2)])
+# Eight seeds: with gates twice as strong as at the start the state moves by 0.03 at the most after step 100; three times as strong, where
+# the candidate's answer to the state comes near to one, by 0.33, and by 0.04 in the mean.
+@pytest.mark.parametrize(("gain", "most", "mean"), [(2.0, 0.05, 0.005), (3.0, 0.5, 0.05)])
 def test_the_same_frame_a_thousand_times_does_not_drift(gain: float, most: float, mean: float) -> None:
     model = small_model(2).eval()
     for parameter in model.fusion.parameters():
