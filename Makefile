@@ -36,8 +36,11 @@ help:
 demo: $(VENV)/.installed
 	@$(BIN)/python -m pipelines.demo
 
+# `make test WORKERS=2` runs the tests in two processes; those of a file stay together, since they share what takes long to make.
+WORKERS ?= 0
+
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile
 
 stability: $(VENV)/.installed-test
 	$(BIN)/python -m tests.stability.page docs/stability.md
