@@ -21,7 +21,7 @@ NAME = "effects.json"
 
 def find_effects(job: Job, posed: Capture) -> Corrections:
     """What is to be corrected; `effects.json` tells the evidence, the decisions and what they cost. With `effects: off` nothing is read."""
-    from toolkit.effects.decide import asleep, decide
+    from toolkit.effects.decide import asleep, choose_field, decide
 
     settings, field = job.settings.effects, job.settings.field
     for wish, names in (("on", settings.on), ("off", settings.off)):
@@ -50,7 +50,9 @@ def find_effects(job: Job, posed: Capture) -> Corrections:
         uses=[asdict(settings), holdout, [frame.name for frame in posed.frames], pixel_state(posed)],
         after=["poses"],
     )
-    return Corrections.from_dict(data.get("corrections", {}) if isinstance(data, dict) else {})
+    corrections = Corrections.from_dict(data.get("corrections", {}) if isinstance(data, dict) else {})
+    choose_field(field, data["effects"])
+    return corrections
 
 
 def refine(poses: PoseResult, corrections: Corrections) -> PoseResult:

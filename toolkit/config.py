@@ -46,14 +46,14 @@ class ViewsSettings:
 class KeyframesSettings:
     method: str = "parallax"  # parallax (with overlap and sharpness) | uniform: every n-th training view, as in the paper
     every: int = 10  # n of `uniform`
-    most: int = 12  # key frames that the networks fuse at most
+    most: int = 16  # key frames that the networks fuse at most
 
 
 @dataclass
 class NetworkSettings:
     weights: str | None = None  # file of trained networks; None: the shipped ones
-    voxels: float = 24.0  # voxels that make up the median depth, on the finest lattice
-    levels: int = 1  # lattices, each of half the voxel size of the one before; 1: the paper's single one
+    voxels: float = 48.0  # voxels that make up the median depth, on the finest lattice
+    levels: int = 2  # lattices, each of half the voxel size of the one before; 1: the paper's single one
 
 
 @dataclass
@@ -61,9 +61,12 @@ class FieldSettings:
     channels: int = 16  # features a voxel
     decoder: str = "deferred"  # deferred | per_sample (the paper's)
     hidden: int = 64  # width of the decoder
+    view: str = (
+        "auto"  # auto (by the evidence of the effects stage) | full | low (first order) | none: of the direction, what the decoder sees
+    )
     background: str = "auto"  # auto | on | off: contract what lies outside the region of interest
     resolution: int | None = None  # voxels along the longest side of the volume; None: by preset and picture size
-    init: str = "auto"  # auto (network: few training views and no background) | network | classical
+    init: str = "auto"  # auto (network: few training views) | network | classical
 
 
 @dataclass
@@ -142,6 +145,7 @@ CHOICES = {
     "poses.matching": ("auto", "exhaustive", "sequential"),
     "field.decoder": ("deferred", "per_sample"),
     "field.background": ("auto", "on", "off"),
+    "field.view": ("auto", "full", "low", "none"),
     "field.init": ("auto", "network", "classical"),
     "keyframes.method": ("parallax", "uniform"),
     "tsdf.enabled": ("auto", "on", "off"),

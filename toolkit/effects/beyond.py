@@ -14,6 +14,7 @@ half says how much worse the best nearer place explains what they show.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -155,7 +156,8 @@ def _patches(own: Array) -> tuple[Array, Array]:
     """(N, K, 2) working pixels of one patch a cell, at its best corner, and (N, K) their log light without its mean."""
     height, width = (side // CELL * CELL for side in own.shape)
     edge = HALF + 2
-    quality = cv2.cornerMinEigenVal(own, 5, 3)
+    light: np.ndarray[Any, np.dtype[np.float32]] = own.astype(np.float32)
+    quality = cv2.cornerMinEigenVal(light, 5, ksize=3)
     for border in (np.s_[:edge], np.s_[-edge:], np.s_[:, :edge], np.s_[:, -edge:]):
         quality[border] = 0
     cells = quality[:height, :width].reshape(height // CELL, CELL, width // CELL, CELL).transpose(0, 2, 1, 3).reshape(-1, CELL * CELL)

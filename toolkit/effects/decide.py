@@ -10,7 +10,7 @@ import numpy as np
 
 from toolkit.camera import Array
 from toolkit.capture.types import Capture
-from toolkit.config import EffectsSettings
+from toolkit.config import EffectsSettings, FieldSettings
 from toolkit.effects import light, vignetting
 from toolkit.effects.adjust import LENS, POSES, ROWS, adjust
 from toolkit.effects.correct import Corrections, correctable
@@ -24,9 +24,12 @@ from toolkit.progress import SILENT, Progress
 MOST_LEFT_OUT = 0.1  # of the training frames
 TOLD_ONLY = {
     ROWS: "only told, not corrected",
-    VIEWS: "the decoder always sees the direction of view",
+}
+OF_FIELD = {  # no correction of pictures, but what the field is made of
+    VIEWS: "what the decoder sees of the direction: field.view",
     FAR: "whether space beyond the region is modelled is decided with the scene (field.background)",
 }
+PLAIN_VIEW = "full"  # what the decoder sees of the direction where nothing speaks for view dependence
 
 
 @dataclass(frozen=True)
@@ -92,9 +95,21 @@ def decide(capture: Capture, test: Array, settings: EffectsSettings, progress: P
     return Decided(tuple(decisions), corrections, time.monotonic() - began, found.facts)
 
 
+def choose_field(field: FieldSettings, effects: list[dict[str, Any]]) -> None:
+    """Set what is left to `auto` in `field` by the decisions (as in `Decision.to_dict`); the scene decides on a background not found."""
+    for entry in effects:
+        wished = entry["wish"]
+        if entry["effect"] == VIEWS and field.view == "auto":
+            field.view = "full" if entry["on"] else "none" if wished == "off" else PLAIN_VIEW
+        if entry["effect"] == FAR and field.background == "auto" and (entry["on"] or wished == "off"):
+            field.background = "on" if entry["on"] else "off"
+
+
 def _decision(finding: Finding, wished: str, capture: Capture, found: Survey) -> Decision:
     name = finding.effect
     wanted = wished == "on" or (wished == "auto" and finding.there)
+    if name in OF_FIELD:
+        return Decision(finding, wished, wanted, OF_FIELD[name])
     if name in TOLD_ONLY:
         return Decision(finding, wished, False, TOLD_ONLY[name])
     if not wanted:

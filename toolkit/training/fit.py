@@ -31,6 +31,7 @@ from toolkit.training.levels import all_places, finer, first_field, pruned, visi
 from toolkit.training.rays import PixelPool
 from toolkit.training.schedule import Schedule
 from toolkit.training.start import colour_behind, finest_resolution, levels, possible, space_of
+from toolkit.training.view import limit
 from toolkit.volume.host import Host, TorchHost
 from toolkit.volume.space import Space
 
@@ -202,6 +203,7 @@ def _first(
     space, ladder = _ladder(views, train, scene, settings)
     places = possible(space, ladder[0], all_places(space, ladder[0]), views)
     decoder = make_decoder(settings.field.decoder, settings.field.channels, settings.field.hidden).to(device)
+    limit(decoder, settings.field.view)
     behind = colour_behind(views).to(device)
     near = 0.5 * scene.near
     fine = 4

@@ -20,6 +20,7 @@ from toolkit.training.finite import broken, refuse
 from toolkit.training.fused_order import hit_codes, remember_depths
 from toolkit.training.rays import PixelPool
 from toolkit.training.step import Rates
+from toolkit.training.view import blind
 
 Array = np.ndarray[Any, Any]
 GUESS_CELL = 8  # pixels a side of the tiles that remember how far a view sees
@@ -41,6 +42,7 @@ class FusedOptimiser:
         self.tiles = (int(heights) // GUESS_CELL + 1, int(widths) // GUESS_CELL + 1, GUESS_CELL)
         self.guess = np.zeros(len(pool.pose) * self.tiles[0] * self.tiles[1], np.float32)
         self._take_decoder(field)
+        self.blind = blind(field.decoder).numpy()
         self.moments = [(np.zeros_like(weight), np.zeros_like(weight)) for weight in self._weights()]
         self.decoder_steps = 0
         steps = np.arange(1, 2049)
@@ -182,6 +184,10 @@ class FusedOptimiser:
         d = self.decoder
         return d.w1, d.b1, d.w2, d.b2, d.w3, d.b3
 
+    def _of_direction(self) -> Array:
+        """(9, hidden) weights that take the direction of view."""
+        return self.decoder.w1[self.field.decoder.channels :][:9]
+
     def _make_room(self, rays: int) -> None:
         """For a batch of so many rays."""
         if not self.tape or len(self.tape[0]) != rays:
@@ -222,4 +228,6 @@ class FusedOptimiser:
         for weight, (first, second), *own in zip(self._weights(), self.moments, *parts, strict=True):
             gradient = np.ascontiguousarray(sum(own[1:], own[0]))
             moves.adam_dense(weight.reshape(-1), gradient.reshape(-1), first.reshape(-1), second.reshape(-1), scale, *_CONSTANTS)
+        if self.blind.any():
+            self._of_direction()[self.blind] = 0
         self._turn_decoder()

@@ -38,6 +38,9 @@ class FusedPerSampleOptimiser(FusedOptimiser):
     def _weight_gradients(self, thread: int, part: slice) -> tuple[Array, ...]:
         return _moved(self.scratch[thread].total)
 
+    def _of_direction(self) -> Array:
+        return self.net.w3[len(self.net.b3) :][:9]
+
     def _turn_decoder(self) -> None:
         turn(self.net)
 

@@ -14,6 +14,7 @@ from toolkit.render.rays import OPACITY_FLOOR
 from toolkit.training.adam import LazyAdam
 from toolkit.training.finite import NotFiniteError, check
 from toolkit.training.rays import Batch
+from toolkit.training.view import blind, of_direction
 from toolkit.volume.lookup import corners, gather, scatter
 
 Tensor = torch.Tensor
@@ -36,6 +37,7 @@ class Optimiser:
     """A field with the optimiser state of its rows, and the largest weight that each voxel was seen with."""
 
     def __init__(self, field: Field) -> None:
+        self.blind = blind(field.decoder)
         self.decoder = torch.optim.Adam(field.decoder.parameters(), lr=1e-3, betas=(0.9, 0.99), eps=1e-10)
         self.renew_rows(field)
 
@@ -102,6 +104,8 @@ class Optimiser:
             self.seen.nan_to_num_(0.0)
             raise
         self.decoder.step()
+        if self.blind.any():
+            of_direction(field.decoder)[:, self.blind] = 0.0
         self.decoder.zero_grad(set_to_none=True)
         return error, len(samples)
 
