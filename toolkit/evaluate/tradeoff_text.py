@@ -107,7 +107,8 @@ def sentence(step: Step, unit: str = "units") -> str:
     if step.axis == "decoder":
         at = f" at {value_text('iterations', (step.after.setting.get('wanted') or {}).get('iterations'))} of fitting"
     parts = [gain_text("psnr", step.gains["psnr"])] if "psnr" in step.gains else []
-    if "psnr" in step.gains and step.before.seeds > 1 and step.after.seeds > 1:
+    # What is only shown otherwise is of the same fits: how these differ from each other says nothing about the step.
+    if "psnr" in step.gains and step.before.seeds > 1 and step.after.seeds > 1 and not step.after.shown_otherwise:
         both = (step.before.spread.get("psnr", 0) ** 2 + step.after.spread.get("psnr", 0) ** 2) ** 0.5
         parts[0] += f" (±{both:.1f})"
     if "depth_error" in step.gains:
