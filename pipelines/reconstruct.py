@@ -89,7 +89,7 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
     if ("tsdf" in goals and wants_tsdf(job, posed)) or stages.usable("tsdf"):
         pictures["tsdf"] = fuse_tsdf(job, posed, scene, views)
     if goals & {"field", "render", "export"} or stages.usable("field"):
-        if uses_network(job, views, scene):
+        if uses_network(job, views):
             made = make_network_field(job, views, scene)
             if job.settings.fit.finetune:  # else the field is this one
                 pictures["network"] = render_network_views(job, made, views)

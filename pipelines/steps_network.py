@@ -12,6 +12,7 @@ import numpy as np
 from pipelines.job import Job, set_seeds
 from pipelines.kept import NETWORK, read_kept
 from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture, write_png, write_pngs
+from pipelines.room import require_pictures
 from pipelines.steps_capture import choose_keyframes
 from toolkit.errors import InputError
 from toolkit.files import fingerprint, write_json
@@ -35,7 +36,7 @@ class NetworkField:
     facts: dict[str, Any]
 
 
-def uses_network(job: Job, views: Views, scene: Scene) -> bool:
+def uses_network(job: Job, views: Views) -> bool:
     """Whether this run starts from the networks (or ends with them).
 
     Raises:
@@ -52,8 +53,8 @@ def uses_network(job: Job, views: Views, scene: Scene) -> bool:
         return False  # the seconds of the whole run are planned, and the networks' are not among them
     if not settings.fit.finetune:
         return True
-    # Before a far background the present networks' start did not win on validation views; see docs/few_views.md.
-    return not scene.has_background and int(np.count_nonzero(~np.asarray(views.test))) < FEW_VIEWS
+    # With few views the networks' start won by up to 3 dB on validation captures, with many it is not needed; see docs/few_views.md.
+    return int(np.count_nonzero(~np.asarray(views.test))) < FEW_VIEWS
 
 
 def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
@@ -147,6 +148,7 @@ def render_network_views(job: Job, made: NetworkField, views: Views) -> Pictures
         pictures = Pictures(facts=dict(made.facts))
         view = make_renderer(made.field, job.settings.engine)
         indices = np.flatnonzero(views.test)
+        require_pictures([views.intrinsics[index] for index in indices], kept=True, advice="run again with a lower --image-size")
         for count, index in enumerate(indices):
             job.progress.update(count, len(indices), views.names[index])
             job.progress.check()

@@ -12,6 +12,7 @@ import numpy as np
 from pipelines.job import Job, set_seeds
 from pipelines.kept import EVALUATION, EXPORT_FACTS, NOTES, TIMELINE, read_kept
 from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture, write_pngs
+from pipelines.room import require_pictures, require_scores
 from pipelines.steps_capture import last_of, pixel_state
 from toolkit.files import write_json
 
@@ -86,7 +87,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     settings = job.settings
     path, times, told = job.folder / "field.safetensors", job.folder / "timeline.json", job.folder / FIT_NOTES
     notes: list[str] = []
-    made = make_network_field(job, views, scene) if uses_network(job, views, scene) else None
+    made = make_network_field(job, views, scene) if uses_network(job, views) else None
     start = job.stages.record("field") if go_on and job.stages.usable("field") and not job.other_field else None
 
     def load() -> Fitted:
@@ -146,6 +147,7 @@ def render_test_views(job: Job, field: Field, views: Views) -> Pictures:
         pictures = Pictures()
         view = make_renderer(field, job.settings.engine)
         indices = np.flatnonzero(views.test)
+        require_pictures([views.intrinsics[index] for index in indices], kept=True, advice="run again with a lower --image-size")
         for count, index in enumerate(indices):
             job.progress.update(count, len(indices), views.names[index])
             job.progress.check()
@@ -196,6 +198,7 @@ def score_pictures(job: Job, views: Views, pictures: dict[str, Pictures]) -> dic
 
     def make() -> dict[str, Any]:
         indices = np.flatnonzero(views.test)
+        require_scores(views, len(pictures))
         out: dict[str, Any] = {}
         for count, (what, shown) in enumerate(pictures.items()):
             job.progress.update(count, len(pictures), what)

@@ -166,16 +166,16 @@ def test_parts_of_the_networks_can_be_switched_off(room: Path, tmp_path: Path, c
     assert all(value != rows["whole"]["psnr"] for value in others) and len(set(others)) == 4
 
 
-@pytest.mark.parametrize(("count", "background", "used"), [(23, False, True), (24, False, False), (5, True, False)])
-def test_which_start_is_automatic(count: int, background: bool, used: bool) -> None:
+@pytest.mark.parametrize(("count", "used"), [(23, True), (24, False)])
+def test_which_start_is_automatic(count: int, used: bool) -> None:
     settings = load_settings()
-    views, scene = SimpleNamespace(test=np.zeros(count, bool)), SimpleNamespace(has_background=background)
+    views = SimpleNamespace(test=np.zeros(count, bool))
     job = SimpleNamespace(settings=settings, plan=None)
-    assert uses_network(job, views, scene) is used  # type: ignore[arg-type]
+    assert uses_network(job, views) is used  # type: ignore[arg-type]
     job.plan = object()
-    assert not uses_network(job, views, scene)  # type: ignore[arg-type]
+    assert not uses_network(job, views)  # type: ignore[arg-type]
     settings.fit.finetune = False
-    assert uses_network(job, views, scene)  # type: ignore[arg-type]
+    assert uses_network(job, views)  # type: ignore[arg-type]
 
 
 def test_lists_of_numbers() -> None:

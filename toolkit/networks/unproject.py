@@ -11,7 +11,8 @@ from torch import Tensor
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.pyramid import Pyramid
 
-MARGIN = 1.0
+MARGIN = 1.0  # voxels
+COLOURED = 0.35  # of a voxel's side: with a whole one pictures of fern and of a living room are 0.7 to 0.9 dB worse
 
 
 @dataclass(frozen=True)
@@ -71,16 +72,16 @@ def look_up(views: Sequence[EncodedView], projection: Projection, step: Tensor) 
 
     Two sizes matter. To tell depths apart, views are compared at the size of `step`: larger cells look the same from voxel to voxel (and a
     voxel is often many pixels wide while its neighbour in depth is less than a pixel away), smaller ones differ by chance. To colour the
-    voxel, they are averaged over all that it covers.
+    voxel, they are averaged over a part of what it covers: interpolation between voxels blurs once more.
 
     Args:
         step: (N,) pixels by which views disagree about the voxel's neighbour in depth.
 
     Returns:
-        (K, N, C): features and direction code (F), colour at the size of the step (3), colour at the size of the voxel (3).
+        (K, N, C): features and direction code (F), colour at the size of the step (3), colour for the voxel (3).
     """
     parts = []
     for view, pixels, footprint in zip(views, projection.pixels, projection.footprint, strict=True):
         fine = [view.features.lookup(pixels, step), view.colours.lookup(pixels, step)]
-        parts.append(torch.cat([*fine, view.colours.lookup(pixels, footprint)], 1))
+        parts.append(torch.cat([*fine, view.colours.lookup(pixels, COLOURED * footprint)], 1))
     return torch.stack(parts)

@@ -31,10 +31,10 @@ from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK
 
 SHIPPED = Path(weights.__file__).parent / "weights" / "nerfusion.safetensors"
-# Voxels that make up the median depth. With 40 instead, validation pictures of gum lost 0.7 dB and a key frame took four times as long.
-VOXELS_TO_MEDIAN = 24.0
-GAMMA = 0.95  # the paper's 0.6 cuts holes where the networks are in doubt: 15.1 instead of 16.2 dB there
-LEAST, MOST = 32, 256  # resolution of the lattice
+# Voxels that make up the median depth, on the finer of two lattices. One lattice of 24 alone loses 1.5 to 2.5 dB (docs/few_views.md).
+VOXELS_TO_MEDIAN, LEVELS = 48.0, 2
+GAMMA = 0.95  # the paper's 0.6 cuts holes where the networks are in doubt
+LEAST, MOST = 32, 384  # resolution of the lattice
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class NetworkOptions:
     """
 
     voxels: float = VOXELS_TO_MEDIAN
-    levels: int = 1
+    levels: int = LEVELS
     gamma: float | None = GAMMA
 
 
