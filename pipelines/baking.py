@@ -30,10 +30,12 @@ def write(job: Job, field: Field, views: Views, scene: Scene, seen: float, place
     import numpy as np
     import torch
 
+    from pipelines.room import require_baking
     from toolkit.render.bake import bake as quantise
     from toolkit.render.bake_file import read_baked, write_baked
     from toolkit.render.bake_views import seen_voxels
 
+    require_baking(field)
     keep, train = None, np.flatnonzero(~views.test)
     if seen > 0:
         lenses = [views.intrinsics[i] for i in train]

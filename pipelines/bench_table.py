@@ -37,7 +37,7 @@ def table(
         raise InputError(f"--name {name} is for one table, and {len(held)} files are given; leave it out")
     for path, found in held:
         title = name or path.resolve().parent.name
-        put_between_marks(into, title, _whole(path, lambda found=found, title=title: _table(found, title, data)))  # type: ignore[misc]
+        put_between_marks(into, title, _whole(path, lambda found=found, title=title: _table(found, title, data)))
 
 
 def _table(measured: Any, title: str, data: Path | None) -> str:

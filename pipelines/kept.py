@@ -95,8 +95,7 @@ def misfit(value: Any, form: Any, where: str = "the whole") -> str:
     unknown = [key for key in value if key not in named]
     if unknown and others is None:
         return f"{where} has {unknown[0]!r:.40}"
-    told = (misfit(one, named.get(key, others), f"{key:.40}") for key, one in value.items())
-    return next((wrong for wrong in told if wrong), "")
+    return next((wrong for key, one in value.items() if (wrong := misfit(one, named.get(key, others), f"{key:.40}"))), "")
 
 
 def _plain(value: Any, form: str, where: str) -> str:

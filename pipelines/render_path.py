@@ -13,6 +13,7 @@ from pipelines.job import Job, open_job
 from pipelines.pictures import Camera, camera_of, orbit_cameras, pictures
 from pipelines.reconstruct import BEFORE, stand
 from pipelines.rendered import file_name, write_png
+from pipelines.room import require_pictures
 from pipelines.steps_results import fit_radiance_field
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture import nerf_json
@@ -67,6 +68,7 @@ def render_run(
         place = to or job.folder / "renders" / (
             "orbit.mp4" if given is None and views == "orbit" else "cameras" if given is not None else "test"
         )
+        require_pictures(lenses, kept=False)
         start = time.monotonic()
         job.progress.begin("render")
         write(job, camera_of(job, field, ready, scene, baked), names, lenses, poses, place, fps)

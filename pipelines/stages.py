@@ -86,6 +86,7 @@ class Stages:
         version: int = 1,
         in_place: bool = False,
         keeps: bool = False,
+        rounded: bool = False,
     ) -> T:
         """The stage's result: loaded when it is finished and nothing that went in has changed, else made and recorded.
 
@@ -97,6 +98,8 @@ class Stages:
             version: raised when the stage's code changes what it writes.
             in_place: `make` itself writes into the folder, so an older result is gone once it starts.
             keeps: `make` may return early when the user asks to stop; what it has is kept.
+            rounded: the files hold less precision than memory: the result is what they hold, so that a run that was killed later and
+                goes on has the same one.
 
         Raises:
             Interrupted: the user asked to stop.
@@ -116,7 +119,8 @@ class Stages:
                 self._note(record, cached=True)
                 return value
         self.progress.check()
-        return self._make(name, key, before, make, save, in_place, keeps)
+        value = self._make(name, key, before, make, save, in_place, keeps)
+        return load() if rounded else value
 
     def _make(
         self,

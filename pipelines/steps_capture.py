@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.job import Job, set_seeds
+from pipelines.room import require_file
 from toolkit.errors import InputError
 from toolkit.files import fingerprint, read_json, write_json
 
@@ -107,6 +108,7 @@ def find_camera_poses(job: Job, capture: Capture) -> PoseResult:
         uses=uses,
         after=last_of(job, "capture", "frames"),
         in_place=True,
+        rounded=True,
     )
 
 
@@ -198,11 +200,15 @@ def make_views(job: Job, posed: Capture, scene: Scene, corrections: Corrections 
         views = prepare_views(posed, scene.working_from_input, settings, job.progress)
         return views if corrections is None else corrections.on_views(views)
 
+    def load() -> Views:
+        require_file(path, f"the prepared pictures of {posed.root}")
+        return load_views(path)
+
     return job.stages.run(
         "views",
         make=make,
         save=save,
-        load=lambda: load_views(path),
+        load=load,
         uses=[settings.image_size, settings.holdout, limit_of(job), pixel_state(posed)],
         after=last_of(job, "poses", "effects", "scene"),
     )

@@ -12,6 +12,7 @@ import numpy as np
 from pipelines.job import Job
 from pipelines.kept import COMPARED, read_kept
 from pipelines.rendered import Pictures
+from pipelines.room import require_meshes, require_scores
 from toolkit.errors import InputError
 from toolkit.files import write_json
 
@@ -109,6 +110,7 @@ def score_methods(job: Job, all_of_it: Compared) -> dict[str, Any]:
 
     views = all_of_it.views
     indices = np.flatnonzero(views.test)
+    require_scores(views, len(all_of_it.pictures))
     pictures = {name: shown.pictures for name, shown in all_of_it.pictures.items()}
     seconds = {name: shown.seconds for name, shown in all_of_it.pictures.items()}
     job.progress.update(0, 2, "pictures")
@@ -178,6 +180,8 @@ def measure_meshes(job: Job, all_of_it: Compared) -> dict[str, Any]:
     from toolkit.tsdf.mesh import Mesh
 
     job.progress.update(1, 2, "meshes")
+    true_mesh = None if all_of_it.truth is None else all_of_it.truth.mesh
+    require_meshes([*mesh_files(job, all_of_it.pictures).values(), *([true_mesh] if true_mesh is not None else [])])
     meshes, truth = working_meshes(job, all_of_it)
     if truth is None:
         return {"geometry": None, "seen_share": None}

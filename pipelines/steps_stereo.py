@@ -45,6 +45,7 @@ def match_pictures(job: Job, scene: Scene, views: Views) -> list[StereoDepth]:
         save=save,
         load=load,
         after=["scene", "views"],
+        rounded=True,
     )
 
 

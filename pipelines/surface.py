@@ -11,6 +11,7 @@ import numpy as np
 from pipelines.job import Job
 from pipelines.pictures import camera_of, orbit_cameras, pictures
 from pipelines.rendered import Pictures, to_picture
+from pipelines.room import require_pictures
 from pipelines.summary import put_cameras
 from toolkit.camera import Intrinsics, Similarity
 from toolkit.errors import InputError
@@ -65,6 +66,8 @@ def fuse_training_frames(
     mesh = volume.mesh().cleaned(min_area_share=SMALL_PART)
     write_surface(folder, scene, mesh, volume.points())
     found = Pictures()
+    lenses = [views.intrinsics[index] for index in np.flatnonzero(views.test)]
+    require_pictures(lenses, kept=True, advice="run again with a lower --image-size")
     for index in np.flatnonzero(views.test):
         job.progress.check()
         start = time.monotonic()
@@ -125,7 +128,9 @@ def export_field(
         _, lenses, around = orbit_cameras(views, scene, job.settings.export.video_frames)
         job.progress.update(0, len(around), "orbit video")
         camera = camera_of(job, field, views, scene, baked=False)
-        write_video(folder / "orbit.mp4", pictures(camera, [at_most(lens, VIDEO_SIDE) for lens in lenses], around, job.progress), FPS)
+        lenses = [at_most(lens, VIDEO_SIDE) for lens in lenses]
+        require_pictures(lenses, kept=False, advice="leave video out of export.formats")
+        write_video(folder / "orbit.mp4", pictures(camera, lenses, around, job.progress), FPS)
         written.append(folder / "orbit.mp4")
     return facts, written
 
@@ -143,11 +148,13 @@ def export_surface(
     from toolkit.render.image import make_renderer, render_view
 
     chosen = spread(len(views), job.settings.export.mesh_views)
+    lenses = [at_most(views.intrinsics[index], MESH_SIDE) for index in chosen]
+    require_pictures(lenses, kept=True, advice="lower export.mesh_views")
     view = make_renderer(field, job.settings.engine)
     volume = field_volume(
         lambda lens, pose: render_view(field, lens, pose, view),
         views.world_from_camera[chosen],
-        [at_most(views.intrinsics[index], MESH_SIDE) for index in chosen],
+        lenses,
         region=(scene.centre - scene.half_size, scene.centre + scene.half_size),
         progress=job.progress,
     )

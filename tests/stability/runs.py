@@ -50,7 +50,7 @@ def corrupt(folder: Path) -> list[str]:
     """Files that are not whole, but for those still being written (`.tmp-…`); records that promise what is not there."""
     wrong = []
     for path in sorted(folder.rglob("*")):
-        if path.is_dir() or ".tmp-" in str(path.relative_to(folder)) or path.name in (".lock", "error.log"):
+        if path.is_dir() or ".tmp-" in str(path.relative_to(folder)) or path.name in (".lock", "error.log", "log.txt"):
             continue
         try:
             _open(path)
@@ -91,18 +91,18 @@ def differences(first: Path, second: Path) -> list[str]:
     """What two finished runs differ in, besides times and identities; meshes and points are the same to the byte."""
     names = {str(path.relative_to(folder)) for folder in (first, second) for path in folder.rglob("*") if path.is_file()}
     out = []
-    for name in sorted(names - {".lock", "run.json", "report.html"}):
+    for name in sorted(names - {".lock", "run.json", "report.html", "sparse/log.txt"}):
         a, b = first / name, second / name
         if not a.is_file() or not b.is_file():
             out.append(f"{name} is only in one of them")
-        elif a.read_bytes() != b.read_bytes() and _content(a) != _content(b):
+        elif a.read_bytes() != b.read_bytes() and _content(a, first) != _content(b, second):
             out.append(f"{name} differs")
     return out
 
 
-def _content(path: Path) -> Any:
+def _content(path: Path, folder: Path) -> Any:
     if path.suffix == ".json":
-        return _timeless(json.loads(path.read_text(encoding="utf-8")))
+        return _timeless(json.loads(path.read_text(encoding="utf-8").replace(str(folder), "")))
     if path.suffix == ".safetensors":
         with safe_open(path, framework="numpy") as file:
             return {name: file.get_tensor(name).tobytes() for name in file.keys()}  # noqa: SIM118

@@ -11,6 +11,9 @@ import trimesh
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
+from pipelines.console import ConsoleProgress
+from pipelines.folder import RunFolder
+from pipelines.stages import Stages
 from toolkit.capture.storage import capture_from_dict, capture_to_dict
 from toolkit.capture.types import Capture
 from toolkit.config import load_settings
@@ -18,6 +21,7 @@ from toolkit.effects.correct import Corrections
 from toolkit.errors import InputError
 from toolkit.evaluate.selftest.edit import small_field
 from toolkit.export.mesh import mesh_facts
+from toolkit.files import read_json, write_json
 from toolkit.render.bake import bake
 from toolkit.render.bake_file import METADATA_KEY, read_baked, write_baked
 from toolkit.simulate.settings import read_scene_file
@@ -82,3 +86,18 @@ def test_a_surface_does_not_depend_on_the_order_in_which_threads_came_to_its_par
     corners = [mesh.vertices[mesh.triangles] for mesh in (shuffled[0], ordered[0])]
     outward = [np.einsum("tj,tj->t", np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]), c.mean(1)) for c in corners]
     assert all((side > 0).all() for side in outward)  # no triangle was turned over
+
+
+def test_a_stage_whose_file_rounds_answers_what_the_file_holds(tmp_path: Path) -> None:
+    """Points of structure from motion keep seven digits on disk: a run that was killed after them went on with other numbers."""
+    kept = tmp_path / "third.json"
+
+    def save(value: float) -> list[Path]:
+        write_json(kept, round(value, 7))
+        return [kept]
+
+    with RunFolder(tmp_path) as folder:
+        stages = Stages(folder, ConsoleProgress())
+        plain = stages.run("plain", lambda: 1 / 3, save, lambda: read_json(kept))
+        assert plain == 1 / 3
+        assert stages.run("rounded", lambda: 1 / 3, save, lambda: read_json(kept), rounded=True) == 0.3333333

@@ -7,6 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipelines import room
+from tests.stability.runs import OPTIONS, make_source
+from tests.stability.stops import fieldfuse
 from tests.tsdf.scenes import CAMERA
 from tests.tsdf.test_frames import written
 from toolkit import memory
@@ -70,3 +73,49 @@ def test_fewer_workers_look_for_features(tmp_path: Path, monkeypatch: pytest.Mon
             sfm.find_poses(capture, tmp_path / "out", PosesSettings(), threads=4)
     assert asked == [4, 2, 1]
     assert sfm._pixels(capture, 80) == 80 * 60 and np.isclose(each, 300 * sfm._pixels(capture, 10_000))
+
+
+HUGE = 2**44
+REFUSALS = {  # command → the estimate that is made too large, and what the refusal speaks of
+    "render": (("render", "--views", "orbit", "--frames", "3"), "RENDER_BYTES", "rendering 3 pictures"),
+    "evaluate": (("evaluate",), "SCORE_BYTES", "scoring 4 pictures"),
+    "bake": (("bake",), "ROW_COPIES", "baking a field of"),
+    "tsdf": (("tsdf", "--voxel-size", "0.2"), "RENDER_BYTES", "rendering 2 pictures"),
+    "compare": (("compare",), "SCORE_BYTES", "scoring 4 pictures"),
+}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run."""
+    folder = tmp_path_factory.mktemp("little")
+    answer = fieldfuse("run", make_source(folder / "room"), "--out", folder / "out", *OPTIONS)
+    assert answer.code == 0, answer.err
+    return folder / "out"
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_each_command_refuses_with_numbers_what_does_not_fit(name: str, finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With little memory as such, the first stage that reads anything refuses; here each command's own estimate is the one that does."""
+    (command, *more), bytes_each, what = REFUSALS[name]
+    monkeypatch.setattr(room, bytes_each, HUGE)
+    if name == "evaluate":  # scored once, it would only be read
+        (finished / "stages" / "evaluate.json").unlink(missing_ok=True)
+    answer = fieldfuse(command, finished, *more, "--threads", "1", "--quiet")
+    assert answer.code == 2, answer
+    sentence = answer.sentence()
+    assert what in sentence and "GB of memory and" in sentence and "is free; " in sentence, sentence
+
+
+def test_an_export_leaves_out_the_meshes_that_do_not_fit_and_says_so(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(room, "RENDER_BYTES", HUGE)
+    answer = fieldfuse("export", finished, "--formats", "obj,cameras", "--threads", "1", "--quiet", "--json")
+    assert answer.code == 0, answer
+    assert "points and meshes were left out: rendering 3 pictures" in answer.out and "GB is free" in answer.out
+    assert (finished / "exports" / "cameras" / "transforms.json").is_file() and not (finished / "exports" / "mesh.obj").is_file()
+
+
+def test_prepared_pictures_that_do_not_fit_are_not_read(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    allow(monkeypatch, 1000)
+    answer = fieldfuse("render", finished, "--quiet")
+    assert answer.code == 2 and "the prepared pictures of" in answer.sentence() and "GB is free" in answer.sentence()
