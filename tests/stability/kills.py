@@ -1,8 +1,9 @@
 """kill -9 at random moments of a small real run, again and again: `python -m tests.stability.kills --kills 50`.
 
 Half of the moments are drawn in time, half among the changes that the run makes to files, where a kill can do the most harm. After each
-kill no file may be damaged; a run that is let go on must end with the same files as one that was never killed. Every third run starts from
-the networks. With `--state FILE` a survey that was ended (by `--seconds`, say) is taken up where it was left, if the code is the same.
+kill no file may be damaged; a run that is let go on must end with the same files as one that was never killed. The last third of the kills
+meets runs that start from the networks. With `--state FILE` a survey that was ended (by `--seconds`, say) is taken up where it was left, if
+the code is the same.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from tests.stability.runs import NETWORK, ROOT, command, corrupt, differences, l
 from toolkit.files import fingerprint, read_json, write_json
 
 EACH = 5  # kills before a run is left alone
-NETWORK_EVERY = 3  # of so many runs one starts from the networks
+NETWORK_SHARE = 1 / 3  # of the kills meet runs that start from the networks
 
 
 @dataclass
@@ -33,14 +34,14 @@ class Survey:
     kills: int = 0
     late: int = 0  # moments that came when the run had ended
     runs: int = 0
-    from_networks: int = 0  # runs that started from the networks
+    from_networks: int = 0  # kills of runs that started from the networks
     seconds: float = 0.0
     wrong: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
         survived = "all survived" if not self.wrong else f"{len(self.wrong)} problems"
-        started = f", {self.from_networks} of which started from the networks" if self.from_networks else ""
-        return [f"{self.kills} kills in {self.runs} runs{started}: {survived}; {self.seconds:.0f} s."]
+        started = f", {self.from_networks} of them of runs that started from the networks" if self.from_networks else ""
+        return [f"{self.kills} kills{started}, in {self.runs} runs: {survived}; {self.seconds:.0f} s."]
 
 
 def kill_runs(
@@ -49,23 +50,24 @@ def kill_runs(
     seed: int,
     each: int = EACH,
     seconds: float = 1e9,
-    network_every: int = NETWORK_EVERY,
+    network_share: float = NETWORK_SHARE,
     state: Path | None = None,
 ) -> Survey:
     """Kill until `kills` are counted or the time is over; run n draws from `seed` and n alone.
 
     Args:
-        network_every: each so-manieth run starts from the networks; 0: none.
+        network_share: so much of the kills, the last ones, meets runs that start from the networks.
         state: kept after each run, and gone on from.
     """
-    survey, code = Survey(), fingerprint([seed, each, network_every, *_sources()])
+    survey, code = Survey(), fingerprint([seed, each, network_share, kills, *_sources()])
     if state is not None and state.is_file() and read_json(state).get("code") == code:
         survey = Survey(**read_json(state)["survey"])
     source, began, before = make_source(folder / "room"), time.monotonic(), survey.seconds
     whole: dict[bool, tuple[Path, float]] = {}
+    plain = kills - round(kills * network_share)
     while survey.kills < kills and time.monotonic() - began < seconds:
         number = survey.runs
-        networks = network_every > 0 and number % network_every == network_every - 1
+        networks = survey.kills >= plain
         if networks not in whole:
             whole[networks] = _undisturbed(source, folder / f"whole{networks:d}", networks)
         _one_run(
@@ -75,7 +77,7 @@ def kill_runs(
             folder / f"run{number}",
             *whole[networks],
             networks,
-            min(each, kills - survey.kills),
+            min(each, (kills if networks else plain) - survey.kills),
         )
         survey.seconds = before + time.monotonic() - began
         if state is not None:
@@ -94,7 +96,7 @@ def _undisturbed(source: Path, out: Path, networks: bool) -> tuple[Path, float]:
 
 def _one_run(survey: Survey, draw: random.Random, source: Path, out: Path, whole: Path, alone: float, networks: bool, kills: int) -> None:
     """Kill one run up to `kills` times, let it go on, and compare it with the `whole` one, which took `alone` seconds."""
-    more, changes = options(networks), count_changes(whole)
+    more, changes, before = options(networks), count_changes(whole), survey.kills
     for _ in range(kills):
         if draw.random() < 0.5:
             done = launch({"event": draw.randint(1, changes), "signal": "SIGKILL"}, source, out, *more).returncode
@@ -112,7 +114,7 @@ def _one_run(survey: Survey, draw: random.Random, source: Path, out: Path, whole
         survey.wrong.append(f"run {survey.runs} did not go on: {last.stderr[-500:]}")
     survey.wrong += [f"run {survey.runs}: {text}" for text in differences(whole, out) + leftovers(out) + corrupt(out)]
     survey.runs += 1
-    survey.from_networks += networks
+    survey.from_networks += (survey.kills - before) * networks
 
 
 def options(networks: bool) -> tuple[str, ...]:

@@ -28,7 +28,7 @@ LONG = pytest.mark.timeout(900)  # what takes half a minute alone takes minutes 
 
 @LONG
 def test_killed_three_times_at_random_the_run_goes_on_to_the_same_files(tmp_path: Path) -> None:
-    survey = kill_runs(tmp_path, kills=3, seed=int(os.environ.get("FIELDFUSE_SEED", "7")), each=3, network_every=0)
+    survey = kill_runs(tmp_path, kills=3, seed=int(os.environ.get("FIELDFUSE_SEED", "7")), each=3, network_share=0)
     assert survey.kills == 3 and not survey.wrong
 
 
