@@ -25,6 +25,7 @@ MODULES = (
     "edit",
     "network",
     "network_views",
+    "network_fusion",
     "engines",
     "place",
     "place_files",

@@ -1,4 +1,4 @@
-"""Networks: encodings, decoders, block convolution, aggregation over views and the recurrent fusion, at the edges of their range."""
+"""Networks: encodings, decoders, block convolution and aggregation over views, at the edges of their range."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from toolkit.networks.aggregate import aggregate, evidence
 from toolkit.networks.block_conv import block_conv3d
 from toolkit.networks.decoder import make_decoder
 from toolkit.networks.encoding import positional, spherical_harmonics
-from toolkit.networks.gru import FusionGRU, RunningMean
 from toolkit.volume.topology import Topology
 
 GROUP = "networks"
@@ -177,61 +176,3 @@ def aggregation(folder: Path) -> list[Measure]:
         for what, error in aggregation_errors(values, visible).items():
             out.append(Measure(f"{name}: {what}", error, bounds.get(what, 0.0)))
     return out
-
-
-def recurrence_errors(frames: int) -> dict[str, float]:
-    """Run the recurrence over random frames, every hundredth a thousand times as large, and look at what comes out."""
-    topology = Topology(torch.zeros((1, 3), dtype=torch.int64))
-    inside = torch.rand(512) < 0.2
-    gru, mean = FusionGRU(4, 8), RunningMean()
-    state, average = torch.zeros(513, 4), torch.zeros(513, 4)
-    count = torch.zeros(512)
-    mask = torch.cat([inside, inside.new_zeros(1)])[:, None]
-    largest, wrong = 0.0, 0.0
-    with torch.no_grad():
-        for frame in range(frames):
-            raw = torch.randn(513, 4) * (1e3 if frame % 100 == 99 else 1.0) * mask
-            local = torch.tanh(raw)
-            state = gru(state, count, local, raw, topology, inside) * mask
-            average = mean(average, count, local, raw, topology, inside) * mask
-            count += inside
-            largest = max(largest, float(state.abs().max()), float(average.abs().max()))
-            wrong += not_finite(state, average)
-    return {"state beyond ±1": max(0.0, largest - 1), "values that are not finite": wrong}
-
-
-@case(GROUP, "recurrent fusion: 200 frames stay bounded")
-def recurrence(folder: Path) -> list[Measure]:
-    return [Measure(name, error, 1e-6 if name.startswith("state") else 0.0) for name, error in recurrence_errors(200).items()]
-
-
-@case(GROUP, "recurrent fusion: 10,000 frames stay bounded", slow=True)
-def long_recurrence(folder: Path) -> list[Measure]:
-    return [Measure(name, error, 1e-6 if name.startswith("state") else 0.0) for name, error in recurrence_errors(10_000).items()]
-
-
-@case(GROUP, "recurrent fusion: first frame, saturated gates, the same frame twice, an empty local volume")
-def recurrence_edges(folder: Path) -> list[Measure]:
-    topology = Topology(torch.zeros((1, 3), dtype=torch.int64))
-    inside = torch.rand(512) < 0.2
-    mask = torch.cat([inside, inside.new_zeros(1)])[:, None]
-    gru, mean = FusionGRU(4, 8), RunningMean()
-    none, once = torch.zeros(512), inside.float()
-    raw = (torch.randn(513, 4) * mask).requires_grad_(True)
-    first = gru(torch.zeros(513, 4), none, torch.tanh(raw), raw, topology, inside)
-    first[:-1][inside].sum().backward()
-    assert raw.grad is not None
-    held = torch.full((513, 4), 0.5) * mask
-    large = (torch.full((513, 4), 1e4) * mask).requires_grad_(True)
-    saturated = gru(held, once, torch.tanh(large), large, topology, inside)
-    saturated.sum().backward()
-    assert large.grad is not None
-    nowhere = torch.zeros(512, dtype=torch.bool)
-    empty = gru(held, once, torch.zeros(513, 4), torch.zeros(513, 4), topology, nowhere)
-    value = torch.tanh(raw.detach()) * mask
-    twice = mean(mean(torch.zeros(513, 4), none, value, value, topology, inside), once, value, value, topology, inside)
-    return [
-        Measure("values that are not finite", not_finite(first, saturated, empty, raw.grad, large.grad), 0.0),
-        Measure("first frame without a gradient", float(raw.grad[:-1][inside].abs().sum() == 0), 0.0),
-        Measure("mean of the same frame twice", absolute(twice, value), 2e-7),
-    ]

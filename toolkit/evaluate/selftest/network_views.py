@@ -1,4 +1,4 @@
-"""Networks, continued: voxels seen by awkward views, gradients under lower precision, gates that are stuck, state that survives pruning."""
+"""Networks, continued: voxels seen by awkward views, gradients under lower precision, state that survives pruning."""
 
 from __future__ import annotations
 
@@ -16,13 +16,11 @@ from toolkit.networks.aggregate import aggregate, evidence
 from toolkit.networks.block_conv import block_conv3d
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.decoder import make_decoder
-from toolkit.networks.gru import FusionGRU
-from toolkit.networks.unproject import project
-from toolkit.training.nerfusion.health import saturation
+from toolkit.networks.unproject import MARGIN, project
 from toolkit.training.step import Optimiser, Rates
-from toolkit.volume.topology import Topology
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 50.0
+SIDE = 0.05  # of a voxel
 LOW = 16  # roundings of the lower precision that a gradient through a few layers may carry
 TURNS = 8  # times that, behind the sines and cosines of the paper's decoder
 
@@ -50,15 +48,17 @@ def seen_by_views(folder: Path) -> list[Measure]:
     )
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(400, 3, generator=generator) * 2 - 1
-    edge = torch.tensor([[3 * 32 / FOCAL, 0, 0], [-3 * 32 / FOCAL, 0, 0], [0, 3 * 24 / FOCAL, 0], [0, -3 * 24 / FOCAL, 0]])  # on the border
+    across, down = 3 * 32 / FOCAL + MARGIN * SIDE, 3 * 24 / FOCAL + MARGIN * SIDE
+    edge = torch.tensor([[across, 0, 0], [-across, 0, 0], [0, down, 0], [0, -down, 0]])  # on the border of what counts as seen from ahead
     points = torch.cat([points, edge, edge * 1.0001, torch.zeros(1, 3)])
-    found = project(points, torch.full((len(points),), 0.05), cameras, 0.1, 10.0)
+    found = project(points, torch.full((len(points),), SIDE), cameras, 0.1, 10.0)
     wrong, worst = 0, 0.0
     for index, pose in enumerate(poses.values()):
         local = points.double() - pose[:3, 3].double()
         depth = local[:, 2]
         pixels = local[:, :2] / depth[:, None] * FOCAL + torch.tensor([WIDTH / 2, HEIGHT / 2])
-        margin = torch.minimum(pixels, torch.tensor([WIDTH, HEIGHT]) - pixels).amin(1)
+        beside = MARGIN * SIDE * FOCAL / depth.clamp_min(0.1)  # cells that reach over the border count as seen
+        margin = torch.minimum(pixels, torch.tensor([WIDTH, HEIGHT]) - pixels).amin(1) + beside
         seen = (depth > 0.1) & (depth <= 10) & (margin >= 0)
         sure = (margin.abs() > 1e-3) & ((depth - 0.1).abs() > 1e-6)
         wrong += int((found.visible[index] != seen)[sure].sum())
@@ -120,31 +120,6 @@ def reduced_gradients(folder: Path) -> list[Measure]:
         (sums[0].sum() + sums[1].sum()).backward()
         assert low.grad is not None and exact.grad is not None
         out.append(Measure(f"aggregation, {name}, by the largest", by_size(low.grad, exact.grad), bound))
-    return out
-
-
-@case(GROUP, "recurrent fusion: stuck gates are reported, open ones pass a gradient")
-def stuck_gates(folder: Path) -> list[Measure]:
-    """A gate at its end passes hardly any gradient: what counts is that its share is measured and shown (`GateWatch`)."""
-    topology = Topology(torch.zeros((1, 3), dtype=torch.int64))
-    inside = torch.ones(512, dtype=torch.bool)
-    out = []
-    for name, bias, wanted in (("open", 0.0, 0.0), ("stuck", 1e3, 1.0), ("shut", -1e3, 1.0)):
-        torch.manual_seed(0)
-        gru = FusionGRU(4, 8)
-        seen: list[float] = []
-        hook = gru.update.register_forward_hook(lambda module, given, answer, seen=seen: seen.append(saturation(torch.sigmoid(answer))))
-        last = [parameter for key, parameter in gru.update.named_parameters() if key.endswith("bias")][-1]
-        last.data.fill_(bias)
-        raw = torch.randn(513, 4).requires_grad_(True)
-        state = gru(torch.full((513, 4), 0.3), torch.ones(512), torch.tanh(raw), raw, topology, inside)
-        state[:-1].sum().backward()
-        hook.remove()
-        assert raw.grad is not None
-        out.append(Measure(f"{name}: share of saturated gates, off by", abs(seen[0] - wanted), 0.05))
-        out.append(Measure(f"{name}: values that are not finite", not_finite(state, raw.grad), 0.0))
-        if name == "open":
-            out.append(Measure("open: no gradient", float(raw.grad.abs().sum() == 0), 0.0))
     return out
 
 
