@@ -36,6 +36,7 @@ Depth = Annotated[
     ),
 ]
 FORMATS = "export.formats=[ply]"  # the mesh alone: what is compared
+DEPTH_FROM = "fit.depth_from=any"  # where pictures are matched for a surface, the field may know that depth, too
 
 
 def compare(
@@ -65,6 +66,8 @@ def compare(
     wanted = list(pairs or [])
     if out is not None and not any(pair.startswith("export.formats=") for pair in wanted):
         wanted.insert(0, FORMATS)
+    if out is not None and (depth == "auto" or "matching" in depth) and not any(pair.startswith("fit.depth_from=") for pair in wanted):
+        wanted.insert(0, DEPTH_FROM)
     options = gather(preset, config, wanted, **flags, **{"poses.source": poses})
     bound_threads(options)
     from pipelines.console import make_progress

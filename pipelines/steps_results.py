@@ -79,6 +79,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     has is the start, and the budget is for what is added.
     """
     from pipelines.steps_network import make_network_field, uses_network
+    from pipelines.steps_stereo import views_for_fit
     from toolkit.render.field import Field
     from toolkit.training.fit import fit_field
     from toolkit.training.network_start import network_start
@@ -88,6 +89,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     path, times, told = job.folder / "field.safetensors", job.folder / "timeline.json", job.folder / FIT_NOTES
     notes: list[str] = []
     made = make_network_field(job, views, scene) if uses_network(job, views) else None
+    views, known = views_for_fit(job, scene, views)
     start = job.stages.record("field") if go_on and job.stages.usable("field") and not job.other_field else None
 
     def load() -> Fitted:
@@ -125,7 +127,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
         settings.seed,
         start and start.made,
     ]
-    after = ["scene", "views", *(["network"] if made is not None else [])]
+    after = ["scene", "views", *known, *(["network"] if made is not None else [])]
     value = job.stages.run("field", make, save, load, uses=uses, after=after, keeps=True)
     # The file holds less precision than memory: what is shown and scored is what everybody can load.
     return value if job.stages.cached["field"] else load()

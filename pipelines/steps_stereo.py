@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from pipelines.job import Job
 from toolkit.errors import InputError
 
 if TYPE_CHECKING:
+    from toolkit.camera import Array
     from toolkit.capture.types import Capture, Views
     from toolkit.poses.scene import Scene
     from toolkit.tsdf.stereo import StereoDepth
@@ -47,6 +49,32 @@ def match_pictures(job: Job, scene: Scene, views: Views) -> list[StereoDepth]:
         after=["scene", "views"],
         rounded=True,
     )
+
+
+def views_for_fit(job: Job, scene: Scene, views: Views) -> tuple[Views, list[str]]:
+    """The views with the depth that the settings' `fit.depth_from` lets a fit know, and the stages that this depth comes from.
+
+    Raises:
+        InputError: the pictures are to be matched, and cannot be.
+        Interrupted: the user asked to stop.
+    """
+    wanted = job.settings.fit.depth_from if job.settings.fit.depth > 0 else "off"
+    if wanted == "off":
+        return replace(views, depths=[]), []
+    if wanted == "sensor" or any(depth is not None for depth in views.depths):
+        return views, []
+    return with_matched(views, match_pictures(job, scene, views)), ["stereo"]
+
+
+def with_matched(views: Views, found: list[StereoDepth]) -> Views:
+    """Views whose training pictures have the depth that was found for them, one after the other."""
+    from toolkit.tsdf.stereo_frames import depth_at
+
+    depths: list[Array | None] = [None] * len(views)
+    for index, one in zip(np.flatnonzero(~views.test), found, strict=True):
+        camera = views.intrinsics[index]
+        depths[index] = depth_at(one, camera.width, camera.height)
+    return replace(views, depths=depths)
 
 
 def reuse_matched(job: Job, scene: Scene, views: Views) -> None:

@@ -44,7 +44,8 @@ def doubled(field: Field) -> Field:
 
 
 def doubled_rays(batch: Batch) -> Batch:
-    return Batch(batch.origins.double(), batch.directions.double(), batch.colour.double(), batch.view)
+    distance = None if batch.distance is None else batch.distance.double()
+    return Batch(batch.origins.double(), batch.directions.double(), batch.colour.double(), batch.view, distance)
 
 
 def clear_of_zero(field: Field, batch: Batch, margin: float) -> torch.Tensor:

@@ -19,7 +19,7 @@ from toolkit.training.fused import FusedOptimiser
 from toolkit.training.rays import PixelPool
 from toolkit.training.step import Optimiser, Rates
 
-RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03)
+RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03, depth=0.05)
 
 
 def looking(eye: np.ndarray) -> np.ndarray:
@@ -38,8 +38,10 @@ def made_views(count: int = 5, side: int = 24) -> Views:
     eyes = 3 * eyes / np.linalg.norm(eyes, axis=1, keepdims=True)
     poses = np.stack([looking(eye) for eye in eyes])
     images = [generator.integers(0, 256, (side, side, 3), dtype=np.uint8) for _ in range(count)]
-    lens = [Intrinsics(30, 31, side, side, 11.5, 12.5)] * count
-    return Views([f"{i}" for i in range(count)], images, lens, poses, np.zeros(count, bool))
+    lens = [Intrinsics(side, side, 30, 31, 11.5, 12.5)] * count
+    depths = [(generator.uniform(2, 4, (side, side)) * (generator.random((side, side)) < 0.7)).astype(np.float32) for _ in range(count)]
+    depths[-1] = None  # one picture whose depth nobody knows
+    return Views([f"{i}" for i in range(count)], images, lens, poses, np.zeros(count, bool), depths=depths)
 
 
 @pytest.mark.parametrize("shell", [0.0, 1.0])
@@ -86,7 +88,7 @@ def gradients(engine: FusedOptimiser, picks: torch.Tensor) -> list[torch.Tensor]
 def test_gradients_agree(shell: float, seed: int, threads: int) -> None:
     """Compiled, torch, and torch in float64: within 1e-4 of the largest, every value of every tensor."""
     field = random_field(shell, 32, keep=0.5, raw=-2.5, seed=seed)
-    pool = PixelPool(made_views())
+    pool = PixelPool(made_views(), depth=True)
     picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(seed))[:300]
     exact = exact_gradients(field, pool.take(picks), RATES)
     reference = torch_gradients(field, pool.take(picks), RATES)
@@ -112,7 +114,7 @@ def test_products_of_a_layer(rays: int) -> None:
 
 def test_a_step_moves_rows_as_the_reference_does() -> None:
     """Three steps of both engines on the same pixels: the same field, within what a sign flip of a vanishing gradient may do."""
-    pool = PixelPool(made_views())
+    pool = PixelPool(made_views(), depth=True)
     fields = [random_field(1.0, 32, keep=0.5, raw=-2.5) for _ in range(2)]
     rates = replace(RATES, density=0.1, feature=0.05, decoder=1e-3)
     reference, fused = Optimiser(fields[0]), FusedOptimiser(fields[1], pool, threads=2)
@@ -140,7 +142,7 @@ def test_a_step_moves_rows_as_the_reference_does() -> None:
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_same_seed_gives_the_same_field(threads: int) -> None:
     """Bit for bit, for a fixed number of threads."""
-    pool = PixelPool(made_views())
+    pool = PixelPool(made_views(), depth=True)
     results = []
     for _ in range(2):
         field = random_field(1.0, 32, keep=0.5, raw=-2.5)
@@ -154,7 +156,7 @@ def test_the_same_seed_gives_the_same_field(threads: int) -> None:
 
 def test_pruned_voxels_are_left_alone() -> None:
     """After pruning rows stay where they are, so the optimiser state stays good and erased voxels get no gradient."""
-    pool = PixelPool(made_views())
+    pool = PixelPool(made_views(), depth=True)
     field = random_field(1.0, 32, keep=1.0, raw=-2.5)
     engine = FusedOptimiser(field, pool, seed=1, threads=1)
     engine.step(256, replace(RATES, density=0.1, feature=0.05))

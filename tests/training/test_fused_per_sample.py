@@ -22,7 +22,7 @@ from toolkit.training.fused_per_sample import FusedPerSampleOptimiser
 from toolkit.training.rays import PixelPool
 from toolkit.training.step import Optimiser, Rates
 
-RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03)
+RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03, depth=0.05)
 
 
 @pytest.fixture
@@ -130,7 +130,7 @@ CLEAR = 2e-3  # the same steepness puts a hidden unit whose input is nearer to z
 def test_gradients_agree(shell: float, seed: int, threads: int, every_sample: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiled, torch, and torch in float64, on rays of which rounding cannot put a hidden unit on the other side of its ReLU."""
     field = random_field(shell, 32, "per_sample", keep=0.5, raw=-3.5, seed=seed)
-    pool = PixelPool(made_views())
+    pool = PixelPool(made_views(), depth=True)
     picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(seed))[:600]
     picks = picks[clear_of_zero(field, pool.take(picks), CLEAR)]
     assert len(picks) > 60
@@ -158,7 +158,7 @@ def test_gradients_agree(shell: float, seed: int, threads: int, every_sample: No
 def test_what_is_left_out_has_no_weight(monkeypatch: pytest.MonkeyPatch, every_sample: None) -> None:
     """Rays end where their light is spent; gradients are the same within a hundredth."""
     field = made_field(1.0, 0.5, -2.5)
-    pool = PixelPool(made_views())
+    pool = PixelPool(made_views(), depth=True)
     picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(2))[:200]
     whole = FusedPerSampleOptimiser(field, pool, threads=1)
     wanted = gradients(whole, picks, monkeypatch)
@@ -173,7 +173,7 @@ def test_what_is_left_out_has_no_weight(monkeypatch: pytest.MonkeyPatch, every_s
 @pytest.mark.usefixtures("every_sample")
 def test_a_step_moves_rows_as_the_reference_does() -> None:
     """Three steps of both engines on the same pixels: the same field, within what a sign flip of a vanishing gradient may do."""
-    pool = PixelPool(made_views())
+    pool = PixelPool(made_views(), depth=True)
     fields = [made_field(1.0, 0.5, -3.5) for _ in range(2)]
     rates = replace(RATES, density=0.1, feature=0.05, decoder=1e-3)
     reference, fused = Optimiser(fields[0]), FusedPerSampleOptimiser(fields[1], pool, threads=2)
@@ -201,7 +201,7 @@ def test_a_step_moves_rows_as_the_reference_does() -> None:
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_same_seed_gives_the_same_field(threads: int) -> None:
     """Bit for bit, for a fixed number of threads."""
-    pool = PixelPool(made_views())
+    pool = PixelPool(made_views(), depth=True)
     results = []
     for _ in range(2):
         field = made_field(1.0, 0.5, -2.5)
@@ -218,7 +218,7 @@ def test_the_same_seed_gives_the_same_field(threads: int) -> None:
 def test_colours_during_a_fit_are_those_of_the_field() -> None:
     """After steps and `sync`, torch sees the same pictures."""
     field = made_field(1.0, 0.5, -2.5)
-    engine = FusedPerSampleOptimiser(field, PixelPool(made_views()), threads=1)
+    engine = FusedPerSampleOptimiser(field, PixelPool(made_views(), depth=True), threads=1)
     for _ in range(3):
         engine.step(128, replace(RATES, density=0.1, feature=0.05, decoder=1e-2))
     origins, directions = random_rays(200)
@@ -230,7 +230,7 @@ def test_colours_during_a_fit_are_those_of_the_field() -> None:
 def test_pruned_voxels_are_left_alone() -> None:
     """Rays through nothing are background, and move nothing."""
     field = made_field(1.0, 1.0, -2.5)
-    engine = FusedPerSampleOptimiser(field, PixelPool(made_views()), seed=1, threads=1)
+    engine = FusedPerSampleOptimiser(field, PixelPool(made_views(), depth=True), seed=1, threads=1)
     engine.go_on_with(replace(field, occupied=torch.zeros_like(field.occupied)))
     before = field.density_rows.clone()
     error, looked = engine.step(256, replace(RATES, density=0.1, feature=0.05))

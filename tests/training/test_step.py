@@ -11,6 +11,7 @@ from toolkit.render.field import Field, density
 from toolkit.render.march import Samples, march
 from toolkit.training import step as step_module
 from toolkit.training.adam import LazyAdam
+from toolkit.training.depth import REACH
 from toolkit.training.rays import Batch
 from toolkit.training.step import Optimiser, Rates
 from toolkit.volume.lookup import corners
@@ -50,6 +51,9 @@ def reference_loss(field: Field, samples: Samples, batch: Batch, rates: Rates, r
         ) / 3
         total = total + ((mixed - batch.colour[ray]) ** 2).sum() / (3 * count)
         total = total + (rates.distortion * spread + rates.opacity * (1 - opacity) ** 2) / count
+        if batch.distance is not None and batch.distance[ray] > 0:
+            away = (samples.distance[mine] - batch.distance[ray]).abs() / (REACH * batch.distance[ray])
+            total = total + rates.depth * (w * (away.clamp_max(1) - 1)).sum() / count
     return total
 
 
@@ -59,9 +63,14 @@ def test_gradients_match_autograd(decoder: str, shell: float, monkeypatch: pytes
     field = random_field(background=shell, resolution=16, decoder=decoder, raw=-2.0)
     monkeypatch.setattr(step_module, "STOP", -1.0)
     origins, directions = random_rays(24)
-    batch = Batch(origins, directions, torch.rand(24, 3, generator=torch.Generator().manual_seed(1)), torch.zeros(24, dtype=torch.int64))
-    rates = Rates(0.0, 0.0, 0.0, 0.01, 0.03, colour_threshold=-1.0)
     samples = march(field.grid, origins, directions, field.near, field.fine)
+    generator = torch.Generator().manual_seed(1)
+    distance = torch.zeros(24)
+    distance[samples.ray] = samples.distance  # the last one of each ray …
+    distance *= torch.rand(24, generator=generator) > 0.4  # … and of some nothing is known
+    assert bool((distance > 0).any()) and bool((distance == 0).any())
+    batch = Batch(origins, directions, torch.rand(24, 3, generator=generator), torch.zeros(24, dtype=torch.int64), distance)
+    rates = Rates(0.0, 0.0, 0.0, 0.01, 0.03, colour_threshold=-1.0, depth=0.05)
     monkeypatch.setattr(step_module, "march", lambda *arguments: samples)  # the same samples for both, without jitter
     raw_rows = field.density_rows.clone().requires_grad_(True)
     feature_rows = field.feature_rows.clone().requires_grad_(True)

@@ -32,9 +32,10 @@ STRETCH = F(MAX_STRETCH)
 THIN = F(0.01)  # below this optical thickness 1 - exp(-τ) is taken from its series: the difference would lose digits
 THIRD = F(1 / 3)
 LINE = 64  # bytes of a cache line
-VALUES = 8  # columns of a sample's floats
+VALUES = 9  # columns of a sample's floats
 PADDED = 16  # inputs of the decoder beside the features: nine harmonics, and zeros that make a round number
-X, Y, Z, RAW, TAU, WEIGHT, AFTER, PLACE = range(VALUES)  # AFTER: transmittance behind the sample
+# AFTER: transmittance behind the sample; ALONG: distance from the camera, working units
+X, Y, Z, RAW, TAU, WEIGHT, AFTER, PLACE, ALONG = range(VALUES)
 
 
 def _prefetch(context: Any, array: Any, index: Any, half: bool) -> Any:

@@ -10,6 +10,7 @@ from numba import njit
 
 from toolkit.render.kernels import (
     AFTER,
+    ALONG,
     HALF,
     ONE,
     OPTIONS,
@@ -84,7 +85,7 @@ def march_ray(
         stop: the march ends once the transmittance is below.
         marks: (M · 512,) uint16 for `mark`, or of length 0. Of a ray that ends somewhere the strongest sample counts as seen fully: on a
             fine lattice a surface is several voxels thick and none of them may hold much weight.
-        cells: (S,) int32, all_rows: (S, 8) int32 corners, values: (S, 8) float32: the kept samples.
+        cells: (S,) int32, all_rows: (S, 8) int32 corners, values: (S, VALUES) float32: the kept samples.
         result: (3,) float32 distance at which half of the light is stopped (0: never), transmittance left, samples looked up.
 
     Returns:
@@ -217,6 +218,7 @@ def march_ray(
                     values[kept, RAW], values[kept, TAU] = raw, tau
                     values[kept, WEIGHT], values[kept, AFTER] = weight, after
                     values[kept, PLACE] = (F(step_index) + where) * unit
+                    values[kept, ALONG] = (s + (s1 - s) * where) * half
                     for corner in range(8):
                         prefetch(volume.feature, np.int64(all_rows[kept, corner]))
                     kept += 1

@@ -208,6 +208,7 @@ def march_ray(
                 values[K.RAW] = raw_density(volume, cell, x - F(i), y - F(j), z - F(k))
                 values[K.TAU] = length
                 values[K.PLACE] = (F(step_index) + where) * unit
+                values[K.ALONG] = (s + (s1 - s) * where) * half
                 values[BEGIN], values[SPAN] = (s + (s1 - s) * F(index) * per_fine) * half, (s1 - s) * per_fine * half
                 waiting += 1
                 if waiting == TILE:

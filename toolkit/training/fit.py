@@ -129,7 +129,7 @@ def fit_field(
     validation = _Sample(train, np.flatnonzero(aside), VALIDATION_PIXELS, device)
     room.require_start(train, start, settings, device)
     # Views that are kept aside come last, so that joining them is a matter of a limit.
-    pool = PixelPool(train.subset(np.argsort(aside, kind="stable")), device)
+    pool = PixelPool(train.subset(np.argsort(aside, kind="stable")), device, depth=settings.fit.depth > 0)
     pool.limit = int((pool.view < np.count_nonzero(~aside)).sum())
     budget = settings.fit.budget or DEFAULT_BUDGET
     warm_up(settings, progress)

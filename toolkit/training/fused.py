@@ -37,7 +37,8 @@ class FusedOptimiser:
     def __init__(self, field: Field, pool: PixelPool, seed: int = 0, threads: int | None = None) -> None:
         self.pool, self.threads = pool, threads or torch.get_num_threads()
         self.generator = np.random.default_rng(seed)
-        self.pixels = kernels.Pixels(pool.colour.numpy(), pool.place.numpy(), pool.view.numpy(), pool.camera.numpy(), pool.pose.numpy())
+        given = (pool.colour, pool.place, pool.view, pool.camera, pool.pose, pool.distance)
+        self.pixels = kernels.Pixels(*(tensor.numpy() for tensor in given))
         widths, heights = pool.camera[:, 4].max(), pool.height
         self.tiles = (int(heights) // GUESS_CELL + 1, int(widths) // GUESS_CELL + 1, GUESS_CELL)
         self.guess = np.zeros(len(pool.pose) * self.tiles[0] * self.tiles[1], np.float32)
@@ -120,7 +121,8 @@ class FusedOptimiser:
         hit_codes(self.space, self.pixels, picks, self.guess, self.tiles, codes, tiles)
         order = np.argsort(codes)
         picks, jitter = picks[order], jitter[order]
-        losses = kernels.Losses(*(np.float32(v) for v in (rates.distortion, rates.opacity, rates.colour_threshold, STOP)))
+        weights = (rates.distortion, rates.opacity, rates.depth, rates.colour_threshold, STOP)
+        losses = kernels.Losses(*(np.float32(weight) for weight in weights))
         depths = np.empty(rays, np.float32)
         cuts = [rays * t // self.threads for t in range(self.threads + 1)]
         self._make_room(rays)

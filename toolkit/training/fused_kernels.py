@@ -14,8 +14,10 @@ from toolkit.render import kernels as K
 from toolkit.render.kernels_decode import decode, encode_direction, multiply
 from toolkit.render.kernels_lookup import gather_row
 from toolkit.render.kernels_march import march_ray
+from toolkit.training.depth import REACH as REACH_
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
+REACH = F(REACH_)
 
 
 class Pixels(NamedTuple):
@@ -26,6 +28,7 @@ class Pixels(NamedTuple):
     source: Any  # (N,) int32 which view
     camera: Any  # (V, 5) float32 fx, fy, cx, cy, width
     pose: Any  # (V, 4, 4) float32
+    distance: Any  # (N,) float32 to the surface along the ray, 0: unknown; or of length 0
 
 
 class Gradients(NamedTuple):
@@ -47,6 +50,7 @@ class Losses(NamedTuple):
 
     distortion: Any
     opacity: Any
+    depth: Any
     threshold: Any
     stop: Any
 
@@ -66,6 +70,14 @@ def pixel_ray(pixels: Any, pick: Any, ray: Any) -> None:
     scale = ONE / np.sqrt(dx * dx + dy * dy + dz * dz)
     ray[0], ray[1], ray[2] = pose[view, 0, 3], pose[view, 1, 3], pose[view, 2, 3]
     ray[3], ray[4], ray[5] = dx * scale, dy * scale, dz * scale
+
+
+@njit(**K.OPTIONS)
+def depth_pull(along: Any, distance: Any) -> Any:
+    """`depth.depth_gradient` of one sample."""
+    if distance <= ZERO:
+        return ZERO
+    return min(abs(along - distance) / (REACH * distance), ONE) - ONE
 
 
 @njit(**K.OPTIONS)
@@ -131,6 +143,7 @@ def gradient_pass(
     per_value = TWO / (F(3) * F(count))
     spread = F(4) / (F(space.fine) * F(space.resolution))
     distortion, opacity_loss = losses.distortion / F(count), TWO * losses.opacity / F(count)
+    depth_loss = losses.depth / F(count)
     used, looked = 0, 0
     error = 0.0
     for number in range(len(picks)):
@@ -197,9 +210,10 @@ def gradient_pass(
         for i in range(kept):
             total += values[i, K.WEIGHT]
             total_place += values[i, K.WEIGHT] * values[i, K.PLACE]
+        distance = pixels.distance[pick] if pixels.distance.shape[0] > 0 else ZERO
         before, before_place = ZERO, ZERO
         for i in range(kept):
-            g = constant
+            g = constant + depth_loss * depth_pull(values[i, K.ALONG], distance)
             for c in range(channels):
                 g += features[i, c] * g_given[c]
             weight, place = values[i, K.WEIGHT], values[i, K.PLACE]

@@ -16,7 +16,7 @@ from toolkit.render import kernels as K
 from toolkit.render.kernels_matrix import add_outer, product
 from toolkit.render.kernels_net import BATCH, SAMPLES, Net, Tape, decode_colours, make_tape
 from toolkit.render.kernels_per_sample import march_ray
-from toolkit.training.fused_kernels import pixel_ray
+from toolkit.training.fused_kernels import depth_pull, pixel_ray
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
 RAYS = 64  # rays at a time, when they have few samples
@@ -112,12 +112,22 @@ def decoder_backward(width: Any, net: Net, scratch: Scratch, count: Any) -> None
 
 @njit(**K.OPTIONS)
 def ray_backward(
-    space: Any, tape: Tape, first: Any, last: Any, background: Any, target: Any, count: Any, losses: Any, g_logit: Any, g_raw: Any
+    space: Any,
+    tape: Tape,
+    first: Any,
+    last: Any,
+    background: Any,
+    target: Any,
+    surface: Any,
+    count: Any,
+    losses: Any,
+    g_logit: Any,
+    g_raw: Any,
 ) -> Any:
     """Loss of one ray whose samples are first … last − 1 of the tape, and its gradients g_logit (S, 3) and g_raw (S,) there.
 
     Args:
-        target: (3,) uint8 colour; count: rays of the whole batch.
+        target: (3,) uint8 colour; surface: distance where the ray ends, 0: unknown; count: rays of the whole batch.
 
     Returns:
         sum of squared colour errors.
@@ -139,7 +149,7 @@ def ray_backward(
     g_red, g_green, g_blue = red * per_value, green * per_value, blue * per_value
     constant = -(g_red * background[0] + g_green * background[1] + g_blue * background[2]) - left * (TWO * losses.opacity / F(count))
     spread = F(4) / (F(space.fine) * F(space.resolution))
-    distortion = losses.distortion / F(count)
+    distortion, depth_loss = losses.distortion / F(count), losses.depth / F(count)
     before, before_place = ZERO, ZERO
     for i in range(first, last):
         weight, place = tape.values[i, K.WEIGHT], tape.values[i, K.PLACE]
@@ -150,6 +160,7 @@ def ray_backward(
         after, after_place = total - before - weight, total_place - before_place - weight * place
         pull = place * (before - after) - (before_place - after_place)
         g_raw[i] = g_red * a + g_green * b + g_blue * c + constant + TWO * distortion * (pull + weight * spread * K.THIRD)
+        g_raw[i] += depth_loss * depth_pull(tape.values[i, K.ALONG], surface)
         before += weight
         before_place += weight * place
     # so far ∂L/∂w; ∂L/∂τ_i = T_i e^{-τ_i} g_i - Σ_{j>i} w_j g_j, far to near
@@ -246,8 +257,9 @@ def gradient_pass(
         starts[rays] = samples
         decode_colours(net, tape, samples)
         for r in range(rays):
-            target = pixels.colour[picks[begun + r]]
-            arguments = (background, target, count, losses, scratch.g_logit, scratch.g_raw)
+            pick = picks[begun + r]
+            surface = pixels.distance[pick] if pixels.distance.shape[0] > 0 else ZERO
+            arguments = (background, pixels.colour[pick], surface, count, losses, scratch.g_logit, scratch.g_raw)
             error += ray_backward(space, tape, starts[r], starts[r + 1], *arguments)
         decoder_backward(space.width, net, scratch, samples)
         used = _scatter(tape, samples, scratch, index, thread + 1, zero_row, gradients, space.width, used)

@@ -13,7 +13,7 @@ from toolkit.training.engine import chosen_engine
 from toolkit.training.schedule import Schedule
 from toolkit.volume.topology import BLOCK, VOXELS
 
-POOL_BYTES = 2 * 11  # a pixel: colour, place, view, and one copy of them while they are put together
+POOL_BYTES = 2 * 15  # a pixel: colour, place, view, distance, and one copy of them while they are put together
 HALF = BLOCK // 2
 BESIDE = 1.5  # blocks at a finer level, by those that hold voxels: some hold nothing but corners of their neighbours' voxels
 

@@ -124,4 +124,5 @@ class Schedule:
         fall = (1 + rays / SLOWING) ** -0.85 * self.slower * LAST_RATE ** max(0.0, (done - LAST_PRUNE) / (1 - LAST_PRUNE))
         fit = self.settings
         opacity = fit.opacity if self.opaque else 0.0
-        return Rates(fit.rate_density * fall, fit.rate_feature * fall, fit.rate_decoder * fall, fit.distortion, opacity)
+        steps = (fit.rate_density * fall, fit.rate_feature * fall, fit.rate_decoder * fall)
+        return Rates(*steps, fit.distortion, opacity, depth=fit.depth)

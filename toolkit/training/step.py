@@ -12,6 +12,7 @@ from toolkit.render.field import Field, density
 from toolkit.render.march import BRICK, Samples, march
 from toolkit.render.rays import OPACITY_FLOOR
 from toolkit.training.adam import LazyAdam
+from toolkit.training.depth import depth_gradient
 from toolkit.training.finite import NotFiniteError, check
 from toolkit.training.rays import Batch
 from toolkit.training.view import blind, of_direction
@@ -31,6 +32,7 @@ class Rates:
     opacity: float = 0.0  # weight of the mean of (1 - opacity)², for captures in which every ray ends somewhere
     random_background: bool = False  # what is behind everything is another colour for every ray, so that it cannot stand in for a surface
     colour_threshold: float = 3e-3  # samples of smaller weight are neither decoded nor given a gradient
+    depth: float = 0.0  # weight of the mean of the depth term (see `depth`), for rays whose surface is known
 
 
 class Optimiser:
@@ -68,6 +70,12 @@ class Optimiser:
     def _spread(self, weight: Tensor) -> Tensor:
         """Interval of every sample in the units of `Samples.place`."""
         return torch.full_like(weight, BRICK / (self.field.fine * self.field.resolution))
+
+    def _depth(self, batch: Batch, samples: Samples, rates: Rates) -> Tensor | float:
+        """The depth term's gradient for the samples' weights."""
+        if rates.depth <= 0 or batch.distance is None:
+            return 0.0
+        return depth_gradient(samples.distance, batch.distance[samples.ray]) * (rates.depth / len(batch.origins))
 
     def _move(self, rows: Tensor, corner_weights: Tensor, g_density: Tensor, g_feature: Tensor, rates: Rates, residual: Tensor) -> None:
         """From gradients of what was looked up to a step of the rows that it was looked up from.
@@ -145,6 +153,7 @@ class Optimiser:
         if rates.distortion > 0:
             _, g_distortion = distortion(weight, kept.place, self._spread(weight), kept.first, kept.ray, count)
             g_weight = g_weight + g_distortion * (rates.distortion / count)
+        g_weight = g_weight + self._depth(batch, kept, rates)
         g_thickness = thickness_gradient(weight, transmittance, thickness, g_weight, kept.first, kept.ray, count)
         g_raw = torch.where(raw < RAW_MAX, g_thickness * thickness, torch.zeros_like(raw))  # ∂τ/∂raw = τ
         self._move(rows, corner_weights, g_raw, per_ray[:, :-1] * weight[:, None], rates, residual)
@@ -172,6 +181,7 @@ class Optimiser:
         if rates.distortion > 0:
             _, g_distortion = distortion(weight, samples.place, self._spread(weight), samples.first, samples.ray, count)
             g_weight = g_weight + g_distortion * (rates.distortion / count)
+        g_weight = g_weight + self._depth(batch, samples, rates)
         g_thickness = thickness_gradient(weight, transmittance, tau, g_weight, samples.first, samples.ray, count)
         torch.autograd.backward([thickness, colour], [g_thickness, weight[:, None] * g_mixed])
         assert features.grad is not None and base.grad is not None

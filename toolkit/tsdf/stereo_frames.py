@@ -6,11 +6,12 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from toolkit.camera import Intrinsics
+from toolkit.camera import Array, Intrinsics
 from toolkit.capture.types import Views
 from toolkit.errors import InputError, first_line
 from toolkit.files import atomic_path
@@ -21,6 +22,7 @@ from toolkit.tsdf.stereo import StereoDepth
 from toolkit.tsdf.volume import TsdfVolume
 
 LEAST_CONFIDENCE = 0.5  # two other views confirm a depth for each one that sees through it
+SMOOTH = 0.05  # share by which depths side by side may differ, to be interpolated
 
 
 def stereo_frames(views: Views, depths: Sequence[StereoDepth], least_confidence: float = LEAST_CONFIDENCE) -> Iterator[DepthFrame]:
@@ -48,6 +50,21 @@ def fuse_stereo(
     )
     frames = stereo_frames(views, depths, least_confidence)
     return fuse_held(frames, len(depths), voxel_size, depth_max, carve=carve, nothing=nothing, progress=progress)
+
+
+def depth_at(found: StereoDepth, width: int, height: int, least_confidence: float = LEAST_CONFIDENCE) -> Array:
+    """(height, width) float32 depth of a view on more or fewer pixels than it was found on, 0 where it is unknown, not confident enough,
+    or beside an edge, where it would lie between two surfaces."""
+    depth = np.where(found.confidence >= least_confidence, found.depth, np.float32(0))
+    if depth.shape == (height, width):
+        return np.ascontiguousarray(depth, dtype=np.float32)
+    inverse: Array = np.where(depth > 0, 1 / np.maximum(depth, np.float32(1e-12)), 0).astype(np.float32)
+    window = np.ones((3, 3), np.uint8)
+    nearest, farthest = cv2.dilate(inverse, window), cv2.erode(inverse, window)
+    smooth: Array = ((farthest > 0) & (nearest <= (1 + SMOOTH) * farthest)).astype(np.uint8)
+    inverse = cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
+    smooth = cv2.resize(smooth, (width, height), interpolation=cv2.INTER_NEAREST)
+    return np.where(smooth > 0, 1 / np.maximum(inverse, np.float32(1e-12)), np.float32(0)).astype(np.float32)
 
 
 def save_stereo(path: Path | str, names: Sequence[str], depths: Sequence[StereoDepth]) -> None:

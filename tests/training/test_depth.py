@@ -1,0 +1,80 @@
+"""The depth term: distances along rays, its gradient, and a fit that finds the surface where colours alone cannot."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.poses.textured import arc, render
+from tests.training.test_fit import ticking, wanted
+from tests.training.test_fused import made_views
+from toolkit.camera import Intrinsics, Similarity
+from toolkit.capture.types import Views
+from toolkit.poses.scene import Scene
+from toolkit.render.image import render_view
+from toolkit.training.depth import REACH, depth_gradient, ray_distances
+from toolkit.training.fit import fit_field
+from toolkit.training.rays import PixelPool
+
+
+def test_distances_along_rays_are_those_of_the_pools_directions() -> None:
+    views = made_views()
+    pool = PixelPool(views, depth=True)
+    batch = pool.take(torch.arange(len(pool)))
+    assert batch.distance is not None
+    for index, depth in enumerate(views.depths):
+        mine = batch.view == index
+        if depth is None:
+            assert not bool(batch.distance[mine].any())
+            continue
+        along = (batch.directions[mine] @ torch.from_numpy(views.world_from_camera[index][:3, 2]).float()) * batch.distance[mine]
+        np.testing.assert_allclose(along.numpy(), depth.reshape(-1), atol=1e-5)
+
+
+def test_without_depth_nothing_is_kept() -> None:
+    views = made_views()
+    assert PixelPool(views).take(torch.arange(3)).distance is None
+    assert PixelPool(replace(views, depths=[]), depth=True).take(torch.arange(3)).distance is None
+
+
+def test_what_is_no_depth_stays_unknown() -> None:
+    depth = np.array([[np.nan, -1.0, 0.0, np.inf, 2.0]], np.float32)
+    found = ray_distances(depth, Intrinsics(5, 1, 5, 5, 2.5, 0.5))
+    assert (found[0, :4] == 0).all() and found[0, 4] > 2
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_weight_is_drawn_to_the_surface_alike_at_any_scale(scale: float) -> None:
+    away = torch.tensor([0.0, 0.5, 1.0, 5.0, -0.5, -0.9])
+    target = torch.full((6,), 2.0 * scale)
+    got = depth_gradient(target * (1 + REACH * away), target)
+    torch.testing.assert_close(got, torch.tensor([-1.0, -0.5, 0.0, 0.0, -0.5, -0.1]), atol=1e-3, rtol=0)
+    assert not bool(depth_gradient(target, torch.zeros(6)).any())
+
+
+def blank_views() -> Views:
+    """The corner of walls, painted all grey, with its exact depth."""
+    camera = Intrinsics(48, 36, 45, 45, 24, 18)
+    poses = arc(9, 44.0)
+    depths = [render(pose, camera)[1].astype(np.float32) for pose in poses]
+    grey = np.full((36, 48, 3), 90, np.uint8)
+    return Views([f"{i}" for i in range(9)], [grey] * 9, [camera] * 9, poses, np.arange(9) == 4, depths=list(depths))
+
+
+@pytest.mark.parametrize(("weight", "found"), [("fit.depth=0.05", True), ("fit.depth=0", False)])
+def test_a_wall_without_texture_is_found_by_its_depth(weight: str, found: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At a held-out view. The start, which depth empties too, is taken away from both, so that the term alone decides."""
+    ticking(monkeypatch, 0.015)
+    monkeypatch.setattr("toolkit.training.fit.possible", lambda _space, _resolution, places, _views: places)
+    views = blank_views()
+    scene = Scene(Similarity.identity(), np.array([0.0, -1.5, 1.0]), np.full(3, 4.5), 3.4, 1.0, 8.0, 0.0, False, False)
+    field = fit_field(views, scene, wanted(weight)).field
+    rendered = render_view(field, views.intrinsics[4], views.world_from_camera[4])
+    depth = views.depths[4]
+    assert depth is not None
+    known = depth > 0
+    error = np.where(rendered.depth > 0, np.abs(rendered.depth - depth) / np.maximum(depth, 1e-6), 1.0)[known]
+    assert (float(np.median(error)) < 0.04) is found, float(np.median(error))

@@ -1,0 +1,30 @@
+"""The depth term of a fit: light is to end where a picture's depth is known, by a sensor or by matching; the paper has no such term.
+
+Of a ray whose surface lies at the distance d, each sample with weight w at the distance t costs w · (min(|t − d| / (r d), 1) − 1):
+nothing beyond the reach r d of it, and the less the nearer it lies. So weight is drawn to the surface whatever lies far from it, and a
+depth that is wrong costs no more than one that is missing by far.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from toolkit.camera import Array, Intrinsics
+
+Tensor = torch.Tensor
+REACH = 0.05  # r: share of the distance within which a sample counts as near the surface
+
+
+def ray_distances(depth: Array, camera: Intrinsics) -> Array:
+    """(H, W) float32 depth along z → distance along each pixel's ray; 0, missing, stays 0. The camera is a pinhole."""
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    length = np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2)
+    return np.asarray(np.where(np.isfinite(depth) & (depth > 0), depth * length, 0), dtype=np.float32)
+
+
+def depth_gradient(distance: Tensor, target: Tensor) -> Tensor:
+    """(samples,) gradient of the term for the samples' weights, from their distances and those of their rays' surfaces (0: unknown)."""
+    away = (distance - target).abs() / (REACH * target).clamp_min(1e-9)
+    return torch.where(target > 0, away.clamp_max(1.0) - 1.0, torch.zeros_like(away))
