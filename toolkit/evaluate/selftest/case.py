@@ -26,6 +26,7 @@ MODULES = (
     "network",
     "network_views",
     "network_fusion",
+    "network_sweep",
     "engines",
     "place",
     "place_files",
