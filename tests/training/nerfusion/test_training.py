@@ -59,17 +59,34 @@ def test_a_run_leaves_weights_curve_and_checkpoint(tmp_path: Path) -> None:
     assert checkpoint_settings(checkpoints(tmp_path)[-1])["loss"]["rays"] == SMALL["loss"]["rays"]
 
 
+def test_what_is_shipped_is_the_average_along_the_run(tmp_path: Path) -> None:
+    trainer = Trainer(tiny_settings(optimiser={"average": 0.3}), tmp_path, Crew())
+    mean = state(trainer)
+    for step in range(4):
+        trainer.run(until=step + 1)
+        decay = min(0.3, (1 + step) / (10 + step))
+        mean = {name: decay * mean[name] + (1 - decay) * value for name, value in state(trainer).items()}
+    shipped = load_model(tmp_path / WEIGHTS).state_dict()
+    assert shipped.keys() == mean.keys() and not same(shipped, state(trainer))
+    for name, value in mean.items():
+        torch.testing.assert_close(shipped[name], value, rtol=1e-5, atol=1e-6)
+    for average in (-0.1, 1.0):
+        with pytest.raises(InputError, match=r"optimiser\.average"):
+            tiny_settings(optimiser={"average": average})
+
+
 def test_resuming_repeats_every_bit(tmp_path: Path) -> None:
-    """Stopped once in each stage; weights, moments of Adam and the curve are those of a run that never stopped."""
-    whole = Trainer(tiny_settings(), tmp_path / "whole", Crew())
+    """Stopped once in each stage; weights, their average, moments of Adam and the curve are those of a run that never stopped."""
+    settings = tiny_settings(optimiser={"average": 0.9})
+    whole = Trainer(settings, tmp_path / "whole", Crew())
     whole.run()
     for stop in (1, 3):
-        first = Trainer(tiny_settings(), tmp_path / "parts", Crew(), resume=stop > 1)
+        first = Trainer(settings, tmp_path / "parts", Crew(), resume=stop > 1)
         assert first.run(until=stop) == stop
-    second = Trainer(tiny_settings(), tmp_path / "parts", Crew(), resume=True)
-    assert second.step == 3 and same(state(first), state(second))
+    second = Trainer(settings, tmp_path / "parts", Crew(), resume=True)
+    assert second.step == 3 and same(state(first), state(second)) and same(first.average.values, second.average.values)
     second.run()
-    assert same(state(whole), state(second))
+    assert same(state(whole), state(second)) and same(whole.average.values, second.average.values)
     for a, b in zip(whole.model.parameters(), second.model.parameters(), strict=True):
         for name in ("step", "exp_avg", "exp_avg_sq"):
             assert torch.equal(whole.adam.state[a][name], second.adam.state[b][name])

@@ -17,10 +17,11 @@ from torch import nn
 
 from toolkit.errors import InputError, first_line
 from toolkit.files import atomic_path
+from toolkit.training.nerfusion.average import Average
 from toolkit.training.nerfusion.caution import Caution
 
 Tensor = torch.Tensor
-MODEL, FIRST, SECOND, COUNT = "model.", "adam.first.", "adam.second.", "adam.step."
+MODEL, FIRST, SECOND, COUNT, AVERAGE = "model.", "adam.first.", "adam.second.", "adam.step.", "average."
 FORMAT = "fieldfuse-training-1"
 
 
@@ -30,7 +31,14 @@ def checkpoint_name(step: int) -> str:
 
 
 def save_checkpoint(
-    folder: Path, step: int, model: nn.Module, adam: torch.optim.Adam, settings: dict[str, Any], keep: int, caution: Caution
+    folder: Path,
+    step: int,
+    model: nn.Module,
+    adam: torch.optim.Adam,
+    settings: dict[str, Any],
+    keep: int,
+    caution: Caution,
+    average: Average | None = None,
 ) -> Path:
     """Write the state after `step` steps, and remove all but the newest `keep` checkpoints.
 
@@ -43,6 +51,7 @@ def save_checkpoint(
         if state:
             tensors[FIRST + name], tensors[SECOND + name] = state["exp_avg"], state["exp_avg_sq"]
             tensors[COUNT + name] = torch.as_tensor(state["step"], dtype=torch.float32).reshape(1)
+    tensors |= {} if average is None else {AVERAGE + name: value for name, value in average.values.items()}
     meta = {"format": FORMAT, "step": str(step), "settings": json.dumps(settings), "caution": json.dumps(caution.to_dict())}
     path = folder / checkpoint_name(step)
     with atomic_path(path) as temporary:
@@ -57,8 +66,8 @@ def checkpoints(folder: Path) -> list[Path]:
     return sorted(folder.glob("checkpoint-*.safetensors"))
 
 
-def load_checkpoint(path: Path, model: nn.Module, adam: torch.optim.Adam) -> int:
-    """Put a checkpoint's state into `model` and `adam`; answers the number of steps taken.
+def load_checkpoint(path: Path, model: nn.Module, adam: torch.optim.Adam, average: Average | None = None) -> int:
+    """Put a checkpoint's state into `model`, `adam` and `average`; answers the number of steps taken.
 
     Raises:
         InputError: not a checkpoint, or one of other networks.
@@ -82,6 +91,8 @@ def load_checkpoint(path: Path, model: nn.Module, adam: torch.optim.Adam) -> int
                 "exp_avg": first.to(parameter.device).clone(),
                 "exp_avg_sq": second.to(parameter.device).clone(),
             }
+        if average is not None:
+            average.load({name[len(AVERAGE) :]: value for name, value in tensors.items() if name.startswith(AVERAGE)})
     except (KeyError, ValueError, RuntimeError) as error:
         raise InputError(f"{path} is not a checkpoint of these networks ({first_line(error)}); start anew in another folder") from error
     return step

@@ -12,6 +12,7 @@ from toolkit.errors import InputError
 from toolkit.networks.model import NerfusionModel
 from toolkit.networks.weights import config_from, load_model, save_model
 from toolkit.progress import SILENT, Progress
+from toolkit.training.nerfusion.average import Average
 from toolkit.training.nerfusion.caution import MOST, Caution, where_not_finite
 from toolkit.training.nerfusion.checkpoint import checkpoints, load_caution, load_checkpoint, save_checkpoint
 from toolkit.training.nerfusion.curve import Curve
@@ -81,6 +82,7 @@ class Trainer:
         self.settings, self.out, self.crew = settings, out, crew
         self.model = make_model(settings).to(crew.device)
         self.adam = torch.optim.Adam(self.model.parameters(), lr=settings.optimiser.rate, betas=BETAS)
+        self.average = Average(self.model, settings.optimiser.average)
         self.mixture = Mixture(settings, crew.rank)
         self.stepper = Stepper(self.model, settings)
         self.curve = Curve(out)
@@ -88,7 +90,7 @@ class Trainer:
         self.step, self.caution = 0, Caution()
         found = checkpoints(out)
         if resume and found:
-            self.step = load_checkpoint(found[-1], self.model, self.adam)
+            self.step = load_checkpoint(found[-1], self.model, self.adam, self.average)
             self.caution = load_caution(found[-1])
             self.curve.load(self.step)
         elif found and crew.leads:
@@ -153,6 +155,7 @@ class Trainer:
             for group in self.adam.param_groups:
                 group["lr"] = rate
             self.adam.step()
+            self.average.update(self.model, step)
             self.caution.well()
         else:
             self._skip(outcome.loss)
@@ -190,7 +193,8 @@ class Trainer:
     def _validate(self) -> None:
         sheet = self.out / f"validation-{self.step:07d}.png"
         levels = self.settings.stage.levels if self.step > self.settings.stage.steps else 1
-        numbers, each = validate(self.model, self.cases, self.crew.device, sheet, self.stepper.prunes(self.step), levels)
+        with self.average.applied(self.model):
+            numbers, each = validate(self.model, self.cases, self.crew.device, sheet, self.stepper.prunes(self.step), levels)
         for name, values in each.items():
             numbers |= {f"{key} {name}": value for key, value in values.items()}
         self.curve.add({"step": float(self.step), **numbers})
@@ -203,7 +207,15 @@ class Trainer:
             OutputError: the folder is not writable.
         """
         save_checkpoint(
-            self.out, self.step, self.model, self.adam, train_settings_dict(self.settings), self.settings.record.keep, self.caution
+            self.out,
+            self.step,
+            self.model,
+            self.adam,
+            train_settings_dict(self.settings),
+            self.settings.record.keep,
+            self.caution,
+            self.average,
         )
-        save_model(self.out / WEIGHTS, self.model, {"steps": self.step})
+        with self.average.applied(self.model):
+            save_model(self.out / WEIGHTS, self.model, {"steps": self.step})
         self.curve.write()
