@@ -121,8 +121,9 @@ def struck(stage: str, number: int, times: int) -> Iterator[None]:
         yield
 
 
-def stop_everywhere(folder: Path, kind: Kind, times: int, first: int = 0) -> list[str]:
-    """Stop a run at each of its stages, SIGINT and SIGTERM in turn (`first` 1: SIGTERM first); what was wrong, at best nothing."""
+def stop_everywhere(folder: Path, kind: Kind, times: int, first: int = 0, only: tuple[str, ...] = ()) -> list[str]:
+    """Stop a run at each of its stages, or at `only` some, SIGINT and SIGTERM in turn (`first` 1: SIGTERM first); what was wrong, at best
+    nothing."""
     source, whole, out = kind.make(folder / "source"), folder / "whole", folder / "out"
     handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     told = fieldfuse("run", source, "--out", whole, *OPTIONS, *kind.options)
@@ -132,6 +133,8 @@ def stop_everywhere(folder: Path, kind: Kind, times: int, first: int = 0) -> lis
     if {path.stem for path in (whole / "stages").glob("*.json")} != set(kind.stages):
         wrong.append(f"the run has other stages: {sorted(path.stem for path in (whole / 'stages').glob('*.json'))}")
     for index, stage in enumerate((*kind.stages, REPORT)):
+        if only and stage not in only:
+            continue
         number = (signal.SIGINT, signal.SIGTERM)[(index + first) % 2]
         with struck(stage, number, times):
             answer = fieldfuse("run", source, "--out", out, *OPTIONS, *kind.options)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 import time
@@ -13,16 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.console import ConsoleProgress
 from pipelines.folder import RunFolder
-from tests.pipelines.made import Answer, call, environment
+from tests.pipelines.made import Answer, environment
 from tests.stability.kills import kill_runs
-from tests.stability.runs import OPTIONS, PATIENCE, ROOT, STAGES, corrupt, differences, launch, leftovers, make_source
+from tests.stability.runs import PATIENCE, ROOT, corrupt, differences, launch, leftovers, make_source
+from tests.stability.stops import KINDS, stop_everywhere
 from tests.stability.writers_more import ELSEWHERE
 from toolkit.config import Settings
-from toolkit.files import read_json
 
-Capsys = pytest.CaptureFixture[str]
 LONG = pytest.mark.timeout(900)  # what takes half a minute alone takes minutes on a busy machine
 
 
@@ -60,43 +57,20 @@ def test_the_comparison_of_folders_notices_changes(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------ signals
 
 
-def struck(monkeypatch: pytest.MonkeyPatch, stage: str, number: int, times: int) -> None:
-    """Send a signal to this process as soon as `stage` begins."""
-
-    def begin(self: ConsoleProgress, name: str) -> None:
-        self.stage = name
-        if name == stage:
-            for _ in range(times):
-                os.kill(os.getpid(), number)
-
-    monkeypatch.setattr(ConsoleProgress, "begin", begin)
-
-
 @LONG
-@pytest.mark.parametrize("times", [1, 2], ids=["once", "twice"])
-def test_signals_at_each_stage(times: int, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("kind", "times", "only"),
+    [("RGB-D", 1, ()), ("RGB-D", 2, ()), ("pictures, from the networks", 2, ("stereo", "network", "direct")), ("video", 1, ("frames",))],
+)
+def test_signals_at_each_stage(kind: str, times: int, only: tuple[str, ...], tmp_path: Path) -> None:
     """One folder is stopped at one stage after the other: each time in a sentence, with whole files, and it goes on from there."""
-    source, out = make_source(tmp_path / "room"), tmp_path / "out"
-    handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
-    for index, stage in enumerate(STAGES):
-        with monkeypatch.context() as patch:
-            struck(patch, stage, (signal.SIGINT, signal.SIGTERM)[(index + times) % 2], times)  # each stage meets both
-            answer = call(capsys, "run", source, "--out", out, *OPTIONS)
-        assert "Traceback" not in answer.err
-        if times == 2 or (stage != "field" and stage != STAGES[-1]):
-            assert answer.code == 130, (stage, answer)
-            assert ("same command again" in answer.err) == (times == 1), (stage, answer)
-        else:  # the fit keeps what it has and the report follows; behind the last stage there is nothing to stop
-            assert answer.code == 0, (stage, answer)
-        assert corrupt(out) == [], stage
-        done = {path.stem for path in (out / "stages").glob("[!.]*.json")} if (out / "stages").exists() else set()
-        assert done >= set(STAGES[:index]) - {"field", "render", "export"}, stage
-    answer = call(capsys, "run", source, "--out", out, *OPTIONS)
-    assert answer.code == 0, answer
-    assert corrupt(out) == [] and leftovers(out) == []
-    assert {path.stem for path in (out / "stages").glob("*.json")} == set(STAGES)
-    assert not any("stopped early" in text for text in read_json(out / "report.json")["warnings"])
-    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
+    assert stop_everywhere(tmp_path, KINDS[kind], times, times % 2, only) == []
+
+
+def test_a_stop_that_is_not_heard_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.stability.stops.os.kill", lambda *_: None)
+    found = stop_everywhere(tmp_path, KINDS["RGB-D"], 1, only=("views",))
+    assert len(found) == 2 and all("SIG" in text for text in found), found  # it ended with 0, and said nothing of going on
 
 
 # ------------------------------------------------------------------------------------------------ disks

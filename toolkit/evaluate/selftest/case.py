@@ -28,6 +28,7 @@ MODULES = (
     "network_fusion",
     "network_sweep",
     "engines",
+    "engines_gradients",
     "place",
     "place_files",
     "cameras",
