@@ -22,26 +22,39 @@ def table(
     ] = None,
 ) -> None:
     """Put measured tables into a Markdown page, between marks, so that no number in it is typed."""
-    from toolkit.errors import InputError
     from toolkit.evaluate.suites.tables import put_between_marks
-    from toolkit.files import read_json
 
-    held = [(path, read_json(path)) for path in files]
+    for title, text in sections(files, name, data):
+        put_between_marks(into, title, text)
+
+
+def sections(files: list[Path], name: str | None, data: Path | None) -> list[tuple[str, str]]:
+    """What `files` hold, as names and Markdown.
+
+    Raises:
+        InputError: a file holds no results, or there is one name for several tables.
+    """
+    from pipelines.kept import ANY, read_kept
+    from toolkit.errors import InputError
+
+    held = [(path, read_kept(path, ANY)) for path in files]
     planned = [found for _, found in held if isinstance(found, dict) and isinstance(found.get("budget"), dict)]
     if planned and len(planned) == len(held):
         from toolkit.evaluate.budget_table import budget_table
 
-        put_between_marks(into, name or "total-budget", _whole(files[0], lambda: budget_table(planned, _commands(planned, data))))
-        return
+        return [(name or "total-budget", _whole(files[0], lambda: budget_table(planned, _commands(planned, data))))]
     if name is not None and len(held) > 1:
         raise InputError(f"--name {name} is for one table, and {len(held)} files are given; leave it out")
+    out = []
     for path, found in held:
         title = name or path.resolve().parent.name
-        put_between_marks(into, title, _whole(path, lambda found=found, title=title: _table(found, title, data)))
+        out.append((title, _whole(path, lambda path=path, found=found, title=title: _table(path, found, title, data))))
+    return out
 
 
-def _table(measured: Any, title: str, data: Path | None) -> str:
+def _table(path: Path, measured: Any, title: str, data: Path | None) -> str:
     """The Markdown of one file's content."""
+    from pipelines.kept import TRADEOFF, fitting
     from toolkit.evaluate.compare_table import compare_table
     from toolkit.evaluate.suites import suite_of
     from toolkit.evaluate.suites.tables import suite_table
@@ -52,7 +65,10 @@ def _table(measured: Any, title: str, data: Path | None) -> str:
     if "methods" in found:
         return compare_table(found, title)
     found["rows"] = list(measured["rows"])
-    return suite_table(suite_of(found["suite"]), found) if "suite" in found else tradeoff_table(tradeoff_data(found), title)
+    if "suite" in found:
+        return suite_table(suite_of(found["suite"]), found)
+    fitting(measured, TRADEOFF, path)
+    return tradeoff_table(tradeoff_data(found), title)
 
 
 def _commands(measured: list[Any], data: Path | None) -> list[str]:
@@ -71,7 +87,7 @@ def _whole(path: Path, make: Any) -> str:
 
     try:
         return str(make())
-    except (KeyError, TypeError, AttributeError) as error:
+    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
         raise InputError(
             f"{path} holds no results of a benchmark or a trade-off ({error}); give results.json, tradeoff.json or compare.json"
         ) from error

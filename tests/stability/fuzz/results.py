@@ -20,7 +20,9 @@ MEASURED = (
     "tradeoff.csv",
     "tradeoff/points/point.json",
     "compare/scores.json",
+    "compare/compare.json",
     "results.json",
+    "report.json",
     "few_views.json",
 )
 PAGE_EVERY = 25  # the whole page takes a hundred times as long as its numbers
@@ -118,7 +120,8 @@ def read_results(root: Path, number: int) -> None:
 
 
 def make_measured(root: Path) -> None:
-    """What `tradeoff`, `compare` and the benchmarks leave."""
+    """What `tradeoff`, `compare`, the benchmarks and runs of a total budget leave."""
+    from toolkit.evaluate.compare import compare_data
     from toolkit.evaluate.suites import SUITES
     from toolkit.evaluate.tradeoff_page import csv_text, tradeoff_data
 
@@ -153,6 +156,15 @@ def make_measured(root: Path) -> None:
         "matching": None,
     }
     write_json(root / "compare" / "scores.json", compared)
+    methods = [
+        {"key": key, "title": key, "score": scores, "geometry": geometry, "stages": [{"stage": "fit", "seconds": 1.0}]} for key in "ab"
+    ]
+    facts = {"methods": methods, "truth": {"seen_share": 0.8}, "matching": None, "machine": machine, "command": "fieldfuse compare room"}
+    write_json(root / "compare" / "compare.json", compare_data(facts))
+    choice = {"image_size": 240, "fit_seconds": 12.5, "resolution": 256, "video_frames": 9, "effects": True}
+    told = {"asked_seconds": 60, "predicted_seconds": 58.0, "real_seconds": 63.0, "stages": {"effects": {"real": 5.0}}, "choice": choice}
+    report = {"source": "/data/lego", "budget": told, "evaluation": {"field": {"psnr": 27.25}}, "command": "fieldfuse run lego"}
+    write_json(root / "report.json", report)
     suite = next(iter(SUITES.values()))
     row = {"scene": "lego", "variant": suite.variants[0].key, "width": 9, "height": 9, "train": 8, "test": 2, "psnr": 20.0, "ssim": 0.8,
            "lpips": 0.2, "fit_seconds": 1.0, "seconds": 2.0, "voxels": 10, "error": None}  # fmt: skip
@@ -167,7 +179,7 @@ def make_measured(root: Path) -> None:
 def read_measured(root: Path, number: int) -> None:
     """What the commands that go on from them, or show them, make of each; the worker judges the first that fails."""
     from pipelines import kept
-    from pipelines.bench_suite import measured_text
+    from pipelines.bench_table import sections
     from pipelines.tradeoff_sweep import rows_at
     from toolkit.evaluate.compare import compare_data
     from toolkit.evaluate.compare_text import comparison_text
@@ -183,8 +195,10 @@ def read_measured(root: Path, number: int) -> None:
         comparison_text(compare_data({"methods": methods, "truth": {"seen_share": found["seen_share"]}, "matching": found["matching"]}))
 
     readers: tuple[Callable[[], Any], ...] = (
-        lambda: measured_text(root / "tradeoff.json", "a", None),
-        lambda: measured_text(root / "results.json", "a", None),
+        lambda: sections([root / "tradeoff.json"], None, None),
+        lambda: sections([root / "results.json"], None, None),
+        lambda: sections([root / "compare" / "compare.json"], None, None),
+        lambda: sections([root / "report.json"], None, None),
         lambda: tradeoff_data({"rows": rows_at(root / "tradeoff" / "points" / "point.json", "abc") or []}),
         lambda: few_views_table(kept.read_kept(root / "few_views.json", kept.FEW_VIEWS)["rows"]),
         compared,
