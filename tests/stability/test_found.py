@@ -11,6 +11,7 @@ import trimesh
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
+from pipelines.bench_table import sections
 from pipelines.console import ConsoleProgress
 from pipelines.folder import RunFolder
 from pipelines.stages import Stages
@@ -20,8 +21,10 @@ from toolkit.config import load_settings
 from toolkit.effects.correct import Corrections
 from toolkit.errors import InputError
 from toolkit.evaluate.selftest.edit import small_field
+from toolkit.evaluate.selftest.fits import scene_of
 from toolkit.export.mesh import mesh_facts
 from toolkit.files import read_json, write_json
+from toolkit.poses.scene import Scene
 from toolkit.render.bake import bake
 from toolkit.render.bake_file import METADATA_KEY, read_baked, write_baked
 from toolkit.simulate.settings import read_scene_file
@@ -101,3 +104,35 @@ def test_a_stage_whose_file_rounds_answers_what_the_file_holds(tmp_path: Path) -
         plain = stages.run("plain", lambda: 1 / 3, save, lambda: read_json(kept))
         assert plain == 1 / 3
         assert stages.run("rounded", lambda: 1 / 3, save, lambda: read_json(kept), rounded=True) == 0.3333333
+
+
+def test_a_scene_between_no_depths() -> None:
+    """The plane sweep divides by the step from plane to plane, and said NaN."""
+    data = scene_of().to_dict()
+    assert Scene.from_dict(data).far == data["far"]
+    for near, far in ((2.0, 2.0), (3.0, 2.0), (-1.0, 2.0), (float("nan"), 2.0), (1.0, float("nan"))):
+        with pytest.raises(InputError, match=r"scene\.json is not .*depths from"):
+            Scene.from_dict({**data, "near": near, "far": far})
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        {
+            "budget": {"asked_seconds": 1, "predicted_seconds": 0.0, "real_seconds": 1, "stages": {}, "choice": {}},
+            "source": "a",
+            "command": "b",
+        },
+        {"rows": [{"psnr": 10**400}], "command": "a"},
+        {"rows": [{"id": "a", "method": "field"}], "command": "a", "unit": None, "machine": {}},
+        {"methods": [{"key": "a", "stages": [1]}], "command": "a"},
+        {"suite": "llff", "rows": [1], "command": "a"},
+        [],
+    ],
+)
+def test_measurements_that_are_none(damaged: object, tmp_path: Path) -> None:
+    path = tmp_path / "results.json"
+    path.write_text(json.dumps(damaged))
+    with pytest.raises(InputError) as told:
+        sections([path], None, None)
+    assert str(path) in str(told.value) or "damaged" in str(told.value) or "methods" in str(told.value)

@@ -68,6 +68,8 @@ class Scene:
             InputError: the data does not hold what `to_dict` writes.
         """
         try:
+            if not 0 <= float(data["near"]) < float(data["far"]):
+                raise ValueError(f"depths from {data['near']} to {data['far']}")
             return cls(
                 working_from_input=Similarity.from_dict(data["working_from_input"]),
                 centre=np.array(data["centre"], dtype=np.float64).reshape(3),
