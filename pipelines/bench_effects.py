@@ -19,6 +19,9 @@ def effects(
     against_all_on: Annotated[
         bool, typer.Option("--against-all-on", help="Fit captures with what was found, and with all effects on.")
     ] = False,
+    against_all_off: Annotated[
+        bool, typer.Option("--against-all-off", help="Fit captures with what was found, and with all effects off.")
+    ] = False,
     every: Annotated[int, typer.Option(min=1, help="Of the captures, every so manieth is fitted.")] = 2,
     seconds: Annotated[float, typer.Option(min=0.5, help="Processor seconds of each fit.")] = 3.0,
     quiet: Quiet = False,
@@ -35,13 +38,14 @@ def effects(
     progress = make_progress(quiet)
     began = time.monotonic()
     planned = plan(FIRST_SEED if first_seed is None else first_seed)
+    against = [mode for mode, wanted in (("all_off", against_all_off), ("all_on", against_all_on)) if wanted]
     data: dict[str, Any]
     with progress.listening():
         progress.begin("effects")
-        if against_all_on:
+        if against:
             from toolkit.evaluate.effects_fits import compared
 
-            data = compared(planned[::every], folder, seconds, progress)
+            data = compared(planned[::every], folder, seconds, against, progress)
         else:
             looked = look_at(planned, folder, progress)
             data = {**confusion(looked), "each": [one.to_dict() for one in looked]}
@@ -49,7 +53,7 @@ def effects(
     if to is not None:
         write_json(to, data)
     if not quiet:
-        for line in fits_table(data) if against_all_on else table(data):
+        for line in fits_table(data) if against else table(data):
             typer.echo(line)
 
 
@@ -68,10 +72,12 @@ def table(data: dict[str, Any]) -> list[str]:
 
 
 def fits_table(data: dict[str, Any]) -> list[str]:
-    """Each capture's scores with what was found and with all on, as lines of Markdown, and their means."""
-    head = ("capture", "found", "auto, dB", "all on, dB", "auto, corrected", "all on, corrected", "auto, seconds", "all on, seconds")
+    """Each capture's scores in each mode as lines of Markdown, and their means."""
+    modes = data["modes"]
+    told = (("psnr", "dB"), ("psnr_corrected", "dB, corrected"), ("seconds", "s"))
+    head = ["capture", "found", *(f"{mode.replace('_', ' ')}, {unit}" for _, unit in told for mode in modes)]
     out = [f"| {' | '.join(head)} |", "|" + " --- |" * len(head)]
     for one in [*data["each"], {"name": "mean", "found": [], **data["mean"]}]:
-        cells = [f"{one[mode][key]:.2f}" for key in ("psnr", "psnr_corrected", "seconds") for mode in ("auto", "all_on")]
+        cells = [f"{one[mode][key]:.2f}" for key, _ in told for mode in modes]
         out.append(f"| {one['name']} | {', '.join(one['found'])} | {' | '.join(cells)} |")
     return out

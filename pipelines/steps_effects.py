@@ -17,6 +17,11 @@ if TYPE_CHECKING:
     from toolkit.poses.result import PoseResult
 
 NAME = "effects.json"
+SEES = {
+    "none": "colours do not hang on the direction of view",
+    "low": "colours hang on the direction of view in first order",
+    "full": "colours hang on the direction of view",
+}
 
 
 def find_effects(job: Job, posed: Capture) -> Corrections:
@@ -51,7 +56,7 @@ def find_effects(job: Job, posed: Capture) -> Corrections:
         after=["poses"],
     )
     corrections = Corrections.from_dict(data.get("corrections", {}) if isinstance(data, dict) else {})
-    choose_field(field, data["effects"])
+    choose_field(field, data["effects"], settings.off)
     return corrections
 
 
@@ -73,8 +78,11 @@ def effects_part(job: Job, background: bool | None) -> dict[str, Any] | None:
     if "effects" not in job.stages.records:
         return None
     data = read_kept(job.folder / NAME, EFFECTS)
-    effects = data["effects"]
+    effects, view = data["effects"], job.settings.field.view
     for entry in effects:
+        if entry["effect"] == "view_dependence" and view != "auto":
+            entry["on"] = view != "none"
+            entry["note"] = f"{SEES[view]}: field.view={view}"
         if entry["effect"] == "background" and background is not None:
             entry["on"] = background
             entry["note"] = "space beyond the region of interest is modelled" if background else "nothing beyond the region is modelled"

@@ -37,9 +37,9 @@ def colours(decoder: Deferred | PerSample, directions: torch.Tensor) -> torch.Te
 @pytest.mark.parametrize("kind", ["deferred", "per_sample"])
 def test_a_fit_does_not_learn_what_it_may_not_see(engine: str, kind: str) -> None:
     views, around = sphere_views(8), torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    looks = count()  # a clock that stands still but for being looked at: as many steps on any machine
     for view in ("none", "low", "full"):
         settings = wanted("budget=1", f"engine={engine}", f"field.decoder={kind}", f"field.view={view}", "field.resolution=32")
-        looks = count()  # a clock that stands still but for being looked at: as many steps on any machine
         fitted = fit_field(views, scene(), settings, ticks=lambda: 0.02 * next(looks))
         decoder = fitted.field.decoder
         assert fitted.steps > 5
@@ -62,8 +62,12 @@ def test_effects_choose_what_is_left_to_them_alone() -> None:
     choose_field(missed, [entry("view_dependence", False), entry("background", False)])
     assert missed.view in ("low", "full") and missed.background == "auto"
     off = FieldSettings()
-    choose_field(off, [entry("view_dependence", False, "off"), entry("background", False, "off")])
+    named = [entry("view_dependence", False, "off"), entry("background", False, "off")]
+    choose_field(off, named, ["view_dependence", "background"])
     assert (off.view, off.background) == ("none", "off")
+    unasked = FieldSettings()  # effects=off with some that are on: as if nothing had been looked for
+    choose_field(unasked, named)
+    assert (unasked.view, unasked.background) == ("full", "auto")
     own = FieldSettings(view="low", background="off")
     choose_field(own, [entry("view_dependence", True), entry("background", True)])
     assert (own.view, own.background) == ("low", "off")

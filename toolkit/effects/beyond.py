@@ -106,20 +106,20 @@ def _look(seen: Sightings, problem: Problem, near: float, one: int, others: Arra
     # A patch is carried by its middle and one step across and down; between them the way is taken as even.
     middle = pixels[:, pixels.shape[1] // 2]
     around = pixels[0] - middle[0]  # (K, 2)
-    rays = _rays(seen, problem, one, (middle[:, None] + CROSS).reshape(-1, 2)).reshape(len(middle), 3, 3)
+    rays = rays_of(seen, problem, one, (middle[:, None] + CROSS).reshape(-1, 2)).reshape(len(middle), 3, 3)
 
-    def carried(other: int, some: Array, nearness: float) -> Array:
+    def patches(other: int, some: Array, nearness: float) -> Array:
         """(n, K, 2) working pixels of picture `other` for patches with rays (n, 3, 3)."""
-        to = _carried(seen, problem, one, other, some.reshape(-1, 3), nearness).reshape(len(some), 3, 2)
+        to = carried(seen, problem, one, other, some.reshape(-1, 3), nearness).reshape(len(some), 3, 2)
         across, down = (to[:, 1] - to[:, 0]) / HALF, (to[:, 2] - to[:, 0]) / HALF
         return np.asarray(to[:, :1] + around[:, :1] * across[:, None] + around[:, 1:] * down[:, None])
 
     fit = np.arange(len(others)) % 2 == 0
     infinity, alike = np.full((len(others), len(pixels)), np.nan), np.full((len(others), len(pixels)), np.nan)
     for k, other in enumerate(others):
-        there = carried(int(other), rays, 0.0)
+        there = patches(int(other), rays, 0.0)
         infinity[k] = _difference(picture(int(other)), there, patch)
-        moved = pixels + (_carried(seen, problem, one, int(other), rays[:, 0], near) - there[:, there.shape[1] // 2])[:, None]
+        moved = pixels + (carried(seen, problem, one, int(other), rays[:, 0], near) - there[:, there.shape[1] // 2])[:, None]
         alike[k] = np.where(np.isfinite(infinity[k]), _difference(own, moved, patch), np.nan)
     variance = (patch**2).mean(1)
     enough = (np.isfinite(infinity[fit]).sum(0) >= 2) & (np.isfinite(infinity[~fit]).sum(0) >= 2)
@@ -131,7 +131,7 @@ def _look(seen: Sightings, problem: Problem, near: float, one: int, others: Arra
     errors = np.full((len(STEPS), len(others), len(maybe)), np.nan)
     for k, other in enumerate(others):
         for n, step in enumerate(STEPS):
-            errors[n, k] = _difference(picture(int(other)), carried(int(other), rays[maybe], float(step) * near), patch[maybe])
+            errors[n, k] = _difference(picture(int(other)), patches(int(other), rays[maybe], float(step) * near), patch[maybe])
     nearer_fit = np.stack([_middle(error[fit]) for error in errors])
     nearer_fit = np.where(np.isfinite(nearer_fit), nearer_fit, np.inf)
     best = nearer_fit.argmin(0)
@@ -171,7 +171,7 @@ def _patches(own: Array) -> tuple[Array, Array]:
     return pixels.astype(np.float64), patch - patch.mean(1, keepdims=True) if len(patch) else patch
 
 
-def _rays(seen: Sightings, problem: Problem, one: int, pixels: Array) -> Array:
+def rays_of(seen: Sightings, problem: Problem, one: int, pixels: Array) -> Array:
     """(N, 3) directions in camera axes of working pixels, by the lens and rows that were found."""
     camera = seen.cameras[one]
     pixel = (pixels + 0.5) / seen.scale[one]
@@ -185,8 +185,8 @@ def _rays(seen: Sightings, problem: Problem, one: int, pixels: Array) -> Array:
     return rays + (pixel[:, 1:] / camera.height - 0.5) * np.cross(turn, rays) if turn.any() else rays
 
 
-def _carried(seen: Sightings, problem: Problem, one: int, other: int, rays: Array, nearness: float) -> Array:
-    """(N, 2) working pixels of picture `other` that show what lies on rays (N, 3) of picture `one` at the inverse depth `nearness`."""
+def carried(seen: Sightings, problem: Problem, one: int, other: int, rays: Array, nearness: float | Array) -> Array:
+    """(N, 2) working pixels of picture `other` that show what lies on rays (N, 3) of picture `one` at an inverse depth, one or (N, 1)."""
     camera, first, second = seen.cameras[other], problem.poses[one], problem.poses[other]
     there = rays @ (second[:3, :3].T @ first[:3, :3]).T + nearness * (second[:3, :3].T @ (first[:3, 3] - second[:3, 3]))
     motion = problem.motion[other]

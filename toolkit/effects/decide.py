@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,13 +96,17 @@ def decide(capture: Capture, test: Array, settings: EffectsSettings, progress: P
     return Decided(tuple(decisions), corrections, time.monotonic() - began, found.facts)
 
 
-def choose_field(field: FieldSettings, effects: list[dict[str, Any]]) -> None:
-    """Set what is left to `auto` in `field` by the decisions (as in `Decision.to_dict`); the scene decides on a background not found."""
+def choose_field(field: FieldSettings, effects: list[dict[str, Any]], off: Sequence[str] = ()) -> None:
+    """Set what is left to `auto` in `field` by the decisions (as in `Decision.to_dict`); the scene decides on a background not found.
+
+    Args:
+        off: effects that are off by name. (That nothing is to be corrected, `effects.mode=off`, says nothing about the field.)
+    """
     for entry in effects:
-        wished = entry["wish"]
-        if entry["effect"] == VIEWS and field.view == "auto":
-            field.view = "full" if entry["on"] else "none" if wished == "off" else PLAIN_VIEW
-        if entry["effect"] == FAR and field.background == "auto" and (entry["on"] or wished == "off"):
+        name, unwanted = entry["effect"], entry["effect"] in off
+        if name == VIEWS and field.view == "auto":
+            field.view = "full" if entry["on"] or entry["wish"] == "off" and not unwanted else "none" if unwanted else PLAIN_VIEW
+        if name == FAR and field.background == "auto" and (entry["on"] or unwanted):
             field.background = "on" if entry["on"] else "off"
 
 

@@ -15,7 +15,7 @@ MOST_POINTS = 1600  # that take part
 HELD_OUT = 4  # every so manieth point is kept out of the fits
 FEWEST = 60  # points without which nothing is told
 OUTLIER = 6.0  # deviations of a point's worst observation beyond which it is taken for a wrong match, once nothing explains it
-MARGIN = {LENS: 0.08, POSES: 0.25, ROWS: 0.15}  # least relative fall of the held-out residual, larger for what has more numbers
+MARGIN = {LENS: 0.08, POSES: 0.4, ROWS: 0.15}  # least relative fall of the held-out residual, larger for what has more numbers
 LEAST = 0.003  # working pixels by which it has to fall at least
 
 

@@ -42,18 +42,32 @@ def forward(pictures: list[Tensor]) -> Tensor:
     return total / len(pictures)
 
 
-THRESHOLD = 0.041  # factors of two of the slopes' energy
+THRESHOLD = 0.033  # factors of two of the slopes' energy
 BLURRED = -0.7  # factors of two below the others: such a frame is worth less than it costs
 FEWEST = 100
 DARKEST, BRIGHTEST = 0.02, 0.6  # linear light of a patch: noise and clipping change slopes too, and exposure decides how much
 TREND = 8  # frames from which on a slow trend is told from blur, which comes and goes
 
 
+def _sharpness(energy: Array, distance: Array, frame: Array, point: Array, frames: int) -> tuple[Array, Array, Array]:
+    """(frames,) factors of two of each frame's sharpness, and (O,) the weights of observations and what they leave."""
+    tracks = Tracks(np.zeros((len(frame), 3)), frame, point, np.zeros(len(frame)))
+    weight, constants, left = np.ones(len(frame)), np.zeros((frames, 1)), energy[:, None]
+    for _ in range(ROUNDS):
+        plain, _ = without_points_and_frames(np.stack([energy, distance], axis=1), tracks, weight, frames)
+        bend = float((weight * plain[:, 1] ** 2).sum())
+        power = float((weight * plain[:, 0] * plain[:, 1]).sum()) / bend if bend > 1e-9 else 0.0
+        left, constants = without_points_and_frames((energy - power * distance)[:, None], tracks, weight, frames)
+        weight, _ = robust(left[:, 0])
+    return constants[:, 0], weight, left[:, 0]
+
+
 def evidence(slope: Array, depth: Array, frame: Array, point: Array, frames: int, linear: Array | None = None) -> Evidence:
     """Whether the same points are sharper in some frames than in others.
 
     The slopes' energy at an observation is the point's own, times the frame's sharpness, times a power of the depth (from nearby, slopes a
-    pixel are gentler). Slow trends over the frames are no blur of a moving camera and are taken out.
+    pixel are gentler). Slow trends over the frames are no blur of a moving camera: they are taken out, and the number is no larger than what
+    two halves of the points agree on of how frames differ from their neighbours.
 
     Args:
         slope: (O,) mean square of the slopes of log light round the observation. depth: (O,) along z. frame, point: (O,).
@@ -68,29 +82,28 @@ def evidence(slope: Array, depth: Array, frame: Array, point: Array, frames: int
     if int(used.sum()) < FEWEST or len(np.unique(frame[used])) < TREND:
         return Evidence("motion_blur", 0.0, THRESHOLD, "too few points are shared between pictures to compare their sharpness")
     number = np.unique(point[used], return_inverse=True)[1]
-    tracks = Tracks(np.zeros((int(used.sum()), 3)), frame[used], number, np.zeros(int(used.sum())))
-    energy, distance = np.log2(slope[used])[:, None], np.log2(depth[used])[:, None]
-    weight, constants, left = np.ones(len(number)), np.zeros((frames, 1)), energy
-    for _ in range(ROUNDS):
-        plain, _ = without_points_and_frames(np.concatenate([energy, distance], axis=1), tracks, weight, frames)
-        bend = float((weight * plain[:, 1] ** 2).sum())
-        power = float((weight * plain[:, 0] * plain[:, 1]).sum()) / bend if bend > 1e-9 else 0.0
-        left, constants = without_points_and_frames(energy - power * distance, tracks, weight, frames)
-        weight, _ = robust(left[:, 0])
-    seen = np.bincount(tracks.frame, weight, frames)
+    every, energy, distance = frame[used], np.log2(slope[used]), np.log2(depth[used])
+    constants, weight, left = _sharpness(energy, distance, every, number, frames)
+    seen = np.bincount(every, weight, frames)
     told = seen > 0
-    values = constants[told, 0]
+    values = constants[told]
     steps = np.linspace(-1, 1, len(values))
     values = values - np.polynomial.Polynomial.fit(steps, values, 2)(steps)
-    chance = float((float((weight * left[:, 0] ** 2).sum() / weight.sum()) / np.maximum(seen[told], 1)).mean())
+    chance = float((float((weight * left**2).sum() / weight.sum()) / np.maximum(seen[told], 1)).mean())
     deviation = float(np.sqrt(max(float(np.mean(values**2)) - chance, 0.0)))
+    halves = []
+    for half in (number % 2 == 0, number % 2 == 1):
+        halves.append(_sharpness(energy[half], distance[half], every[half], np.unique(number[half], return_inverse=True)[1], frames)[0])
+    jumps = [one[1:-1] - 0.5 * (one[2:] + one[:-2]) for one in halves]
+    agreed = float(np.sqrt(max(float(np.mean(jumps[0] * jumps[1])), 0.0) / 1.5))  # 1.5: of independent frames, what such jumps add up to
+    deviation = min(deviation, agreed)
     sharpness = np.zeros(frames)
     sharpness[told] = values
     return Evidence(
         "motion_blur",
         deviation,
         THRESHOLD,
-        f"the slopes of the same points differ in energy by {deviation:.2f} factors of two (deviation over frames); "
+        f"the slopes of the same points differ in energy by {deviation:.3f} factors of two (deviation over frames); "
         f"{THRESHOLD:g} or more speak for frames that are blurred by motion or focus",
         {"sharpness": sharpness.tolist()},
     )

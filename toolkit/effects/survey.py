@@ -10,7 +10,7 @@ import numpy as np
 
 from toolkit.camera import Array
 from toolkit.capture.types import Capture
-from toolkit.effects import background, beyond, geometry, light, motion_blur, view_dependence
+from toolkit.effects import background, beyond, geometry, light, motion_blur, sheen, view_dependence
 from toolkit.effects.adjust import LENS, POSES, ROWS, Problem, predict
 from toolkit.effects.evidence import Evidence
 from toolkit.effects.light import EXPOSURE, VIGNETTING
@@ -52,7 +52,10 @@ class Finding:
             "reason": self.reason,
         }
         if self.before is not None and self.after is not None:
-            out["held_out"] = {"before": round(float(self.before), 4), "after": round(float(self.after), 4), "unit": self.unit}
+            before, after = float(self.before), float(self.after)
+            out["held_out"] = {"before": round(before, 4), "after": round(after, 4), "unit": self.unit}
+            if before > 0 and after > 0:
+                out["held_out"]["decibels"] = round(20 * float(np.log10(before / after)), 2)
         return out
 
 
@@ -125,20 +128,14 @@ def look(seen: Sightings, began: float | None = None) -> Survey:
     kept = seen.where(mine)
     # `where` drops points that are left with one observation; the problem has none of these, so both number alike.
     found = light.explain(kept.tracks(), frames)
-    flat = found.canonical(kept.tracks())
-    left, use = light.left_over(flat, frames)
-    place = kept.pixel * kept.scale[kept.frame][:, None]
-    dependence = view_dependence.evidence(left[use], kept.frame[use], place[use])
-    depth = np.zeros(len(kept.frame))
-    order = np.argsort(explained.observation, kind="stable")
-    depth[:] = predict(explained.problem)[0][order, 2]
+    depth = predict(explained.problem)[0][np.argsort(explained.observation, kind="stable"), 2]
     blur = motion_blur.evidence(kept.slope[:, 0] + kept.slope[:, 2], depth, kept.frame, kept.point, frames, kept.linear)
     usual = float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
     findings = {
         **{name: _of_light(found, name) for name in (EXPOSURE, VIGNETTING)},
         LENS: _lens(explained),
         ROWS: _rows(explained, seen),
-        VIEWS: _plain(dependence),
+        VIEWS: _views(kept, explained.problem, depth, found),
         FAR: _far(seen, explained.problem, usual),
         BLUR: _plain(blur),
         POSES: _poses(explained),
@@ -190,6 +187,17 @@ def _poses(found: geometry.Explained) -> Finding:
         f"{100 * _gain(choice):.0f}% less"
     )
     return Finding(POSES, max(_gain(choice), 0.0), geometry.MARGIN[POSES], reason, choice.kept, choice.before, choice.after, PIXELS)
+
+
+def _views(kept: Sightings, problem: Problem, depth: Array, found: light.Light) -> Finding:
+    """By patches of the pictures; without pictures by points alone."""
+    if kept.pictures:
+        said = sheen.shiny(kept, problem, depth, found)
+        number, threshold, reason = said.evidence.number, said.evidence.threshold, said.evidence.reason
+        return Finding(VIEWS, number, threshold, reason, said.found, said.before, said.after, "stops")
+    left, use = light.left_over(found.canonical(kept.tracks()), len(kept.names))
+    place = kept.pixel * kept.scale[kept.frame][:, None]
+    return _plain(view_dependence.evidence(left[use], kept.frame[use], place[use]))
 
 
 def _far(seen: Sightings, problem: Problem, usual: float) -> Finding:

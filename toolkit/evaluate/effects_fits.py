@@ -6,7 +6,7 @@ Seconds are of the processor, so that other work on the machine does not blur th
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,7 @@ def fit_with(capture: Capture, settings: Settings, progress: Progress = SILENT) 
     if not asleep(settings.effects):
         decided = decide(capture, test, settings.effects, progress)
         corrections, on = decided.corrections, [one.finding.effect for one in decided.decisions if one.on]
-        choose_field(settings.field, decided.to_dict()["effects"])
+        choose_field(settings.field, decided.to_dict()["effects"], settings.effects.off)
     looked = time.process_time() - began
     posed = corrections.on_capture(capture)
     scene = describe_scene(posed, progress)
@@ -70,29 +70,34 @@ def fit_with(capture: Capture, settings: Settings, progress: Progress = SILENT) 
 
 MODES: dict[str, list[str]] = {
     "auto": ["effects=auto"],
+    "all_off": ["effects=off"],
     "all_on": ["effects.on=[exposure,vignetting,distortion,poses,motion_blur,view_dependence,background]"],
 }
 SHOWN = ("psnr", "psnr_corrected", "effects_seconds", "seconds")
 
 
-def compared(planned: Iterable[Planned], folder: Path, seconds: float, progress: Progress = SILENT) -> dict[str, Any]:
-    """Fit each capture with what was found (`auto`) and with every correction on (`all_on`), `seconds` of the processor each.
+def compared(
+    planned: Iterable[Planned], folder: Path, seconds: float, against: Sequence[str] = ("all_on",), progress: Progress = SILENT
+) -> dict[str, Any]:
+    """Fit each capture with what was found (`auto`) and with each mode of `against` (of `MODES`), `seconds` of the processor each.
 
     Returns:
-        `each` capture with its `found` effects and what `fit_with` says of both, and the `mean` of `SHOWN`.
+        `each` capture with its `found` effects and what `fit_with` says of every mode, and the `mean` of `SHOWN`.
     """
+    modes = ("auto", *against)
     todo, each = list(planned), []
     for number, one in enumerate(todo):
         progress.check()
         progress.update(number, len(todo), one.name)
         capture = open_capture(film(one, folder))
         fits = {}
-        for mode, pairs in MODES.items():
+        for mode in modes:
             fixed = [f"budget={seconds}", "field.init=classical", "threads=1", "device=cpu"]
-            fits[mode] = fit_with(capture, load_settings(pairs=[*pairs, *fixed]), progress)
+            fits[mode] = fit_with(capture, load_settings(pairs=[*MODES[mode], *fixed]), progress)
         each.append({"name": one.name, "found": fits["auto"]["on"], **fits})
     return {
         "each": each,
+        "modes": modes,
         "budget": seconds,
-        "mean": {mode: {key: float(np.mean([one[mode][key] for one in each])) for key in SHOWN} for mode in MODES},
+        "mean": {mode: {key: float(np.mean([one[mode][key] for one in each])) for key in SHOWN} for mode in modes},
     }

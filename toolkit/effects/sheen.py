@@ -1,0 +1,212 @@
+"""View dependence between the points: patches that one picture shows brighter than others show the same surface.
+
+A highlight is small, wanders, and seldom lies where features do. So one patch a cell of picture r is carried into other pictures s by the
+plane through the points round it. With P the patch's log light without its mean, and l the logarithm of its mean light,
+
+    d_s = l_r − l_s − median of the same over all patches of r in s,     told where  mean (P_s − P_r)² < SAME · mean P_r² + NOISE
+
+so the texture has to agree while the light may differ, and exposure drops out. A patch's excess is the median of d_s over the pictures s. It
+is *shiny* when at least three quarters of the patches round it are BRIGHTER: what noise, edges and wrong planes do is not alike over an
+area. Half of the pictures s predict, from the patches round each shiny one, what the other half sees.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from toolkit.camera import Array
+from toolkit.effects.adjust import Problem
+from toolkit.effects.beyond import carried, rays_of
+from toolkit.effects.evidence import Evidence
+from toolkit.effects.light import EXPOSURE, VIGNETTING, Light
+from toolkit.effects.sightings import LINEAR, Sightings
+from toolkit.effects.vignetting import Vignetting, falloff
+
+THRESHOLD = 0.0014  # share of the patches
+LEAST = 3  # shiny ones
+FEWEST = 150  # patches
+BRIGHTER = 0.1  # stops
+GAIN = 0.2  # least relative fall of the held-out error
+REFERENCES, OTHERS = 16, 8  # pictures whose patches are looked at, and in how many others each
+TURN = 40.0  # degrees between the axes of pictures that are compared
+HALF, CELL = 3, 10  # working pixels: half a patch, and one patch a cell
+BLUR = 1.0  # working pixels: planes and poses are a little off
+SAME, NOISE = 0.4, 0.0012  # of the patch's variance, and squared stops
+STIFF = 0.01  # squared stops a pixel, over a patch: what keeps a patch without texture where its plane puts it
+FARTHEST = 2.0  # working pixels that a patch may be moved for its texture to agree
+ZOOM = 1.4  # most that a patch may be larger or smaller: blur takes light over the edges of what is small
+DARKEST, CLIPPED = 24, 200  # stored grey: noise below; beyond, a channel may have lost light that darker pictures show
+NEAREST, FLAT, REACH = 7, 0.02, 45.0  # points that make a plane, their relative error, and how far off the third of them may be
+VIEWS = 3  # others that show a patch
+
+
+@dataclass(frozen=True)
+class Shiny:
+    """What patches say: the evidence, and what shiny ones in held-out pictures are off, in stops, unpredicted and predicted."""
+
+    evidence: Evidence
+    before: float | None = None
+    after: float | None = None
+
+    @property
+    def found(self) -> bool:
+        return self.evidence.found and self.before is not None and self.after is not None and self.after < (1 - GAIN) * self.before
+
+
+@dataclass(frozen=True)
+class _Picture:
+    log: Array  # (h, w) log₂ light, a little blurred
+    dark: Array  # (h, w) darkest stored value round a pixel
+    bright: Array
+
+
+def shiny(seen: Sightings, problem: Problem, depth: Array, found: Light) -> Shiny:
+    """Look at patches of some pictures in others.
+
+    Args:
+        seen: the observations that `problem` explains. depth: (O,) along z, of each of them.
+        found: what is known about light; vignetting that is there is taken out.
+    """
+    count = len(seen.pictures)
+    uneven = EXPOSURE in found.kept or VIGNETTING in found.kept
+    pictures = [_picture(seen, index, found) for index in range(count)]
+    total, hits, errors = 0, 0, np.zeros((0, 2))
+    for one in np.unique(np.linspace(0, count - 1, min(REFERENCES, count)).round().astype(int)) if count else ():
+        excess = _excess(seen, problem, depth, pictures, int(one), uneven)
+        if excess is None:
+            continue
+        least, _, told = _around(excess[0])
+        hit = told & (least > BRIGHTER)
+        _, expected, _ = _around(excess[1])
+        off = np.stack([np.abs(excess[2][hit]), np.abs(excess[2][hit] - expected[hit])], axis=1)
+        total, hits, errors = total + int(told.sum()), hits + int(hit.sum()), np.concatenate([errors, off])
+    share = hits / total if total >= FEWEST and hits >= LEAST else 0.0
+    errors = errors[np.isfinite(errors).all(1)]
+    before, after = (float(value) for value in np.median(errors, axis=0)) if len(errors) else (None, None)
+    reason = (
+        f"{100 * share:.2f}% of the patches lie in areas that one picture shows more than {BRIGHTER:g} stops brighter than others show the "
+        f"same surface; {100 * THRESHOLD:.2f}% or more speak for highlights or reflections"
+    )
+    return Shiny(Evidence("view_dependence", share, THRESHOLD, reason), before, after)
+
+
+def _picture(seen: Sightings, index: int, found: Light) -> _Picture:
+    grey, camera = seen.pictures[index], seen.cameras[index]
+    light = np.maximum(LINEAR[grey], LINEAR[8])
+    if VIGNETTING in found.kept:
+        x = (np.arange(grey.shape[1]) + 0.5) / seen.scale[index] - camera.cx
+        y = (np.arange(grey.shape[0]) + 0.5) / seen.scale[index] - camera.cy
+        radius = np.hypot(x[None], y[:, None]) / (0.5 * np.hypot(camera.width, camera.height))
+        light = light / falloff(Vignetting(found.corner), torch.from_numpy(radius)).numpy()
+    log = np.log2(cv2.GaussianBlur(light, (0, 0), BLUR))
+    square = np.ones((2 * HALF + 1, 2 * HALF + 1), np.uint8)
+    return _Picture(log.astype(np.float32), cv2.erode(grey, square), cv2.dilate(grey, square))
+
+
+def _excess(seen: Sightings, problem: Problem, depth: Array, pictures: list[_Picture], one: int, uneven: bool) -> Array | None:
+    """(3, rows, columns) stops by which patches of picture `one` are brighter than others show them: by all others, by every second, and by
+    the rest. NaN: not told. None: there is nothing to compare."""
+    own, mine = pictures[one], seen.frame == one
+    height, width = own.log.shape
+    rows, columns = np.arange(CELL // 2, height - HALF - 1, CELL), np.arange(CELL // 2, width - HALF - 1, CELL)
+    middle = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    place = seen.pixel[mine] * seen.scale[one] - 0.5
+    others = _others(problem.poses, one)
+    if len(place) < NEAREST or len(others) < VIEWS:
+        return None
+    nearness = _nearness(place, 1 / depth[mine], middle)
+    some = np.flatnonzero(np.isfinite(nearness))
+    corner = np.array([[0, 0], [HALF, 0], [0, HALF]])
+    rays = rays_of(seen, problem, one, (middle[some][:, None] + corner).reshape(-1, 2).astype(np.float64))
+    steps = np.arange(-HALF, HALF + 1)
+    around = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    column, row = (middle[some][:, None] + around).transpose(2, 0, 1)
+    texture, light = _split(own.log[row, column])
+    slope = np.stack([cv2.Sobel(own.log, cv2.CV_32F, *order, scale=0.125)[row, column] for order in ((1, 0), (0, 1))], axis=2)
+    slope -= slope.mean(1, keepdims=True)
+    steer = np.linalg.inv(np.einsum("nka,nkb->nab", slope, slope) + STIFF * np.eye(2))
+    able = own.dark[row[:, 0] + HALF, column[:, 0] + HALF] > DARKEST
+    if uneven:
+        able &= own.bright[row[:, 0] + HALF, column[:, 0] + HALF] < CLIPPED
+    excess = np.full((len(others), len(some)), np.nan)
+    for k, other in enumerate(others):
+        to = carried(seen, problem, one, int(other), rays, np.repeat(nearness[some], 3)[:, None]).reshape(-1, 3, 2)
+        step = (to[:, 1:] - to[:, :1]) / HALF  # (n, 2, 2): one pixel across and one down
+        zoom = np.sqrt(np.abs(np.linalg.det(step)))
+        at = to[:, :1] + np.einsum("ka,nab->nkb", around, step)
+        there, inside = _sampled(pictures[int(other)].log, at)
+        turn = np.einsum("nab,nkb,nk->na", steer, slope, _split(there)[0] - texture)
+        at = at - np.einsum("na,nab->nb", np.clip(turn, -FARTHEST, FARTHEST), step)[:, None]
+        there, still = _sampled(pictures[int(other)].log, at)
+        shape, level = _split(there)
+        same = ((shape - texture) ** 2).mean(1) < SAME * (texture**2).mean(1) + NOISE
+        centre = np.clip(np.nan_to_num(at[:, len(around) // 2]).round().astype(int), 0, [width - 1, height - 1])
+        told = able & inside & still & same & (zoom > 1 / ZOOM) & (zoom < ZOOM)
+        told &= pictures[int(other)].dark[centre[:, 1], centre[:, 0]] > DARKEST
+        if uneven:
+            told &= pictures[int(other)].bright[centre[:, 1], centre[:, 0]] < CLIPPED
+        if told.sum() > 2 * VIEWS:
+            excess[k] = np.where(told, light - level - np.median((light - level)[told]), np.nan)
+    out = np.full((3, len(middle)), np.nan)
+    out[0, some] = _middle(excess, VIEWS)
+    out[1, some], out[2, some] = _middle(excess[::2], 1), _middle(excess[1::2], 1)
+    return out.reshape(3, len(rows), len(columns))
+
+
+def _others(poses: Array, one: int) -> Array:
+    """Pictures that look about the same way, spread over how far away they were taken."""
+    step = np.linalg.norm(poses[:, :3, 3] - poses[one, :3, 3], axis=1)
+    able = np.flatnonzero((poses[:, :3, 2] @ poses[one, :3, 2] > np.cos(np.deg2rad(TURN))) & (step > 0))
+    able = able[np.argsort(-step[able], kind="stable")]
+    return np.asarray(able[np.unique(np.linspace(0, len(able) - 1, OTHERS).round().astype(int))] if len(able) > OTHERS else able)
+
+
+def _nearness(place: Array, inverse: Array, cells: Array) -> Array:
+    """(N,) inverse depth in the middle of cells, by the plane through the points round each; NaN where these lie on none."""
+    away = np.linalg.norm(cells[:, None] - place[None], axis=2)
+    near = np.argsort(away, axis=1)[:, :NEAREST]
+    reach = np.take_along_axis(away, near[:, 2:3], 1)[:, 0]
+    matrix = np.concatenate([(place[near] - cells[:, None]) / REACH, np.ones((*near.shape, 1))], axis=2)
+    wanted, weight = inverse[near], np.ones(near.shape)
+    plane, error = np.zeros((len(cells), 3)), np.zeros(near.shape)
+    for _ in range(3):  # an inverse depth is even over a plane's picture
+        normal = np.einsum("nki,nk,nkj->nij", matrix, weight, matrix) + 1e-3 * np.diag([1.0, 1.0, 1e-6])
+        plane = np.linalg.solve(normal, np.einsum("nki,nk,nk->ni", matrix, weight, wanted)[..., None])[..., 0]
+        error = np.abs(np.einsum("nki,ni->nk", matrix, plane) - wanted) / np.maximum(plane[:, 2:], 1e-9)
+        weight = np.minimum(1.0, FLAT / np.maximum(error, 1e-12)) ** 2
+    even = ((error < FLAT).sum(1) >= NEAREST - 2) & (reach < REACH) & (plane[:, 2] > 0)
+    return np.where(even, plane[:, 2], np.nan)
+
+
+def _split(log: Array) -> tuple[Array, Array]:
+    """Patches (N, K) of log light without their mean, and (N,) the logarithm of their mean light."""
+    return log - log.mean(1, keepdims=True), np.log2(np.exp2(log).mean(1))
+
+
+def _sampled(log: Array, at: Array) -> tuple[Array, Array]:
+    """(N, K) values at pixels (N, K, 2), and (N,) whether all lie in the picture."""
+    inside = np.asarray(((at >= 0) & (at <= [log.shape[1] - 1, log.shape[0] - 1])).all((1, 2)))
+    pixels = np.nan_to_num(at, nan=-9.0).astype(np.float32)
+    return cv2.remap(log, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64), inside
+
+
+def _middle(values: Array, least: int) -> Array:
+    """Median over the first axis of what is finite; NaN where this is less than `least`."""
+    ordered, count = np.sort(values, axis=0), np.isfinite(values).sum(0)  # NaN last
+    low, high = np.maximum((count - 1) // 2, 0), np.minimum(count // 2, len(values) - 1)
+    middle = 0.5 * (np.take_along_axis(ordered, low[None], 0)[0] + np.take_along_axis(ordered, high[None], 0)[0])
+    return np.where(count >= least, middle, np.nan)
+
+
+def _around(excess: Array) -> tuple[Array, Array, Array]:
+    """Of the 3×3 cells round each (rows, columns): their lower quartile, their median, and whether six of them at least are told."""
+    padded = np.pad(excess, 1, constant_values=np.nan)
+    rows, columns = excess.shape
+    near = np.sort([padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)], axis=0)
+    count = np.isfinite(near).sum(0)
+    low, middle = (np.take_along_axis(near, np.minimum(share, 8)[None], 0)[0] for share in (count // 4, count // 2))
+    return low, middle, count >= 6
