@@ -211,7 +211,7 @@ def baked_march(
                 after = transmittance * F(math.exp(-tau))
                 weight = transmittance - after
                 if transmittance > HALF and after <= HALF:
-                    part = math.log(TWO * transmittance) / max(tau, F(1e-12))
+                    part = (transmittance - HALF) / (transmittance - after)
                     median = (s + (s1 - s) * (F(index) + part) * per_fine) * half
                 if weight > threshold and kept < starts.shape[0]:
                     corner_starts(baked, slot, i8, j8, k8, starts, kept)

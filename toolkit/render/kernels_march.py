@@ -204,8 +204,8 @@ def march_ray(
                 weight = transmittance - after
                 if tau < THIN:
                     weight = transmittance * tau * (ONE - tau * HALF * (ONE - tau * THIRD))
-                if transmittance > HALF and after <= HALF:  # T e^{-p τ} = ½ within the sample's interval
-                    part = math.log(TWO * transmittance) / max(tau, F(1e-12))
+                if transmittance > HALF and after <= HALF:  # where it would be ½ if the sample's weight were spread evenly
+                    part = (transmittance - HALF) / (transmittance - after)
                     median = (s + (s1 - s) * (F(index) + part) * per_fine) * half
                 if marking:
                     mark(marks, cell, weight)

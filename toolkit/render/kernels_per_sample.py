@@ -59,7 +59,7 @@ def settle(
         if tau < K.THIN:
             weight = transmittance * tau * (ONE - tau * HALF * (ONE - tau * K.THIRD))
         if transmittance > HALF and after <= HALF:
-            light[2] = begin + span * (math.log(TWO * transmittance) / max(tau, F(1e-12)))
+            light[2] = begin + span * ((transmittance - HALF) / (transmittance - after))
         if marking:
             mark(marks, cells[i - first], weight)
             if weight > light[4]:

@@ -56,10 +56,14 @@ def render_rays(field: Field, origins: Tensor, directions: Tensor, threshold: fl
 
 
 def median_distance(samples: Samples, transmittance: Tensor, thickness: Tensor, count: int) -> Tensor:
-    """(B,) distance at which the transmittance falls through ½, interpolated within the sample's interval; 0 where it never does."""
+    """(B,) distance at which the transmittance falls through ½; 0 where it never does.
+
+    Within a sample's interval its weight counts as spread evenly: where exactly a surface lies that stops nearly all light within one
+    interval is not known from its one density, and the middle is off by as much to either side. T e^{-p τ} = ½ would put it at the front.
+    """
     after = transmittance * torch.exp(-thickness)
     crossing = ((transmittance > 0.5) & (after <= 0.5)).nonzero().squeeze(1)
-    part = torch.log(2 * transmittance[crossing]) / thickness[crossing].clamp_min(1e-12)  # T e^{-p τ} = ½
+    part = (transmittance[crossing] - 0.5) / (transmittance[crossing] - after[crossing])
     out = torch.zeros(count, device=transmittance.device)
     out[samples.ray[crossing]] = samples.distance[crossing] + (part - 0.5) * samples.span[crossing]
     return out
