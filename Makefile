@@ -28,7 +28,7 @@ SOURCES := toolkit pipelines configs tests
 help:
 	@echo "make demo    film a small made-up scene, reconstruct it, and print where the results are (in demo/)"
 	@echo "make test    lint, type check, import layers and all tests"
-	@echo "make stability  the hard cases for the numbers and 50 kills of a small run (some minutes); renews docs/stability.md"
+	@echo "make stability  the hard cases for the numbers, 50 kills and 156 stops of small runs (half an hour); renews docs/stability.md"
 	@echo "make fuzz    100,000 damaged files for every reader (half an hour); renews docs/stability.md"
 	@echo "make venv    only make the environment in $(VENV)"
 	@echo "make lpips   add the weights of the LPIPS measure"
@@ -45,6 +45,7 @@ test: lint
 stability: $(VENV)/.installed-test
 	$(BIN)/python -m tests.stability.page docs/stability.md
 	$(BIN)/python -m tests.stability.kills --kills 50 --state .kills-state.json --page docs/stability.md
+	$(BIN)/python -m tests.stability.stops --page docs/stability.md
 
 fuzz: $(VENV)/.installed-test
 	$(BIN)/python -m tests.stability.fuzz --inputs 100000 --state .fuzz-state.json --page docs/stability.md

@@ -159,6 +159,13 @@ def stop_everywhere(folder: Path, kind: Kind, times: int, first: int = 0, only: 
     return wrong + differences(whole, out) + leftovers(out) + corrupt(out)
 
 
+def told(names: list[str], count: int, wrong: list[str], seconds: float) -> list[str]:
+    """What came of it, for the page."""
+    ended = "all survived" if not wrong else f"{len(wrong)} problems"
+    stages = [f"- {name}: {', '.join((*KINDS[name].stages, REPORT))}" for name in names]
+    return [f"{count} stops: {ended}; {seconds:.0f} s. The stages of each kind of run:", "", *stages]
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(prog="stops")
     parser.add_argument("--only", action="append", default=[], choices=list(KINDS))
@@ -174,12 +181,10 @@ def main() -> int:
             sys.stderr.write(f"{time.monotonic() - began:6.0f} s  {name}, {times}×: {len(found)} problems\n")
     for text in wrong:
         sys.stdout.write(text + "\n")
+    lines = told(chosen.only or list(KINDS), count, wrong, time.monotonic() - began)
+    sys.stdout.write("\n".join(lines) + "\n")
     if chosen.page is not None:
-        ended = "all survived" if not wrong else f"{len(wrong)} problems"
-        kinds = "; ".join(f"{name}: {', '.join((*KINDS[name].stages, REPORT))}" for name in chosen.only or KINDS)
-        replace_part(
-            chosen.page, "stops", [f"{count} stops: {ended}; {time.monotonic() - began:.0f} s. Stages of each kind of run: {kinds}."]
-        )
+        replace_part(chosen.page, "stops", lines)
     return 1 if wrong else 0
 
 

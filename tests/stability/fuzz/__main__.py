@@ -18,7 +18,8 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", action="append", default=[], help="a target's name; may be repeated")
     parser.add_argument("--state", type=Path, help="notes how far it came, so that a run that was stopped goes on; removed at the end")
-    parser.add_argument("--page", type=Path, help="a page whose part `fuzz` is replaced by the result")
+    parser.add_argument("--page", type=Path, help="a page of which a part is replaced by the result")
+    parser.add_argument("--part", default="fuzz", help="that part's name")
     chosen = parser.parse_args()
 
     shown = 0
@@ -35,7 +36,7 @@ def main() -> int:
     result = fuzz(*given) if chosen.state is None else fuzz_in_rounds(chosen.state, *given)
     told(result)
     if chosen.page is not None:
-        replace_part(chosen.page, "fuzz", result.lines())
+        replace_part(chosen.page, chosen.part, result.lines())
     sys.stderr.write("\n".join(result.lines()) + "\n")
     if chosen.state is not None:
         chosen.state.unlink()  # the next run begins anew
