@@ -14,12 +14,14 @@ from safetensors.numpy import load_file, save_file
 from pipelines.bench_table import sections
 from pipelines.console import ConsoleProgress
 from pipelines.folder import RunFolder
+from pipelines.kept import FEW_VIEWS, read_kept
 from pipelines.stages import Stages
 from toolkit.capture.storage import capture_from_dict, capture_to_dict
 from toolkit.capture.types import Capture
 from toolkit.config import load_settings
 from toolkit.effects.correct import Corrections
 from toolkit.errors import InputError
+from toolkit.evaluate.few_views import few_views_table
 from toolkit.evaluate.selftest.edit import small_field
 from toolkit.evaluate.selftest.fits import scene_of
 from toolkit.export.mesh import mesh_facts
@@ -136,3 +138,15 @@ def test_measurements_that_are_none(damaged: object, tmp_path: Path) -> None:
     with pytest.raises(InputError) as told:
         sections([path], None, None)
     assert str(path) in str(told.value) or "damaged" in str(told.value) or "methods" in str(told.value)
+
+
+@pytest.mark.parametrize("seconds", [{}, {"seconds": "5"}, {"seconds": None}, {"seconds": 5.0, "psnr": "20"}])
+def test_few_views_whose_seconds_are_not_there_or_no_number(seconds: dict[str, object], tmp_path: Path) -> None:
+    path = tmp_path / "few_views.json"
+    row = {"views": 3, "start": "direct", "budget": 0, "psnr": 20.0, **seconds}
+    path.write_text(json.dumps({"rows": [row]}))
+    if seconds:
+        with pytest.raises(InputError, match="is not a number"):
+            read_kept(path, FEW_VIEWS)
+    else:
+        assert "| 3 |  | 20.00 |  |" in few_views_table(read_kept(path, FEW_VIEWS)["rows"])

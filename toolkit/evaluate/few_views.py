@@ -163,7 +163,12 @@ def few_views_table(rows: list[dict[str, Any]]) -> str:
     lines = [" | ".join(["", *head, ""]).strip(), "|".join(["", *(" --- " for _ in head), ""])]
     for count in sorted({row["views"] for row in rows}):
         direct = found.get((count, "direct", 0), {})
-        cells = [str(count), _decibel(found.get((count, "nearest", 0))), _decibel(direct), f"{direct['seconds']:.0f}" if direct else ""]
+        cells = [
+            str(count),
+            _decibel(found.get((count, "nearest", 0))),
+            _decibel(direct),
+            f"{direct['seconds']:.0f}" if "seconds" in direct else "",
+        ]
         cells += [_decibel(found.get((count, start, budget))) for budget, start in fits]
         lines.append(" | ".join(["", *cells, ""]).strip())
     return "\n".join(lines) + "\n"
