@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -138,7 +139,7 @@ def export_field(
 def export_surface(
     job: Job, folder: Path, formats: set[str], field: Field, scene: Scene, views: Views
 ) -> tuple[dict[str, Any], list[Path]]:
-    """The field's depth, rendered at the capture's own cameras and fused: points and meshes of the region of interest.
+    """The field's depth at the training cameras, polished by their pictures and fused: points and meshes of the region of interest.
 
     Raises:
         InputError: the field has no surface.
@@ -146,16 +147,21 @@ def export_surface(
     from toolkit.export.mesh import mesh_facts, write_mesh
     from toolkit.export.surface import field_volume
     from toolkit.render.image import make_renderer, render_view
+    from toolkit.tsdf.stereo_polish import Polisher
 
-    chosen = spread(len(views), job.settings.export.mesh_views)
-    lenses = [at_most(views.intrinsics[index], MESH_SIDE) for index in chosen]
+    shown = views.subset(np.flatnonzero(~views.test))  # held-out pictures are not looked at
+    cameras = [at_most(camera, MESH_SIDE) for camera in shown.intrinsics]
+    chosen = spread(len(shown), job.settings.export.mesh_views)
+    lenses = [cameras[index] for index in chosen]
     require_pictures(lenses, kept=True, advice="lower export.mesh_views")
     view = make_renderer(field, job.settings.engine)
+    polisher = Polisher(shown, cameras, scene.near, scene.far, scene.median_depth)
     volume = field_volume(
         lambda lens, pose: render_view(field, lens, pose, view),
-        views.world_from_camera[chosen],
+        shown.world_from_camera[chosen],
         lenses,
         region=(scene.centre - scene.half_size, scene.centre + scene.half_size),
+        polish=[partial(polisher.polished, index) for index in chosen],
         progress=job.progress,
     )
     input_from_working = scene.working_from_input.inverse()

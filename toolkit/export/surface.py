@@ -18,6 +18,7 @@ from toolkit.tsdf.volume import TsdfVolume
 
 # (intrinsics, world_from_camera) → (rgb, depth, opacity), or an object with these names, as `render_view` gives.
 Render = Callable[[Intrinsics, Array], Any]
+Polish = Callable[[Array], Array]  # depth (H, W) → better depth, 0 = none
 
 STEEPEST = 4.0  # tangent of the angle between view and surface normal (76°) beyond which a depth step is taken as an edge
 SMALLEST_EDGE = 0.02  # share of depth: smaller steps are never an edge
@@ -42,12 +43,14 @@ def rendered_frame(
     world_from_camera: Array,
     min_opacity: float = 0.7,
     region: tuple[Array, Array] | None = None,
+    polish: Polish | None = None,
 ) -> DepthFrame:
-    """Render one view and keep its reliable depth; `region` (lowest corner, highest corner) drops what lies outside that box."""
+    """Render one view and keep its reliable depth, polished before; `region` (lowest corner, highest corner) drops what lies outside it."""
     rendered = render(intrinsics, world_from_camera)
     rgb, depth, opacity = (rendered.rgb, rendered.depth, rendered.opacity) if hasattr(rendered, "rgb") else rendered
     camera = intrinsics.pinhole()
-    depth = reliable_depth(np.asarray(depth), np.asarray(opacity), camera.fx, min_opacity)
+    depth = np.asarray(depth) if polish is None else polish(np.asarray(depth))
+    depth = reliable_depth(depth, np.asarray(opacity), camera.fx, min_opacity)
     pose = np.asarray(world_from_camera, dtype=np.float64)
     if region is not None:
         v, u = np.nonzero(depth)
@@ -69,6 +72,7 @@ def field_volume(
     min_opacity: float = 0.7,
     region: tuple[Array, Array] | None = None,
     carve: bool = True,
+    polish: Sequence[Polish] | None = None,
     progress: Progress = SILENT,
 ) -> TsdfVolume:
     """Render all (N, 4, 4) poses and fuse their reliable depth; its `mesh()` and `points()` are the field's surface.
@@ -79,6 +83,7 @@ def field_volume(
         voxel_size, depth_max: working units; None: from the rendered depth, the voxel size made coarser until it fits into memory.
         region: lowest and highest corner (3,) of the box that is kept, working frame.
         carve: views also empty what others put in front of their surface, which removes most floaters.
+        polish: for each pose what its rendered depth is made better by; see `stereo_polish`.
 
     Raises:
         InputError: no view shows a surface, or the voxel size that was asked for is too fine for the memory.
@@ -88,8 +93,9 @@ def field_volume(
     cameras = [intrinsics] * len(poses) if isinstance(intrinsics, Intrinsics) else list(intrinsics)
     if len(cameras) != len(poses) or not cameras:
         raise InputError(f"a surface needs one camera a pose, there are {len(cameras)} cameras and {len(poses)} poses")
+    better = [None] * len(poses) if polish is None else list(polish)
     return fuse_held(
-        (rendered_frame(render, camera, pose, min_opacity, region) for camera, pose in zip(cameras, poses, strict=True)),
+        (rendered_frame(render, camera, pose, min_opacity, region, how) for camera, pose, how in zip(cameras, poses, better, strict=True)),
         len(poses),
         voxel_size,
         depth_max,

@@ -18,6 +18,7 @@ PRUNE_EVERY = 150  # steps
 LAST_PRUNE = 0.8  # of the budget; from here on the field is only polished, on all views
 SLOWING = 1e7  # rays after which step sizes begin to fall
 LAST_RATE = 0.08  # of the step sizes, at the very end
+LAST_DEPTH = 0.1  # of the depth term's weight, at the very end: depth decides early where surfaces are, colours how they look
 FIRST_BATCH = 256  # rays a step at the coarsest level, doubled at each level: early on the number of steps counts
 WORTH = 0.5  # rays that must be left for every voxel of a finer level: with fewer it ends blurred, and worse than the coarser one
 LOOK_STEPS = 60  # from one look at the validation views to the next …
@@ -125,4 +126,4 @@ class Schedule:
         fit = self.settings
         opacity = fit.opacity if self.opaque else 0.0
         steps = (fit.rate_density * fall, fit.rate_feature * fall, fit.rate_decoder * fall)
-        return Rates(*steps, fit.distortion, opacity, depth=fit.depth)
+        return Rates(*steps, fit.distortion, opacity, depth=fit.depth * LAST_DEPTH**done)
