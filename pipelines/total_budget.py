@@ -96,7 +96,8 @@ class TotalBudget:
             pace = self._pace(job)
             after = sum(self.predicted.get(stage, 0.0) for stage in ("render", "evaluate", "report")) * pace
             left = self.asked - self.elapsed() - after
-            self.choice.fit_seconds = round(max(model.LEAST_FIT, left - self._for_exports(job, left)), 2)
+            left -= self._for_exports(job, left) + self.speed.seconds("beside", 1.0)
+            self.choice.fit_seconds = round(max(model.LEAST_FIT, left), 2)
             self.choice.resolution = model.resolution_for(
                 self.choice.fit_seconds, self.speed.units["fit"] * pace, finest(job, views, scene)
             )
@@ -169,6 +170,10 @@ class TotalBudget:
                 real, predicted = told["stages"].get(name, {}).get("real"), self.predicted.get(name)
                 if real and predicted and max(real, predicted) > WORTH_LEARNING and name not in ("export", "effects"):
                     self.speed.learn(name, predicted, real)
+            fitted = told["stages"].get("fit", {}).get("real")
+            if fitted and self.choice is not None and self.choice.fit_seconds:
+                beside = self.speed.seconds("beside", 1.0)
+                self.speed.learn("beside", beside, max(fitted - self.choice.fit_seconds, 0.2 * beside))
             self._learn_effects(job, told["stages"].get("effects", {}).get("real"))
             made = told["stages"].get("export", {}).get("real")
             if made and self.export_planned > WORTH_LEARNING:
@@ -180,12 +185,15 @@ class TotalBudget:
         return told
 
     def _for_exports(self, job: Job, left: float) -> float:
-        """Seconds that are set aside for exports: a share of what is left, and no more than all of them can take."""
+        """Seconds that are set aside for exports: a share of what is left, no more than all of them can take, no less
+        than the fewest."""
         assert self.speed is not None and self.work is not None and self.choice is not None
         export = job.settings.export
         video = export.video_frames if "video" in export.formats else 0
         most = model.most_export_seconds(self.speed, self.work, self.choice, export.mesh_views, video)
-        return min(model.EXPORT_SHARE * max(0.0, left), most)
+        surface = bool({"points", "ply", "obj", "glb"} & set(export.formats))
+        least = min(most, model.least_export_seconds(self.speed, self.work, self.choice)) if surface else 0.0
+        return max(least, min(model.EXPORT_SHARE * max(0.0, left), most))
 
     def _learn_effects(self, job: Job, real: float | None) -> None:
         """Looking for effects takes less when none is corrected: what is learnt is what a picture takes."""
@@ -202,7 +210,7 @@ class TotalBudget:
         done = [name for name in ("capture", "scene", "views") if name in self.predicted and not job.stages.cached.get(name, True)]
         real = sum(job.stages.records[name].seconds for name in done)
         predicted = sum(self.predicted[name] for name in done)
-        return min(max(real / predicted, 0.5), 3.0) if predicted > 0.5 else 1.0
+        return min(max((real + model.STEADY) / (predicted + model.STEADY), 0.5), 3.0)
 
     def _predicted_ray(self) -> float:
         assert self.speed is not None

@@ -20,6 +20,7 @@ VOXELS_A_RAY = 2.0  # as the schedule: a finer level is worth its voxels only wh
 SURFACE = 3.0  # occupied voxels of a lattice of n a side, in n²
 FIT_SHARE = 0.35  # of the seconds, at least, that the fit should have when pictures are chosen
 LEAST_FIT = 2.0  # seconds
+STEADY = 5.0  # seconds of stages that count as predicted well when it is told how busy the machine is: first imports are no sign of it
 EXPORT_SHARE = 0.25  # of the seconds, at most, that are planned for exports
 EXPORT_FIXED = 25.0  # pictures' worth of features: making, cleaning and writing meshes, whatever is rendered for them
 EXPORT_RAY = 1.2  # of the time of a test view's ray: fusing depth and writing video frames come on top
@@ -42,6 +43,7 @@ COST = {
     "scene": ("features", 1.0),
     "views": ("decode", 7.0),
     "tsdf": ("decode", 80.0),
+    "beside": ("features", 8.0),  # what a fit takes beside its own seconds: reading, the timeline, writing
     "render": ("ray", 1.5),
     "export": ("ray", 1.5),
     "evaluate": ("score", 1.0),
@@ -157,6 +159,11 @@ def most_export_seconds(speed: Speed, work: Work, choice: Choice, mesh_views: in
     whole = replace(choice, mesh_views=mesh_views, video_frames=video_frames)
     a_ray = EXPORT_RAY * speed.seconds("render", 1.0)
     return speed.factors.get("export", 1.0) * (EXPORT_FIXED * speed.units["features"] + export_rays(work, whole) * a_ray)
+
+
+def least_export_seconds(speed: Speed, work: Work, choice: Choice) -> float:
+    """What exports take at least: a mesh of the fewest views, and no video."""
+    return most_export_seconds(speed, work, choice, MESH_VIEWS[0], 0)
 
 
 def predict(speed: Speed, work: Work, choice: Choice) -> dict[str, float]:
