@@ -16,6 +16,7 @@ from pipelines.summary import base_data, warnings_of
 
 if TYPE_CHECKING:
     from toolkit.camera import Array
+    from toolkit.capture.types import Views
     from toolkit.evaluate.compare_meshes import MeshPictures
 
 SHOWN_VIEWS = 8
@@ -94,12 +95,16 @@ def describe_method(job: Job, all_of_it: Compared, name: str, found: dict[str, A
     """One of the comparison's `methods`."""
     stages = {stage["name"]: stage for stage in job.stages.summary()}
     own = OWN_STAGES.get(name, (name,))
+    note = NOTES.get(name, "")
+    if name == "field":
+        matched, note = depth_in_fit(job, all_of_it.views)
+        own = (*matched, *own)
     path = job.folder / KEPT.get(name, f"{name}/mesh.ply")
     facts = all_of_it.pictures[name].facts
     return {
         "key": name,
         "title": TITLES[name],
-        "note": NOTES.get(name, ""),
+        "note": note,
         "reference": name == "tsdf_exact",
         "stages": [stages[stage] for stage in own if stage in stages],
         "mesh_seconds": stages["export"]["seconds"] if name == "field" else None,
@@ -109,6 +114,16 @@ def describe_method(job: Job, all_of_it: Compared, name: str, found: dict[str, A
         "geometry": (found["geometry"] or {}).get(name),
         "mesh": mesh_facts if name == "field" else facts.get("mesh"),
     }
+
+
+def depth_in_fit(job: Job, views: Views) -> tuple[tuple[str, ...], str]:
+    """The stages before the fit that its depth comes from, and the words for it."""
+    fit = job.settings.fit
+    if "stereo" in job.stages.records["field"].after:
+        return ("stereo",), "fitted to colours and matched depth"
+    if fit.finetune and fit.depth > 0 and fit.depth_from != "off" and any(depth is not None for depth in views.depths):
+        return (), "fitted to colours and the sensor's depth"
+    return (), ""
 
 
 def shown_meshes(job: Job, all_of_it: Compared) -> list[MeshPictures]:

@@ -81,6 +81,8 @@ def test_all_methods_are_scored_alike(compared: Path) -> None:
         assert method["seconds"] > 0 and method["peak_memory_mb"] > 50 and method["disk_bytes"] > 1000 and method["memory_bytes"] > 1000
         assert method["score"]["acc_5"] is not None and method["geometry"]["f_score_4"] is not None
         assert method["reference"] is (key == "tsdf_exact") or method["reference"] is None
+    assert found["field"]["note"] == "fitted to colours and the sensor's depth"
+    assert [stage["name"] for stage in found["field"]["stages"]] == ["field", "render"]
     assert found["tsdf"]["score"]["on"]["tsdf"]["psnr"] > found["tsdf"]["score"]["psnr"]
     assert set(found["field"]["score"]["on"]) == {"tsdf", "tsdf_stereo", "tsdf_exact"} == set(direct["score"]["on"])
     assert data["truth"] == {"mesh": True, "depth": "exact", "seen_share": data["truth"]["seen_share"], "unit": "input units"}
@@ -139,6 +141,8 @@ def test_pictures_alone(tmp_path: Path, capsys: Capsys) -> None:
     data = read_json(tmp_path / "out" / "compare.json")
     assert list(methods(data)) == ["field", "tsdf_stereo"]
     assert data["truth"]["mesh"] is False and data["truth"]["depth"] is None
+    # The field knew the matched depth, and its time says so.
+    assert [stage["name"] for stage in methods(data)["field"]["stages"]] == ["stereo", "field", "render"]
     assert methods(data)["tsdf_stereo"]["geometry"] is None and methods(data)["tsdf_stereo"]["score"]["coverage"] > 0.5
     assert not list((tmp_path / "out" / "exports").glob("*.mp4"))  # only what is compared is made
 
