@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -29,6 +30,7 @@ from toolkit.files import read_json, write_json
 from toolkit.poses.scene import Scene
 from toolkit.render.bake import bake
 from toolkit.render.bake_file import METADATA_KEY, read_baked, write_baked
+from toolkit.simulate.mesh_scene import load_mesh_scene
 from toolkit.simulate.settings import read_scene_file
 from toolkit.training.nerfusion.settings import load_train_settings
 from toolkit.tsdf.mesh import Mesh
@@ -150,3 +152,22 @@ def test_few_views_whose_seconds_are_not_there_or_no_number(seconds: dict[str, o
             read_kept(path, FEW_VIEWS)
     else:
         assert "| 3 |  | 20.00 |  |" in few_views_table(read_kept(path, FEW_VIEWS)["rows"])
+
+
+@pytest.mark.parametrize("damage", ["a picture cut short", "a corner that is not there", "a number beyond float32", "nothing"])
+def test_meshes_to_film_with_damaged_surfaces(damage: str, tmp_path: Path) -> None:
+    """Textures are read where they are first looked at, behind the reader's own checks; rays were cast at triangles between no vertices."""
+    cv2.imwrite(str(tmp_path / "picture.png"), np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8))
+    (tmp_path / "model.mtl").write_text("newmtl paint\nKd 0.5 0.6 0.7\nmap_Kd picture.png\n")
+    first = "1e200" if damage == "a number beyond float32" else "0"
+    corners = f"v {first} 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\n"
+    last = "9" if damage == "a corner that is not there" else "4"
+    (tmp_path / "model.obj").write_text(f"mtllib model.mtl\n{corners}usemtl paint\nf 1/1 2/2 3/3\nf 1/1 2/2 {last}/3\n")
+    if damage == "a picture cut short":
+        data = (tmp_path / "picture.png").read_bytes()
+        (tmp_path / "picture.png").write_bytes(data[: len(data) - 300])
+    if damage == "nothing":
+        assert len(load_mesh_scene(tmp_path / "model.obj").mesh().triangles) == 2
+    else:
+        with pytest.raises(InputError, match=r"model\.obj"):
+            load_mesh_scene(tmp_path / "model.obj")

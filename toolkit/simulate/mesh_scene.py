@@ -20,6 +20,7 @@ from toolkit.simulate.seen import Mesh, Rays, Seen
 
 Tensor = torch.Tensor
 
+LARGEST = 1e18  # of what is read; its square must be a float32
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 TEXTURE_SIDE = 1024  # pixels: larger textures are halved to it
 SUN = (0.35, 0.25, 0.9)  # towards the light
@@ -151,6 +152,19 @@ def load_mesh_scene(path: Path | str, up: str = "z", scale: float = 1.0) -> Mesh
     if not parts:
         raise InputError(f"{path} holds no triangles; point clouds cannot be filmed")
     turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) if up == "y" else np.eye(3)
+    try:
+        pictures, joined = _joined(parts, turn * scale)
+    except Exception as error:  # textures are read where they are first looked at
+        raise InputError(f"{path} has surfaces or textures that cannot be read ({type(error).__name__}); save it again") from error
+    if not all((np.abs(joined[name]) < LARGEST).all() for name in ("vertices", "places", "tint")):  # NaN is not, either
+        raise InputError(f"{path} has vertices or colours that are not finite or too large; repair the mesh")
+    if joined["triangles"].min() < 0 or joined["triangles"].max() >= len(joined["vertices"]):
+        raise InputError(f"{path} has triangles between vertices that it does not have; repair the mesh")
+    return MeshScene(atlas=Atlas(pictures, mirrored=False), **joined)
+
+
+def _joined(parts: list[tuple[Array, Any]], turn: Array) -> tuple[list[Array], dict[str, Array]]:
+    """All textures, and the columns of `MeshScene` over all parts; `turn` (3, 3) goes from the file's axes and unit to metres."""
     pictures: list[Array] = [np.ones((4, 4, 3), dtype=np.float32)]
     known: dict[int, int] = {}
     columns: dict[str, list[Array]] = {name: [] for name in ("vertices", "triangles", "texture", "places", "tint", "gloss")}
@@ -160,17 +174,14 @@ def load_mesh_scene(path: Path | str, up: str = "z", scale: float = 1.0) -> Mesh
         vertices = np.asarray(part.vertices) @ place[:3, :3].T + place[:3, 3]
         places = getattr(part.visual, "uv", None)
         places = np.zeros((len(part.vertices), 2)) if places is None or len(places) != len(part.vertices) else np.asarray(places)
-        columns["vertices"].append(vertices @ turn.T * scale)
+        columns["vertices"].append(vertices @ turn.T)
         columns["triangles"].append(np.asarray(part.faces) + count)
         columns["texture"].append(np.full(len(part.faces), number))
         columns["places"].append(np.stack([places[:, 0], 1 - places[:, 1]], axis=1)[part.faces])  # trimesh counts rows from below
         columns["tint"].append(tint[part.faces])
         columns["gloss"].append(np.full(len(part.faces), gloss))
         count += len(part.vertices)
-    joined = {name: np.concatenate(values) for name, values in columns.items()}
-    if not np.isfinite(joined["vertices"]).all():
-        raise InputError(f"{path} has vertices that are not finite; repair the mesh")
-    return MeshScene(atlas=Atlas(pictures, mirrored=False), **joined)
+    return pictures, {name: np.concatenate(values) for name, values in columns.items()}
 
 
 def _surface(part: Any, pictures: list[Array], known: dict[int, int]) -> tuple[int, Array, float]:

@@ -33,13 +33,13 @@ def damage(data: bytes, name: str, rng: Rng) -> bytes:
     """One damaged version of a file, by what it is as often as by its bytes alone."""
     if rng.random() < 0.55:
         lower = name.lower()
-        if lower.endswith((".json", ".yaml")):
+        if lower.endswith((".json", ".yaml", ".gltf")):
             return damaged_json(data, rng)
         if lower.endswith(".safetensors"):
             return damaged_safetensors(data, rng)
         if data.startswith(PNG):
             return damaged_png(data, rng)
-        if lower.endswith((".txt", ".log", ".ply")):
+        if lower.endswith((".txt", ".log", ".ply", ".obj", ".mtl", ".pfm")):
             return damaged_text(data, rng)
     return damaged_bytes(data, rng)
 

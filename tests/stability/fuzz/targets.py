@@ -14,6 +14,17 @@ import torch
 
 from tests.capture.layouts import LAYOUTS
 from tests.capture.made import eyes, render, save_picture
+from tests.stability.fuzz.given import (
+    DATASETS,
+    MESHES,
+    TRUTH,
+    make_datasets,
+    make_meshes,
+    make_truth,
+    read_datasets,
+    read_meshes,
+    read_truth,
+)
 from tests.stability.fuzz.models import make_models, make_training, read_baked_field, read_models, read_training
 from tests.stability.fuzz.results import FILES as RESULT_FILES
 from tests.stability.fuzz.results import MEASURED, make_measured, make_results, read_measured, read_results
@@ -258,5 +269,8 @@ TARGETS: tuple[Target, ...] = (
     Target("baked", ("bounded.safetensors", "background.safetensors"), make_models, read_baked_field, 2.0),
     Target("models", ("weights.safetensors", "scene.yaml", "scene.yaml"), make_models, read_models, 1.0),
     Target("training", TRAINING_FILES, make_training, read_training, 1.0),
+    Target("meshes", MESHES, make_meshes, read_meshes, 2.0),
+    Target("ground truth", TRUTH, make_truth, read_truth, 1.0),
+    Target("data sets", DATASETS, make_datasets, read_datasets, 1.0),
     Target("points", ("points.ply",), make_extras, lambda root, number: read_ply_points(root / "points.ply"), 0.5),
 )  # fmt: skip
