@@ -72,7 +72,10 @@ def kernel_lines(outcomes: list[Outcome]) -> list[str]:
 
 def _relative(measure: Measure) -> bool:
     """Errors by a size, and those of values of about 1; not counts, lengths in steps or decibels, nor bounds of zero or above a tenth."""
-    counted = r"in steps|in voxels|in pixels|dB|not finite|is not|lost|wrong|share|metres|PSNR|float64 can|rounding|orthonormal|that meet"
+    counted = (
+        r"in steps|length along|in voxels|in pixels|dB|not finite|is not|lost|wrong|share|metres|PSNR|float64 can|rounding|orthonormal"
+        r"|that meet"
+    )
     return 0 < measure.bound < 0.1 and not re.search(counted, measure.quantity)
 
 
@@ -84,10 +87,14 @@ def _share(error: float, bound: float) -> float:
     return error / bound if bound > 0 else error
 
 
+def _tell(outcome: Outcome) -> None:
+    sys.stderr.write(f"{outcome.seconds:6.1f} s  {outcome.case.title}\n")
+
+
 def main() -> int:
     page = Path(sys.argv[1])
     with np.errstate(all="ignore"):
-        outcomes = run_cases(all_cases(), lambda outcome: sys.stderr.write(f"{outcome.seconds:6.1f} s  {outcome.case.title}\n"))
+        outcomes = run_cases(all_cases(), _tell)
     replace_part(page, "cases", case_lines(outcomes))
     replace_part(page, "kernels", kernel_lines(outcomes))
     return 0 if all(outcome.good for outcome in outcomes) else 1
