@@ -42,14 +42,14 @@ def direct_field(
         Interrupted: the user asked to stop.
     """
     from toolkit.keyframes import KeyFrames, select_keyframes
-    from toolkit.training.from_network import Inference, NetworkOptions, load_networks
+    from toolkit.training.from_network import Inference, NetworkOptions, load_networks, voxels_to_median
 
     train = np.flatnonzero(~np.asarray(views.test))
     keys = select_keyframes(views.world_from_camera[train], [views.intrinsics[index] for index in train], scene.median_depth)
     if share < 1:
         kept = np.unique(np.linspace(0, len(keys.indices) - 1, max(1, round(share * len(keys.indices)))).round().astype(int))
         keys = KeyFrames(keys.indices[kept], keys.neighbours[kept])
-    options = NetworkOptions(settings.network.voxels / voxel_factor, settings.network.levels)
+    options = NetworkOptions((settings.network.voxels or voxels_to_median(views)) / voxel_factor, settings.network.levels)
     model = load_networks(weights_of(settings), settings.device)
     inference = Inference(model, views, scene, keys, settings.field.background, options)
     for _ in inference.frames(progress):

@@ -46,13 +46,13 @@ class ViewsSettings:
 class KeyframesSettings:
     method: str = "parallax"  # parallax (with overlap and sharpness) | uniform: every n-th training view, as in the paper
     every: int = 10  # n of `uniform`
-    most: int = 16  # key frames that the networks fuse at most
+    most: int = 24  # key frames that the networks fuse at most
 
 
 @dataclass
 class NetworkSettings:
     weights: str | None = None  # file of trained networks; None: the shipped ones
-    voxels: float = 48.0  # voxels that make up the median depth, on the finest lattice
+    voxels: float | None = None  # voxels that make up the median depth, on the finest lattice; None: 48, or a voxel to five pixels there
     levels: int = 2  # lattices, each of half the voxel size of the one before; 1: the paper's single one
 
 

@@ -7,7 +7,8 @@ import torch.nn.functional as F
 
 from tests.networks.test_block_conv import cube, dense_of, rows_of
 from toolkit.networks.gru import FusionGRU, RunningMean
-from toolkit.networks.local import LocalReconstruction, colour_latent
+from toolkit.networks.head import FieldHead
+from toolkit.networks.local import LocalReconstruction, colour_latent, inside_latent
 from toolkit.volume.topology import Topology
 
 CHANNELS = 4
@@ -82,7 +83,9 @@ def test_against_dense_convolutions() -> None:
     count, weight = (dense_of(given[name][:, None], topology, low, 3) for name in ("count", "weight"))
     z = torch.sigmoid(gate(gru.update, torch.cat([state, local], 1)) + torch.log(weight / count))
     r = torch.sigmoid(gate(gru.reset, torch.cat([state, local], 1)))
-    candidate = torch.tanh(raw + gate(gru.candidate, torch.cat([r * state, local], 1)))
+    learned = gate(gru.candidate, torch.cat([r * state, local], 1))
+    learned[:, 3] = 0.5 * torch.tanh(learned[:, 3] / 0.5)  # the distance behind the surface is changed by no more than half
+    candidate = torch.tanh(raw + learned)
     expected = rows_of((1 - z) * state + z * candidate, topology, low)
     found = gru(**given, topology=topology)[:-1]
     torch.testing.assert_close(found[inside], expected[inside], atol=1e-10, rtol=1e-8)
@@ -129,10 +132,33 @@ def test_local_network_against_dense_convolutions() -> None:
     x, present = dense_of(rows[:-1], topology, low, 3), dense_of(seen.double()[:, None], topology, low, 3)
     for number, layer in enumerate(network.convolutions):
         x = F.conv3d(torch.relu(x) if number else x, layer.weight, layer.bias, padding=1) * present
+    x[:, 3] = 0.5 * torch.tanh(x[:, 3] / 0.5)
     expected = rows_of(x, topology, low) + start[:-1]
     found = network(rows, start, topology, seen)
     torch.testing.assert_close(found[:-1], expected, atol=1e-10, rtol=1e-8)
     assert not found[-1].any() and not found[:-1][~seen].any()
+
+
+def test_what_the_sweep_is_sure_of_stays_whatever_was_learned() -> None:
+    """A voxel surely in front of the surface stays nearly free, and one surely behind it stays solid, under any weights."""
+    topology, _ = cube(2, 1.0, 0)
+    torch.manual_seed(0)
+    network, gru, head = LocalReconstruction(5, 6, 8), FusionGRU(8, 6), FieldHead(8, 6, 8)
+    with torch.no_grad():
+        for parameter in (*network.parameters(), *gru.parameters(), *head.density.parameters(), *head.body.parameters()):
+            parameter.mul_(30).add_(torch.randn_like(parameter))
+    seen = torch.ones(topology.zero_row, dtype=torch.bool)
+    for signed, thinnest, thickest in ((1.0, 0.0, 0.1), (-1.0, 4.0, torch.inf)):
+        start = torch.zeros(topology.zero_row + 1, 8)
+        start[:-1, 3] = inside_latent(torch.tensor(signed))
+        raw = network(torch.rand(topology.zero_row + 1, 6), start, topology, seen)
+        none, weight = torch.zeros_like(start), torch.ones(topology.zero_row)
+        state, count = none, torch.zeros(topology.zero_row)
+        for _ in range(3):
+            state = gru(state, count, torch.tanh(raw), raw, weight, topology, seen).detach()
+            count += 1
+        thickness = torch.exp(head.thickness(state[:-1]))
+        assert thinnest <= float(thickness.min()) and float(thickness.max()) <= thickest
 
 
 def test_colour_latents_decode_to_their_colour() -> None:

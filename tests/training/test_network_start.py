@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 from tests.networks.made import INTRINSICS, SMALL, small_model, wall_pictures
-from toolkit.camera import Similarity
+from toolkit.camera import Intrinsics, Similarity
 from toolkit.capture.types import Views
 from toolkit.config import Settings, load_settings
 from toolkit.errors import InputError
@@ -20,7 +21,7 @@ from toolkit.poses.scene import Scene
 from toolkit.render.field import Field
 from toolkit.render.image import render_view
 from toolkit.training.fit import fit_field
-from toolkit.training.from_network import Inference, NetworkOptions, load_networks
+from toolkit.training.from_network import Inference, NetworkOptions, lattice_of, load_networks, voxels_to_median
 from toolkit.training.network_start import THICK, THIN, network_start, widened
 from toolkit.training.start import space_of
 from toolkit.volume.lookup import corners, gather
@@ -141,6 +142,17 @@ def test_the_field_can_be_had_after_every_key_frame_and_grows() -> None:
     voxels = [running.field().voxels for _ in running.frames()]
     assert len(voxels) == 2 and 0 < voxels[0] <= voxels[1]
     assert running.seconds > running.encode_seconds > 0
+
+
+def test_a_voxel_spans_no_more_than_some_pixels_at_the_median_depth() -> None:
+    """48 voxels to the median depth for wide angles and small pictures, more for long lenses and large ones."""
+    views, about = wall_views(), scene()
+    assert voxels_to_median(views) == 48
+    long = replace(views, intrinsics=[Intrinsics(64, 64, 600.0, 600.0, 32.0, 32.0)] * len(views))
+    assert voxels_to_median(long) == pytest.approx(120)
+    wide, fine = (lattice_of(space_of(views, about), about, voxels_to_median(v), 2) for v in (views, long))
+    assert DEPTH / fine.voxel_size / 600 == pytest.approx(1 / 5, rel=0.1) and fine.resolution > 2 * wide.resolution
+    assert lattice_of(space_of(views, about), about, 1e5, 2).resolution == 384
 
 
 def test_nothing_to_look_at_is_said() -> None:

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from toolkit.networks.block_conv import BlockConv3d
+from toolkit.networks.local import held
 from toolkit.volume.topology import Topology
 
 LEAST = 1e-3  # of a local volume's weight
@@ -74,7 +75,7 @@ class FusionGRU(nn.Module):
         known = torch.cat([known, known.new_full((1,), -torch.inf)])[:, None]
         z = torch.sigmoid(self.update(both, topology, inside) - known)
         r = torch.sigmoid(self.reset(both, topology, inside))
-        candidate = torch.tanh(raw + self.candidate(torch.cat([r * state, local], 1), topology, inside))
+        candidate = torch.tanh(raw + held(self.candidate(torch.cat([r * state, local], 1), topology, inside)))
         return (1 - z) * state + z * candidate
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from toolkit.networks.local import COLOUR_SCALE, INSIDE
+from toolkit.networks.local import COLOUR_SCALE, INSIDE, within
 
 START = -0.5  # log optical thickness of a voxel on the surface at the start
 SCALE = 3.0  # the density output's gain
+CHANGE = 0.5  # most that the learned part may add to what the latent says, before the gain
 STEEP = 2.0  # of the start: latents of ±0.93 are a voxel of exp(−7.6) and one of exp(3.6)
 
 
@@ -25,15 +26,13 @@ class FieldHead(nn.Module):
         nn.init.zeros_(first.bias)
         self.body = nn.Sequential(first, nn.ReLU())
         self.density = nn.Linear(hidden, 1)
-        self.inside = nn.Linear(channels, 1, bias=False)  # density starts behind the surface
+        self.steep = nn.Parameter(torch.tensor(STEEP))  # density rises behind the surface
         self.features = nn.Linear(hidden, features)
         self.skip = nn.Linear(channels, features, bias=False)
         nn.init.kaiming_normal_(self.density.weight, nonlinearity="linear")
         nn.init.zeros_(self.density.bias)
         with torch.no_grad():
             self.density.weight.mul_(0.1)
-            nn.init.zeros_(self.inside.weight)
-            self.inside.weight[:, INSIDE] = STEEP
             self.features.weight.mul_(0.1)
             nn.init.zeros_(self.features.bias)
             nn.init.zeros_(self.skip.weight)
@@ -49,4 +48,5 @@ class FieldHead(nn.Module):
         return self._thickness(latent, self.body(latent))
 
     def _thickness(self, latent: Tensor, hidden: Tensor) -> Tensor:
-        return START + SCALE * (self.density(hidden) + self.inside(latent)).squeeze(1)
+        learned = within(self.density(hidden).squeeze(1), CHANGE)
+        return START + SCALE * (learned + self.steep * latent[:, INSIDE])

@@ -13,6 +13,20 @@ from toolkit.volume.topology import Topology
 COLOUR_SCALE = 4.0  # a latent colour of ±1 is a colour logit of ±4
 INSIDE = 3  # the latent that starts as how far behind the surface the voxel lies
 MOST = 0.93  # latent colours are kept inside this, so that tanh is not driven to its ends
+CHANGE = 0.5  # most that networks may add to the distance behind the surface, before tanh: free space of which the sweep is sure stays so
+
+
+def within(learned: Tensor, most: float) -> Tensor:
+    """What is learned, kept within ± `most` without a kink."""
+    return most * torch.tanh(learned / most)
+
+
+def held(learned: Tensor) -> Tensor:
+    """(N, channels) learned additions to a latent; that to the distance behind the surface is kept within ± `CHANGE`.
+
+    Without it networks paint pictures right before the cameras of key frames, which explains neighbouring views just as well as surfaces.
+    """
+    return torch.cat([learned[:, :INSIDE], within(learned[:, INSIDE : INSIDE + 1], CHANGE), learned[:, INSIDE + 1 :]], 1)
 
 
 def inside_latent(signed: Tensor) -> Tensor:
@@ -62,4 +76,4 @@ class LocalReconstruction(nn.Module):
         """
         for number, convolution in enumerate(self.convolutions):
             rows = convolution(torch.relu(rows) if number else rows, topology, seen)
-        return rows + start
+        return held(rows) + start

@@ -17,7 +17,7 @@ from toolkit.networks.encoder import TRUNKS
 from toolkit.networks.model import ModelConfig, NerfusionModel
 
 METADATA_KEY = "fieldfuse.networks"
-VERSION = 4  # 1: other normalisation in the encoder; 2: without the agreement of views; 3: without the plane sweep
+VERSION = 5  # 1: other normalisation in the encoder; 2: without agreement; 3: without the sweep; 4: density changed without bounds
 MAX_BYTES = 10 * 2**20
 LIMITS = {"direction": 0}  # least values; every other number is at least 1
 CHOICES = {"encoder": TRUNKS, "decoder": ("deferred", "per_sample"), "fusion": ("gru", "mean")}

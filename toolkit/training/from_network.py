@@ -31,8 +31,10 @@ from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK
 
 SHIPPED = Path(weights.__file__).parent / "weights" / "nerfusion.safetensors"
-# Voxels that make up the median depth, on the finer of two lattices. One lattice of 24 alone loses 1.5 to 2.5 dB (docs/few_views.md).
+# Voxels that make up the median depth at least, on the finer of two lattices. One lattice of 24 alone loses 1.5 to 2.5 dB, while 104
+# gain 0.25 dB at five times the seconds (docs/few_views.md), so no voxel need be smaller than some pixels; a larger one shows.
 VOXELS_TO_MEDIAN, LEVELS = 48.0, 2
+PIXELS = 5.0
 GAMMA = 0.95  # the paper's 0.6 cuts holes where the networks are in doubt
 LEAST, MOST = 32, 384  # resolution of the lattice
 
@@ -42,12 +44,12 @@ class NetworkOptions:
     """What direct inference can be told.
 
     Attributes:
-        voxels: voxels that make up the median depth, on the finest lattice.
+        voxels: voxels that make up the median depth, on the finest lattice; None: as `voxels_to_median` says.
         levels: lattices, each of half the voxel size of the one before; 1: the paper's single one.
         gamma: see-through voxels (exp(−optical thickness) above it) are not rendered; None: all are.
     """
 
-    voxels: float = VOXELS_TO_MEDIAN
+    voxels: float | None = None
     levels: int = LEVELS
     gamma: float | None = GAMMA
 
@@ -61,10 +63,15 @@ def load_networks(path: Path | str | None = None, device: torch.device | str = "
     return load_model(SHIPPED if path is None else path, device)
 
 
-def lattice_of(space: Space, scene: Scene, options: NetworkOptions) -> Lattice:
-    """The finest lattice: about `options.voxels` voxels to the median depth, within what memory allows."""
-    unit = BLOCK * 2 ** (options.levels - 1)
-    wanted = 2 * space.extent * space.half / (scene.median_depth / options.voxels)
+def voxels_to_median(views: Views) -> float:
+    """Voxels that make up the median depth: 48, or as many as let a voxel there span no more than five pixels of the views."""
+    return max(VOXELS_TO_MEDIAN, float(np.median([lens.fx for lens in views.intrinsics])) / PIXELS)
+
+
+def lattice_of(space: Space, scene: Scene, voxels: float, levels: int) -> Lattice:
+    """The finest of `levels` lattices: about `voxels` voxels to the median depth, within what memory allows."""
+    unit = BLOCK * 2 ** (levels - 1)
+    wanted = 2 * space.extent * space.half / (scene.median_depth / voxels)
     return Lattice(space, int(np.clip(unit * round(wanted / unit), max(LEAST, unit), MOST)))
 
 
@@ -95,7 +102,8 @@ class Inference:
         self.model, self.keys, self.options = model, keys, options or NetworkOptions()
         self.train = views.subset(train)
         self.near, self.far = scene.near, scene.far
-        self.lattice = lattice_of(space_of(views, scene, background), scene, self.options)
+        voxels = self.options.voxels or voxels_to_median(self.train)
+        self.lattice = lattice_of(space_of(views, scene, background), scene, voxels, self.options.levels)
         self.behind = colour_behind(views).to(model.device)
         self.seconds = self.encode_seconds = 0.0
         self.done = 0

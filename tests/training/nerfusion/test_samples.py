@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -15,8 +17,9 @@ from toolkit.training.nerfusion import region
 from toolkit.training.nerfusion.drawing import depth_range, draw_sample
 from toolkit.training.nerfusion.mixture import Mixture
 from toolkit.training.nerfusion.procedural import ProceduralScene
+from toolkit.training.nerfusion.rays import in_sight, picture_rays
 from toolkit.training.nerfusion.region import lattice_resolution, region_around, surface_points
-from toolkit.training.nerfusion.samples import choose_views, view_distance
+from toolkit.training.nerfusion.samples import Pictures, choose_views, view_distance
 from toolkit.volume.space import Space
 
 
@@ -81,6 +84,35 @@ def test_objects_use_sixteen_pictures_and_refer_to_near_ones() -> None:
         for row in choice.references:
             others = [apart[row[0], i] for i in used if i != row[0]]
             assert apart[row[0], row[1:]].max() <= np.sort(others)[4]
+
+
+@pytest.mark.parametrize(("ordered", "kind"), [(False, "object"), (True, "room")])
+def test_half_of_the_targets_are_near_and_the_others_anywhere(ordered: bool, kind: str) -> None:
+    poses = ring(60)
+    apart = view_distance(poses, 2.0)
+    near, far = [], []
+    for seed in range(60):
+        choice = choose_views(poses, ordered, kind, np.random.default_rng(seed), views=3, key_frames=1, targets=2, depth=2.0)
+        key = int(choice.references[0, 0])
+        near.append(apart[key, choice.targets[0, 0]])
+        far.append(apart[key, choice.targets[0, 1]])
+    middle = float(np.median(apart[0]))
+    assert np.median(near) < 0.6 * middle < np.median(far) and max(far) > 1.5 * middle
+
+
+def test_rays_that_end_behind_what_a_reference_shows_are_left_out() -> None:
+    """Two cameras face each other across a plane between them: neither sees what the other one does."""
+    poses = torch.eye(4).repeat(2, 1, 1)
+    poses[1, :3, :3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))
+    poses[1, 2, 3] = 2.0
+    flat = torch.full((2, 8, 8), 1.0)
+    pictures = Pictures(torch.rand(2, 3, 8, 8), torch.tensor([[8.0, 8, 4, 4]]).repeat(2, 1), poses, flat)
+    rays, key = picture_rays(pictures, 1), torch.tensor([0])
+    assert bool(in_sight(rays, pictures, key).all())  # the plane itself, seen from behind
+    thick = replace(pictures, depths=torch.stack([flat[0] - 0.2, flat[1] - 0.2]))
+    assert not bool(in_sight(picture_rays(thick, 1), thick, key).any())
+    unknown = replace(pictures, depths=torch.stack([torch.zeros(8, 8), flat[1] - 0.2]))
+    assert bool(in_sight(picture_rays(unknown, 1), unknown, key).all())
 
 
 def test_samples_move_with_their_scene_and_do_not_depend_on_where_it_lies() -> None:

@@ -9,6 +9,7 @@ import torch
 from toolkit.training.nerfusion.samples import Pictures
 
 Tensor = torch.Tensor
+HIDDEN = 0.05  # relative: what lies this much behind what a picture shows is not shown by it
 
 
 @dataclass(frozen=True)
@@ -61,9 +62,10 @@ def random_rays(pictures: Pictures, targets: Tensor, count: int, generator: torc
 
 
 def in_sight(rays: TargetRays, pictures: Pictures, references: Tensor) -> Tensor:
-    """(R,) bool: where a ray ends lies inside at least one of the pictures at `references` (any shape), or nobody knows where it ends.
+    """(R,) bool: at least one of the pictures at `references` (any shape) shows where a ray ends, or nobody knows where it ends.
 
-    What no reference shows cannot be predicted; such rays would only add noise to the gradient. What hides the end is not asked.
+    What no reference shows cannot be predicted; such rays would only add noise to the gradient. Where a reference's depth is not known,
+    what hides the end is not asked.
     """
     points = rays.origins + rays.directions * rays.distance[:, None]
     height, width = pictures.images.shape[2:]
@@ -73,7 +75,9 @@ def in_sight(rays: TargetRays, pictures: Pictures, references: Tensor) -> Tensor
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         depth = local[:, 2].clamp_min(1e-9)
         u, v = local[:, 0] / depth * fx + cx, local[:, 1] / depth * fy + cy
-        seen |= (local[:, 2] > 0) & (u >= 0) & (u <= width) & (v >= 0) & (v <= height)
+        inside = (local[:, 2] > 0) & (u >= 0) & (u <= width) & (v >= 0) & (v <= height)
+        there = pictures.depths[view, v.long().clamp(0, height - 1), u.long().clamp(0, width - 1)]
+        seen |= inside & ((there == 0) | (depth <= (1 + HIDDEN) * there))
     return seen
 
 

@@ -62,7 +62,7 @@ class Sample:
     name: str
     pictures: Pictures
     references: Tensor  # (F, K) int64: each key frame (first column) and its K − 1 neighbours
-    targets: Tensor  # (F, T) int64: pictures near each key frame that are not among its references
+    targets: Tensor  # (F, T) int64: pictures near each key frame, and others, that are not among its references
     space: Space
     resolution: int  # voxels along the side of the space's cube
     near: float  # nearest depth that matters, along z
@@ -97,7 +97,8 @@ def choose_views(
     Videos of rooms: key frames are 2–5% of the frames, one after the other in time, at least a few frames apart; references are
     neighbours in time. Otherwise: 16 frames are drawn, key frames among them, and references are near in place and direction, at a
     difference that suits matching.
-    Targets are frames close to the key frame (videos: between its references or just beyond) that it does not refer to.
+    Half of the targets are frames close to the key frame (videos: between its references or just beyond), the others are from anywhere;
+    none is one that it refers to.
 
     Raises:
         InputError: fewer frames than one key frame, its references and one target need.
@@ -125,7 +126,7 @@ def _by_time(count: int, rng: np.random.Generator, views: int, key_frames: int, 
         reach = max(2, min(len(spare), 2 * targets, (views - 1) * step + 1))
         close = sorted(spare, key=lambda i: (abs(i - key), i))[:reach]
         references.append(near)
-        wanted.append(_draw(rng, close, targets))
+        wanted.append(_near_and_far(rng, close, spare, targets))
     return Choice(np.array(references), np.array(wanted))
 
 
@@ -149,8 +150,15 @@ def _by_place(poses: Array, rng: np.random.Generator, views: int, key_frames: in
             cost = cost - 0.25 * np.minimum(apart[refer[-1]], 2 * sweet)
         near = [int(i) for i in np.argsort(apart[key], kind="stable") if int(i) not in refer]
         references.append([int(pool[i]) for i in refer])
-        wanted.append([int(pool[i]) for i in _draw(rng, near[: 2 * targets], targets)])
+        wanted.append([int(pool[i]) for i in _near_and_far(rng, near[: 2 * targets], near, targets)])
     return Choice(np.array(references), np.array(wanted))
+
+
+def _near_and_far(rng: np.random.Generator, close: list[int], all_of_them: list[int], count: int) -> list[int]:
+    """Half of the targets from nearby, the others from anywhere: seen from nearby alone, a picture painted right before the key frame's
+    camera is as good as a surface, and from everywhere else it is fog.
+    """
+    return _draw(rng, close, count - count // 2) + _draw(rng, all_of_them, count // 2)
 
 
 def _draw(rng: np.random.Generator, among: list[int], count: int) -> list[int]:
