@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -60,8 +61,8 @@ def test_a_run_leaves_weights_curve_and_checkpoint(tmp_path: Path) -> None:
 
 
 def test_what_is_shipped_is_the_average_along_the_run(tmp_path: Path) -> None:
-    trainer = Trainer(tiny_settings(optimiser={"average": 0.3}), tmp_path, Crew())
-    mean = state(trainer)
+    trainer = Trainer(tiny_settings(optimiser={"average": 0.3, "start_share": 0.25}), tmp_path, Crew())
+    start = mean = state(trainer)
     for step in range(4):
         trainer.run(until=step + 1)
         decay = min(0.3, (1 + step) / (10 + step))
@@ -69,15 +70,15 @@ def test_what_is_shipped_is_the_average_along_the_run(tmp_path: Path) -> None:
     shipped = load_model(tmp_path / WEIGHTS).state_dict()
     assert shipped.keys() == mean.keys() and not same(shipped, state(trainer))
     for name, value in mean.items():
-        torch.testing.assert_close(shipped[name], value, rtol=1e-5, atol=1e-6)
-    for average in (-0.1, 1.0):
-        with pytest.raises(InputError, match=r"optimiser\.average"):
-            tiny_settings(optimiser={"average": average})
+        torch.testing.assert_close(shipped[name], 0.75 * value + 0.25 * start[name], rtol=1e-5, atol=1e-6)
+    for name, value in itertools.product(("average", "start_share"), (-0.1, 1.0)):
+        with pytest.raises(InputError, match=rf"optimiser\.{name}"):
+            tiny_settings(optimiser={name: value})
 
 
 def test_resuming_repeats_every_bit(tmp_path: Path) -> None:
     """Stopped once in each stage; weights, their average, moments of Adam and the curve are those of a run that never stopped."""
-    settings = tiny_settings(optimiser={"average": 0.9})
+    settings = tiny_settings(optimiser={"average": 0.9, "start_share": 0.5})
     whole = Trainer(settings, tmp_path / "whole", Crew())
     whole.run()
     for stop in (1, 3):
@@ -87,6 +88,7 @@ def test_resuming_repeats_every_bit(tmp_path: Path) -> None:
     assert second.step == 3 and same(state(first), state(second)) and same(first.average.values, second.average.values)
     second.run()
     assert same(state(whole), state(second)) and same(whole.average.values, second.average.values)
+    assert (tmp_path / "whole" / WEIGHTS).read_bytes() == (tmp_path / "parts" / WEIGHTS).read_bytes()
     for a, b in zip(whole.model.parameters(), second.model.parameters(), strict=True):
         for name in ("step", "exp_avg", "exp_avg_sq"):
             assert torch.equal(whole.adam.state[a][name], second.adam.state[b][name])

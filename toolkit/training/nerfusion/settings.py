@@ -75,6 +75,7 @@ class OptimiserSettings:
     final: float = 0.05  # share of the rate at the end; cosine in between
     clip: float = 1.0  # largest norm of the gradient
     average: float = 0.0  # weights that are validated and shipped: the average along the run, of about 1 / (1 − this) steps; 0: the newest
+    start_share: float = 0.0  # share in them of the weights before the first step
     reduced: bool = False  # bfloat16 autocast
 
 
@@ -180,8 +181,9 @@ def _check(settings: TrainSettings) -> None:
             raise InputError(f"{name} is {value}; it must be at least 1")
     if not 0 < settings.optimiser.rate < 1 or not settings.optimiser.clip > 0:
         raise InputError("optimiser.rate must lie between 0 and 1, and optimiser.clip above 0")
-    if not 0 <= settings.optimiser.average < 1:
-        raise InputError(f"optimiser.average is {settings.optimiser.average}; it must be 0 or more, and less than 1")
+    for name, share in (("average", settings.optimiser.average), ("start_share", settings.optimiser.start_share)):
+        if not 0 <= share < 1:
+            raise InputError(f"optimiser.{name} is {share}; it must be 0 or more, and less than 1")
 
 
 def train_settings_dict(settings: TrainSettings) -> dict[str, Any]:

@@ -82,7 +82,7 @@ class Trainer:
         self.settings, self.out, self.crew = settings, out, crew
         self.model = make_model(settings).to(crew.device)
         self.adam = torch.optim.Adam(self.model.parameters(), lr=settings.optimiser.rate, betas=BETAS)
-        self.average = Average(self.model, settings.optimiser.average)
+        self.average = Average(self.model, settings.optimiser.average, settings.optimiser.start_share)
         self.mixture = Mixture(settings, crew.rank)
         self.stepper = Stepper(self.model, settings)
         self.curve = Curve(out)
