@@ -17,11 +17,13 @@ from pipelines.console import ConsoleProgress
 from pipelines.folder import RunFolder
 from pipelines.kept import FEW_VIEWS, read_kept
 from pipelines.stages import Stages
+from toolkit.camera import Intrinsics
 from toolkit.capture.storage import capture_from_dict, capture_to_dict
 from toolkit.capture.types import Capture
 from toolkit.config import load_settings
 from toolkit.effects.correct import Corrections
 from toolkit.errors import InputError
+from toolkit.evaluate.compare_truth import find_truth
 from toolkit.evaluate.few_views import few_views_table
 from toolkit.evaluate.selftest.edit import small_field
 from toolkit.evaluate.selftest.fits import scene_of
@@ -171,3 +173,11 @@ def test_meshes_to_film_with_damaged_surfaces(damage: str, tmp_path: Path) -> No
     else:
         with pytest.raises(InputError, match=r"model\.obj"):
             load_mesh_scene(tmp_path / "model.obj")
+
+
+def test_ground_truth_whose_camera_is_no_numbers(tmp_path: Path) -> None:
+    (tmp_path / "ground_truth").mkdir()
+    camera = {**Intrinsics(8, 6, 7.0, 7.0, 4.0, 3.0).to_dict(), "fx": [1.0, 2.0]}
+    write_json(tmp_path / "ground_truth" / "cameras.json", {"intrinsics": camera, "frames": []})
+    with pytest.raises(InputError, match="does not list cameras"):
+        find_truth(Capture("photos", tmp_path, ()))

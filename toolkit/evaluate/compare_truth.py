@@ -51,8 +51,10 @@ def find_truth(capture: Capture) -> GroundTruth | None:
             for entry in about["frames"]:
                 if "picture" in entry:
                     depths[inside(root, str(entry["picture"]))] = inside(root, str(entry["truth"]))
-        except (KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"{folder / CAMERAS} does not list cameras as a simulated capture does ({error}); remove {folder}") from error
+        except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
+            raise InputError(
+                f"{folder / CAMERAS} does not list cameras as a simulated capture does ({first_line(error)}); remove {folder}"
+            ) from error
     return None if mesh is None and not depths else GroundTruth(mesh, depths, camera)
 
 

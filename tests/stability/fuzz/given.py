@@ -23,11 +23,11 @@ from toolkit.evaluate.geometry import read_mesh, surface_points
 from toolkit.files import write_json
 from toolkit.simulate.mesh_scene import load_mesh_scene
 from toolkit.simulate.seen import Rays
+from toolkit.training.nerfusion.captured import CapturedScene
 from toolkit.training.nerfusion.datasets.dtu import dtu_scene, dtu_scenes
 from toolkit.training.nerfusion.datasets.scanned_objects import scanned_object_folders, scanned_object_scene
 from toolkit.training.nerfusion.datasets.scannet import scannet_folders, scannet_scene
 from toolkit.training.nerfusion.datasets.synthetic import synthetic_folders, synthetic_scene
-from toolkit.training.nerfusion.samples import Pictures
 
 MESHES = ("ascii.ply", "binary.ply", "coloured.ply", "model.obj", "model.mtl", "picture.png", "model.glb", "model.gltf")
 TRUTH = ("ground_truth/cameras.json", "ground_truth/0.safetensors", "ground_truth/mesh.ply")
@@ -107,14 +107,16 @@ def make_datasets(root: Path) -> None:
 def read_datasets(root: Path, number: int) -> None:
     """A picture of each."""
     all_of(
-        lambda: finite(dtu_scene(dtu_scenes(root / "dtu")[0], 160).pictures([2])),
-        lambda: finite(scannet_scene(scannet_folders(root / "scannet")[0], 64).pictures([3])),
-        lambda: finite(scanned_object_scene(scanned_object_folders(root / "objects")[0], 32).pictures([2])),
-        lambda: finite(synthetic_scene(synthetic_folders(root / "synthetic")[0], 32).pictures([1])),
+        lambda: finite(dtu_scene(dtu_scenes(root / "dtu")[0], 160)),
+        lambda: finite(scannet_scene(scannet_folders(root / "scannet")[0], 64)),
+        lambda: finite(scanned_object_scene(scanned_object_folders(root / "objects")[0], 32)),
+        lambda: finite(synthetic_scene(synthetic_folders(root / "synthetic")[0], 32)),
     )
 
 
-def finite(found: Pictures) -> None:
+def finite(scene: CapturedScene) -> None:
+    """Look at the last picture; views whose pose is not known are left out."""
+    found = scene.pictures([len(scene.world_from_camera) - 1])
     if not bool(torch.isfinite(found.world_from_camera).all() and torch.isfinite(found.intrinsics).all()):
         raise ValueError("a camera that is not finite")
 
