@@ -10,16 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from tests.networks.made import HEIGHT, INTRINSICS, WIDTH, poses, small_model
 from toolkit.capture.types import Views
 from toolkit.errors import InputError, Interrupted
 from toolkit.fusion import KEPT_PICTURES, Fused, Fusion, FusionOptions, fuse_views, fusion_lattice
 from toolkit.keyframes import KeyFrames
+from toolkit.networks.block_conv import BlockConv3d
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.head import SCALE, START
 from toolkit.networks.lattice import Lattice
+from toolkit.networks.local import INSIDE
 from toolkit.networks.model import NerfusionModel
 from toolkit.networks.refine import part
 from toolkit.progress import Progress
@@ -38,17 +39,16 @@ def captured(count: int = 5) -> tuple[Views, KeyFrames]:
 
 
 def opinionated(seed: int = 0) -> NerfusionModel:
-    """A model whose densities differ widely from place to place, as a trained one's do: one latent alone tells them, whatever the head
-    starts from, since pictures of noise agree nowhere."""
+    """A model whose densities differ widely from place to place, as a trained one's do: the local network tells them, since pictures of
+    noise agree nowhere."""
     model = small_model(seed).eval()
-    channels, head = model.config.channels, model.to_field
-    sizes = {layer: (layer.in_features, layer.out_features) for layer in head.children() if isinstance(layer, nn.Linear)}
-    (direct,) = (layer for layer, size in sizes.items() if size == (channels, 1) and layer is not head.density)
+    head, last = model.to_field, model.local.convolutions[-1]
+    assert isinstance(last, BlockConv3d)
     with torch.no_grad():
+        last.weight[INSIDE] *= 100
         head.density.weight.zero_()
-        direct.weight.zero_()
-        direct.weight[:, 5] = 4.0
         head.density.bias.fill_((-0.6 - START) / SCALE)
+        head.steep.fill_(2.0)
     return model
 
 
@@ -80,7 +80,7 @@ def run(levels: int, gamma: float, resolution: int = 48, prune_every: int = 100)
 
 
 def test_a_finer_level_knows_only_where_the_coarse_one_is_not_see_through() -> None:
-    dense, half, empty = run(1, 0.6), run(2, 0.6), run(2, 1e-30)
+    dense, half, empty = run(1, 0.6), run(2, 0.6), run(2, 1e-300)
     assert [frame for frame, _, _ in half] == [0, 1, 2, 3, 4]
     assert 0.02 * dense[-1][1] < half[-1][1] < 0.9 * dense[-1][1]
     assert all(known == 0 for _, known, _ in empty), "where nothing is solid, nothing is looked at finer"
