@@ -1,4 +1,4 @@
-"""Highlights looked for between points, on pictures of a textured wall that are made up: found where light wanders over it, and only then."""
+"""Highlights looked for between points, on made-up pictures of a textured wall: found where light wanders over it, and only then."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def stored(linear: Array) -> Array:
 def wall(
     lamp: float = 0.0, gain: Array | None = None, corner: float = 1.0, top: float = -9.0, away: float = AWAY, seed: int = 0
 ) -> Sightings:
-    """Cameras that pass a wall, which is all that is known of points. A lamp's image stands still in the picture and so wanders over the wall.
+    """Cameras that pass a wall, which is all that is known of points. A lamp's image stands still in the picture, so wanders over the wall.
 
     Args:
         lamp: linear light that it adds. gain: (FRAMES,) of exposure. corner: of a vignetting. top: y/z above which the picture shows what

@@ -105,7 +105,7 @@ def choose_field(field: FieldSettings, effects: list[dict[str, Any]], off: Seque
     for entry in effects:
         name, unwanted = entry["effect"], entry["effect"] in off
         if name == VIEWS and field.view == "auto":
-            field.view = "full" if entry["on"] or entry["wish"] == "off" and not unwanted else "none" if unwanted else PLAIN_VIEW
+            field.view = "full" if entry["on"] or (entry["wish"] == "off" and not unwanted) else "none" if unwanted else PLAIN_VIEW
         if name == FAR and field.background == "auto" and (entry["on"] or unwanted):
             field.background = "on" if entry["on"] else "off"
 

@@ -66,7 +66,7 @@ def evidence(slope: Array, depth: Array, frame: Array, point: Array, frames: int
     """Whether the same points are sharper in some frames than in others.
 
     The slopes' energy at an observation is the point's own, times the frame's sharpness, times a power of the depth (from nearby, slopes a
-    pixel are gentler). Slow trends over the frames are no blur of a moving camera: they are taken out, and the number is no larger than what
+    pixel are gentler). Slow trends over the frames are no blur of a moving camera: they are taken out; the number is no larger than what
     two halves of the points agree on of how frames differ from their neighbours.
 
     Args:
@@ -91,9 +91,10 @@ def evidence(slope: Array, depth: Array, frame: Array, point: Array, frames: int
     values = values - np.polynomial.Polynomial.fit(steps, values, 2)(steps)
     chance = float((float((weight * left**2).sum() / weight.sum()) / np.maximum(seen[told], 1)).mean())
     deviation = float(np.sqrt(max(float(np.mean(values**2)) - chance, 0.0)))
-    halves = []
-    for half in (number % 2 == 0, number % 2 == 1):
-        halves.append(_sharpness(energy[half], distance[half], every[half], np.unique(number[half], return_inverse=True)[1], frames)[0])
+    halves = [
+        _sharpness(energy[half], distance[half], every[half], np.unique(number[half], return_inverse=True)[1], frames)[0]
+        for half in (number % 2 == 0, number % 2 == 1)
+    ]
     jumps = [one[1:-1] - 0.5 * (one[2:] + one[:-2]) for one in halves]
     agreed = float(np.sqrt(max(float(np.mean(jumps[0] * jumps[1])), 0.0) / 1.5))  # 1.5: of independent frames, what such jumps add up to
     deviation = min(deviation, agreed)

@@ -5,8 +5,8 @@ plane through the points round it. With P the patch's log light without its mean
 
     d_s = l_r − l_s − median of the same over all patches of r in s,     told where  mean (P_s − P_r)² < SAME · mean P_r² + NOISE
 
-so the texture has to agree while the light may differ, and exposure drops out. A patch's excess is the median of d_s over the pictures s. It
-is *shiny* when at least three quarters of the patches round it are BRIGHTER: what noise, edges and wrong planes do is not alike over an
+so the texture has to agree while the light may differ, and exposure drops out. A patch's excess is the median of d_s over the pictures s.
+It is *shiny* when at least three quarters of the patches round it are BRIGHTER: what noise, edges and wrong planes do is not alike over an
 area. Half of the pictures s predict, from the patches round each shiny one, what the other half sees.
 """
 

@@ -122,12 +122,14 @@ def colmap_model(camera: Intrinsics) -> tuple[str, list[float]]:
 def quaternion(rotation: Array) -> Array:
     """(w, x, y, z) with w ≥ 0 of a rotation matrix: the largest eigenvector of its symmetric 4×4 form (Bar-Itzhack 2000)."""
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)
-    form = np.array([
-        [a + e + i, h - f, c - g, d - b],
-        [h - f, a - e - i, b + d, c + g],
-        [c - g, b + d, e - a - i, f + h],
-        [d - b, c + g, f + h, i - a - e],
-    ])
+    form = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ]
+    )
     out = np.linalg.eigh(form)[1][:, -1]
     return np.asarray(-out if out[0] < 0 else out)
 

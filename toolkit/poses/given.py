@@ -18,15 +18,19 @@ def given_poses(capture: Capture) -> PoseResult:
     posed = [frame for frame in capture.frames if frame.world_from_camera is not None and frame.intrinsics is not None]
     missing = [frame.name for frame in capture.frames if frame.world_from_camera is None or frame.intrinsics is None]
     if len(posed) < 2:
-        raise PoseError(f"{capture.root}: {len(posed)} of {len(capture.frames)} frames come with a pose and intrinsics, at least 2 "
-            f"are needed; use --set poses.source=sfm to find them")
+        raise PoseError(
+            f"{capture.root}: {len(posed)} of {len(capture.frames)} frames come with a pose and intrinsics, at least 2 "
+            f"are needed; use --set poses.source=sfm to find them"
+        )
     poses = np.array([frame.world_from_camera for frame in posed], dtype=np.float64)
     cameras = [frame.intrinsics.checked(f"{capture.root}, {frame.name}") for frame in posed if frame.intrinsics is not None]
     centres = poses[:, :3, 3]
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     if not spread > 1e-9 * max(1.0, float(np.abs(centres).max())):
-        raise PoseError(f"{capture.root}: all {len(posed)} given cameras stand on one spot, so depth cannot be told; record while "
-            f"moving sideways, or correct the poses")
+        raise PoseError(
+            f"{capture.root}: all {len(posed)} given cameras stand on one spot, so depth cannot be told; record while "
+            f"moving sideways, or correct the poses"
+        )
     warnings = []
     if missing:
         warnings.append(f"{len(missing)} of {len(capture.frames)} frames come without a pose and are left out: {listed(missing)}")

@@ -61,8 +61,10 @@ class PoseResult:
         """
         try:
             names = [str(name) for name in data["names"]]
-            poses = [checked_pose(np.array(pose, dtype=np.float64), f"poses.json, "
-                f"{name}") for name, pose in zip(names, data["world_from_camera"], strict=True)]
+            poses = [
+                checked_pose(np.array(pose, dtype=np.float64), f"poses.json, {name}")
+                for name, pose in zip(names, data["world_from_camera"], strict=True)
+            ]
             cameras = [Intrinsics.from_dict(camera) for camera in data["intrinsics"]]
             if len(cameras) != len(names):
                 raise ValueError("as many cameras as names are needed")
@@ -97,8 +99,9 @@ class PoseResult:
         by_name = {frame.name: frame for frame in capture.frames}
         absent = [name for name in self.names if name not in by_name]
         if absent:
-            raise InputError(f"the poses hold {len(absent)} frames that the capture does not ({absent[0]} first); remove poses.json "
-                f"and run again")
+            raise InputError(
+                f"the poses hold {len(absent)} frames that the capture does not ({absent[0]} first); remove poses.json and run again"
+            )
         frames = [
             replace(by_name[name], intrinsics=camera, world_from_camera=np.array(pose, dtype=np.float64))
             for name, camera, pose in zip(self.names, self.intrinsics, self.world_from_camera, strict=True)

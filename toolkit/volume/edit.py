@@ -95,9 +95,7 @@ def trilinear_density(topology: Topology, density: Tensor) -> Callable[[Tensor, 
     return function
 
 
-def prune(
-    occupied: Tensor, density: Callable[[Tensor, Tensor], Tensor], voxel_size: float, gamma: float = 0.6, samples: int = 3
-) -> Tensor:
+def prune(occupied: Tensor, density: Callable[[Tensor, Tensor], Tensor], voxel_size: float, gamma: float = 0.6, samples: int = 3) -> Tensor:
     """Occupied voxels that are not see-through, after NeRFusion's pruning rule (its section on fine-tuning) made free of scale.
 
     The paper drops a voxel when the smallest exp(−σ) over k points in it exceeds γ. That depends on the unit of length, so here
@@ -124,9 +122,7 @@ def prune(
     return out
 
 
-def split(
-    topology: Topology, occupied: Tensor, rows: Sequence[Tensor], mode: str = "trilinear"
-) -> tuple[Topology, Tensor, list[Tensor]]:
+def split(topology: Topology, occupied: Tensor, rows: Sequence[Tensor], mode: str = "trilinear") -> tuple[Topology, Tensor, list[Tensor]]:
     """Every voxel into 2×2×2: the same field on a lattice of half the voxel size and the same origin.
 
     Args:
