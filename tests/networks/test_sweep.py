@@ -148,6 +148,9 @@ def test_extreme_places_read_finite_numbers() -> None:
         assert bool(torch.isfinite(value).all()) and float(value.min()) >= -1 and float(value.max()) <= 1
     with pytest.raises(ValueError, match="nearest or a farthest"):
         sweep(described, seen_by, 0.0, math.inf)
+    for near, far in ((1.0, 1.0), (2.0, 1.0)):
+        with pytest.raises(ValueError, match="looks at nothing"):
+            sweep(described, seen_by, near, far)
 
 
 def test_descriptors_forgive_exposure_and_are_small() -> None:

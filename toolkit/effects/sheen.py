@@ -136,7 +136,8 @@ def _excess(seen: Sightings, problem: Problem, depth: Array, pictures: list[_Pic
     for k, other in enumerate(others):
         to = carried(seen, problem, one, int(other), rays, np.repeat(nearness[some], 3)[:, None]).reshape(-1, 3, 2)
         step = (to[:, 1:] - to[:, :1]) / HALF  # (n, 2, 2): one pixel across and one down
-        zoom = np.sqrt(np.abs(np.linalg.det(step)))
+        with np.errstate(invalid="ignore"):  # behind the other camera it is NaN, and told below as out of sight
+            zoom = np.sqrt(np.abs(np.linalg.det(step)))
         at = to[:, :1] + np.einsum("ka,nab->nkb", around, step)
         there, inside = _sampled(pictures[int(other)].log, at)
         turn = np.einsum("nab,nkb,nk->na", steer, slope, _split(there)[0] - texture)

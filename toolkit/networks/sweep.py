@@ -99,7 +99,7 @@ def sweep(described: Sequence[Tensor], cameras: Cameras, near: float, far: float
         near, far: 0 and ∞ where unknown.
 
     Raises:
-        ValueError: neither is known.
+        ValueError: neither is known, or the nearest does not lie before the farthest.
     """
     near, far = _bounded(near, far)
     low, high = 1 / far, 1 / near
@@ -131,7 +131,10 @@ def _bounded(near: float, far: float) -> tuple[float, float]:
     """A range of depths with both ends."""
     if not (near > 0 or math.isfinite(far)):
         raise ValueError("a sweep needs a nearest or a farthest depth")
-    return (near if near > 0 else far / RANGE), (far if math.isfinite(far) else RANGE * near)
+    near, far = (near if near > 0 else far / RANGE), (far if math.isfinite(far) else RANGE * near)
+    if not near < far:
+        raise ValueError(f"a sweep from {near:g} to {far:g} looks at nothing; the nearest depth must lie before the farthest")
+    return near, far
 
 
 def _pixels(described: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor, tuple[int, int]]:
