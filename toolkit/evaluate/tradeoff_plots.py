@@ -19,7 +19,7 @@ MARKERS = {"field": "o", "field_per_sample": "D", "direct": "^", "tsdf": "s", "t
 CURVES = {"field": "iterations", "field_per_sample": "iterations", "direct": "keyframes", "tsdf": "voxel_size", "tsdf_stereo": "voxel_size"}
 INK, QUIET, LINE, FRONT = "#18212c", "#5c6979", "#dfe5eb", "#18212c"
 COST_TITLES = {"seconds": "seconds that the method alone takes", "memory_mb": "memory beyond the libraries"}
-SIZE = (7.2, 4.3)
+SIZE = (7.2, 4.6)
 DPI = 130
 METADATA = {"Software": None}
 
@@ -35,7 +35,7 @@ def quality_plot(points: Sequence[Point], cost: str, measure: str) -> bytes | No
         return None
     figure = Figure(figsize=SIZE, layout="constrained", facecolor="white")
     axes = figure.add_subplot()
-    _frame(axes, cost, measure, [point.mean[cost] for point in known])
+    _frame(axes, cost, measure, _reach(known, cost))
     front = pareto(known, cost, measure)
     axes.step(
         [point.mean[cost] for point in front],
@@ -60,12 +60,18 @@ def quality_plot(points: Sequence[Point], cost: str, measure: str) -> bytes | No
         linewidths=1.1,
         zorder=5,
     )
-    axes.legend(frameon=False, fontsize=9, labelcolor=INK, loc="best")
+    figure.legend(frameon=False, fontsize=9, labelcolor=INK, loc="outside upper left", ncols=3, columnspacing=1.6)  # never over marks
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         figure.savefig(buffer, format="png", dpi=DPI, metadata=METADATA)
     return buffer.getvalue()
+
+
+def _reach(points: Sequence[Point], cost: str) -> list[float]:
+    """Costs with the ends of their error bars, where those are above zero."""
+    ends = [point.mean[cost] + sign * point.spread.get(cost, 0.0) for point in points for sign in (-1, 0, 1)]
+    return [value for value in ends if value > 0]
 
 
 def _curves(points: Sequence[Point]) -> dict[str, list[Point]]:
