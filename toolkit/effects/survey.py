@@ -159,11 +159,16 @@ def _gain(choice: geometry.Choice) -> float:
     return 1 - choice.after / choice.before if choice.before > 0 else 0.0
 
 
+def _percent(choice: geometry.Choice) -> str:
+    """The gain in words; adding zero turns a rounded -0 into 0."""
+    return f"{round(100 * _gain(choice), 0) + 0:.0f}"
+
+
 def _lens(found: geometry.Explained) -> Finding:
     choice = found.choices[LENS]
-    rings = ", ".join(f"{value:+.2f}" for value in found.profile)
+    rings = ", ".join(f"{round(float(value), 2) + 0:+.2f}" for value in found.profile)
     reason = (
-        f"a lens with k1 and k2 beyond the given one lowers what held-out points are off by {100 * _gain(choice):.0f}%; from the middle "
+        f"a lens with k1 and k2 beyond the given one lowers what held-out points are off by {_percent(choice)}%; from the middle "
         f"to the corners points lie {rings} working pixels too far out"
     )
     return Finding(LENS, max(_gain(choice), 0.0), geometry.MARGIN[LENS], reason, choice.kept, choice.before, choice.after, PIXELS)
@@ -171,7 +176,7 @@ def _lens(found: geometry.Explained) -> Finding:
 
 def _rows(found: geometry.Explained, seen: Sightings) -> Finding:
     choice = found.choices[ROWS]
-    reason = f"rows read one after the other lower what held-out points are off by {100 * _gain(choice):.0f}%"
+    reason = f"rows read one after the other lower what held-out points are off by {_percent(choice)}%"
     if choice.kept:
         share, alike = geometry.readout(found.problem.motion, geometry.steps_of(found.problem.poses, seen.times))
         if alike > 0.5:
@@ -184,7 +189,7 @@ def _poses(found: geometry.Explained) -> Finding:
     choice = found.choices[POSES]
     reason = (
         f"held-out points are {choice.before:.2f} working pixels off with the given poses, {choice.after:.2f} with refined ones: "
-        f"{100 * _gain(choice):.0f}% less"
+        f"{_percent(choice)}% less"
     )
     return Finding(POSES, max(_gain(choice), 0.0), geometry.MARGIN[POSES], reason, choice.kept, choice.before, choice.after, PIXELS)
 
