@@ -131,7 +131,7 @@ def preview(inference: Inference, frame: int) -> Any:
     camera, photo = inference.train.intrinsics[frame], inference.train.images[frame]
     shrink = min(1.0, PREVIEW_SIDE / max(camera.width, camera.height))
     camera = camera.scaled(max(1, round(shrink * camera.width)), max(1, round(shrink * camera.height)))
-    field = inference.field()
+    field = inference.field(carved=False)
     # The compiled renderer is faster, but the first picture must not wait for a compiler.
     shown = to_picture(render_view(field, camera, inference.train.world_from_camera[frame], make_renderer(field, "torch")))
     small = cv2.resize(photo, (camera.width, camera.height), interpolation=cv2.INTER_AREA)

@@ -21,7 +21,7 @@ from toolkit.poses.scene import Scene
 from toolkit.render.field import Field
 from toolkit.render.image import render_view
 from toolkit.training.fit import fit_field
-from toolkit.training.from_network import Inference, NetworkOptions, lattice_of, load_networks, voxels_to_median
+from toolkit.training.from_network import Inference, NetworkOptions, inside_silhouettes, lattice_of, load_networks, voxels_to_median
 from toolkit.training.network_start import THICK, THIN, network_start, widened
 from toolkit.training.start import space_of
 from toolkit.volume.lookup import corners, gather
@@ -153,6 +153,27 @@ def test_a_voxel_spans_no_more_than_some_pixels_at_the_median_depth() -> None:
     wide, fine = (lattice_of(space_of(views, about), about, voxels_to_median(v), 2) for v in (views, long))
     assert DEPTH / fine.voxel_size / 600 == pytest.approx(1 / 5, rel=0.1) and fine.resolution > 2 * wide.resolution
     assert lattice_of(space_of(views, about), about, 1e5, 2).resolution == 384
+
+
+def test_what_lies_outside_of_the_silhouettes_is_left_out() -> None:
+    """Alpha says that the left half of every picture shows nothing: what is left of the field shows in the right halves alone."""
+    views = wall_views()
+    height, width = views.images[0].shape[:2]
+    alpha = np.full((height, width), 255, np.uint8)
+    alpha[:, : width // 2] = 0
+    views = replace(views, alpha=[alpha] * len(views), background=(1.0, 1.0, 1.0))
+    running = Inference(inference().model, views, scene(), KeyFrames(np.array([0, 2]), np.array([[1], [1]])), options=NetworkOptions(32.0))
+    list(running.frames())
+    whole, carved = running.field(carved=False), running.field()
+    assert 0 < carved.voxels < whole.voxels
+    for index in (0, 2, 3):
+        full, rest = (
+            np.asarray(render_view(one, views.intrinsics[index], views.world_from_camera[index]).opacity) for one in (whole, carved)
+        )
+        left = width // 2 - 4  # voxels reach over the edge by some pixels, and over the picture's border, where nothing is judged
+        assert float(rest[2:-2, :left].mean()) < 0.01 and float(rest.max()) > 0.99
+        assert index == 0 or float(full[:, :left].mean()) > 0.8
+    assert torch.equal(inside_silhouettes(whole, views).occupied.sum(), carved.occupied.sum())
 
 
 def test_nothing_to_look_at_is_said() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
 from toolkit.render.fused import make_field, without_empty_blocks
-from toolkit.training.start import colour_behind, space_of
+from toolkit.training.start import colour_behind, emptied_by_views, space_of
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK
 
@@ -73,6 +73,19 @@ def lattice_of(space: Space, scene: Scene, voxels: float, levels: int) -> Lattic
     unit = BLOCK * 2 ** (levels - 1)
     wanted = 2 * space.extent * space.half / (scene.median_depth / voxels)
     return Lattice(space, int(np.clip(unit * round(wanted / unit), max(LEAST, unit), MOST)))
+
+
+def inside_silhouettes(field: Field, views: Views) -> Field:
+    """The field without the voxels that the views' alpha says are empty: nothing there has a colour for the networks to match."""
+    rows = field.occupied.nonzero().view(-1)
+    if len(rows) == 0:
+        return field
+    corner = Lattice(field.space, field.resolution).contracted(field.topology.keys, rows)
+    places = ((corner + field.space.extent) / (2 * field.space.extent / field.resolution)).round().long().cpu()
+    empty = emptied_by_views(field.space, field.resolution, places, views).to(rows.device)
+    occupied = field.occupied.clone()
+    occupied[rows[empty]] = False
+    return field if bool(empty.all()) else replace(field, occupied=occupied)
 
 
 class Inference:
@@ -124,8 +137,11 @@ class Inference:
             yield fused.frame
 
     @torch.no_grad()
-    def field(self) -> Field:
+    def field(self, carved: bool = True) -> Field:
         """The field of the key frames so far, in memory of its own; it shares the networks' decoder.
+
+        Args:
+            carved: captures with alpha: without what lies outside of the silhouettes of all training views, which takes a second or two.
 
         Raises:
             InputError: no key frame has been fused yet.
@@ -134,6 +150,9 @@ class Inference:
             raise InputError("no key frame has been fused yet, so there is no field; fuse one first")
         start = time.perf_counter()
         gamma, allowed = self.options.gamma, self._latest.allowed
-        made = without_empty_blocks(make_field(self.model, self._latest.volume, self.behind, gamma, 0.5 * self.near, allowed=allowed))
+        made = make_field(self.model, self._latest.volume, self.behind, gamma, 0.5 * self.near, allowed=allowed)
+        if carved and self.train.background is not None:
+            made = inside_silhouettes(made, self.train)
+        made = without_empty_blocks(made)
         self.seconds += time.perf_counter() - start
         return made

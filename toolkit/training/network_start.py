@@ -23,7 +23,7 @@ from toolkit.volume.edit import resample
 Tensor = torch.Tensor
 THIN = -4.5  # raw density of what is see-through or unknown, as in the classical start
 THICK = 2.0  # largest raw density of the start
-RESOLUTION = 128  # level of the fit at which the networks' field comes in; 64 loses up to 1.4 dB with three views (docs/few_views.md)
+RESOLUTION = 64  # level of the fit at which the networks' field comes in
 
 
 def widened(decoder: Deferred, hidden: int, generator: torch.Generator) -> Deferred:

@@ -31,6 +31,7 @@ SEEN_BY = 3  # training views that must see a voxel: fewer cannot tell its depth
 # 3 to 12 views it cost up to 9 dB on validation views, while with all of them nothing was gained or lost. With so few the fit may
 # also start from the networks.
 FEW_VIEWS = 24
+EMPTIED = 0.02  # share of the views that may err when they say that a voxel is empty
 
 
 def make_space(scene: Scene, background: bool, margin: float = MARGIN) -> Space:
@@ -83,6 +84,19 @@ def levels(finest: int) -> list[int]:
 
 def possible(space: Space, resolution: int, places: Tensor, views: Views) -> Tensor:
     """(N, 3) voxels → the ones that can hold something, judged from the training views alone."""
+    seen, emptied, count = _judged(space, resolution, places, views)
+    keep = (seen >= (SEEN_BY if count >= FEW_VIEWS else 1)) & (emptied <= EMPTIED * count)
+    return places[torch.from_numpy(keep)] if keep.any() else places
+
+
+def emptied_by_views(space: Space, resolution: int, places: Tensor, views: Views) -> Tensor:
+    """(N, 3) voxels → (N,) bool, those where alpha (or, without it, measured depth) of the training views says that there is nothing."""
+    _, emptied, count = _judged(space, resolution, places, views)
+    return torch.from_numpy(emptied > EMPTIED * count)
+
+
+def _judged(space: Space, resolution: int, places: Tensor, views: Views) -> tuple[Array, Array, int]:
+    """(N, 3) voxels → (N,) how many training views see each, and how many say that it is empty; and how many there are."""
     voxel = 2 * space.extent / resolution
     centre = (places.double() + 0.5) * voxel - space.extent
     points = space.to_working(centre).numpy()
@@ -96,8 +110,7 @@ def possible(space: Space, resolution: int, places: Tensor, views: Views) -> Ten
         visible, empty = _look(views, int(index), points, np.broadcast_to(radius, len(points)))
         seen += visible
         emptied += empty
-    keep = (seen >= (SEEN_BY if len(train) >= FEW_VIEWS else 1)) & (emptied <= 0.02 * len(train))
-    return places[torch.from_numpy(keep)] if keep.any() else places
+    return seen, emptied, len(train)
 
 
 def _look(views: Views, index: int, points: Array, radius: Array) -> tuple[Array, Array]:
