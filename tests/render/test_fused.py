@@ -133,8 +133,8 @@ def test_a_small_volume_learns_from_its_pictures() -> None:
 
 
 def test_what_is_rendered_moves_to_where_the_wall_is() -> None:
-    """A sweep that sees the wall 6% too near is corrected by colours alone, as far as the bounds on what is learned let them: to 3.7%, and to
-    under 3.5% without bounds. A voxel is 2.4% of the wall's depth."""
+    """A sweep that sees the wall 6% too near is corrected by colours alone, as far as the bounds on what is learned let them: to 3.7%, and
+    to under 3.5% without bounds. A voxel is 2.4% of the wall's depth."""
     _, errors, _ = learnt(0.03)
     first, last = np.mean(errors[:5]), np.mean(errors[-5:])
     assert 0.045 < first < 0.075, f"the start was meant to be 6% off, not {first:.1%}"
