@@ -14,7 +14,6 @@ import os
 import signal
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -80,19 +79,12 @@ KEEPS = ("field", "evaluate", REPORT)
 def fieldfuse(*arguments: object) -> Answer:
     """The command line in this process, its fit on a clock that advances by looks."""
     from pipelines import cli
+    from toolkit.training import fit
 
-    out, err, looks = io.StringIO(), io.StringIO(), itertools.count()
-    main, last = threading.main_thread(), [0.0]
-
-    def clock() -> float:
-        # Threads that other tests left behind may look at it too; only looks of the run itself make it go on.
-        if threading.current_thread() is main:
-            last[0] = next(looks) * TICK
-        return last[0]
-
+    out, err, looks = io.StringIO(), io.StringIO(), itertools.count(1)
     with (
         mock.patch.object(sys, "argv", ["fieldfuse", *map(str, arguments)]),
-        mock.patch.object(time, "perf_counter", clock),
+        mock.patch.object(fit._Clock, "seconds", lambda _: next(looks) * TICK),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):
