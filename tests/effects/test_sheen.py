@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from tests.effects.walls import AWAY, FRAMES, problem_of, wall
+from toolkit.effects.evidence import HeldOut
 from toolkit.effects.light import EXPOSURE, VIGNETTING, Light
-from toolkit.effects.sheen import THRESHOLD, Shiny, shiny
+from toolkit.effects.sheen import THRESHOLD, shiny
 from toolkit.effects.sightings import Sightings
 
 PLAIN = Light({}, frozenset(), {}, {}, np.ones((FRAMES, 3)), 1.0)
 
 
-def looked(seen: Sightings, found: Light = PLAIN, wrong: float = 0.0) -> Shiny:
+def looked(seen: Sightings, found: Light = PLAIN, wrong: float = 0.0) -> HeldOut:
     depth = np.full(len(seen.frame), AWAY)
     depth[: int(wrong * len(depth))] *= 0.5
     return shiny(seen, problem_of(seen), np.random.default_rng(1).permutation(depth), found)

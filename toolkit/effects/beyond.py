@@ -13,7 +13,6 @@ half says how much worse the best nearer place explains what they show.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -21,7 +20,7 @@ import numpy as np
 
 from toolkit.camera import Array, distort
 from toolkit.effects.adjust import Problem
-from toolkit.effects.evidence import Evidence
+from toolkit.effects.evidence import Evidence, HeldOut
 from toolkit.effects.sightings import LINEAR, Sightings
 from toolkit.poses.points import undistorted
 
@@ -40,20 +39,7 @@ CROSS = np.array([[0, 0], [HALF, 0], [0, HALF]])  # working pixels
 GAIN = 0.3  # least relative fall of the held-out error
 
 
-@dataclass(frozen=True)
-class Far:
-    """What patches say: the evidence, and the error of far patches in held-out pictures, in stops, nearer and at infinity."""
-
-    evidence: Evidence
-    before: float | None = None
-    after: float | None = None
-
-    @property
-    def found(self) -> bool:
-        return self.evidence.found and self.before is not None and self.after is not None and self.after < (1 - GAIN) * self.before
-
-
-def far(seen: Sightings, problem: Problem, usual: float) -> Far:
+def far(seen: Sightings, problem: Problem, usual: float) -> HeldOut:
     """Look at patches of some pictures in others.
 
     Args:
@@ -81,9 +67,8 @@ def far(seen: Sightings, problem: Problem, usual: float) -> Far:
         f"{100 * share:.1f}% of the patches lie more than {2 * NEAR_LIMIT:g} times as far as the scene usually is: other pictures show them"
         f" where infinity would be; {100 * THRESHOLD:.1f}% or more speak for a distant background"
     )
-    return Far(
-        Evidence("background", share, THRESHOLD, reason), None if before is None else float(before), None if after is None else float(after)
-    )
+    evidence = Evidence("background", share, THRESHOLD, reason)
+    return HeldOut(evidence, GAIN, None if before is None else float(before), None if after is None else float(after))
 
 
 def _others(poses: Array, one: int) -> Array:

@@ -96,3 +96,22 @@ def robust(residual: Array) -> tuple[Array, float]:
     size = np.abs(residual) if residual.ndim == 1 else np.linalg.norm(residual, axis=1) / np.sqrt(residual.shape[1])
     deviation = 1.4826 * float(np.median(size)) if len(size) else 0.0
     return np.minimum(1.0, TUNING * max(deviation, 1e-9) / np.maximum(size, 1e-12)), deviation
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Evidence from patches of pictures, and how well what it says predicts held-out pictures.
+
+    Attributes:
+        least: relative fall of the error that counts.
+        before, after: error of the patches in question in held-out pictures, in stops, without and with the effect; None: there are none.
+    """
+
+    evidence: Evidence
+    least: float
+    before: float | None = None
+    after: float | None = None
+
+    @property
+    def found(self) -> bool:
+        return self.evidence.found and self.before is not None and self.after is not None and self.after < (1 - self.least) * self.before

@@ -21,7 +21,7 @@ import torch
 from toolkit.camera import Array
 from toolkit.effects.adjust import Problem
 from toolkit.effects.beyond import carried, rays_of
-from toolkit.effects.evidence import Evidence
+from toolkit.effects.evidence import Evidence, HeldOut
 from toolkit.effects.light import EXPOSURE, VIGNETTING, Light
 from toolkit.effects.sightings import LINEAR, Sightings
 from toolkit.effects.vignetting import Vignetting, falloff
@@ -45,26 +45,13 @@ VIEWS = 3  # others that show a patch
 
 
 @dataclass(frozen=True)
-class Shiny:
-    """What patches say: the evidence, and what shiny ones in held-out pictures are off, in stops, unpredicted and predicted."""
-
-    evidence: Evidence
-    before: float | None = None
-    after: float | None = None
-
-    @property
-    def found(self) -> bool:
-        return self.evidence.found and self.before is not None and self.after is not None and self.after < (1 - GAIN) * self.before
-
-
-@dataclass(frozen=True)
 class _Picture:
     log: Array  # (h, w) log₂ light, a little blurred
     dark: Array  # (h, w) darkest stored value round a pixel
     bright: Array
 
 
-def shiny(seen: Sightings, problem: Problem, depth: Array, found: Light) -> Shiny:
+def shiny(seen: Sightings, problem: Problem, depth: Array, found: Light) -> HeldOut:
     """Look at patches of some pictures in others.
 
     Args:
@@ -91,7 +78,7 @@ def shiny(seen: Sightings, problem: Problem, depth: Array, found: Light) -> Shin
         f"{100 * share:.2f}% of the patches lie in areas that one picture shows more than {BRIGHTER:g} stops brighter than others show the "
         f"same surface; {100 * THRESHOLD:.2f}% or more speak for highlights or reflections"
     )
-    return Shiny(Evidence("view_dependence", share, THRESHOLD, reason), before, after)
+    return HeldOut(Evidence("view_dependence", share, THRESHOLD, reason), GAIN, before, after)
 
 
 def _picture(seen: Sightings, index: int, found: Light) -> _Picture:

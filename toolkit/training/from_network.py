@@ -32,7 +32,7 @@ from toolkit.volume.topology import BLOCK
 
 SHIPPED = Path(weights.__file__).parent / "weights" / "nerfusion.safetensors"
 # Voxels that make up the median depth at least, on the finer of two lattices. One lattice of 24 alone loses 1.5 to 2.5 dB, while 104
-# gain 0.25 dB at five times the seconds (docs/few_views.md), so no voxel need be smaller than some pixels; a larger one shows.
+# gain 0.25 dB for about three times the seconds (docs/few_views.md), so no voxel need be smaller than some pixels; a larger one shows.
 VOXELS_TO_MEDIAN, LEVELS = 48.0, 2
 PIXELS = 5.0
 GAMMA = 0.95  # the paper's 0.6 cuts holes where the networks are in doubt

@@ -40,4 +40,4 @@ def test_shipped_weights_load_and_see_depth() -> None:
     # Untrained networks begin with the plane sweep and mean colours, so they are no straw man: 3.2% median depth error, 13.7 dB.
     assert trained["psnr_local"] > untrained["psnr_local"] + 1.5, (trained, untrained)
     assert trained["depth_likelihood"] > untrained["depth_likelihood"] + 0.15, (trained, untrained)
-    assert trained["depth_error"] < min(untrained["depth_error"], 0.1), (trained, untrained)
+    assert trained["depth_error"] < min(untrained["depth_error"], 0.035), (trained, untrained)

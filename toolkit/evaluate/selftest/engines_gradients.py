@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -97,14 +98,19 @@ def exact_gradients(field: Field, batch: Batch) -> dict[str, Tensor]:
     return {"densities": found[0] * rows, "features": found[1] * rows[:, None], **dict(zip(names, found[2:], strict=True))}
 
 
+def both_gradients(decoder: str, seed: int, pick_seed: int) -> Iterator[tuple[str, dict[str, Tensor], dict[str, Tensor]]]:
+    """What kind of field it is, its gradients in float64 and those of the compiled step, on 300 pixels each."""
+    pool = pixels()
+    for shell in (0.0, 1.0):
+        field = translucent(seed, shell, decoder)
+        picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(pick_seed))[:300]
+        yield "with a background" if shell else "bounded", exact_gradients(field, pool.take(picks)), compiled_gradients(field, pool, picks)
+
+
 @case(GROUP, "gradients of a compiled step against autograd in float64")
 def gradients(folder: Path) -> list[Measure]:
-    pool, out = pixels(), []
-    for shell in (0.0, 1.0):
-        field = translucent(4, shell, "deferred")
-        picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(1))[:300]
-        exact, found = exact_gradients(field, pool.take(picks)), compiled_gradients(field, pool, picks)
-        name = "with a background" if shell else "bounded"
+    out = []
+    for name, exact, found in both_gradients("deferred", 4, 1):
         out += [Measure(f"{name}: gradient of {key}, by the largest", by_size(found[key], exact[key]), 1e-4) for key in exact]
         out.append(Measure(f"{name}: gradients that are not finite", not_finite(*found.values()), 0.0))
     return out
@@ -114,12 +120,8 @@ def gradients(folder: Path) -> list[Measure]:
 def gradients_per_sample(folder: Path) -> list[Measure]:
     """Its sines are up to 16π times as steep as what is looked up, and rounding puts some hidden units on the other side of their ReLU:
     the whole of a gradient is held to float64, not its every entry."""
-    pool, out = pixels(), []
-    for shell in (0.0, 1.0):
-        field = translucent(5, shell, "per_sample")
-        picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(2))[:300]
-        exact, found = exact_gradients(field, pool.take(picks)), compiled_gradients(field, pool, picks)
-        name = "with a background" if shell else "bounded"
+    out = []
+    for name, exact, found in both_gradients("per_sample", 5, 2):
         for key, wanted in exact.items():
             error = float((found[key].double() - wanted).norm() / wanted.norm())
             out.append(Measure(f"{name}: gradient of {key}, by its norm", error, 5e-3))
