@@ -203,6 +203,15 @@ def test_ordered_is_sorted_and_does_not_depend_on_history() -> None:
         assert torch.equal(grid.find(ordered), slots) and torch.equal(grid.topology().keys, ordered)
 
 
+def test_slots_of_a_fresh_table_are_the_same_every_time() -> None:
+    keys = torch.unique(torch.randint(-20, 20, (5000, 3), generator=torch.Generator().manual_seed(0)), dim=0).int()
+    for _ in range(3):  # with two processors, one insertion of all keys gives another order each time
+        grid = BlockGrid(0.1, {"density": 1}, capacity=len(keys) + 1)
+        slots = grid.activate(keys[torch.randperm(len(keys))])
+        assert torch.equal(grid.find(keys), torch.arange(len(keys))) and len(slots) == len(keys)
+        grid.close()
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.tuples(st.booleans(), st.integers(-3, 3), st.integers(-3, 3)), max_size=30))
 def test_grid_holds_what_a_dictionary_holds(steps: list[tuple[bool, int, int]]) -> None:

@@ -36,7 +36,8 @@ class BlockGrid:
     """A growing set of 8×8×8 blocks with float32 attributes.
 
     Buffer slot b of the grid owns rows b·512 … b·512 + 511 of every attribute, z-major inside the block as in `Topology`. Slots are in
-    no order; `ordered`, `topology`, `gather` and `scatter` work in the order of sorted keys, which is the same in every run.
+    no order, though the same in every run as long as the table has not grown; `ordered`, `topology`, `gather` and `scatter` work in the
+    order of sorted keys.
 
     Args:
         voxel_size: edge of a voxel in working units.
@@ -131,7 +132,10 @@ class BlockGrid:
         needed = len(self) + len(missing)
         if needed > self.capacity:
             self.reserve(max(needed, int(self.capacity * GROWTH)))
-        self._map.activate(self._to_open3d(missing))
+        # Open3D inserts with several threads, which draw slots in the order in which they come; one key at a time, the order is ours.
+        inserted = self._to_open3d(missing)
+        for index in range(len(missing)):
+            self._map.activate(inserted[index : index + 1])
         fresh = self.find(missing)
         for name, channels in self.attributes.items():
             self.rows(name).detach().view(-1, VOXELS * channels).index_fill_(0, fresh, 0.0)
