@@ -218,6 +218,20 @@ def test_field_alone_and_surface_alone() -> None:
     assert "TSDF" in page.text and "Photo" in page.text
 
 
+def test_a_column_of_depth_is_shown_where_there_is_depth() -> None:
+    """Every row of the table then has as many cells as its head."""
+    for depth in (True, False):
+        data, pictures = sample()
+        if not depth:
+            for score in (data["evaluation"]["field"], data["evaluation"]["tsdf"]):
+                score["depth_abs_err"] = None
+        page = render_page(report_data(data), pictures)
+        assert ("Depth error" in page) is depth and ("depth error" in table(data)) is depth
+        body = page[page.index("<h2>Quality on test views") :]
+        rows = re.findall(r"<tr.*?</tr>", body[: body.index("</table>")], re.DOTALL)
+        assert len(rows) > 3 and {len(re.findall(r"<t[hd][ >]", row)) for row in rows} == {6 if depth else 5}
+
+
 def test_computed_poses_are_told() -> None:
     data, pictures = sample()
     assert SFM_NOTE not in report_data(data)["notes"]

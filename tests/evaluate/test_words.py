@@ -17,9 +17,9 @@ from toolkit.evaluate import words
         (0.0996, "0.1 s"),
         (4.24, "4.2 s"),
         (9.96, "10 s"),
-        (59.7, "1 min 0 s"),
+        (59.7, "1 min"),
         (372, "6 min 12 s"),
-        (3599.8, "1 h 0 min"),
+        (3599.8, "1 h"),
         (7322, "2 h 2 min"),
     ],
 )
@@ -41,6 +41,11 @@ def test_duration(seconds: float, shown: str) -> None:
 )
 def test_size(count: float, shown: str) -> None:
     assert words.size(count) == shown
+
+
+@pytest.mark.parametrize(("count", "shown"), [(0, "0 key frames"), (1, "1 key frame"), (1234, "1,234 key frames")])
+def test_counted(count: int, shown: str) -> None:
+    assert words.counted(count, "key frame") == shown
 
 
 def test_memory_and_share() -> None:

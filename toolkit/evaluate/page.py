@@ -72,7 +72,11 @@ def comparison(data: dict[str, Any]) -> list[dict[str, Any]]:
         if score is None:
             continue
         frames = score.get("key_frames")
-        note = "" if frames is None else f"{words.whole(frames)} key frames fused in {words.duration(score.get('seconds'))}, nothing fitted"
+        note = (
+            ""
+            if frames is None
+            else f"{words.counted(frames, 'key frame')} fused in {words.duration(score.get('seconds'))}, nothing fitted"
+        )
         rows.append({**score, "title": title, "note": note, "part": False})
         if score.get("psnr_masked") is not None:
             note = f"where it has surface: {words.share(score.get('coverage'))} of the pixels"
@@ -104,7 +108,7 @@ def headline(data: dict[str, Any]) -> list[tuple[str, str, str]]:
     for key, title in METHODS:
         score = evaluation.get(key)
         if score is not None and score["psnr"] is not None:
-            views = f"{score['views']} test view{'' if score['views'] == 1 else 's'}" if score["views"] is not None else "test views"
+            views = words.counted(score["views"], "test view") if score["views"] is not None else "test views"
             out.append((words.decimal(score["psnr"], 1), "dB", f"{title}: PSNR on {views}"))
     if data["seconds_total"] is not None:
         out.append((words.duration(data["seconds_total"]), "", "from capture to report"))
@@ -136,7 +140,7 @@ def subtitle(data: dict[str, Any]) -> list[str]:
     capture = data["capture"]
     out = [str(capture["kind"])] if capture["kind"] is not None else []
     if capture["frames"] is not None:
-        out.append(f"{words.whole(capture['frames'])} frames")
+        out.append(words.counted(capture["frames"], "frame"))
     if capture["width"] is not None and capture["height"] is not None:
         out.append(f"{capture['width']}×{capture['height']}")
     out += {"sfm": ["poses computed"], "given": ["poses given"]}.get(str(data["poses"]["source"]), [])
@@ -174,13 +178,15 @@ def render_page(data: dict[str, Any], pictures: Pictures) -> str:
     # The plots are our own text but for stage names, which matplotlib escapes.
     time_plot, stage_plot = psnr_over_time(data["timeline"], levels), stage_bars(data["stages"])
     near, far = pictures.depth_range or (None, None)
+    rows = comparison(data)
     return template(TEMPLATE).render(
         data=data,
         title=short_name(data["source"]) or "Report",
         subtitle=subtitle(data),
         unit=words.unit_of(data),
         headline=headline(data),
-        rows=comparison(data),
+        rows=rows,
+        depth=any(row.get("depth_abs_err") is not None for row in rows),
         views=view_rows(data, pictures),
         open_views=OPEN_VIEWS,
         tile_height=TILE_HEIGHT,

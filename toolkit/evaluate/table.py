@@ -13,6 +13,8 @@ from rich.text import Text
 from toolkit.evaluate import words
 from toolkit.evaluate.report import report_data
 
+METHODS = (("field", "field"), ("network", "networks alone"), ("tsdf", "TSDF"))
+
 
 def headline_table(data: dict[str, Any]) -> Table:
     """One row a method (field, networks alone, TSDF, nearest picture), facts of the run in the caption. `data` as for `write_report`."""
@@ -20,9 +22,10 @@ def headline_table(data: dict[str, Any]) -> Table:
     unit = words.unit_of(data)
     evaluation = data["evaluation"]
     table = Table(box=box.SIMPLE_HEAD, title_justify="left", caption_justify="left", caption_style="")
-    for name in ("", "PSNR", "SSIM", "LPIPS", f"depth error ({unit})", "render a view"):
+    depth = any((evaluation.get(key) or {}).get("depth_abs_err") is not None for key, _ in METHODS)
+    for name in ("", "PSNR", "SSIM", "LPIPS", *([f"depth error ({unit})"] if depth else []), "render a view"):
         table.add_column(name, justify="left" if name == "" else "right", no_wrap=True)
-    for key, title in (("field", "field"), ("network", "networks alone"), ("tsdf", "TSDF")):
+    for key, title in METHODS:
         score = evaluation.get(key)
         if score is not None:
             table.add_row(
@@ -30,11 +33,11 @@ def headline_table(data: dict[str, Any]) -> Table:
                 words.decimal(score["psnr"]),
                 words.decimal(score["ssim"], 3),
                 words.decimal(score["lpips"], 3),
-                words.significant(score["depth_abs_err"]),
+                *([words.significant(score["depth_abs_err"])] if depth else []),
                 words.duration(score["seconds_per_view"]),
             )
             if score.get("key_frames") is not None:
-                table.add_row(f"  {words.whole(score['key_frames'])} key frames in {words.duration(score.get('seconds'))}")
+                table.add_row(f"  {words.counted(score['key_frames'], 'key frame')} in {words.duration(score.get('seconds'))}")
             if score.get("psnr_masked") is not None:
                 table.add_row(f"  on its surface, {words.share(score.get('coverage'))} of the pixels", words.decimal(score["psnr_masked"]))
     floor = evaluation.get("nearest_image")
@@ -49,7 +52,7 @@ def facts(data: dict[str, Any]) -> list[str]:
     capture, poses, field = data["capture"], data["poses"], data["field"]
     lines = []
     if capture["frames"] is not None:
-        line = f"{words.whole(capture['frames'])} frames"
+        line = words.counted(capture["frames"], "frame")
         if poses["registered"] is not None and poses["total"] is not None:
             line += f", {poses['registered']} of {poses['total']} with a pose"
         lines.append(line)

@@ -127,12 +127,12 @@ def setting_text(point: Point, unit: str = "units") -> str:
     if point.value("iterations") is not None:
         parts.append(value_text("iterations", point.value("iterations")))
     if point.value("keyframes") is not None:
-        parts.append(f"{point.value('keyframes')} key frames")
+        parts.append(words.counted(point.value("keyframes"), "key frame"))
     if point.value("voxel_size") is not None and ("voxel_size" in point.axes or not parts):
         parts.append(value_text("voxel_size", point.value("voxel_size"), unit))
     wanted = point.setting.get("wanted") or {}
     if wanted.get("views", 1) != 1:
-        parts.append(f"{point.value('views')} views")
+        parts.append(words.counted(point.value("views"), "view"))
     if wanted.get("samples", SAMPLES_A_VOXEL) != SAMPLES_A_VOXEL:
         parts.append(f"{value_text('samples', point.value('samples'))} samples a voxel")
     if wanted.get("precision", "float16") != "float16":

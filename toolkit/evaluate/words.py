@@ -41,7 +41,7 @@ def memory(megabytes: float | None) -> str:
 
 
 def duration(seconds: float | None) -> str:
-    """0.012 → 12 ms, 4.2 → 4.2 s, 372 → 6 min 12 s, 7322 → 2 h 2 min."""
+    """0.012 → 12 ms, 4.2 → 4.2 s, 60 → 1 min, 372 → 6 min 12 s, 7322 → 2 h 2 min."""
     if seconds is None:
         return NONE
     if seconds < 0.0995:
@@ -52,9 +52,18 @@ def duration(seconds: float | None) -> str:
     if total < 60:
         return f"{total} s"
     if total < 3600:
-        return f"{total // 60} min {total % 60} s"
-    total = round(seconds / 60)
-    return f"{total // 60} h {total % 60} min"
+        return _two(total, "min", "s")
+    return _two(round(seconds / 60), "h", "min")
+
+
+def _two(total: int, large: str, small: str) -> str:
+    """60 of the small unit make a large one; none of it is not told."""
+    return f"{total // 60} {large}" + (f" {total % 60} {small}" if total % 60 else "")
+
+
+def counted(count: float | None, thing: str) -> str:
+    """1 key frame, 1,234 key frames."""
+    return f"{whole(count)} {thing}{'' if count == 1 else 's'}"
 
 
 def share(value: float | None) -> str:
