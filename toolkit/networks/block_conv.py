@@ -17,6 +17,7 @@ from torch.autograd.function import once_differentiable
 from toolkit.volume.topology import BLOCK, HALO, VOXELS, Topology
 
 DEFAULT_CHUNK = 64  # blocks at a time: 4 MB of halo at 16 channels in float32
+FEW = 4096  # blocks up to which the halo's rows (4 kB a block) are kept for the next convolution on the same topology
 _ONES, _ZEROS = [1, 1, 1], [0, 0, 0]
 
 
@@ -82,7 +83,7 @@ def block_conv3d(
 
 def _haloed(values: Tensor, topology: Topology, start: int, stop: int, buffer: Tensor) -> Tensor:
     """(M · 512 + 1, C) → (n, C, 10, 10, 10) in channels-last-3d memory, written into `buffer`."""
-    rows = topology.halo_chunk(start, stop).view(-1)
+    rows = (topology.halo_rows[start:stop] if topology.blocks <= FEW else topology.halo_chunk(start, stop)).view(-1)
     out = buffer[: len(rows)]
     torch.index_select(values, 0, rows, out=out)
     return out.view(-1, BLOCK + 2, BLOCK + 2, BLOCK + 2, values.shape[1]).permute(0, 4, 1, 2, 3)

@@ -18,7 +18,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from toolkit.networks.block_conv import BlockConv3d
+from toolkit.networks.block_conv import BlockConv3d, block_conv3d
 from toolkit.networks.local import held
 from toolkit.volume.topology import Topology
 
@@ -39,8 +39,18 @@ class _Gate(nn.Module):
             last.weight.mul_(0.1)
 
     def forward(self, rows: Tensor, topology: Topology, inside: Tensor) -> Tensor:
-        for number, convolution in enumerate(self.convolutions):
-            rows = convolution(torch.relu(rows) if number else rows, topology, inside)
+        return self.after(self.first(rows, topology, inside), topology, inside)
+
+    @property
+    def first(self) -> BlockConv3d:
+        first = self.convolutions[0]
+        assert isinstance(first, BlockConv3d)
+        return first
+
+    def after(self, rows: Tensor, topology: Topology, inside: Tensor) -> Tensor:
+        """The output, from that of the first convolution."""
+        for convolution in self.convolutions[1:]:
+            rows = convolution(torch.relu(rows), topology, inside)
         return rows
 
 
@@ -73,10 +83,18 @@ class FusionGRU(nn.Module):
         both = torch.cat([state, local], 1)
         known = torch.log(count.clamp_max(self.most)) - torch.log(weight.clamp_min(LEAST))  # −∞ where nothing is known: z = 1
         known = torch.cat([known, known.new_full((1,), -torch.inf)])[:, None]
-        z = torch.sigmoid(self.update(both, topology, inside) - known)
-        r = torch.sigmoid(self.reset(both, topology, inside))
+        update, reset = self._gates(both, topology, inside)
+        z, r = torch.sigmoid(update - known), torch.sigmoid(reset)
         candidate = torch.tanh(raw + held(self.candidate(torch.cat([r * state, local], 1), topology, inside)))
         return (1 - z) * state + z * candidate
+
+    def _gates(self, both: Tensor, topology: Topology, inside: Tensor) -> list[Tensor]:
+        """M_z and M_r of [H, V]; their first convolutions are one, which costs as much as either alone."""
+        one, other = self.update.first, self.reset.first
+        assert one.bias is not None and other.bias is not None
+        weight, bias = torch.cat([one.weight, other.weight]), torch.cat([one.bias, other.bias])
+        rows = block_conv3d(both, topology, weight, bias, inside, one.chunk)
+        return [gate.after(part, topology, inside) for gate, part in zip((self.update, self.reset), rows.chunk(2, 1), strict=True)]
 
 
 def mean_gate(count: Tensor, weight: Tensor, most: int = MOST) -> Tensor:

@@ -97,12 +97,14 @@ class LocalVolume(LatentVolume):
 
     Attributes:
         weight: (M · 512,) in (0, 1] where the corner is known: how much the key frame can say of it.
-        active: (M,) bool, blocks about surfaces. The networks work on these alone; the others hold what the known terms say.
+        busy: blocks about surfaces. The networks work on these alone; the others hold what the known terms say.
+        place: (M' · 512 + 1,) rows of the busy blocks, the zero row last (the same way back).
     """
 
     raw: Tensor  # (M · 512 + 1, C)
     weight: Tensor
-    active: Tensor
+    busy: Topology
+    place: Tensor
 
     def detached(self) -> LocalVolume:
         return replace(self, rows=self.rows.detach(), raw=self.raw.detach())

@@ -155,7 +155,7 @@ class NerfusionModel(nn.Module):
         latent = projected.new_zeros((size + 1, config.hidden)).index_copy(0, where, projected)
         busy, place = _blocks(topology, active)
         raw = start.index_copy(0, place, self.local(latent[place], start[place], busy, count[place[:-1]] > 0))
-        return LocalVolume(lattice, topology, torch.tanh(raw), count, raw, weight, active)
+        return LocalVolume(lattice, topology, torch.tanh(raw), count, raw, weight, busy, place)
 
     def _observe(
         self,
@@ -216,8 +216,7 @@ class NerfusionModel(nn.Module):
         before = part.rows * mask
         z = mean_gate(count, local.weight)
         rows = (1 - z) * before + z * local.rows
-        busy, place = _blocks(local.topology, local.active)
-        inner = place[:-1]
+        busy, place, inner = local.busy, local.place, local.place[:-1]
         after = self.fusion(before[place], count[inner], local.rows[place], local.raw[place], local.weight[inner], busy, inside[inner])
         return replace(part, rows=rows.index_copy(0, place, after), count=count + local.weight)
 
