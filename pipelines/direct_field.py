@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,7 +50,8 @@ def direct_field(
     if share < 1:
         kept = np.unique(np.linspace(0, len(keys.indices) - 1, max(1, round(share * len(keys.indices)))).round().astype(int))
         keys = KeyFrames(keys.indices[kept], keys.neighbours[kept])
-    options = NetworkOptions((settings.network.voxels or voxels_to_median(views)) / voxel_factor, settings.network.levels)
+    options = NetworkOptions.of(settings.network)
+    options = replace(options, voxels=(options.voxels or voxels_to_median(views)) / voxel_factor)
     model = load_networks(weights_of(settings), settings.device)
     inference = Inference(model, views, scene, keys, settings.field.background, options)
     for _ in inference.frames(progress):

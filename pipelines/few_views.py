@@ -14,6 +14,7 @@ from pipelines.options import Config, ImageSize, Out, Pairs, Quiet, Seed, Source
 if TYPE_CHECKING:
     from pipelines.job import Job
     from toolkit.capture.types import Capture
+    from toolkit.effects.correct import Corrections
     from toolkit.evaluate.few_views import Ground
 
 ALL = "all"
@@ -43,12 +44,12 @@ def few_views(
 
     seconds, measured = numbers(budgets, "budgets"), part_of(starts)
     counts = [None if part == ALL else int(part) for part in wanted(views)]
-    with _job(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as (job, posed):
+    with _job(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as (job, posed, corrections):
         path = job.folder.path / f"{FILE}.json"
         rows: list[dict[str, Any]] = read_kept(path, FEW_VIEWS)["rows"] if path.is_file() else []
         model = load_networks(job.settings.network.weights, job.settings.device)
         for count in counts:
-            ground = ground_of(job, posed, count)
+            ground = ground_of(job, posed, count, corrections)
             done = {(row["views"], row["start"], row["budget"]) for row in rows}
             for row in few_views_rows(ground, model, seconds, done, measured, job.progress):
                 rows.append(row)
@@ -73,9 +74,9 @@ def ablations(
 
     count = None if views == ALL else int(numbers(views, "views")[0])
     rows = []
-    with _job(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as (job, posed):
+    with _job(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as (job, posed, corrections):
         model = load_networks(job.settings.network.weights, job.settings.device)
-        for row in ablation_rows(ground_of(job, posed, count), model, job.progress):
+        for row in ablation_rows(ground_of(job, posed, count, corrections), model, job.progress):
             rows.append(row)
             _keep(job, ABLATIONS, rows, ablation_table(rows))
     _tell(ablation_table(rows), quiet)
@@ -130,21 +131,26 @@ def numbers(text: str, name: str) -> list[float]:
 
 
 @contextmanager
-def _job(source: Path, out: Path, options: dict[str, Any], quiet: bool) -> Iterator[tuple[Job, Capture]]:
-    """A job of one thread on `source`, with everything up to the poses done."""
+def _job(source: Path, out: Path, options: dict[str, Any], quiet: bool) -> Iterator[tuple[Job, Capture, Corrections]]:
+    """A job of one thread on `source`, with everything up to the effects done as a run does it with all training pictures, so that poses
+    are the same for every number of views."""
     from pipelines.console import make_progress
     from pipelines.job import bound_threads
 
     bound_threads(options)
     from pipelines.job import open_job
     from pipelines.steps_capture import choose_frames, find_camera_poses, find_capture
+    from pipelines.steps_effects import find_effects
 
     with open_job(source, out, options, make_progress(quiet)) as job:
         capture = choose_frames(job, find_capture(job))
-        yield job, find_camera_poses(job, capture).apply(capture)
+        posed = find_camera_poses(job, capture).apply(capture)
+        job.settings.effects.off.append("blur")  # of three pictures none is left out
+        corrections = find_effects(job, posed)
+        yield job, corrections.on_capture(posed), corrections
 
 
-def ground_of(job: Job, posed: Capture, count: int | None) -> Ground:
+def ground_of(job: Job, posed: Capture, count: int | None, corrections: Corrections) -> Ground:
     """The capture with `count` of its training views (None: all), as a run would prepare it."""
     from toolkit.capture.prepare import prepare_views
     from toolkit.capture.subset import limited
@@ -153,7 +159,8 @@ def ground_of(job: Job, posed: Capture, count: int | None) -> Ground:
 
     some = limited(posed, job.settings.capture.holdout, count)
     scene = describe_scene(some, job.progress)
-    return Ground(prepare_views(some, scene.working_from_input, job.settings.capture, job.progress), scene, job.settings)
+    views = prepare_views(some, scene.working_from_input, job.settings.capture, job.progress)
+    return Ground(corrections.on_views(views), scene, job.settings)
 
 
 def _keep(job: Job, name: str, rows: list[dict[str, Any]], table: str) -> None:

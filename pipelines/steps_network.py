@@ -76,7 +76,7 @@ def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
 
         set_seeds(settings.seed)
         start = time.monotonic()
-        options = NetworkOptions(settings.network.voxels, settings.network.levels)
+        options = NetworkOptions.of(settings.network)
         model = load_networks(weights, settings.device)
         inference = Inference(model, views, scene, keys, settings.field.background, options)
         first = _stream(job, inference, start)

@@ -134,6 +134,24 @@ def test_encoded_pictures_are_kept_only_for_a_while(monkeypatch: pytest.MonkeyPa
     assert len(list(fuse_views(model, views, far, lattice, FusionOptions(1, 0.2, FAR)))) == 2
 
 
+def test_measured_depth_is_asked_only_when_it_is_wanted() -> None:
+    model = opinionated()
+    plain, keys = captured(3)
+    deep = captured(3)[0]
+    deep.depths = [None, np.full((HEIGHT, WIDTH), 1.5, np.float32), np.zeros((HEIGHT, WIDTH), np.float32)]
+    lattice = fusion_lattice(SPACE, 0.05, 1)
+
+    def fused(views: Views, measured: bool) -> list[torch.Tensor]:
+        options = FusionOptions(1, 0.5, FAR, measured=measured)
+        return [state.volume.rows.clone() for state in fuse_views(model, views, keys, lattice, options)]
+
+    without, with_it = fused(plain, True), fused(deep, True)
+    assert all(torch.equal(*pair) for pair in zip(without, fused(deep, False), strict=True))
+    assert torch.equal(without[0], with_it[0])
+    assert without[1].shape != with_it[1].shape or not torch.allclose(without[1], with_it[1])
+    assert all(bool(torch.isfinite(rows).all()) for rows in with_it)
+
+
 def test_looking_away_adds_nothing_and_does_not_fail() -> None:
     views, keys = captured(3)
     views.world_from_camera[:, 2, 3] = 40.0

@@ -54,6 +54,7 @@ class NetworkSettings:
     weights: str | None = None  # file of trained networks; None: the shipped ones
     voxels: float | None = None  # voxels that make up the median depth, on the finest lattice; None: 48, or a voxel to five pixels there
     levels: int = 2  # lattices, each of half the voxel size of the one before; 1: the paper's single one
+    depth_from: str = "sensor"  # sensor (if the capture has one; the paper has none) | off
 
 
 @dataclass
@@ -146,6 +147,7 @@ CHOICES = {
     "poses.source": ("auto", "given", "sfm"),
     "poses.matching": ("auto", "exhaustive", "sequential"),
     "field.decoder": ("deferred", "per_sample"),
+    "network.depth_from": ("sensor", "off"),
     "fit.depth_from": ("sensor", "any", "off"),
     "field.background": ("auto", "on", "off"),
     "field.view": ("auto", "full", "low", "none"),

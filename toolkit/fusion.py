@@ -44,6 +44,7 @@ class FusionOptions:
         near, far: depths along z within which a view is asked, working units (the paper: 3 m).
         gamma: coarse cells in which exp(−optical thickness) exceeds this are not looked at finer.
         prune_every: key frames after which blocks without such cells are forgotten.
+        measured: the depth that a sensor measured for key frames goes into their sweep, where there is one (not in the paper).
     """
 
     levels: int = 2
@@ -51,6 +52,7 @@ class FusionOptions:
     far: float = math.inf
     gamma: float = 0.95
     prune_every: int = 8
+    measured: bool = False
 
 
 @dataclass(frozen=True)
@@ -107,13 +109,13 @@ class Fusion:
         self._balls = block_balls(self.stores[0].lattice, self._keys)
 
     @torch.no_grad()
-    def add(self, views: Sequence[EncodedView], cameras: Cameras) -> None:
-        """Fuse one key frame (first) and its neighbours."""
+    def add(self, views: Sequence[EncodedView], cameras: Cameras, depth: Tensor | None = None) -> None:
+        """Fuse one key frame (first) and its neighbours; `depth` (H, W) of the key frame where a sensor measured it, working units."""
         options = self.options
         keys = self._keys[visible_blocks(*self._balls, cameras[0], options.near, options.far)]
         topology, finer = Topology(keys), None
         bounded = options.near > 0 or math.isfinite(options.far)
-        swept = self.model.sweep(views, cameras, options.near, options.far) if bounded else None
+        swept = self.model.sweep(views, cameras, options.near, options.far, depth) if bounded else None
         for level, store in enumerate(self.stores):
             wanted = None if finer is None else finer.known
             local = self.model.local_volume(views, cameras, store.lattice, topology, wanted, options.near, options.far, swept)
@@ -193,7 +195,9 @@ def fuse_views(
         begin = time.perf_counter()
         group = [encoded(index) for index in _together(int(key), neighbours)]
         encode_seconds = time.perf_counter() - begin
-        fusion.add([view for view, _ in group], Cameras.together([camera for _, camera in group]))
+        depth = views.depths[int(key)] if fusion.options.measured and views.depths else None
+        measured = None if depth is None else torch.from_numpy(np.ascontiguousarray(depth, np.float32)).to(model.device)
+        fusion.add([view for view, _ in group], Cameras.together([camera for _, camera in group]), measured)
         if (done + 1) % fusion.options.prune_every == 0:
             fusion.prune()
         seconds = time.perf_counter() - begin

@@ -192,3 +192,50 @@ def test_it_runs_on_cameras_of_the_other_tests() -> None:
     described = list(describe(torch.rand(3, 3, int(seen_by.size[0, 1]), int(seen_by.size[0, 0]))))
     made = sweep(described, seen_by, 0.3, 3.0)
     assert bool((torch.diff(made.table[0], dim=0) <= 1e-6).all()), "what lies nearer is hidden less"
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_a_measured_depth_is_where_the_surface_is(scale: float) -> None:
+    """One view alone: pictures say nothing, the sensor tells two surfaces on the left, and on the right nothing."""
+    described, seen_by = wall(1, scale=scale)
+    depth = torch.full((72, 96), torch.nan)
+    depth[:, :24], depth[:, 24:48], depth[:36, 48:] = 1.5 * scale, 3.0 * scale, 0.0
+    found, blind = (sweep(described, seen_by, 0.8 * scale, 5.0 * scale, given) for given in (depth, None))
+    truncation = torch.full((3,), 0.2 * scale)
+    for column, surface in ((12.0, 1.5), (36.0, 3.0)):
+        z = surface * scale * torch.tensor([0.97, 1.0, 1.03])
+        points = torch.stack([(column - 48) / 90 * z, torch.zeros(3), z], 1)
+        told = found.look(points, truncation)
+        assert torch.allclose(told.signed * 0.2, surface * torch.tensor([0.03, 0.0, -0.03]), atol=0.02 * surface), column
+        assert float(told.sure.min()) > 0.9
+        beyond, before = found.look(points * 1.4, truncation), found.look(points * 0.7, truncation)
+        assert float(beyond.open.max()) < 0.05 and float(before.open.min()) > 0.95
+    unknown = torch.tensor([[0.25, 0.05, 1.0], [0.25, -0.05, 1.0], [0.6, 0.1, 2.0]]) * scale
+    for one, other in zip(vars(found.look(unknown, truncation)).values(), vars(blind.look(unknown, truncation)).values(), strict=True):
+        assert torch.allclose(one, other, atol=0.02)  # of another grid, else the same
+
+
+def test_measured_depths_out_of_range_count_as_its_ends() -> None:
+    described, seen_by = wall(2)
+    truncation = torch.full((1,), 0.1)
+    far, near, junk = (sweep(described, seen_by, 1.0, 4.0, torch.full((72, 96), value)) for value in (1e4, 1e-4, -torch.inf))
+    assert float(far.look(on_axis(torch.tensor([3.0])), truncation).open) > 0.95
+    assert float(near.look(on_axis(torch.tensor([1.5])), truncation).open) < 0.05
+    without = sweep(described, seen_by, 1.0, 4.0)
+    places = on_axis(torch.linspace(1.0, 4.0, 31))
+    assert torch.allclose(junk.look(places, truncation).signed, without.look(places, truncation).signed, atol=0.15)
+
+
+def test_a_sensor_mends_what_pictures_do_not_tell() -> None:
+    """Without texture the sweep finds no wall; the sensor does, and where both speak the wall stays where it is."""
+    described, seen_by = wall(3)
+    flat = [torch.full_like(one, 0.0) for one in described]
+    depth, places = torch.full((72, 96), WALL), on_axis(torch.linspace(0.9, 3.5, 53))
+    truncation = torch.full((53,), 0.15)
+    wanted = ((WALL - places[:, 2]) / 0.15).clamp(-1, 1)
+
+    def wrong(pictures: list[torch.Tensor], given: torch.Tensor | None) -> float:
+        return float((sweep(pictures, seen_by, 0.8, 4.0, given).look(places, truncation).signed - wanted).abs().mean())
+
+    assert wrong(flat, depth) < 0.05 < 0.3 < wrong(flat, None)
+    assert wrong(described, depth) < 0.05

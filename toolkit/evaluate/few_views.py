@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -71,8 +71,8 @@ def infer(model: NerfusionModel, ground: Ground, pruned: bool = True, progress: 
     """The networks' field, and its seconds (processor time) and number of key frames."""
     from toolkit.training.from_network import Inference, NetworkOptions
 
-    network = ground.settings.network
-    options = NetworkOptions(network.voxels, network.levels, *([] if pruned else [None]))
+    options = NetworkOptions.of(ground.settings.network)
+    options = options if pruned else replace(options, gamma=None)
     start = time.process_time()
     inference = Inference(model, ground.views, ground.scene, ground.keys(), ground.settings.field.background, options)
     for _ in inference.frames(progress):

@@ -108,9 +108,10 @@ class NerfusionModel(nn.Module):
             views.append(EncodedView(features, Pyramid.of(whole[index], 1, COLOUR_LEVELS), described[index]))
         return views
 
-    def sweep(self, views: Sequence[EncodedView], cameras: Cameras, near: float, far: float) -> Sweep:
-        """Where along the pixels of the key frame (first) the surface is likely to be; asked once for all lattices. Not differentiable."""
-        return sweep([view.described for view in views], cameras, near, far)
+    def sweep(self, views: Sequence[EncodedView], cameras: Cameras, near: float, far: float, depth: Tensor | None = None) -> Sweep:
+        """Where along the pixels of the key frame (first) the surface is likely to be, its measured `depth` (H, W) included; asked once for
+        all lattices. Not differentiable."""
+        return sweep([view.described for view in views], cameras, near, far, depth)
 
     def local_volume(
         self,

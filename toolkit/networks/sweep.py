@@ -24,6 +24,8 @@ STEP = 0.75  # pixels that the view which moves most moves by from plane to plan
 PLANES = (32, 128)  # fewest and most
 RANGE = 50.0  # farthest by nearest depth, where the caller does not bound them
 PEAK = 2  # planes on either side of the likeliest one that count as the same depth
+NOISE = 0.01  # of a depth that a sensor measured, as a part of it; at least as wide as planes lie apart
+TRUST = 0.98  # in a measured depth, against what the pictures say
 
 
 @dataclass(frozen=True)
@@ -90,13 +92,14 @@ class Sweep:
 
 
 @torch.no_grad()
-def sweep(described: Sequence[Tensor], cameras: Cameras, near: float, far: float) -> Sweep:
+def sweep(described: Sequence[Tensor], cameras: Cameras, near: float, far: float, depth: Tensor | None = None) -> Sweep:
     """Compare the first view with all others at planes between `near` and `far` along its axis; the others may come in any order.
 
     Args:
         described: K times (21, h, w) of `matching.describe`.
         cameras: K.
         near, far: 0 and ∞ where unknown.
+        depth: (H, W) of the first view along z in working units, where a sensor measured it; 0 or not finite where it did not.
 
     Raises:
         ValueError: neither is known, or the nearest does not lie before the farthest.
@@ -113,7 +116,32 @@ def sweep(described: Sequence[Tensor], cameras: Cameras, near: float, far: float
     cost = together(torch.stack(costs), torch.stack(visible)) if costs else rays.new_zeros((len(inverses), len(rays)))
     likely = distribution(cost.view(len(inverses), *shape))
     step = float(inverses[1] - inverses[0])
+    if depth is not None:
+        likely = measured(likely, inverses, depth)
     return Sweep(cameras[0], _table(likely, step), low, step)
+
+
+def measured(likely: Tensor, inverses: Tensor, depth: Tensor) -> Tensor:
+    """What the pictures say, and where a sensor measured the depth, that.
+
+    Args:
+        likely: (D, h, w) likelihoods of the planes.
+        inverses: (D,) of the planes, evenly spaced, ascending.
+        depth: (H, W), 0 or not finite where nothing was measured; beyond the planes it counts as the last of them.
+
+    Returns:
+        (D, h', w') on a grid finer by `SPACING` (pixels of the compared pictures): a depth sensor tells edges better than patches do.
+    """
+    shape = [min(SPACING * side, most) for side, most in zip(likely.shape[1:], depth.shape, strict=True)]
+    # Depth is picked and not averaged: between two surfaces there is nothing.
+    rows, columns = (((torch.arange(n, device=depth.device) + 0.5) * (most / n)).long() for n, most in zip(shape, depth.shape, strict=True))
+    here = depth[rows[:, None], columns]
+    known = torch.isfinite(here) & (here > 0)
+    inverse = (1 / torch.where(known, here, torch.ones_like(here))).clamp(float(inverses[0]), float(inverses[-1]))
+    width = (NOISE * inverse).clamp_min(0.7 * float(inverses[1] - inverses[0]))
+    near = torch.softmax(-0.5 * ((inverses[:, None, None] - inverse) / width).square(), 0)
+    told = F.interpolate(likely[None], shape, mode="bilinear", align_corners=False)[0]
+    return torch.where(known, TRUST * near + (1 - TRUST) * told, told)
 
 
 def _table(likely: Tensor, step: float) -> Tensor:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from toolkit.capture.types import Views
+from toolkit.config import NetworkSettings
 from toolkit.errors import InputError
 from toolkit.fusion import Fused, FusionOptions, fuse_views
 from toolkit.keyframes import KeyFrames
@@ -47,11 +48,18 @@ class NetworkOptions:
         voxels: voxels that make up the median depth, on the finest lattice; None: as `voxels_to_median` says.
         levels: lattices, each of half the voxel size of the one before; 1: the paper's single one.
         gamma: see-through voxels (exp(−optical thickness) above it) are not rendered; None: all are.
+        measured: the views' depth goes into the key frames' sweeps.
     """
 
     voxels: float | None = None
     levels: int = LEVELS
     gamma: float | None = GAMMA
+    measured: bool = False
+
+    @classmethod
+    def of(cls, settings: NetworkSettings) -> NetworkOptions:
+        """As the settings say."""
+        return cls(settings.voxels, settings.levels, measured=settings.depth_from == "sensor")
 
 
 def load_networks(path: Path | str | None = None, device: torch.device | str = "cpu") -> NerfusionModel:
@@ -128,7 +136,7 @@ class Inference:
         Raises:
             Interrupted: the user asked to stop.
         """
-        options = FusionOptions(self.options.levels, self.near, self.far)
+        options = FusionOptions(self.options.levels, self.near, self.far, measured=self.options.measured)
         for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress):
             self._latest = fused
             self.seconds += fused.seconds
