@@ -22,6 +22,12 @@ def effects(
     against_all_off: Annotated[
         bool, typer.Option("--against-all-off", help="Fit captures with what was found, and with all effects off.")
     ] = False,
+    drifting: Annotated[
+        bool,
+        typer.Option(
+            "--drifting", help="Film ten with drift and vignetting; fit with what was found, with all off, and with what is true."
+        ),
+    ] = False,
     every: Annotated[int, typer.Option(min=1, help="Of the captures, every so manieth is fitted.")] = 2,
     seconds: Annotated[float, typer.Option(min=0.5, help="Processor seconds of each fit.")] = 3.0,
     quiet: Quiet = False,
@@ -31,14 +37,17 @@ def effects(
 
     from pipelines.console import make_progress
     from toolkit.evaluate.effects_bench import confusion, look_at
-    from toolkit.evaluate.effects_plan import FIRST_SEED, plan
+    from toolkit.evaluate.effects_plan import FIRST_DRIFTING, FIRST_SEED, plan
+    from toolkit.evaluate.effects_plan import drifting as plan_drifting
     from toolkit.files import write_json
 
     folder.mkdir(parents=True, exist_ok=True)
     progress = make_progress(quiet)
     began = time.monotonic()
-    planned = plan(FIRST_SEED if first_seed is None else first_seed)
+    planned = (plan_drifting if drifting else plan)(first_seed if first_seed is not None else FIRST_DRIFTING if drifting else FIRST_SEED)
     against = [mode for mode, wanted in (("all_off", against_all_off), ("all_on", against_all_on)) if wanted]
+    if drifting:
+        against = ["all_off", "known"]
     data: dict[str, Any]
     with progress.listening():
         progress.begin("effects")
@@ -74,10 +83,54 @@ def table(data: dict[str, Any]) -> list[str]:
 def fits_table(data: dict[str, Any]) -> list[str]:
     """Each capture's scores in each mode as lines of Markdown, and their means."""
     modes = data["modes"]
-    told = (("psnr", "dB"), ("psnr_corrected", "dB, corrected"), ("seconds", "s"))
+    told = (("canonical", "dB"), ("canonical_corrected", "dB, corrected"), ("psnr", "dB, own colours"), ("seconds", "s"))
     head = ["capture", "found", *(f"{mode.replace('_', ' ')}, {unit}" for _, unit in told for mode in modes)]
     out = [f"| {' | '.join(head)} |", "|" + " --- |" * len(head)]
     for one in [*data["each"], {"name": "mean", "found": [], **data["mean"]}]:
         cells = [f"{one[mode][key]:.2f}" for key, _ in told for mode in modes]
         out.append(f"| {one['name']} | {', '.join(one['found'])} | {' | '.join(cells)} |")
+    return out
+
+
+def by_hand(
+    folder: Annotated[Path, typer.Argument(help="Where what each fit gave is kept; what is there is used again.", show_default=False)],
+    captures: Annotated[list[Path], typer.Argument(help="Captures with poses.", show_default=False)],
+    to: Annotated[Path | None, typer.Option("--json", help="Write everything to this JSON file.", show_default=False)] = None,
+    seconds: Annotated[float, typer.Option(min=0.5, help="Processor seconds of each fit.")] = 10.0,
+    image_size: Annotated[int, typer.Option(min=32, help="Long side of the pictures.")] = 240,
+    seeds: Annotated[int, typer.Option(min=1, help="Fits of each, of which the mean is told.")] = 1,
+    quiet: Quiet = False,
+) -> None:
+    """Fit captures with all effects off, with what is found, and with each effect switched on by hand."""
+    import time
+
+    from pipelines.console import make_progress
+    from toolkit.errors import InputError
+    from toolkit.evaluate.effects_switch import switched
+    from toolkit.files import write_json
+
+    progress = make_progress(quiet)
+    began = time.monotonic()
+    named = {(path.parent if path.is_file() else path).name: path for path in captures}
+    if len(named) < len(captures):
+        raise InputError("two captures have the same name, which the table shows them by; give them in folders of different names")
+    with progress.listening():
+        progress.begin("effects")
+        data = switched(named, folder, seconds, image_size, seeds, progress)
+    progress.finish("effects", time.monotonic() - began, False)
+    if to is not None:
+        write_json(to, data)
+    if not quiet:
+        for line in switched_table(data):
+            typer.echo(line)
+
+
+def switched_table(data: dict[str, Any]) -> list[str]:
+    """One row a switch, one column a capture: PSNR in canonical colour / with the left half's correction of colour."""
+    names = list(data["mean"])
+    out = [f"| switched | {' | '.join(names)} |", "|" + " --- |" * (1 + len(names))]
+    for mode in next(iter(data["mean"].values()), {}):
+        means = [data["mean"][name][mode] for name in names]
+        cells = [f"{one['psnr']:.2f} / {one['psnr_corrected']:.2f}" for one in means]
+        out.append(f"| {mode.replace('_', ' ')} | {' | '.join(cells)} |")
     return out

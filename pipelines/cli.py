@@ -117,6 +117,7 @@ for _command in (
 ):
     app.command()(_command)
 bench.app.command("effects")(bench_effects.effects)
+bench.app.command("effects-by-hand")(bench_effects.by_hand)
 bench.app.command("few-views")(few_views.few_views)
 bench.app.command("ablations")(few_views.ablations)
 app.add_typer(bench.app, name="bench")

@@ -36,7 +36,7 @@ def effects_facts(target: Path, quiet: bool) -> dict[str, Any]:
         found = survey(capture.with_frames(posed), progress=progress)
     progress.finish("effects", found.seconds, False)
     return {
-        "effects": [finding.to_dict() for finding in found.findings.values()],
+        "effects": [{**finding.to_dict(), "seconds": found.paid.of(name)} for name, finding in found.findings.items()],
         "seconds": round(found.seconds, 3),
         "looked_at": found.facts,
     }
@@ -48,16 +48,18 @@ def show(data: dict[str, Any]) -> None:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in ("effect", "there", "number", "threshold", "held out", "evidence"):
-        table.add_column(column, justify="right" if column in ("number", "threshold", "held out") else "left", overflow="fold")
+    for column in ("effect", "there", "number", "threshold", "held out", "s", "evidence"):
+        table.add_column(column, justify="right" if column in ("number", "threshold", "held out", "s") else "left", overflow="fold")
     for entry in data["effects"]:
         held = entry.get("held_out")
         change = "" if held is None else f"{held['before']:.3f} → {held['after']:.3f} {held['unit']}"
         there = "yes" if entry["there"] else "no"
-        table.add_row(entry["effect"], there, f"{entry['number']:.3f}", f"{entry['threshold']:g}", change, entry["reason"])
+        paid = f"{entry['seconds']:.2f}" if "seconds" in entry else ""
+        table.add_row(entry["effect"], there, f"{entry['number']:.3f}", f"{entry['threshold']:g}", change, paid, entry["reason"])
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(highlight=False, width=180)
     console.print(table)
     about = data["looked_at"]
-    console.print(f"{about['frames']} pictures and {about['points']} shared points looked at in {data['seconds']:.1f} s")
+    points = f", {about['points_seconds']:.1f} s of it for finding these points" if "points_seconds" in about else ""
+    console.print(f"{about['frames']} pictures and {about['points']} shared points looked at in {data['seconds']:.1f} s{points}")

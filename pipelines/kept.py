@@ -48,10 +48,11 @@ NETWORK = {"key_frames": NUMBER, "seconds": NUMBER, "encode_seconds": NUMBER, "f
 HELD_OUT = {"before": NUMBER, "after": NUMBER, "unit": TEXT, "*": ANY}
 FINDING = {
     "effect": TEXT, "there": FLAG, "number": NUMBER, "threshold": NUMBER, "reason": TEXT, "?held_out": (None, HELD_OUT),
-    "?wish": TEXT, "?on": FLAG, "?note": TEXT, "*": ANY
+    "?wish": TEXT, "?on": FLAG, "?note": TEXT, "?seconds": NUMBER, "*": ANY
 }  # fmt: skip
 EFFECTS = {
-    "effects": [FINDING], "seconds": NUMBER, "looked_at": {"frames": NUMBER, "points": NUMBER, "*": ANY}, "?corrections": {"*": ANY}
+    "effects": [FINDING], "seconds": NUMBER, "?corrections": {"*": ANY},
+    "looked_at": {"frames": NUMBER, "points": NUMBER, "?points_seconds": NUMBER, "*": ANY}
 }  # fmt: skip
 
 

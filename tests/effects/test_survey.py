@@ -10,6 +10,7 @@ import pytest
 from tests.effects.seen import CAMERA, FRAMES, made
 from toolkit.effects import background, geometry, light, motion_blur, view_dependence
 from toolkit.effects.adjust import POSES, adjust, residuals, scatter
+from toolkit.effects.paid import Paid
 from toolkit.effects.refine import aligned, refined_poses
 from toolkit.effects.survey import ORDER, look
 
@@ -144,3 +145,14 @@ def test_readout_is_told_in_shares_of_a_step() -> None:
     found = geometry.explain(made(13, rows=0.4, noise=0.05))
     assert found is not None and "rolling_shutter" in found.kept
     assert CAMERA.height == 240 and np.abs(found.problem.motion[:, :3]).max() > 0.005
+
+
+def test_seconds_of_several_effects_are_split_evenly_and_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = iter([10.0, 13.0, 20.0, 21.0])
+    monkeypatch.setattr("toolkit.effects.paid.time.monotonic", lambda: next(now))
+    paid = Paid()
+    with paid.by("poses", "distortion"):
+        pass
+    with pytest.raises(ValueError, match="stop"), paid.by("poses"):
+        raise ValueError("stop")
+    assert paid.of("poses") == 2.5 and paid.of("distortion") == 1.5 and paid.of("exposure") == 0

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from pipelines.kept import EFFECTS, fitting
 from toolkit.capture import open_capture
 from toolkit.capture.prepare import held_out
 from toolkit.config import load_settings
@@ -55,6 +56,16 @@ def test_drift_and_vignetting_are_corrected_and_off_is_off(captures: dict[str, P
     assert without.corrections.corner is None and without.corrections.gain
 
 
+def test_seconds_stand_beside_each_effect(captures: dict[str, Path]) -> None:
+    capture = open_capture(captures["drift"])
+    data = decide(capture, held_out(capture, 8), load_settings().effects).to_dict()
+    paid = {entry["effect"]: entry["seconds"] for entry in data["effects"]}
+    points = data["looked_at"]["points_seconds"]
+    assert points > 0.02 and paid["exposure"] > paid["vignetting"] > 0 and paid["poses"] == pytest.approx(paid["distortion"], abs=0.002)
+    assert 0.7 * data["seconds"] < points + sum(paid.values()) < 1.02 * data["seconds"] + 0.01
+    fitting(data, EFFECTS, Path("effects.json"))
+
+
 def test_settings() -> None:
     off = load_settings(pairs=["effects=off"]).effects
     assert asleep(off) and wish(off, "poses") == "off"
@@ -80,5 +91,5 @@ def test_info_prints_the_evidence(captures: dict[str, Path]) -> None:
 
     shown = CliRunner().invoke(app, ["info", str(captures["drift"]), "--effects", "--fast", "--quiet"])
     assert shown.exit_code == 0, shown.output
-    assert "exposure" in shown.output and "shared points looked at" in shown.output
+    assert "exposure" in shown.output and "shared points looked at" in shown.output and "s of it for finding these points" in shown.output
     assert not list(captures["drift"].glob("effects.json"))

@@ -17,6 +17,7 @@ from toolkit.effects.adjust import LENS, POSES, ROWS, adjust
 from toolkit.effects.correct import Corrections, correctable
 from toolkit.effects.light import EXPOSURE, VIGNETTING
 from toolkit.effects.motion_blur import BLURRED
+from toolkit.effects.paid import POINTS, Paid
 from toolkit.effects.refine import refined_poses
 from toolkit.effects.sightings import Look, gather
 from toolkit.effects.survey import BLUR, FAR, VIEWS, Finding, Survey, survey
@@ -54,12 +55,13 @@ class Decided:
     corrections: Corrections
     seconds: float
     facts: dict[str, Any]
+    paid: Paid
 
     def to_dict(self) -> dict[str, Any]:
         return {
-            "effects": [decision.to_dict() for decision in self.decisions],
+            "effects": [{**one.to_dict(), "seconds": self.paid.of(one.finding.effect)} for one in self.decisions],
             "seconds": round(self.seconds, 3),
-            "looked_at": self.facts,
+            "looked_at": {**self.facts, "points_seconds": self.paid.of(POINTS)},
             "corrections": self.corrections.to_dict(),
         }
 
@@ -93,7 +95,7 @@ def decide(capture: Capture, test: Array, settings: EffectsSettings, progress: P
     decisions = [_decision(finding, wish(settings, name), capture, found) for name, finding in found.findings.items()]
     on = frozenset(decision.finding.effect for decision in decisions if decision.on)
     corrections = _corrections(capture, test, found, on, progress, known)
-    return Decided(tuple(decisions), corrections, time.monotonic() - began, found.facts)
+    return Decided(tuple(decisions), corrections, time.monotonic() - began, found.facts, found.paid)
 
 
 def choose_field(field: FieldSettings, effects: list[dict[str, Any]], off: Sequence[str] = ()) -> None:
@@ -137,7 +139,8 @@ def _corrections(
     lens = None
     if found.explained is not None and LENS in on:
         explained = found.explained
-        lens = (explained.problem if LENS in explained.kept else adjust(explained.problem, explained.kept | {LENS}).problem).lens
+        with found.paid.by(LENS):
+            lens = (explained.problem if LENS in explained.kept else adjust(explained.problem, explained.kept | {LENS}).problem).lens
     if seen is None or not on & {EXPOSURE, POSES, BLUR}:
         return Corrections(corner=corner, lens=lens)
     gain: dict[str, tuple[float, float, float]] = {}
@@ -146,15 +149,18 @@ def _corrections(
     if BLUR in on:
         left_out = _blurred(seen.names, found.sharpness)
     if on & {EXPOSURE, POSES}:
-        every = gather(capture, range(len(capture.frames)), progress, known=known)
+        with found.paid.by(POINTS):
+            every = gather(capture, range(len(capture.frames)), progress, known=known)
         if EXPOSURE in on:
-            tracks = every.tracks()
-            flat = tracks if corner is None else vignetting.corrected(tracks, corner)
-            gains = light.frame_gains(flat, len(every.names), ~test)
+            with found.paid.by(EXPOSURE):
+                tracks = every.tracks()
+                flat = tracks if corner is None else vignetting.corrected(tracks, corner)
+                gains = light.frame_gains(flat, len(every.names), ~test)
             gain = {name: (float(r), float(g), float(b)) for name, (r, g, b) in zip(every.names, gains, strict=True)}
         if POSES in on:
             kept = found.explained.kept if found.explained is not None else frozenset[str]()
-            moved, beyond = refined_poses(every, ~test, kept | on)
+            with found.paid.by(POSES):
+                moved, beyond = refined_poses(every, ~test, kept | on)
             poses = dict(zip(every.names, moved, strict=True))
             lens = beyond if LENS in on else None
     return Corrections(gain, corner, lens, poses, left_out)

@@ -14,6 +14,7 @@ from toolkit.effects import background, beyond, geometry, light, motion_blur, sh
 from toolkit.effects.adjust import LENS, POSES, ROWS, Problem, predict
 from toolkit.effects.evidence import Evidence
 from toolkit.effects.light import EXPOSURE, VIGNETTING
+from toolkit.effects.paid import POINTS, Paid
 from toolkit.effects.sightings import QUICK, Look, Sightings, choose, gather
 from toolkit.progress import SILENT, Progress
 
@@ -70,6 +71,7 @@ class Survey:
     sharpness: Array  # (F,) factors of two of the slopes' energy
     seconds: float
     facts: dict[str, Any] = field(default_factory=dict)
+    paid: Paid = field(default_factory=Paid)
 
     @property
     def there(self) -> frozenset[str]:
@@ -95,15 +97,19 @@ def survey(
     Raises:
         InputError: a picture cannot be read.
     """
-    began = time.monotonic()
+    began, paid = time.monotonic(), Paid()
     allowed = list(range(len(capture.frames))) if indices is None else list(indices)
     if quick and len(allowed) > FIRST_FRAMES:
         few = [allowed[k] for k in choose(len(allowed), FIRST_FRAMES)]
-        first = look(gather(capture, few, progress, QUICK), began)
+        with paid.by(POINTS):
+            sightings = gather(capture, few, progress, QUICK)
+        first = look(sightings, began, paid)
         if first.explained is not None and not any(near_to(finding) for finding in first.findings.values()):
             return first
     chosen = allowed if most is None else [allowed[k] for k in choose(len(allowed), most)]
-    return look(gather(capture, chosen, progress, known=known), began)
+    with paid.by(POINTS):
+        sightings = gather(capture, chosen, progress, known=known)
+    return look(sightings, began, paid)
 
 
 def near_to(finding: Finding) -> bool:
@@ -115,34 +121,42 @@ def near_to(finding: Finding) -> bool:
     return finding.number > CLOSE * finding.threshold and gain > CLOSE
 
 
-def look(seen: Sightings, began: float | None = None) -> Survey:
-    """The evidence that sightings hold."""
-    began = time.monotonic() if began is None else began
-    explained = geometry.explain(seen) if len(seen.frame) else None
+def look(seen: Sightings, began: float | None = None, paid: Paid | None = None) -> Survey:
+    """The evidence that sightings hold; what each effect's costs is added to `paid`."""
+    began, paid = time.monotonic() if began is None else began, paid or Paid()
+    with paid.by(LENS, ROWS, POSES):
+        explained = geometry.explain(seen) if len(seen.frame) else None
     frames = len(seen.names)
     if explained is None:
         nothing = {name: Finding(name, 0.0, 0.0, "too few points are shared between pictures to tell", False) for name in ORDER}
-        return Survey(nothing, None, None, None, np.zeros(frames), time.monotonic() - began, {"frames": frames, "points": seen.points})
+        facts = {"frames": frames, "points": seen.points, "points_seconds": paid.of(POINTS)}
+        return Survey(nothing, None, None, None, np.zeros(frames), time.monotonic() - began, facts, paid)
     mine = np.zeros(len(seen.frame), dtype=bool)
     mine[explained.observation] = True
     kept = seen.where(mine)
     # `where` drops points that are left with one observation; the problem has none of these, so both number alike.
-    found = light.explain(kept.tracks(), frames)
+    with paid.by(EXPOSURE, VIGNETTING):
+        found = light.explain(kept.tracks(), frames)
     depth = predict(explained.problem)[0][np.argsort(explained.observation, kind="stable"), 2]
-    blur = motion_blur.evidence(kept.slope[:, 0] + kept.slope[:, 2], depth, kept.frame, kept.point, frames, kept.linear)
-    usual = float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
+    with paid.by(BLUR):
+        blur = motion_blur.evidence(kept.slope[:, 0] + kept.slope[:, 2], depth, kept.frame, kept.point, frames, kept.linear)
+    with paid.by(VIEWS):
+        views = _views(kept, explained.problem, depth, found)
+    with paid.by(FAR):
+        far = _far(seen, explained.problem, float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0)
     findings = {
         **{name: _of_light(found, name) for name in (EXPOSURE, VIGNETTING)},
         LENS: _lens(explained),
         ROWS: _rows(explained, seen),
-        VIEWS: _views(kept, explained.problem, depth, found),
-        FAR: _far(seen, explained.problem, usual),
+        VIEWS: views,
+        FAR: far,
         BLUR: _plain(blur),
         POSES: _poses(explained),
     }
     sharpness = np.array(blur.parameters.get("sharpness", np.zeros(frames)))
-    facts = {"frames": frames, "points": len(explained.problem.points), "observations": len(explained.observation)}
-    return Survey(findings, seen, explained, found, sharpness, time.monotonic() - began, facts)
+    points, observations = len(explained.problem.points), len(explained.observation)
+    facts = {"frames": frames, "points": points, "observations": observations, "points_seconds": paid.of(POINTS)}
+    return Survey(findings, seen, explained, found, sharpness, time.monotonic() - began, facts, paid)
 
 
 def _plain(evidence: Evidence) -> Finding:

@@ -13,26 +13,44 @@ from typing import Any
 
 import numpy as np
 
+from toolkit.camera import Array
 from toolkit.capture import open_capture
 from toolkit.capture.prepare import held_out, prepare_views
-from toolkit.capture.types import Capture
+from toolkit.capture.types import Capture, Views
 from toolkit.config import Settings, load_settings
 from toolkit.effects.correct import Corrections
 from toolkit.effects.decide import asleep, choose_field, decide
+from toolkit.evaluate.affine import right_half_psnr
 from toolkit.evaluate.effects_plan import Planned, film
-from toolkit.evaluate.score import score_views
+from toolkit.evaluate.effects_truth import canonical_capture, known_light
+from toolkit.evaluate.images import psnr
+from toolkit.evaluate.score import RenderedView, entry, mean
+from toolkit.files import read_json, write_json
 from toolkit.poses.scene import describe_scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.image import make_renderer, render_view
 from toolkit.training.engine import warm_up
 
+FITS = "fits"
 
-def fit_with(capture: Capture, settings: Settings, progress: Progress = SILENT) -> dict[str, Any]:
+
+def fit_with(
+    capture: Capture,
+    settings: Settings,
+    progress: Progress = SILENT,
+    truth: Capture | None = None,
+    known: Corrections | None = None,
+) -> dict[str, Any]:
     """Look for effects as the settings say, fit for `fit.budget` processor seconds, score the held-out views.
 
+    Args:
+        truth: the same capture with its held-out pictures in canonical colour.
+        known: what is corrected, so that nothing is looked for.
+
     Returns:
-        `on` (what is corrected), `psnr` in canonical colour, `psnr_corrected` (each test picture's colours fitted on its left half, scored
-        on its right), `effects_seconds`, `seconds` (the whole, without warming up), `steps`.
+        `on` (what is corrected), `psnr` (in the colours that the fit was given), `psnr_corrected` (each test picture's colours fitted on
+        its left half, scored on its right), with `truth` the same two against its pictures, `canonical` and `canonical_corrected`,
+        `effects_seconds`, `seconds` (the whole, without warming up), `steps`.
 
     Raises:
         InputError, PoseError: the capture cannot be used.
@@ -43,8 +61,8 @@ def fit_with(capture: Capture, settings: Settings, progress: Progress = SILENT) 
     warm_up(settings, progress)
     began = time.process_time()
     test = held_out(capture, settings.capture.holdout)
-    corrections, on = Corrections(), []
-    if not asleep(settings.effects):
+    corrections, on = known or Corrections(), []
+    if known is None and not asleep(settings.effects):
         decided = decide(capture, test, settings.effects, progress)
         corrections, on = decided.corrections, [one.finding.effect for one in decided.decisions if one.on]
         choose_field(settings.field, decided.to_dict()["effects"], settings.effects.off)
@@ -56,24 +74,32 @@ def fit_with(capture: Capture, settings: Settings, progress: Progress = SILENT) 
     whole = time.process_time() - began
     view = make_renderer(result.field, settings.engine)
     indices = np.flatnonzero(views.test)
-    shown = (render_view(result.field, views.intrinsics[i], views.world_from_camera[i], view) for i in indices)
-    scores = score_views(shown, views, indices)
-    return {
-        "on": on,
-        "psnr": scores["psnr"],
-        "psnr_corrected": scores["psnr_corrected"],
-        "effects_seconds": round(looked, 3),
-        "seconds": round(whole, 3),
-        "steps": result.steps,
-    }
+    shown = [render_view(result.field, views.intrinsics[i], views.world_from_camera[i], view) for i in indices]
+    out = {"on": on, **_scores(shown, views, indices, ("psnr", "psnr_corrected"))}
+    if truth is not None:
+        right = prepare_views(corrections.on_capture(truth), scene.working_from_input, settings.capture, progress)
+        out |= _scores(shown, right, indices, ("canonical", "canonical_corrected"))
+    return {**out, "effects_seconds": round(looked, 3), "seconds": round(whole, 3), "steps": result.steps}
+
+
+def _scores(shown: Sequence[RenderedView], views: Views, indices: Array, names: tuple[str, str]) -> dict[str, Any]:
+    """Under two `names`: the mean PSNR, and that with the left half's correction of colour."""
+    plain, corrected = [], []
+    for picture, index in zip(shown, indices, strict=True):
+        valid = entry(views.valid, int(index))
+        plain.append(psnr(picture.rgb, views.images[index], valid))
+        corrected.append(right_half_psnr(picture.rgb, views.images[index], valid))
+    return {names[0]: mean(plain), names[1]: mean(corrected)}
 
 
 MODES: dict[str, list[str]] = {
     "auto": ["effects=auto"],
     "all_off": ["effects=off"],
     "all_on": ["effects.on=[exposure,vignetting,distortion,poses,motion_blur,view_dependence,background]"],
+    "known": ["effects=off"],  # exposure and vignetting as they were simulated
 }
-SHOWN = ("psnr", "psnr_corrected", "effects_seconds", "seconds")
+SHOWN = ("canonical", "canonical_corrected", "psnr", "psnr_corrected", "effects_seconds", "seconds")
+FIXED = ("field.init=classical", "threads=1", "device=cpu", "tsdf.enabled=off")
 
 
 def compared(
@@ -81,19 +107,30 @@ def compared(
 ) -> dict[str, Any]:
     """Fit each capture with what was found (`auto`) and with each mode of `against` (of `MODES`), `seconds` of the processor each.
 
+    What a fit gave is kept in the capture's folder, and used again by the next call with the same seconds.
+
     Returns:
         `each` capture with its `found` effects and what `fit_with` says of every mode, and the `mean` of `SHOWN`.
+
+    Raises:
+        Interrupted: stopped by the user; fits that are done stay.
     """
     modes = ("auto", *against)
     todo, each = list(planned), []
     for number, one in enumerate(todo):
-        progress.check()
-        progress.update(number, len(todo), one.name)
-        capture = open_capture(film(one, folder))
+        place = film(one, folder)
+        capture = open_capture(place)
+        test = held_out(capture, Settings().capture.holdout)
         fits = {}
         for mode in modes:
-            fixed = [f"budget={seconds}", "field.init=classical", "threads=1", "device=cpu"]
-            fits[mode] = fit_with(capture, load_settings(pairs=[*MODES[mode], *fixed]), progress)
+            progress.check()
+            progress.update(number, len(todo), f"{one.name}, {mode.replace('_', ' ')}")
+            kept = place / FITS / f"{mode}-{seconds:g}s.json"
+            if not kept.is_file():
+                settings = load_settings(pairs=[*MODES[mode], f"budget={seconds}", *FIXED])
+                known = known_light(place, capture, test) if mode == "known" else None
+                write_json(kept, fit_with(capture, settings, progress, canonical_capture(place, capture, test), known))
+            fits[mode] = read_json(kept)
         each.append({"name": one.name, "found": fits["auto"]["on"], **fits})
     return {
         "each": each,

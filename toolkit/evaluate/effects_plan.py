@@ -35,6 +35,7 @@ PATHS = {"room": "walk", "street": "walk", "corridor": "forward", "table": "orbi
 SPEED = {"room": 0.5, "street": 1.0, "corridor": 0.8, "table": 0.9, "sphere": 0.9}  # metres a second
 SHAKE = 8.0  # degrees a second: a hand
 FIRST_SEED = 400_000  # of the captures that stand in the documentation; development uses others
+FIRST_DRIFTING = 410_000  # of those with drift and vignetting
 PLACES = {"highlights": ("room", "sphere", "table"), "background": ("street",)}  # where an effect shows at all
 
 
@@ -67,6 +68,16 @@ def plan(first_seed: int = FIRST_SEED) -> list[Planned]:
             scenes = ["street"]
         label = "+".join(f"{effect}-{strength}" for effect, strength in effects) or "clean"
         out.append(Planned(f"{number:02d}-{label}", scenes[number % len(scenes)], first_seed + number, effects))
+    return out
+
+
+def drifting(first_seed: int = FIRST_DRIFTING) -> list[Planned]:
+    """Ten captures with drift of exposure and vignetting, medium and strong, one of each kind of scene."""
+    out: list[Planned] = []
+    for strength in STRENGTHS[1:]:
+        for scene in dict.fromkeys(SCENES):
+            effects = (("exposure", strength), ("vignetting", strength))
+            out.append(Planned(f"drift-{len(out):02d}-{scene}-{strength}", scene, first_seed + len(out), effects))
     return out
 
 
