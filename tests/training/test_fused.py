@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tests.render.made import random_field, random_rays
 from tests.training.gradients import exact_gradients, torch_gradients
@@ -14,7 +16,7 @@ from toolkit.camera import Intrinsics
 from toolkit.capture.types import Views
 from toolkit.render.compiled import CompiledRenderer
 from toolkit.render.rays import render_rays
-from toolkit.training import fused_kernels
+from toolkit.training import fused_kernels, fused_order
 from toolkit.training.fused import FusedOptimiser
 from toolkit.training.rays import PixelPool
 from toolkit.training.step import Optimiser, Rates
@@ -152,6 +154,46 @@ def test_the_same_seed_gives_the_same_field(threads: int) -> None:
         results.append(engine.sync())
     assert torch.equal(results[0].density_rows, results[1].density_rows)
     assert torch.equal(results[0].feature_rows, results[1].feature_rows)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 5), st.lists(st.floats(0, 200, width=32), min_size=1, max_size=300))
+def test_threads_get_equal_work(threads: int, work: list[float]) -> None:
+    """Every part is within one ray of its due; together they are the whole batch."""
+    memory = np.zeros((len(work), 2), np.float32)
+    memory[:, 1] = work
+    tiles = np.random.default_rng(0).permutation(len(work)).astype(np.int32)
+    cuts = np.array([0, *[-1] * (threads - 1), len(work)], np.int64)
+    fused_order.share(tiles, memory, cuts)
+    assert (np.diff(cuts) >= 0).all()
+    each = memory[tiles, 1].astype(float) + fused_order.RAY_WORK
+    for part in range(threads):
+        got = each[cuts[part] : cuts[part + 1]].sum()
+        assert abs(got - each.sum() / threads) <= each.max() * 1.01
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_batch_is_drawn_anew_when_what_is_asked_for_changes(threads: int) -> None:
+    """The order of a batch is found beside the step before it, and dropped when its size or its pixels are no longer those wanted."""
+    pool = PixelPool(made_views(), depth=True)
+    engine, got = FusedOptimiser(random_field(0.0, 32, keep=0.5, raw=-2.5), pool, threads=threads), []
+    original = engine._gradients
+
+    def noted(thread: int, part: slice, picks: np.ndarray, *rest: object) -> tuple[int, float, int]:
+        got.append((part, picks))
+        return original(thread, part, picks, *rest)  # type: ignore[arg-type]
+
+    engine._gradients = noted  # type: ignore[method-assign,assignment]
+    batches = []
+    for rays, limit in ((200, len(pool)), (200, len(pool)), (200, 50), (120, 50), (120, 50)):
+        pool.limit = limit
+        got.clear()
+        engine.step(rays, RATES)
+        assert {id(picks) for _, picks in got} == {id(got[0][1])}
+        batches.append(got[0][1])
+        assert len(batches[-1]) == rays and batches[-1].max() < limit
+        assert sorted(i for part, _ in got for i in range(part.start, part.stop)) == list(range(rays))
+    assert len({tuple(batch) for batch in batches}) == len(batches)
 
 
 def test_pruned_voxels_are_left_alone() -> None:

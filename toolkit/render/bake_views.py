@@ -30,7 +30,7 @@ def mark_pass(space: Any, volume: Any, cameras: Any, poses: Any, first: Any, las
         cameras: (N, 6) float32 fx, fy, cx, cy, width, height; poses: (N, 3, 4) float32; marks: (M · 512,) uint16, see `kernels.mark`.
     """
     cells, values = np.empty(0, np.int32), np.empty((0, K.VALUES), np.float32)
-    rows, result = np.empty((0, 8), np.int32), np.empty(3, np.float32)
+    rows, result = np.empty((0, 8), np.int32), np.empty(4, np.float32)
     for view in range(first, last):
         camera, pose = cameras[view], poses[view]
         width, height = int(camera[4]), int(camera[5])

@@ -86,7 +86,8 @@ def march_ray(
         marks: (M · 512,) uint16 for `mark`, or of length 0. Of a ray that ends somewhere the strongest sample counts as seen fully: on a
             fine lattice a surface is several voxels thick and none of them may hold much weight.
         cells: (S,) int32, all_rows: (S, 8) int32 corners, values: (S, VALUES) float32: the kept samples.
-        result: (3,) float32 distance at which half of the light is stopped (0: never), transmittance left, samples looked up.
+        result: (4,) float32 distance at which half of the light is stopped (0: never), transmittance left, samples looked up, coarse steps
+            whose fine ones were tried.
 
     Returns:
         number of kept samples.
@@ -117,7 +118,7 @@ def march_ray(
         rise = ONE / math.sqrt(shell * shell + extent * extent * (px * px + py * py + pz * pz))
     far = shell / space.voxel
     marking = marks.shape[0] > 0
-    kept, looked = 0, 0
+    kept, looked, walked = 0, 0, 0
     depth, median = ZERO, ZERO  # optical depth so far
     transmittance = ONE
     step_index = 0
@@ -175,6 +176,7 @@ def march_ray(
                         step_index += 1
             continue
         if s1 > near:
+            walked += 1
             cx, cy, cz = p1x - p0x, p1y - p0y, p1z - p0z
             length = math.sqrt(cx * cx + cy * cy + cz * cz) * per_fine
             for index in range(fine):
@@ -233,5 +235,5 @@ def march_ray(
         step_index += 1
     if marking and transmittance < SOLID:
         mark_surface(marks, strongest_cell)
-    result[0], result[1], result[2] = median, transmittance, F(looked)
+    result[0], result[1], result[2], result[3] = median, transmittance, F(looked), F(walked)
     return kept

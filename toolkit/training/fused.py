@@ -17,13 +17,12 @@ from toolkit.render.field import Field
 from toolkit.training import fused_kernels as kernels
 from toolkit.training import fused_moves as moves
 from toolkit.training.finite import broken, refuse
-from toolkit.training.fused_order import hit_codes, remember_depths
+from toolkit.training.fused_order import Batch, Tiles
 from toolkit.training.rays import PixelPool
 from toolkit.training.step import Rates
 from toolkit.training.view import blind
 
 Array = np.ndarray[Any, Any]
-GUESS_CELL = 8  # pixels a side of the tiles that remember how far a view sees
 BETAS, EPSILON = (0.9, 0.99), 1e-10
 _CONSTANTS = (np.float32(BETAS[0]), np.float32(BETAS[1]), np.float32(EPSILON))
 
@@ -39,9 +38,8 @@ class FusedOptimiser:
         self.generator = np.random.default_rng(seed)
         given = (pool.colour, pool.place, pool.view, pool.camera, pool.pose, pool.distance)
         self.pixels = kernels.Pixels(*(tensor.numpy() for tensor in given))
-        widths, heights = pool.camera[:, 4].max(), pool.height
-        self.tiles = (int(heights) // GUESS_CELL + 1, int(widths) // GUESS_CELL + 1, GUESS_CELL)
-        self.guess = np.zeros(len(pool.pose) * self.tiles[0] * self.tiles[1], np.float32)
+        self.met = Tiles(pool)
+        self.next: Batch | None = None
         self._take_decoder(field)
         self.blind = blind(field.decoder).numpy()
         self.moments = [(np.zeros_like(weight), np.zeros_like(weight)) for weight in self._weights()]
@@ -111,27 +109,41 @@ class FusedOptimiser:
         Raises:
             NotFiniteError: the loss or a gradient is not finite; nothing was moved.
         """
-        picks = self.generator.integers(0, self.pool.limit, rays)
-        return self.step_on(picks, self.generator.random(rays, np.float32), rates)
+        batch = self.next
+        if batch is None or len(batch.picks) != rays or batch.limit != self.pool.limit:
+            batch = self._draw(rays)
+        self.next = self._draw(rays)
+        return self._step(batch, self.next, rates)
 
     def step_on(self, picks: Array, jitter: Array, rates: Rates) -> tuple[float, int]:
         """One step on the pixels `picks` (B,) with the rays' lattices moved by `jitter` (B,)."""
-        rays = len(picks)
-        codes, tiles = np.empty(rays, np.uint32), np.empty(rays, np.int32)
-        hit_codes(self.space, self.pixels, picks, self.guess, self.tiles, codes, tiles)
-        order = np.argsort(codes)
-        picks, jitter = picks[order], jitter[order]
+        return self._step(Batch(picks, jitter, self.threads), None, rates)
+
+    def _draw(self, rays: int) -> Batch:
+        """Random pixels."""
+        picks = self.generator.integers(0, self.pool.limit, rays)
+        return Batch(picks, self.generator.random(rays, np.float32), self.threads, self.pool.limit)
+
+    def _step(self, batch: Batch, following: Batch | None, rates: Rates) -> tuple[float, int]:
+        """One step on `batch`; the order of the `following` one is found beside it."""
+        rays = len(batch.picks)
+        if not batch.sorted:
+            for thread in range(self.threads):
+                batch.look(thread, self.space, self.pixels, self.met)
+            batch.sort(self.met)
+        picks, jitter = batch.picks, batch.jitter
         weights = (rates.distortion, rates.opacity, rates.depth, rates.colour_threshold, STOP)
         losses = kernels.Losses(*(np.float32(weight) for weight in weights))
-        depths = np.empty(rays, np.float32)
-        cuts = [rays * t // self.threads for t in range(self.threads + 1)]
+        met = np.empty((rays, 2), np.float32)
         self._make_room(rays)
 
         def gradients(thread: int) -> tuple[int, float, int, tuple[Array, ...], str | None]:
-            part = slice(cuts[thread], cuts[thread + 1])
+            part = batch.part(thread)
             moves.forget(self.index, thread, self.touched[thread, : self.used[thread]])
-            self.used[thread], error, looked = self._gradients(thread, part, picks, jitter, losses, depths)
+            self.used[thread], error, looked = self._gradients(thread, part, picks, jitter, losses, met)
             weights = self._weight_gradients(thread, part)
+            if following is not None:
+                following.look(thread, self.space, self.pixels, self.met)
             return self.used[thread], error, looked, weights, self._broken(thread, error, weights)
 
         results = self._each(gradients)
@@ -146,7 +158,9 @@ class FusedOptimiser:
             if thread == self.threads - 1:
                 self._move_decoder(rates.decoder, [result[3] for result in results])
             if thread == 0:
-                remember_depths(tiles[order], depths, self.guess)
+                self.met.remember(batch.tiles, met)
+                if following is not None:
+                    following.sort(self.met)
 
         self._each(move)
         return sum(result[1] for result in results) / (3 * rays), sum(result[2] for result in results)
@@ -198,12 +212,12 @@ class FusedOptimiser:
             self.tape = tuple(np.zeros((rays, width), np.float32) for width in widths)
 
     def _gradients(
-        self, thread: int, part: slice, picks: Array, jitter: Array, losses: kernels.Losses, depths: Array
+        self, thread: int, part: slice, picks: Array, jitter: Array, losses: kernels.Losses, met: Array
     ) -> tuple[int, float, int]:
         """The part of a batch that is `thread`'s → rows touched, sum of squared errors, samples looked up."""
         rows = (self.touched[thread], self.density_sums[thread], self.feature_sums[thread])
         own = kernels.Gradients(*rows, *(array[part] for array in self.tape))
-        arguments = (self.pixels, picks[part], jitter[part], len(picks), losses, self.marks[thread], self.index, thread, own, depths[part])
+        arguments = (self.pixels, picks[part], jitter[part], len(picks), losses, self.marks[thread], self.index, thread, own, met[part])
         out: tuple[int, float, int] = kernels.gradient_pass(self.space, self.volume, self.decoder, self.background, *arguments)
         return out
 

@@ -18,6 +18,7 @@ from toolkit.training.depth import REACH as REACH_
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
 REACH = F(REACH_)
+WALK_WORK = F(0.7)  # what a coarse step costs whose fine ones are tried, in samples that are looked up
 
 
 class Pixels(NamedTuple):
@@ -115,7 +116,7 @@ def gradient_pass(
     index: Any,
     thread: Any,
     gradients: Any,
-    depths: Any,
+    met: Any,
 ) -> Any:
     """Forward and backward over the rays of pixels `picks`.
 
@@ -124,7 +125,7 @@ def gradient_pass(
         marks: (M · 512,) uint16, this thread's own, or of length 0.
         index: (M · 512 + 1, threads + 1) int32; column 1 + `thread` is where a row's sums are in `gradients`, −1: not touched, as all are
             on entry.
-        depths: (len(picks),) distance where half of the light was stopped, for those that ask; or of length 0.
+        met: (len(picks), 2) distance where half of the light was stopped, and work in samples, for those that ask; or of length 0.
 
     Returns:
         rows touched, sum of squared colour errors, samples looked up.
@@ -136,7 +137,7 @@ def gradient_pass(
     features = np.empty((most, channels), np.float32)
     g_weight = np.empty(most, np.float32)
     g_given = np.empty(channels, np.float32)
-    colour, result, ray = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(6, np.float32)
+    colour, result, ray = np.empty(3, np.float32), np.empty(4, np.float32), np.empty(6, np.float32)
     touched, density_sums, feature_sums = gradients.touched, gradients.density, gradients.feature
     column = thread + 1
     zero_row = volume.density.shape[0] - 1
@@ -168,8 +169,8 @@ def gradient_pass(
             result,
         )
         looked += int(result[2])
-        if depths.shape[0] > 0:
-            depths[number] = result[0]
+        if met.shape[0] > 0:
+            met[number, 0], met[number, 1] = result[0], result[2] + WALK_WORK * result[3]
         given, h1, h2 = gradients.given[number], gradients.h1[number], gradients.h2[number]
         g1, g2, g_logit = gradients.g1[number], gradients.g2[number], gradients.g_logit[number]
         # composite the features

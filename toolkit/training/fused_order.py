@@ -1,4 +1,4 @@
-"""The order of a batch's rays, compiled: those that look at the same place come one after the other."""
+"""The order of a batch's rays, compiled: those that look at the same place come one after the other, and threads get equal work."""
 
 from __future__ import annotations
 
@@ -9,8 +9,12 @@ from numba import njit
 
 from toolkit.render import kernels as K
 from toolkit.training.fused_kernels import pixel_ray
+from toolkit.training.rays import PixelPool
 
+Array = np.ndarray[Any, Any]
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
+RAY_WORK = F(7)  # what a ray costs beside its samples and coarse steps, in samples
+CELL = 8  # pixels a side of the tiles that remember what rays met
 AHEAD = 8  # pixels for which memory is asked before they are needed
 
 
@@ -25,14 +29,13 @@ def _spread_bits(value: Any) -> Any:
 
 
 @njit(**K.OPTIONS)
-def hit_codes(space: Any, pixels: Any, picks: Any, guess: Any, grid: Any, codes: Any, tiles: Any) -> None:
+def hit_codes(space: Any, pixels: Any, picks: Any, memory: Any, grid: Any, codes: Any, tiles: Any) -> None:
     """Morton codes of where rays are expected to hit: rays that look at the same place come one after the other, so that the memory
     which they share is still in the cache.
 
     Args:
-        guess: (V · gh · gw,) float32 distances last seen from each view, in tiles of `cell` pixels; 0: unknown.
-        grid: ints gh, gw, cell.
-        codes: (B,) uint32 and tiles: (B,) int32, a pixel's place in `guess`: filled here.
+        memory, grid: of `Tiles`.
+        codes: (B,) uint32 and tiles: (B,) int32, a pixel's place in `memory`: filled here.
     """
     ray = np.empty(6, np.float32)
     top = F(1023)
@@ -51,7 +54,7 @@ def hit_codes(space: Any, pixels: Any, picks: Any, guess: Any, grid: Any, codes:
         column = place - row * width
         tile = (view * high + row // cell) * wide + column // cell
         tiles[index] = tile
-        t = guess[tile] / space.half
+        t = memory[tile, 0] / space.half
         x = (ray[0] - space.cx) / space.half + t * ray[3]
         y = (ray[1] - space.cy) / space.half + t * ray[4]
         z = (ray[2] - space.cz) / space.half + t * ray[5]
@@ -65,8 +68,81 @@ def hit_codes(space: Any, pixels: Any, picks: Any, guess: Any, grid: Any, codes:
 
 
 @njit(**K.OPTIONS)
-def remember_depths(tiles: Any, depths: Any, guess: Any) -> None:
-    """Write the distances (B,) that a batch saw into `guess`, at its tiles (B,)."""
+def _remember(tiles: Any, met: Any, memory: Any) -> None:
+    """Write what a batch met (B, 2) into `memory`, at its tiles (B,)."""
     for index in range(len(tiles)):
-        if depths[index] > ZERO:
-            guess[tiles[index]] = depths[index]
+        if met[index, 0] > ZERO:
+            memory[tiles[index], 0] = met[index, 0]
+        memory[tiles[index], 1] = met[index, 1]
+
+
+@njit(**K.OPTIONS)
+def share(tiles: Any, memory: Any, cuts: Any) -> None:
+    """Places cuts[1 : -1] where the rays of `tiles` (B,) fall into parts of equal expected work."""
+    total = ZERO
+    for index in range(len(tiles)):
+        total += RAY_WORK + memory[tiles[index], 1]
+    parts = len(cuts) - 1
+    done, part = ZERO, 1
+    for index in range(len(tiles)):
+        while part < parts and done * F(parts) >= total * F(part):
+            cuts[part] = index
+            part += 1
+        done += RAY_WORK + memory[tiles[index], 1]
+    while part < parts:
+        cuts[part] = len(tiles)
+        part += 1
+
+
+class Tiles:
+    """What rays from each tile of CELL by CELL pixels of a training picture met last.
+
+    Attributes:
+        grid: rows and columns of tiles of the largest picture, and CELL.
+        met: (V · rows · columns, 2) float32 distance where half of the light was stopped (0: unknown), and work.
+    """
+
+    def __init__(self, pool: PixelPool) -> None:
+        self.grid = (int(pool.height) // CELL + 1, int(pool.camera[:, 4].max()) // CELL + 1, CELL)
+        self.met = np.zeros((len(pool.pose) * self.grid[0] * self.grid[1], 2), np.float32)
+
+    def remember(self, tiles: Array, met: Array) -> None:
+        """What a batch met (B, 2) at its tiles (B,)."""
+        _remember(tiles, met, self.met)
+
+
+class Batch:
+    """Rays of one step, and the order that they are worked on in.
+
+    To find the order would take two threads a twentieth of a step, one of them waiting; so it is found beside the step before: `look`
+    by every thread for its part, `sort` by one of them.
+
+    Attributes:
+        picks: (B,) int64 pixels; jitter: (B,) float32 by which the rays' lattices are moved.
+        limit: pixels that `picks` were drawn from.
+        tiles: (B,) int32 places in `Tiles.met`.
+        cuts: (threads + 1,) int64 where each thread's part begins and ends: equal numbers as drawn, equal expected work once sorted.
+    """
+
+    def __init__(self, picks: Array, jitter: Array, threads: int, limit: int = 0) -> None:
+        count = len(picks)
+        self.picks, self.jitter, self.limit = picks, jitter, limit
+        self.codes, self.tiles = np.empty(count, np.uint32), np.empty(count, np.int32)
+        self.cuts = np.array([count * t // threads for t in range(threads + 1)], np.int64)
+        self.sorted = False
+
+    def part(self, thread: int) -> slice:
+        """The rays of one thread."""
+        return slice(int(self.cuts[thread]), int(self.cuts[thread + 1]))
+
+    def look(self, thread: int, space: Any, pixels: Any, tiles: Tiles) -> None:
+        """Codes and tiles of one thread's part, as drawn."""
+        part = self.part(thread)
+        hit_codes(space, pixels, self.picks[part], tiles.met, tiles.grid, self.codes[part], self.tiles[part])
+
+    def sort(self, tiles: Tiles) -> None:
+        """Once all threads have looked."""
+        order = np.argsort(self.codes)
+        self.picks, self.jitter, self.tiles = self.picks[order], self.jitter[order], self.tiles[order]
+        share(self.tiles, tiles.met, self.cuts)
+        self.sorted = True

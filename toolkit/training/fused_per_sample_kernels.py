@@ -218,7 +218,7 @@ def gradient_pass(
     thread: Any,
     gradients: Any,
     scratch: Scratch,
-    depths: Any,
+    met: Any,
 ) -> Any:
     """Forward and backward over the rays of pixels `picks`.
 
@@ -250,8 +250,8 @@ def gradient_pass(
                     K.prefetch(index, np.int64(tape.rows[i, corner]))
             samples += kept
             looked += int(light[3])
-            if depths.shape[0] > 0:
-                depths[number] = light[2]
+            if met.shape[0] > 0:
+                met[number, 0], met[number, 1] = light[2], light[3]
             rays += 1
             number += 1
         starts[rays] = samples
