@@ -9,9 +9,9 @@ import pytest
 
 from tests.effects.seen import CAMERA, FRAMES, made
 from toolkit.effects import background, geometry, light, motion_blur, view_dependence
-from toolkit.effects.adjust import POSES, adjust, residuals, scatter
+from toolkit.effects.adjust import POSES, adjust, predict, residuals, rotation, scatter, vectors
 from toolkit.effects.paid import Paid
-from toolkit.effects.refine import aligned, refined_poses
+from toolkit.effects.refine import refined_poses
 from toolkit.effects.survey import ORDER, look
 
 
@@ -75,6 +75,19 @@ def test_gains_of_training_frames_have_mean_one_and_do_not_hang_on_the_others() 
     np.testing.assert_allclose(other[test], 0.5 * gain[test], rtol=0.02)
 
 
+def aligned(poses: np.ndarray, given: np.ndarray, use: np.ndarray) -> np.ndarray:
+    """`poses` under the similarity that brings those in `use` (F,) bool closest to the given ones: mean turn, spread and place."""
+    u, _, vt = np.linalg.svd(np.einsum("fij,fkj->ik", given[use, :3, :3], poses[use, :3, :3]))
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    centre, target = poses[use, :3, 3].mean(0), given[use, :3, 3].mean(0)
+    away, wanted = (poses[use, :3, 3] - centre) @ rotation.T, given[use, :3, 3] - target
+    scale = float((away * wanted).sum() / max(float((away**2).sum()), 1e-30))
+    out = poses.copy()
+    out[:, :3, :3] = rotation @ poses[:, :3, :3]
+    out[:, :3, 3] = scale * (poses[:, :3, 3] - centre) @ rotation.T + target
+    return out
+
+
 def test_refined_poses_are_better_and_stay_in_the_given_frame() -> None:
     true, wrong = made(9, noise=0.05), made(9, noise=0.05, pose_error=0.004)
     train = np.arange(FRAMES) % 8 != 0
@@ -88,7 +101,29 @@ def test_refined_poses_are_better_and_stay_in_the_given_frame() -> None:
         return float(np.sqrt(np.mean(np.arccos(np.clip(cosines, -1, 1)) ** 2)))
 
     assert off(poses) < 0.2 * off(wrong.poses)
-    np.testing.assert_allclose(aligned(poses[train], wrong.poses[train], np.ones(train.sum(), dtype=bool)), poses[train], atol=1e-6)
+    np.testing.assert_allclose(aligned(poses[train], wrong.poses[train], np.ones(train.sum(), dtype=bool)), poses[train], atol=0.02)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_depths_do_not_drift_where_a_lens_is_a_little_off(seed: int) -> None:
+    """Pictures alone take a slow turn for a slow move there, and all depths are 3% to 5% too large; the given poses hold them."""
+    true, seen = made(seed), made(seed, pose_error=0.004, lens=(0.02, 0.0))
+    whole, _ = geometry.open_problem(seen)
+
+    def depths(poses: np.ndarray) -> np.ndarray:
+        return np.asarray(predict(adjust(replace(whole, poses=poses)).problem)[0][:, 2])
+
+    exact = depths(true.poses)
+    alone = aligned(adjust(whole, frozenset({POSES}), steps=30).problem.poses, seen.poses, np.ones(FRAMES, dtype=bool))
+    refined, _ = refined_poses(seen, np.ones(FRAMES, dtype=bool), frozenset({POSES}))
+    assert np.median(depths(alone) / exact) > 1.028
+    assert abs(np.median(depths(refined) / exact) - 1) < 0.02
+
+
+def test_turns_become_vectors_and_back() -> None:
+    turns = np.random.default_rng(0).normal(0, 0.6, (50, 3))
+    turns[0] = 0
+    np.testing.assert_allclose(vectors(rotation(turns)), turns, atol=1e-12)
 
 
 def test_held_out_frames_move_nothing_of_the_others() -> None:

@@ -58,6 +58,23 @@ class Problem:
 
 
 @dataclass(frozen=True)
+class Belief:
+    """Where cameras are before pictures are looked at, and how sure that is."""
+
+    poses: Array  # (F, 4, 4)
+    weight: Array  # (6,) working pixels² that a square of a turn (radians, camera axes) and of a move costs
+
+    def off(self, poses: Array) -> Array:
+        """(F, 6) turns and moves from the believed poses to these, camera axes."""
+        turned = np.einsum("fji,fjk->fik", self.poses[:, :3, :3], poses[:, :3, :3])
+        moved = np.einsum("fji,fj->fi", poses[:, :3, :3], poses[:, :3, 3] - self.poses[:, :3, 3])
+        return np.concatenate([vectors(turned), moved], axis=1)
+
+    def cost(self, poses: Array) -> float:
+        return 0.5 * float((self.weight * self.off(poses) ** 2).sum())
+
+
+@dataclass(frozen=True)
 class Fitted:
     """A problem at its optimum."""
 
@@ -90,16 +107,16 @@ def scatter(residual: Array) -> float:
     return float(np.median(np.linalg.norm(residual, axis=1)) / 1.1774) if len(residual) else np.inf
 
 
-def adjust(problem: Problem, unknown: frozenset[str] = frozenset(), steps: int = STEPS) -> Fitted:
-    """Fit the points and what is `unknown` beside them."""
+def adjust(problem: Problem, unknown: frozenset[str] = frozenset(), steps: int = STEPS, belief: Belief | None = None) -> Fitted:
+    """Fit the points and what is `unknown` beside them; poses that are unknown stay near those of `belief`, if there is one."""
     damping, current = 1e-3, problem
     left = residuals(current)
     width = TUNING * max(scatter(left), 1e-3)
-    cost = _cost(left, width)
+    cost = _cost(left, width, current, belief)
     for _ in range(steps):
-        moved = _step(current, left, width, unknown, damping)
+        moved = _step(current, left, width, unknown, damping, belief)
         new = residuals(moved)
-        value = _cost(new, width)
+        value = _cost(new, width, moved, belief)
         if not value < cost:
             damping *= 10
             if damping > 1e4:
@@ -108,19 +125,20 @@ def adjust(problem: Problem, unknown: frozenset[str] = frozenset(), steps: int =
         done = value > (1 - SLACK) * cost
         current, left, damping = moved, new, max(damping / 5, 1e-7)
         width = TUNING * max(scatter(left), 1e-3)
-        cost = _cost(left, width)
+        cost = _cost(left, width, current, belief)
         if done:
             break
     return Fitted(current, left, scatter(left))
 
 
-def _cost(residual: Array, width: float) -> float:
-    """Huber's cost over the number of residuals."""
+def _cost(residual: Array, width: float, problem: Problem | None = None, belief: Belief | None = None) -> float:
+    """Huber's cost, and that of the belief, over the number of residuals."""
     size = np.linalg.norm(residual, axis=1)
-    return float(np.where(size < width, 0.5 * size**2, width * (size - 0.5 * width)).mean())
+    held = belief.cost(problem.poses) / max(len(size), 1) if belief is not None and problem is not None else 0.0
+    return float(np.where(size < width, 0.5 * size**2, width * (size - 0.5 * width)).mean()) + held
 
 
-def _step(problem: Problem, left: Array, width: float, unknown: frozenset[str], damping: float) -> Problem:
+def _step(problem: Problem, left: Array, width: float, unknown: frozenset[str], damping: float, belief: Belief | None = None) -> Problem:
     """One damped Gauss-Newton step."""
     by_point, by_camera, columns, count = _slopes(problem, unknown)
     weight = np.minimum(1, width / np.maximum(np.linalg.norm(left, axis=1), 1e-12))
@@ -138,6 +156,10 @@ def _step(problem: Problem, left: Array, width: float, unknown: frozenset[str], 
     np.add.at(right, columns, np.einsum("oac,oa->oc", weighted, left))
     block = np.einsum("oac,oad->ocd", weighted, by_camera)
     np.add.at(matrix, (columns[:, :, None], columns[:, None, :]), block)
+    if belief is not None and POSES in unknown:  # turns by little add up, so that the slope by a turn is the identity
+        pull = belief.weight * belief.off(problem.poses)
+        right[: pull.size] += pull.ravel()
+        matrix[np.arange(pull.size), np.arange(pull.size)] += np.tile(belief.weight, len(pull))
     matrix[np.diag_indices(count)] *= 1 + damping
     matrix[np.diag_indices(count)] += 1e-9 * np.trace(matrix) / count
     mixed = np.einsum("oac,oai->oci", weighted, by_point)  # (O, K, 3)
@@ -231,6 +253,14 @@ def rotation(vectors: Array) -> Array:
     cross = _cross(vectors)
     small = np.maximum(angle, 1e-12)
     return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + (1 - np.cos(angle)) / small**2 * (cross @ cross))
+
+
+def vectors(rotations: Array) -> Array:
+    """(N, 3, 3) → (N, 3) rotation vectors, for angles below a half turn: `rotation` undone."""
+    axis = 0.5 * np.stack([rotations[:, i, j] - rotations[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
+    sine, cosine = np.linalg.norm(axis, axis=1), 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1)
+    angle = np.arctan2(sine, cosine)
+    return np.asarray(axis * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)[:, None])
 
 
 def resect(problem: Problem, frame: int, steps: int = 10) -> Array:

@@ -8,9 +8,10 @@ import numpy as np
 
 from toolkit.camera import Array
 from toolkit.effects import geometry
-from toolkit.effects.adjust import LENS, POSES, ROWS, Problem, adjust, resect
+from toolkit.effects.adjust import LENS, POSES, ROWS, Belief, Problem, adjust, predict, resect
 from toolkit.effects.sightings import Sightings
 
+STEPS, FREE_STEPS = 60, 30  # of the fit, and of one that only tells how much noise is left
 FEWEST = 12  # observations without which a frame keeps its pose
 
 
@@ -27,43 +28,33 @@ def refined_poses(seen: Sightings, train: Array, kept: frozenset[str]) -> tuple[
     mine = train[whole.frame]
     often = np.bincount(whole.point[mine], minlength=len(whole.points)) >= 2
     problem = _only_frames(whole.only(often), train)
-    fitted = adjust(problem, frozenset({POSES, *(kept & {LENS, ROWS})}), steps=30).problem
-    enough = train & (np.bincount(fitted.frame, minlength=len(train)) >= FEWEST)
-    poses = aligned(fitted.poses, seen.poses, enough)
-    moved = replace(fitted, poses=poses, points=_carried(fitted, poses, enough))
-    poses[~enough] = seen.poses[~enough]
+    unknown = frozenset({POSES, *(kept & {LENS, ROWS})})
+    before, free = adjust(problem).scatter, adjust(problem, unknown, FREE_STEPS).scatter
+    moved = adjust(problem, unknown, STEPS, believed(problem, before, free)).problem
+    poses = moved.poses.copy()
+    few = np.bincount(problem.frame, minlength=len(train)) < FEWEST
+    poses[few | ~train] = seen.poses[few | ~train]
     everything = whole.only(often).like(moved)
     everything = replace(everything, points=moved.points, poses=poses)
     for frame in np.flatnonzero(~train):
         rows = everything.frame == frame
         if rows.sum() >= FEWEST:
             poses[frame] = resect(everything, int(frame))
-    return poses, fitted.lens
+    return poses, moved.lens
+
+
+def believed(problem: Problem, before: float, left: float) -> Belief:
+    """The problem's poses, taken to be off by as much as its points show: each by a turn, and by a move at the points' distance, that shift
+    what is seen by `before` working pixels.
+
+    What fits leave, `left` working pixels, hardly tells a slow turn along a walk from a slow move, nor the scale; where a lens or rows
+    are not quite as they are taken to be, all depths drift by some percent. What pictures do tell outweighs this by far.
+    """
+    focal, depth = float(np.median(problem.focal)), float(np.median(predict(problem)[0][:, 2]))
+    turn = (left * focal / max(before, 1e-9)) ** 2
+    return Belief(problem.poses, np.array([turn] * 3 + [turn / max(depth, 1e-9) ** 2] * 3))
 
 
 def _only_frames(problem: Problem, frames: Array) -> Problem:
     keep = frames[problem.frame]
     return replace(problem, frame=problem.frame[keep], point=problem.point[keep], place=problem.place[keep], row=problem.row[keep])
-
-
-def aligned(poses: Array, given: Array, use: Array) -> Array:
-    """`poses` under the similarity that brings those in `use` (F,) bool closest to the given ones: mean turn, spread and place."""
-    u, _, vt = np.linalg.svd(np.einsum("fij,fkj->ik", given[use, :3, :3], poses[use, :3, :3]))
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    centre, target = poses[use, :3, 3].mean(0), given[use, :3, 3].mean(0)
-    away, wanted = (poses[use, :3, 3] - centre) @ rotation.T, given[use, :3, 3] - target
-    scale = float((away * wanted).sum() / max(float((away**2).sum()), 1e-30))
-    out = poses.copy()
-    out[:, :3, :3] = rotation @ poses[:, :3, :3]
-    out[:, :3, 3] = scale * (poses[:, :3, 3] - centre) @ rotation.T + target
-    return out
-
-
-def _carried(problem: Problem, poses: Array, use: Array) -> Array:
-    """(P, 3) the problem's points under the similarity that made `poses` of its own."""
-    first = int(np.flatnonzero(use)[0])
-    rotation = poses[first, :3, :3] @ problem.poses[first, :3, :3].T
-    before, after = problem.poses[use, :3, 3], poses[use, :3, 3]
-    spread = np.linalg.norm(before - before.mean(0))
-    scale = float(np.linalg.norm(after - after.mean(0)) / spread) if spread > 1e-15 else 1.0
-    return np.asarray(scale * (problem.points - problem.poses[first, :3, 3]) @ rotation.T + poses[first, :3, 3])
