@@ -55,10 +55,15 @@ def test_clipped_pixels_that_become_darker_are_not_valid() -> None:
     assert after.images[0] is before.images[0]
 
 
-def test_frames_that_are_left_out_are_not_valid_but_for_test_views() -> None:
-    after = Corrections(left_out=("a", "b")).on_views(views())
+def test_weights_are_shares_of_the_valid_pixels_but_for_test_views() -> None:
+    before = views()
+    before.valid = [None, None, np.arange(64)[None].repeat(48, 0) < 32]
+    after = Corrections(weight={"a": 0.3, "b": 0.3, "c": 0.5}).on_views(before)
     assert after.valid[0] is None
-    assert after.valid[1] is not None and not after.valid[1].any()
+    assert after.valid[1] is not None and abs(after.valid[1].mean() - 0.3) < 0.03
+    assert after.valid[2] is not None and abs(after.valid[2][:, :32].mean() - 0.5) < 0.05 and not after.valid[2][:, 32:].any()
+    again = Corrections(weight={"b": 0.3}).on_views(views())
+    np.testing.assert_array_equal(again.valid[1], after.valid[1])
 
 
 def test_a_lens_is_added_to_what_is_given() -> None:
@@ -84,7 +89,7 @@ def test_poses_and_lens_go_into_the_capture() -> None:
 
 
 def test_corrections_survive_their_file_and_damaged_ones_are_refused() -> None:
-    whole = Corrections({"a": (1.0, 1.1, 0.9)}, 0.6, (-0.1, 0.02), {"a": np.eye(4)}, ("b",))
+    whole = Corrections({"a": (1.0, 1.1, 0.9)}, 0.6, (-0.1, 0.02), {"a": np.eye(4)}, {"b": 0.25})
     again = Corrections.from_dict(whole.to_dict())
     assert again.to_dict() == whole.to_dict() and again.gain == whole.gain
     for damage in (
@@ -93,7 +98,14 @@ def test_corrections_survive_their_file_and_damaged_ones_are_refused() -> None:
         {"corner": "x"},
         {"poses": {"a": [1]}},
         {"lens": [1]},
-        {"left_out": 3},
+        {"weight": 3},
+        {"weight": {"a": 1.5}},
+        {"weight": {"a": "x"}},
     ):
         with pytest.raises(InputError, match=r"effects\.json"):
             Corrections.from_dict({**whole.to_dict(), **damage})
+    older = {key: value for key, value in whole.to_dict().items() if key != "weight"}
+    assert Corrections.from_dict({**older, "left_out": ["b"]}).weight == {"b": 0.0}
+    for damage in ({}, {"left_out": 3}):
+        with pytest.raises(InputError, match=r"effects\.json"):
+            Corrections.from_dict({**older, **damage})

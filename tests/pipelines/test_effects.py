@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -64,6 +65,21 @@ def test_seconds_stand_beside_each_effect(captures: dict[str, Path]) -> None:
     assert points > 0.02 and paid["exposure"] > paid["vignetting"] > 0 and paid["poses"] == pytest.approx(paid["distortion"], abs=0.002)
     assert 0.7 * data["seconds"] < points + sum(paid.values()) < 1.02 * data["seconds"] + 0.01
     fitting(data, EFFECTS, Path("effects.json"))
+
+
+def test_blurred_pictures_weigh_less(tmp_path: Path) -> None:
+    place = tmp_path / "jerk"
+    simulate(scene_file({**SCENE, "path": {**SCENE["path"], "frames": 12}}, "test"), place, effects=[], workers=1)
+    for name in ("000003.png", "000006.png"):
+        path = place / "images" / name
+        cv2.imwrite(str(path), cv2.GaussianBlur(cv2.imread(str(path)), (0, 0), 2.5))
+    capture = open_capture(place)
+    test = held_out(capture, 8)
+    got = decide(capture, test, load_settings(pairs=["effects=off", "effects.on=[motion_blur]"]).effects)
+    weight = {Path(name).stem: value for name, value in got.corrections.weight.items()}
+    assert got.decisions[-2].finding.there and not any(frame.name in got.corrections.weight for frame in np.array(capture.frames)[test])
+    assert max(weight["000003"], weight["000006"]) < 0.6 * min(weight.get(f"{index:06d}", 1.0) for index in (1, 2, 4, 5, 7, 9, 10, 11))
+    assert min(weight.values()) >= 0.1
 
 
 def test_settings() -> None:

@@ -104,6 +104,7 @@ ELSEWHERE = {
     "toolkit/poses/child.py": "as above",
     "toolkit/evaluate/suites/tables.py": "a page of the documentation, for people who measure, through `atomic_path`",
     "toolkit/evaluate/effects_plan.py": "for people who measure effects: captures in a folder of their own",
+    "toolkit/evaluate/effects_truth.py": "the same, one picture at a time through atomic_path",
     "toolkit/poses/worker.py": "as above",
     "toolkit/evaluate/budget.py": "a cache: what cannot be written is not remembered",
     "toolkit/simulate/demo.py": "one video, for people, through `atomic_path`",

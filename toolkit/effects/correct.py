@@ -1,4 +1,4 @@
-"""What is taken out of a capture before anything is fitted to it, as plain data: colours, the lens, errors of poses, blurred frames.
+"""What is taken out of a capture before anything is fitted to it, as plain data: colours, the lens, errors of poses, weights.
 
 Gains have geometric mean 1 over the training pictures, the vignetting is 1 in the middle, refined poses are those that lie closest to the
 given ones under a similarity: every freedom that pictures cannot tell is fixed. Where nothing is to be corrected, the very same objects
@@ -7,6 +7,7 @@ come back.
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -31,7 +32,7 @@ class Corrections:
     corner: float | None = None  # light left at half a diagonal
     lens: tuple[float, float] | None = None  # k1, k2 beyond the given lens
     poses: dict[str, Array] = field(default_factory=dict)  # (4, 4) world_from_camera
-    left_out: tuple[str, ...] = ()  # frames that are not fitted
+    weight: dict[str, float] = field(default_factory=dict)  # of frames that count for less in the fit: share of their pixels, 0 to 1
 
     @property
     def geometric(self) -> bool:
@@ -39,7 +40,7 @@ class Corrections:
 
     @property
     def photometric(self) -> bool:
-        return self.corner is not None or bool(self.gain) or bool(self.left_out)
+        return self.corner is not None or bool(self.gain) or bool(self.weight)
 
     def on_capture(self, capture: Capture) -> Capture:
         """The capture with the refined lens and poses."""
@@ -54,7 +55,8 @@ class Corrections:
     def on_views(self, views: Views) -> Views:
         """The views in canonical colour.
 
-        Not valid any more are clipped pixels that become darker (their colour is not known), and all of a frame that is left out.
+        Not valid any more are clipped pixels that become darker (their colour is not known), and so many of a training frame's pixels, by
+        lot, that what is left is its weight: a fit draws its rays evenly from all that are valid.
         """
         if not self.photometric:
             return views
@@ -66,8 +68,10 @@ class Corrections:
             if lost is not None and lost.any():
                 before = valid[index]
                 valid[index] = ~lost if before is None else before & ~lost
-            if name in self.left_out and not views.test[index]:
-                valid[index] = np.zeros(image.shape[:2], dtype=bool)
+            if name in self.weight and not views.test[index]:
+                drawn = np.random.default_rng(zlib.crc32(name.encode())).random(image.shape[:2]) < self.weight[name]
+                before = valid[index]
+                valid[index] = drawn if before is None else before & drawn
         return replace(views, images=images, valid=valid)
 
     def to_dict(self) -> dict[str, Any]:
@@ -76,7 +80,7 @@ class Corrections:
             "corner": self.corner,
             "lens": None if self.lens is None else list(self.lens),
             "poses": {name: pose.tolist() for name, pose in self.poses.items()},
-            "left_out": list(self.left_out),
+            "weight": dict(self.weight),
         }
 
     @classmethod
@@ -92,12 +96,17 @@ class Corrections:
             corner = None if data["corner"] is None else float(data["corner"])
             lens = None if data["lens"] is None else (float(data["lens"][0]), float(data["lens"][1]))
             numbers = [*(value for values in gain.values() for value in values), *([] if corner is None else [corner])]
+            # Before there were weights, the most blurred frames were left out.
+            weights = data["weight"] if "weight" in data else dict.fromkeys(data["left_out"], 0)
+            weight = {str(name): float(value) for name, value in weights.items()}
+            if any(not 0 <= value <= 1 for value in weight.values()):
+                raise ValueError("a weight is not a share")
             if any(len(values) != 3 for values in gain.values()) or any(not 0 < value < 1e6 for value in numbers):
                 raise ValueError("a gain is not a positive number for each channel")
             if any(not np.isfinite(pose).all() for pose in poses.values()) or (lens is not None and not np.isfinite(lens).all()):
                 raise ValueError("a pose or the lens is not finite")
             exact = {name: (values[0], values[1], values[2]) for name, values in gain.items()}
-            return cls(exact, corner, lens, poses, tuple(str(name) for name in data["left_out"]))
+            return cls(exact, corner, lens, poses, weight)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
             raise InputError(f"effects.json is not what the effects stage writes ({error}); remove it and run again") from error
 

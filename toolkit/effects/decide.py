@@ -16,14 +16,15 @@ from toolkit.effects import light, vignetting
 from toolkit.effects.adjust import LENS, POSES, ROWS, adjust
 from toolkit.effects.correct import Corrections, correctable
 from toolkit.effects.light import EXPOSURE, VIGNETTING
-from toolkit.effects.motion_blur import BLURRED
+from toolkit.effects.motion_blur import POWER
 from toolkit.effects.paid import POINTS, Paid
 from toolkit.effects.refine import refined_poses
 from toolkit.effects.sightings import Look, gather
 from toolkit.effects.survey import BLUR, FAR, VIEWS, Finding, Survey, survey
 from toolkit.progress import SILENT, Progress
 
-MOST_LEFT_OUT = 0.1  # of the training frames
+SHARP = 0.75  # quantile of the sharpness from which on a frame counts in full
+LEAST_WEIGHT = 0.1
 TOLD_ONLY = {
     ROWS: "only told, not corrected",
 }
@@ -145,9 +146,9 @@ def _corrections(
         return Corrections(corner=corner, lens=lens)
     gain: dict[str, tuple[float, float, float]] = {}
     poses: dict[str, Array] = {}
-    left_out: tuple[str, ...] = ()
+    weight: dict[str, float] = {}
     if BLUR in on:
-        left_out = _blurred(seen.names, found.sharpness)
+        weight = _weights([frame.name for frame, held in zip(capture.frames, test, strict=True) if not held], seen.names, found.sharpness)
     if on & {EXPOSURE, POSES}:
         with found.paid.by(POINTS):
             every = gather(capture, range(len(capture.frames)), progress, known=known)
@@ -163,10 +164,13 @@ def _corrections(
                 moved, beyond = refined_poses(every, ~test, kept | on)
             poses = dict(zip(every.names, moved, strict=True))
             lens = beyond if LENS in on else None
-    return Corrections(gain, corner, lens, poses, left_out)
+    return Corrections(gain, corner, lens, poses, weight)
 
 
-def _blurred(names: list[str], sharpness: Array) -> tuple[str, ...]:
-    """The most blurred frames, a tenth of those looked at at most."""
-    order = np.argsort(sharpness, kind="stable")[: int(MOST_LEFT_OUT * len(names))]
-    return tuple(names[index] for index in order if sharpness[index] < BLURRED)
+def _weights(train: Sequence[str], names: Sequence[str], sharpness: Array) -> dict[str, float]:
+    """What each training frame counts for, by its sharpness; those that were not looked at count as much as most do."""
+    share = np.clip(np.exp2(POWER * (sharpness - np.quantile(sharpness, SHARP))), LEAST_WEIGHT, 1)
+    known = dict(zip(names, share, strict=True))
+    usual = float(np.median(share))
+    weight = {name: round(float(known.get(name, usual)), 3) for name in train}
+    return {name: value for name, value in weight.items() if value < 1}

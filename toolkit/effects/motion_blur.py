@@ -43,7 +43,7 @@ def forward(pictures: list[Tensor]) -> Tensor:
 
 
 THRESHOLD = 0.033  # factors of two of the slopes' energy
-BLURRED = -0.7  # factors of two below the others: such a frame is worth less than it costs
+POWER = 2.0  # of a frame's sharpness: its weight in the fit, against that of sharp ones
 FEWEST = 100
 DARKEST, BRIGHTEST = 0.02, 0.6  # linear light of a patch: noise and clipping change slopes too, and exposure decides how much
 TREND = 8  # frames from which on a slow trend is told from blur, which comes and goes
@@ -60,6 +60,15 @@ def _sharpness(energy: Array, distance: Array, frame: Array, point: Array, frame
         left, constants = without_points_and_frames((energy - power * distance)[:, None], tracks, weight, frames)
         weight, _ = robust(left[:, 0])
     return constants[:, 0], weight, left[:, 0]
+
+
+def _trend(values: Array) -> Array:
+    """(n,) the slow trend in the values (n,), of least absolute residuals: a few very blurred frames must not bend it."""
+    steps, weight, trend = np.linspace(-1, 1, len(values)), np.ones(len(values)), values
+    for _ in range(5 * ROUNDS):
+        trend = np.polynomial.Polynomial.fit(steps, values, 2, w=np.sqrt(weight))(steps)
+        weight = 1 / np.maximum(np.abs(values - trend), 0.01)
+    return np.asarray(trend)
 
 
 def evidence(slope: Array, depth: Array, frame: Array, point: Array, frames: int, linear: Array | None = None) -> Evidence:
@@ -99,7 +108,7 @@ def evidence(slope: Array, depth: Array, frame: Array, point: Array, frames: int
     agreed = float(np.sqrt(max(float(np.mean(jumps[0] * jumps[1])), 0.0) / 1.5))  # 1.5: of independent frames, what such jumps add up to
     deviation = min(deviation, agreed)
     sharpness = np.zeros(frames)
-    sharpness[told] = values
+    sharpness[told] = constants[told] - _trend(constants[told])
     return Evidence(
         "motion_blur",
         deviation,
