@@ -28,7 +28,7 @@ def effects(
             "--drifting", help="Film ten with drift and vignetting; fit with what was found, with all off, and with what is true."
         ),
     ] = False,
-    every: Annotated[int, typer.Option(min=1, help="Of the captures, every so manieth is fitted.")] = 2,
+    every: Annotated[int, typer.Option(min=1, help="Of the captures, every so manieth is fitted.")] = 1,
     seconds: Annotated[float, typer.Option(min=0.5, help="Processor seconds of each fit.")] = 3.0,
     quiet: Quiet = False,
 ) -> None:
@@ -99,6 +99,9 @@ def by_hand(
     seconds: Annotated[float, typer.Option(min=0.5, help="Processor seconds of each fit.")] = 10.0,
     image_size: Annotated[int, typer.Option(min=32, help="Long side of the pictures.")] = 240,
     seeds: Annotated[int, typer.Option(min=1, help="Fits of each, of which the mean is told.")] = 1,
+    switches: Annotated[
+        str | None, typer.Option(help="Comma-separated part of what can be switched; all when left out.", show_default=False)
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Fit captures with all effects off, with what is found, and with each effect switched on by hand."""
@@ -106,7 +109,7 @@ def by_hand(
 
     from pipelines.console import make_progress
     from toolkit.errors import InputError
-    from toolkit.evaluate.effects_switch import switched
+    from toolkit.evaluate.effects_switch import SWITCHES, switched
     from toolkit.files import write_json
 
     progress = make_progress(quiet)
@@ -114,9 +117,10 @@ def by_hand(
     named = {(path.parent if path.is_file() else path).name: path for path in captures}
     if len(named) < len(captures):
         raise InputError("two captures have the same name, which the table shows them by; give them in folders of different names")
+    modes = tuple(SWITCHES) if switches is None else tuple(name.strip() for name in switches.split(","))
     with progress.listening():
         progress.begin("effects")
-        data = switched(named, folder, seconds, image_size, seeds, progress)
+        data = switched(named, folder, seconds, image_size, seeds, modes, progress)
     progress.finish("effects", time.monotonic() - began, False)
     if to is not None:
         write_json(to, data)

@@ -12,6 +12,7 @@ from pipelines.bench_effects import switched_table
 from toolkit.capture import open_capture
 from toolkit.capture.prepare import held_out
 from toolkit.effects.correct import canonical
+from toolkit.errors import InputError
 from toolkit.evaluate import effects_fits, effects_plan, effects_switch
 from toolkit.evaluate.effects_plan import Planned, drifting, film
 from toolkit.evaluate.effects_truth import canonical_capture, known_light
@@ -102,14 +103,19 @@ def test_fits_are_scored_against_canonical_pictures_and_kept(tmp_path: Path, mon
 def test_switched_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[dict] = []
 
-    def fit(capture: object, settings: effects_fits.Settings, progress: object) -> dict:
+    def fit(capture: object, settings: effects_fits.Settings, progress: object, found: object = None) -> dict:
+        assert found == ("looked at" if settings.effects.on else None)
         asked.append({"mode": settings.effects.mode, "on": settings.effects.on, "field": settings.field, "seed": settings.seed})
         return {"psnr": 20.0 + settings.seed, "psnr_corrected": 21.0, "seconds": 3.0}
 
     monkeypatch.setattr(effects_switch, "fit_with", fit)
     monkeypatch.setattr(effects_switch, "open_capture", lambda path: path)
+    monkeypatch.setattr(effects_switch, "held_out", lambda capture, holdout: np.zeros(3, bool))
+    monkeypatch.setattr(effects_switch, "survey", lambda capture, *rest, **more: looked.append(capture) or "looked at")
+    looked: list[Path] = []
     captures = {"a": tmp_path / "x", "b": tmp_path / "y"}
     data = effects_switch.switched(captures, tmp_path / "kept", 2, 64, seeds=2)
+    assert looked == list(captures.values())  # once each
     assert len(asked) == len(data["each"]) == 2 * 2 * len(effects_switch.SWITCHES)
     alone = [one for one in asked if one["on"]]
     assert all(one["mode"] == "off" and len(one["on"]) == 1 for one in alone) and len(alone) == 4 * len(effects_switch.ALONE)
@@ -119,3 +125,7 @@ def test_switched_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert lines[0] == "| switched | a | b |" and "| no view | 20.50 / 21.00 | 20.50 / 21.00 |" in lines
     effects_switch.switched(captures, tmp_path / "kept", 2, 64, seeds=2)
     assert len(asked) == len(data["each"])
+    some = effects_switch.switched(captures, tmp_path / "kept", 2, 64, modes=("auto", "poses"))
+    assert list(some["mean"]["b"]) == ["auto", "poses"] and len(asked) == len(data["each"])
+    with pytest.raises(InputError, match="no switch 'pose'"):
+        effects_switch.switched(captures, tmp_path / "kept", 2, 64, modes=("pose",))

@@ -79,12 +79,13 @@ def asleep(settings: EffectsSettings) -> bool:
     return settings.mode == "off" and not settings.on
 
 
-def decide(capture: Capture, test: Array, settings: EffectsSettings, progress: Progress = SILENT) -> Decided:
+def decide(capture: Capture, test: Array, settings: EffectsSettings, progress: Progress = SILENT, found: Survey | None = None) -> Decided:
     """Look at the training frames of a posed capture, decide, and work out the corrections of all frames.
 
     Args:
         test: (N,) bool: held-out frames. They enter nothing that training frames get; afterwards they are brought to the same colours and
             poses by the points that training frames found.
+        found: what a survey of these training frames found before; None: they are looked at.
 
     Raises:
         InputError: a picture cannot be read.
@@ -92,7 +93,7 @@ def decide(capture: Capture, test: Array, settings: EffectsSettings, progress: P
     began = time.monotonic()
     train = [int(index) for index in np.flatnonzero(~test)]
     known: dict[int, Look] = {}
-    found = survey(capture, train, progress, known=known, quick=not settings.on)
+    found = found or survey(capture, train, progress, known=known, quick=not settings.on)
     decisions = [_decision(finding, wish(settings, name), capture, found) for name, finding in found.findings.items()]
     on = frozenset(decision.finding.effect for decision in decisions if decision.on)
     corrections = _corrections(capture, test, found, on, progress, known)

@@ -20,6 +20,7 @@ from toolkit.capture.types import Capture, Views
 from toolkit.config import Settings, load_settings
 from toolkit.effects.correct import Corrections
 from toolkit.effects.decide import asleep, choose_field, decide
+from toolkit.effects.survey import Survey
 from toolkit.evaluate.affine import right_half_psnr
 from toolkit.evaluate.effects_plan import Planned, film
 from toolkit.evaluate.effects_truth import canonical_capture, known_light
@@ -40,12 +41,14 @@ def fit_with(
     progress: Progress = SILENT,
     truth: Capture | None = None,
     known: Corrections | None = None,
+    found: Survey | None = None,
 ) -> dict[str, Any]:
     """Look for effects as the settings say, fit for `fit.budget` processor seconds, score the held-out views.
 
     Args:
         truth: the same capture with its held-out pictures in canonical colour.
         known: what is corrected, so that nothing is looked for.
+        found: what a survey of the training frames found before.
 
     Returns:
         `on` (what is corrected), `psnr` (in the colours that the fit was given), `psnr_corrected` (each test picture's colours fitted on
@@ -63,7 +66,7 @@ def fit_with(
     test = held_out(capture, settings.capture.holdout)
     corrections, on = known or Corrections(), []
     if known is None and not asleep(settings.effects):
-        decided = decide(capture, test, settings.effects, progress)
+        decided = decide(capture, test, settings.effects, progress, found)
         corrections, on = decided.corrections, [one.finding.effect for one in decided.decisions if one.on]
         choose_field(settings.field, decided.to_dict()["effects"], settings.effects.off)
     looked = time.process_time() - began

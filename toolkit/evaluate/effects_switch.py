@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 
 from toolkit.capture import open_capture
+from toolkit.capture.prepare import held_out
 from toolkit.config import load_settings
+from toolkit.effects.survey import Survey, survey
+from toolkit.errors import InputError
 from toolkit.evaluate.effects_fits import FIXED, fit_with
 from toolkit.files import read_json, write_json
 from toolkit.progress import SILENT, Progress
@@ -27,7 +30,13 @@ KEYS = ("psnr", "psnr_corrected", "seconds")
 
 
 def switched(
-    captures: dict[str, Path], folder: Path, seconds: float, long_side: int, seeds: int = 1, progress: Progress = SILENT
+    captures: dict[str, Path],
+    folder: Path,
+    seconds: float,
+    long_side: int,
+    seeds: int = 1,
+    modes: Sequence[str] = tuple(SWITCHES),
+    progress: Progress = SILENT,
 ) -> dict[str, Any]:
     """Fit each capture with everything off, with what is found, and with each effect alone; a fit that is in `folder` is not done again.
 
@@ -35,30 +44,40 @@ def switched(
         captures: by the names that the table shows.
         seconds: processor time of each fit.
         seeds: fits of each, of which the mean is told.
+        modes: of `SWITCHES`.
 
     Raises:
-        InputError, PoseError: a capture cannot be used.
+        InputError, PoseError: a capture cannot be used, or there is no such switch.
         Interrupted: stopped by the user; fits that are done stay.
     """
+    for mode in modes:
+        if mode not in SWITCHES:
+            raise InputError(f"there is no switch {mode!r}; known are {', '.join(SWITCHES)}")
     each: list[dict[str, Any]] = []
-    total = len(captures) * seeds * len(SWITCHES)
-    for seed in range(seeds):
-        for mode, pairs in SWITCHES.items():
-            for name, path in captures.items():
+    total = len(captures) * seeds * len(modes)
+    for name, path in captures.items():
+        found: Survey | None = None  # the same for every effect that is switched on alone
+        for seed in range(seeds):
+            for mode in modes:
                 progress.check()
                 progress.update(len(each), total, f"{name}, {mode.replace('_', ' ')}")
                 kept = folder / name / f"{mode}-{long_side}-{seconds:g}s-{seed}.json"
                 if not kept.is_file():
-                    settings = load_settings(pairs=[*pairs, f"budget={seconds}", f"image_size={long_side}", f"seed={seed}", *FIXED])
-                    write_json(kept, fit_with(open_capture(path), settings, progress))
+                    capture = open_capture(path)
+                    fixed = [f"budget={seconds}", f"image_size={long_side}", f"seed={seed}", *FIXED]
+                    settings = load_settings(pairs=[*SWITCHES[mode], *fixed])
+                    if mode in ALONE and found is None:
+                        train = np.flatnonzero(~held_out(capture, settings.capture.holdout))
+                        found = survey(capture, [int(index) for index in train], progress, quick=False)
+                    write_json(kept, fit_with(capture, settings, progress, found=found if mode in ALONE else None))
                 each.append({"name": name, "mode": mode, "seed": seed, **read_json(kept)})
-    return {"each": each, "budget": seconds, "long_side": long_side, "seeds": seeds, "mean": _means(each, list(captures))}
+    return {"each": each, "budget": seconds, "long_side": long_side, "seeds": seeds, "mean": _means(each, list(captures), modes)}
 
 
-def _means(each: Sequence[dict[str, Any]], names: list[str]) -> dict[str, Any]:
+def _means(each: Sequence[dict[str, Any]], names: list[str], modes: Sequence[str]) -> dict[str, Any]:
     """Capture → switch → mean over the seeds of what `KEYS` names."""
     out: dict[str, Any] = {}
     for name in names:
-        rows = {mode: [one for one in each if one["name"] == name and one["mode"] == mode] for mode in SWITCHES}
+        rows = {mode: [one for one in each if one["name"] == name and one["mode"] == mode] for mode in modes}
         out[name] = {mode: {key: float(np.mean([one[key] for one in fits])) for key in KEYS} for mode, fits in rows.items()}
     return out
