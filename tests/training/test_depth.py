@@ -15,7 +15,7 @@ from toolkit.camera import Intrinsics, Similarity
 from toolkit.capture.types import Views
 from toolkit.poses.scene import Scene
 from toolkit.render.image import render_view
-from toolkit.training.depth import REACH, depth_gradient, ray_distances
+from toolkit.training.depth import NOISE, REACH, depth_gradient, ray_distances
 from toolkit.training.fit import fit_field
 from toolkit.training.rays import PixelPool
 
@@ -50,9 +50,15 @@ def test_what_is_no_depth_stays_unknown() -> None:
 def test_weight_is_drawn_to_the_surface_alike_at_any_scale(scale: float) -> None:
     away = torch.tensor([0.0, 0.5, 1.0, 5.0, -0.5, -0.9])
     target = torch.full((6,), 2.0 * scale)
-    got = depth_gradient(target * (1 + REACH * away), target)
+    got = depth_gradient(target * (1 + NOISE * away.sign() + REACH * away), target)
     torch.testing.assert_close(got, torch.tensor([-1.0, -0.5, 0.0, 0.0, -0.5, -0.1]), atol=1e-3, rtol=0)
     assert not bool(depth_gradient(target, torch.zeros(6)).any())
+
+
+def test_within_its_noise_a_depth_says_nothing() -> None:
+    target = torch.full((3,), 2.0)
+    got = depth_gradient(target * (1 + NOISE * torch.tensor([-0.99, 0.3, 0.99])), target)
+    assert bool((got == -1).all())  # the same for all: no sample is drawn away from another
 
 
 def blank_views() -> Views:

@@ -1,8 +1,12 @@
 """The depth term of a fit: light is to end where a picture's depth is known, by a sensor or by matching; the paper has no such term.
 
-Of a ray whose surface lies at the distance d, each sample with weight w at the distance t costs w · (min(|t − d| / (r d), 1) − 1):
-nothing beyond the reach r d of it, and the less the nearer it lies. So weight is drawn to the surface whatever lies far from it, and a
-depth that is wrong costs no more than one that is missing by far.
+Of a ray whose surface lies at the distance d, each sample with weight w at the distance t costs
+
+    w · (min(max(|t − d| − e d, 0) / (r d), 1) − 1):
+
+nothing beyond the reach r d, the less the nearer it lies, and the same wherever it is as near as a sensor can tell, e d. So weight is drawn
+to the surface whatever lies far from it, a depth that is wrong costs no more than one that is missing by far, and where in its noise the
+surface is, colours decide.
 """
 
 from __future__ import annotations
@@ -13,7 +17,8 @@ import torch
 from toolkit.camera import Array, Intrinsics
 
 Tensor = torch.Tensor
-REACH = 0.05  # r: share of the distance within which a sample counts as near the surface
+REACH = 0.05  # r: share of the distance, beyond the noise, within which a sample counts as near the surface
+NOISE = 0.01  # e: share of the distance by which a measured depth may be off: noise, and pictures that are not quite registered
 
 
 def ray_distances(depth: Array, camera: Intrinsics) -> Array:
@@ -26,5 +31,5 @@ def ray_distances(depth: Array, camera: Intrinsics) -> Array:
 
 def depth_gradient(distance: Tensor, target: Tensor) -> Tensor:
     """(samples,) gradient of the term for the samples' weights, from their distances and those of their rays' surfaces (0: unknown)."""
-    away = (distance - target).abs() / (REACH * target).clamp_min(1e-9)
-    return torch.where(target > 0, away.clamp_max(1.0) - 1.0, torch.zeros_like(away))
+    away = ((distance - target).abs() / target.clamp_min(1e-9) - NOISE) / REACH
+    return torch.where(target > 0, away.clamp(0.0, 1.0) - 1.0, torch.zeros_like(away))

@@ -14,10 +14,11 @@ from toolkit.render import kernels as K
 from toolkit.render.kernels_decode import decode, encode_direction, multiply
 from toolkit.render.kernels_lookup import gather_row
 from toolkit.render.kernels_march import march_ray
+from toolkit.training.depth import NOISE as NOISE_
 from toolkit.training.depth import REACH as REACH_
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
-REACH = F(REACH_)
+REACH, NOISE = F(REACH_), F(NOISE_)
 WALK_WORK = F(0.7)  # what a coarse step costs whose fine ones are tried, in samples that are looked up
 
 
@@ -78,7 +79,7 @@ def depth_pull(along: Any, distance: Any) -> Any:
     """`depth.depth_gradient` of one sample."""
     if distance <= ZERO:
         return ZERO
-    return min(abs(along - distance) / (REACH * distance), ONE) - ONE
+    return min(max(abs(along - distance) / distance - NOISE, ZERO) / REACH, ONE) - ONE
 
 
 @njit(**K.OPTIONS)
