@@ -12,10 +12,11 @@ from pipelines.bench_effects import switched_table
 from toolkit.capture import open_capture
 from toolkit.capture.prepare import held_out
 from toolkit.effects.correct import canonical
-from toolkit.errors import InputError
+from toolkit.errors import InputError, Interrupted
 from toolkit.evaluate import effects_fits, effects_plan, effects_switch
 from toolkit.evaluate.effects_plan import Planned, drifting, film
 from toolkit.evaluate.effects_truth import canonical_capture, known_light
+from toolkit.progress import Progress
 
 DRIFT = (("exposure", "medium"), ("vignetting", "medium"))
 
@@ -98,6 +99,22 @@ def test_fits_are_scored_against_canonical_pictures_and_kept(tmp_path: Path, mon
     assert effects_fits.compared(planned, tmp_path, 0.7, ("all_off", "known")) == data
     with pytest.raises(TypeError):
         effects_fits.compared(planned, tmp_path, 0.8, ("all_off", "known"))
+
+
+@pytest.mark.usefixtures("small")
+def test_of_a_fit_that_is_stopped_nothing_is_kept(tmp_path: Path) -> None:
+    class Stopped(Progress):
+        fitting = False
+
+        def update(self, done: float, total: float, note: str = "") -> None:
+            self.fitting = self.fitting or "³" in note
+
+        def stopping(self) -> bool:
+            return self.fitting
+
+    with pytest.raises(Interrupted):
+        effects_fits.compared([Planned("plain", "room", 7, ())], tmp_path, 3, (), Stopped())
+    assert not list(tmp_path.rglob("fits/*"))
 
 
 def test_switched_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

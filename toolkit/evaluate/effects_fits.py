@@ -57,6 +57,7 @@ def fit_with(
 
     Raises:
         InputError, PoseError: the capture cannot be used.
+        Interrupted: stopped by the user.
     """
     from toolkit.training.fit import fit_field
 
@@ -74,6 +75,7 @@ def fit_with(
     scene = describe_scene(posed, progress)
     views = corrections.on_views(prepare_views(posed, scene.working_from_input, settings.capture, progress))
     result = fit_field(views, scene, settings, progress, ticks=time.process_time)
+    progress.check()  # a fit that was stopped gives what it has, which says nothing here
     whole = time.process_time() - began
     view = make_renderer(result.field, settings.engine)
     indices = np.flatnonzero(views.test)
