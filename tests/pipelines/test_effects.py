@@ -15,6 +15,7 @@ from toolkit.capture.prepare import held_out
 from toolkit.config import load_settings
 from toolkit.effects.decide import asleep, decide, wish
 from toolkit.errors import InputError
+from toolkit.evaluate.effects_truth import known_light
 from toolkit.simulate.settings import scene_file
 from toolkit.simulate.simulate import simulate
 
@@ -55,6 +56,14 @@ def test_drift_and_vignetting_are_corrected_and_off_is_off(captures: dict[str, P
     assert got.corrections.corner == pytest.approx(0.35, abs=0.1)
     without = decide(capture, test, load_settings(pairs=["effects.off=[vignetting]"]).effects)
     assert without.corrections.corner is None and without.corrections.gain
+
+
+def test_what_is_found_is_what_was_simulated(captures: dict[str, Path]) -> None:
+    capture = open_capture(captures["drift"])
+    test = held_out(capture, 8)
+    found, known = decide(capture, test, load_settings().effects).corrections, known_light(captures["drift"], capture, test)
+    off = np.log2([np.divide(found.gain[frame.name], known.gain[frame.name]) for frame in capture.frames])
+    assert np.sqrt(np.mean(off**2)) < 0.02 and found.corner == pytest.approx(known.corner, abs=0.02)
 
 
 def test_seconds_stand_beside_each_effect(captures: dict[str, Path]) -> None:
