@@ -113,12 +113,12 @@ class TotalBudget:
             spent = job.stages.records["render"].seconds
             after = sum(self.predicted.get(stage, 0.0) for stage in ("evaluate", "report")) * self._pace(job)
             factor = self.speed.factors.get("export", 1.0)
-            fixed = factor * model.EXPORT_FIXED * self.speed.units["features"]
+            once, each = (factor * amount * self.speed.units["features"] for amount in model.mesh_work(self.work, self.choice))
             a_ray = factor * model.EXPORT_RAY * (spent / rays if rays else self._predicted_ray())
-            left = self.asked - self.elapsed() - after - fixed
-            views, frames = model.exports_for(self.work, self.choice, left, a_ray)
+            a_frame = a_ray * model.video_rays(self.work, replace(self.choice, video_frames=1))
+            views, frames = model.exports_for(self.asked - self.elapsed() - after - once, each, a_frame)
             self.choice.mesh_views, self.choice.video_frames = min(views, export.mesh_views), min(frames, export.video_frames)
-            self.export_planned = fixed + model.export_rays(self.work, self.choice) * a_ray
+            self.export_planned = once + self.choice.mesh_views * each + self.choice.video_frames * a_frame
             self._keep(job)
         assert self.choice.mesh_views is not None and self.choice.video_frames is not None
         export.mesh_views = self.choice.mesh_views
@@ -256,7 +256,7 @@ def work_of(capture: Capture, settings: Any) -> model.Work:
     total = int(capture.extra.get("frames") or len(capture.frames)) if video else frames
     depth = settings.tsdf.enabled != "off" and capture.has_depth
     effects = settings.effects.mode != "off" or bool(settings.effects.on)
-    return model.Work(frames, width or 640, height or 480, test, posed, depth, bool(outlined), video, total, effects)
+    return model.Work(frames, width or 640, height or 480, test, posed, depth, bool(outlined), video, total, effects, capture.alpha)
 
 
 def finest(job: Job, views: Views, scene: Scene) -> int:

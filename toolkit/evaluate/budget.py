@@ -22,8 +22,12 @@ FIT_SHARE = 0.35  # of the seconds, at least, that the fit should have when pict
 LEAST_FIT = 2.0  # seconds
 STEADY = 5.0  # seconds of stages that count as predicted well when it is told how busy the machine is: first imports are no sign of it
 EXPORT_SHARE = 0.25  # of the seconds, at most, that are planned for exports
-EXPORT_FIXED = 25.0  # pictures' worth of features: making, cleaning and writing meshes, whatever is rendered for them
-EXPORT_RAY = 1.2  # of the time of a test view's ray: fusing depth and writing video frames come on top
+# Pictures' worth of features that a mesh takes: whatever it is of; a megapixel of one view, for its triangles; and a megapixel of all
+# views, to render, polish and fuse their depth and to carve with it. A mesh of 12 views of 400 pixels takes six times that of 160 pixels.
+MESH_FIXED, MESH_TRIANGLES, MESH_DEPTH = 3.0, 240.0, 35.0
+OBJECT = 0.5  # of that where pictures have alpha: the object fills a part of them
+MESH_SIDE, VIDEO_SIDE = 400, 640  # long sides that are rendered at most
+EXPORT_RAY = 1.2  # of the time of a test view's ray: writing video frames comes on top
 MESH_SHARE = 0.6  # of the exports' seconds, the rest is the video's
 FRAME_COUNTS = (100, 75, 50, 36, 24)  # of a video
 MESH_VIEWS, VIDEO_FRAMES = (12, 60), (24, 90)  # fewest and most
@@ -70,6 +74,7 @@ class Work:
     video: bool = False
     total: int = 0
     effects: bool = False  # they are looked for
+    alpha: bool = False  # pictures of an object alone
 
     @property
     def megapixels(self) -> float:
@@ -132,7 +137,7 @@ def amounts(work: Work, choice: Choice) -> dict[str, float]:
         "render": test * pixels,
         "evaluate": test * pixels / 1e6 * methods,
         "report": 1 + 0.2 * min(test, 12) * methods,
-        "export": export_rays(work, choice),
+        "export": video_rays(work, choice),
     }
 
 
@@ -148,17 +153,22 @@ def sift_work(frames: int) -> float:
     return frames * (4.0 + min(frames, 60) / 8.0)
 
 
-def export_rays(work: Work, choice: Choice, mesh_side: int = 400, video_side: int = 640) -> float:
-    """Rays of the mesh's views and the video's."""
-    shown = [(choice.mesh_views or 0, mesh_side), (choice.video_frames or 0, video_side)]
-    return sum(count * work.pixels(min(side, choice.image_size)) for count, side in shown)
+def video_rays(work: Work, choice: Choice) -> float:
+    """Rays of the video's frames."""
+    return (choice.video_frames or 0) * work.pixels(min(VIDEO_SIDE, choice.image_size))
+
+
+def mesh_work(work: Work, choice: Choice) -> tuple[float, float]:
+    """Pictures' worth of features that a mesh takes beside its views, and for each of them."""
+    megapixels = work.pixels(min(MESH_SIDE, choice.image_size)) / 1e6 * (OBJECT if work.alpha else 1.0)
+    return MESH_FIXED + MESH_TRIANGLES * megapixels, MESH_DEPTH * megapixels
 
 
 def most_export_seconds(speed: Speed, work: Work, choice: Choice, mesh_views: int, video_frames: int) -> float:
     """What exports take when nothing of them is left out: more than that they cannot use."""
-    whole = replace(choice, mesh_views=mesh_views, video_frames=video_frames)
-    a_ray = EXPORT_RAY * speed.seconds("render", 1.0)
-    return speed.factors.get("export", 1.0) * (EXPORT_FIXED * speed.units["features"] + export_rays(work, whole) * a_ray)
+    once, each = mesh_work(work, choice)
+    video = video_rays(work, replace(choice, video_frames=video_frames)) * EXPORT_RAY * speed.seconds("render", 1.0)
+    return speed.factors.get("export", 1.0) * ((once + mesh_views * each) * speed.units["features"] + video)
 
 
 def least_export_seconds(speed: Speed, work: Work, choice: Choice) -> float:
@@ -206,17 +216,17 @@ def resolution_for(seconds: float, unit: float, finest: int) -> int:
     return max(64, min(finest, int(most // 32) * 32))
 
 
-def exports_for(work: Work, choice: Choice, seconds: float, a_ray: float) -> tuple[int, int]:
-    """Views of the mesh and frames of the video that `seconds` allow, at `a_ray` seconds a ray; no video when it would be too short."""
+def exports_for(seconds: float, a_view: float, a_frame: float) -> tuple[int, int]:
+    """Views of the mesh and frames of the video that `seconds` allow, at so many seconds a view and a frame; no video when it would be too
+    short."""
 
-    def count(share: float, side: int, limits: tuple[int, int]) -> int:
-        each = work.pixels(min(side, choice.image_size)) * a_ray
-        return min(limits[1], int(seconds * share / max(each, 1e-9)))
+    def count(share: float, each: float, most: int) -> int:
+        return min(most, int(seconds * share / max(each, 1e-9)))
 
-    video = count(1 - MESH_SHARE, 640, VIDEO_FRAMES)
+    video = count(1 - MESH_SHARE, a_frame, VIDEO_FRAMES[1])
     if video < VIDEO_FRAMES[0]:
-        return max(MESH_VIEWS[0], count(1.0, 400, MESH_VIEWS)), 0
-    return max(MESH_VIEWS[0], count(MESH_SHARE, 400, MESH_VIEWS)), video
+        return max(MESH_VIEWS[0], count(1.0, a_view, MESH_VIEWS[1])), 0
+    return max(MESH_VIEWS[0], count(MESH_SHARE, a_view, MESH_VIEWS[1])), video
 
 
 # ------------------------------------------------------------------------------------------------- what is remembered
