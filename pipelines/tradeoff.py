@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as writer
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -151,8 +152,10 @@ def put(job: Any, swept: Any, capture: Any, poses: Any, scene: Any, views: Any, 
     from pipelines.summary import base_data, warnings_of
     from toolkit.evaluate.tradeoff_page import write_tradeoff
 
+    base = base_data(job, capture, poses)
     data = {
-        **base_data(job, capture, poses),
+        **base,
+        "command": base["command"] if swept.left_out else unbounded(base["command"]),
         "warnings": warnings_of(job, capture, poses, scene, views),
         "scene": scene.to_dict(),
         "unit": "m" if scene.metric else "units",
@@ -168,6 +171,14 @@ def put(job: Any, swept: Any, capture: Any, poses: Any, scene: Any, views: Any, 
         "machine": machine(job),
     }
     return write_tradeoff(job.folder.path, data)
+
+
+def unbounded(command: str) -> str:
+    """The command without `--budget`, which only bounds one call: of a sweep that is whole, every row is made by this one."""
+    parts = shlex.split(command)
+    named = [index for index, part in enumerate(parts) if part == "--budget"]
+    drop = {*named, *(index + 1 for index in named), *(index for index, part in enumerate(parts) if part.startswith("--budget="))}
+    return shlex.join(part for index, part in enumerate(parts) if index not in drop)
 
 
 def show(data: dict[str, Any], folder: Path, quiet: bool, as_json: bool) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from pipelines.tradeoff import unbounded
 from pipelines.tradeoff_plan import base_time, chosen_axes, chosen_times, plan
 from tests.pipelines.made import call
 from tests.pipelines.test_matched import make_corner
@@ -70,6 +71,18 @@ def test_axes_and_times_are_checked() -> None:
         chosen_axes("colour", ["views"], {})
     with pytest.raises(InputError, match="the axis keyframes cannot be varied, because there are none; here views can be varied"):
         chosen_axes("keyframes", ["views"], {"keyframes": "there are none"})
+
+
+@pytest.mark.parametrize(
+    ("typed", "whole"),
+    [
+        ("fieldfuse tradeoff 'my fox' --budget 60 --threads 1", "fieldfuse tradeoff 'my fox' --threads 1"),
+        ("fieldfuse tradeoff fox --out runs/fox --budget=60", "fieldfuse tradeoff fox --out runs/fox"),
+        ("fieldfuse tradeoff fox --set fit.budget=3", "fieldfuse tradeoff fox --set fit.budget=3"),
+    ],
+)
+def test_the_command_of_a_whole_sweep_makes_it_in_one_call(typed: str, whole: str) -> None:
+    assert unbounded(typed) == whole
 
 
 def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, capsys: Capsys) -> None:
