@@ -11,6 +11,7 @@ from tests.poses.textured import arc, look_at, render
 from toolkit.camera import Array, Intrinsics, pixel_grid, project, unproject
 from toolkit.capture.types import Views
 from toolkit.errors import InputError, Interrupted
+from toolkit.poses.overlap import parallax, spread_parallax
 from toolkit.progress import Progress
 from toolkit.tsdf.stereo import StereoDepth, inverse_depths, stereo_depths, usable_neighbours
 from toolkit.tsdf.stereo_cost import OUTSIDE, Matcher, best_half, grey_view, plane_homography, sweep
@@ -75,6 +76,31 @@ def test_larger_pictures_are_matched_small_and_keep_their_field_of_view() -> Non
     assert depths[0].intrinsics == CAMERA
     errors, _ = relative_errors(depths, corner()[1][2:5])
     assert np.median(errors) < 0.008
+
+
+def test_a_camera_that_moves_forward_finds_depth() -> None:
+    """The middle of its pictures is seen from one direction alone, what lies around it from several."""
+    eyes = [np.array([0.3, -1.3, -2.4 + 0.25 * step]) for step in range(5)]
+    poses = np.array([look_at(eye, np.array([0.3, -1.3, 3.0])) for eye in eyes])
+    angles = parallax(poses, MEDIAN), spread_parallax(poses, [CAMERA] * 5, MEDIAN)
+    assert angles[0].max() < 1 < angles[1][0, 2:].min()
+    made = [render(pose, CAMERA) for pose in poses]
+    errors, coverage = relative_errors(
+        stereo_depths(views_of(poses, [one for one, _ in made]), NEAR, FAR, MEDIAN), [one for _, one in made]
+    )
+    assert np.median(errors) < 0.01 and coverage > 0.4
+
+
+def test_parallax_of_a_whole_picture_is_that_of_its_points() -> None:
+    poses = arc(3, 20.0)
+    found = spread_parallax(poses, [CAMERA] * 3, MEDIAN)
+    pixels = pixel_grid(160, 120)
+    for i, j in ((0, 1), (2, 0)):
+        points = unproject(CAMERA, poses[i], pixels, np.full(len(pixels), MEDIAN))
+        first, second = (points - poses[k][:3, 3] for k in (i, j))
+        cosine = (first * second).sum(1) / np.linalg.norm(first, axis=1) / np.linalg.norm(second, axis=1)
+        assert found[i, j] == pytest.approx(np.degrees(np.arccos(cosine)).mean(), rel=0.02)
+    assert found.diagonal().max() < 1e-5
 
 
 def test_masked_pixels_have_no_depth() -> None:

@@ -79,6 +79,22 @@ def parallax(world_from_camera: Array, depth: float | Array) -> Array:
     return angles
 
 
+def spread_parallax(world_from_camera: Array, intrinsics: Sequence[Intrinsics], depth: float) -> Array:
+    """(N, N) mean degrees under which a lattice of frame i's points at `depth` sees the two cameras, the whole picture over. A camera that
+    moves along its axis sees the middle of its picture from one direction, and what lies around it from several. Lenses are ignored."""
+    steps = (np.arange(GRID) + 0.5) / GRID
+    u, v = (axis.ravel() for axis in np.meshgrid(steps, steps))
+    centres = world_from_camera[:, :3, 3]
+    angles = np.zeros((len(centres), len(centres)))
+    for i, camera in enumerate(intrinsics):
+        flat = np.stack([(u * camera.width - camera.cx) / camera.fx, (v * camera.height - camera.cy) / camera.fy, np.ones_like(u)], axis=1)
+        points = depth * flat @ world_from_camera[i, :3, :3].T + centres[i]
+        rays = points[None] - centres[:, None]  # (N, grid, 3)
+        rays = rays / np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-15)
+        angles[i] = np.degrees(np.arccos(np.clip((rays * rays[i]).sum(-1), -1.0, 1.0))).mean(-1)
+    return angles
+
+
 def worth(angles: Array, sweet: float = SWEET) -> Array:
     """How good degrees of parallax are for a pair, 0–1: a bump at `sweet`, steeper below than above (as in view selection for MVS, Yao
     2018)."""

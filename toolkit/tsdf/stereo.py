@@ -17,7 +17,7 @@ from toolkit import memory
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture.types import Views
 from toolkit.errors import InputError
-from toolkit.poses.overlap import best_neighbours, overlap, parallax
+from toolkit.poses.overlap import best_neighbours, overlap, parallax, spread_parallax
 from toolkit.progress import SILENT, Progress
 from toolkit.tsdf.stereo_check import confirmed
 from toolkit.tsdf.stereo_cost import GreyView, grey_view, plane_homography, sweep
@@ -120,7 +120,7 @@ def stereo_depths(
 def usable_neighbours(world_from_camera: Array, cameras: Sequence[Intrinsics], median_depth: float, count: int) -> list[list[int]]:
     """For each view the neighbours that suit matching, best first; views that see too little in common or from one place are left out."""
     shares = overlap(world_from_camera, cameras, median_depth)
-    angles = parallax(world_from_camera, median_depth)
+    angles = np.maximum(parallax(world_from_camera, median_depth), spread_parallax(world_from_camera, cameras, median_depth))
     best = best_neighbours(world_from_camera, shares, angles, count, SWEET)
     fits = (np.minimum(shares, shares.T) >= LEAST_OVERLAP) & (angles >= PARALLAX[0]) & (angles <= PARALLAX[1])
     return [[int(other) for other in row if fits[index, other]] for index, row in enumerate(best)]
