@@ -155,7 +155,7 @@ def put(job: Any, swept: Any, capture: Any, poses: Any, scene: Any, views: Any, 
     base = base_data(job, capture, poses)
     data = {
         **base,
-        "command": base["command"] if swept.left_out else unbounded(base["command"]),
+        "command": unbounded(base["command"]),
         "warnings": warnings_of(job, capture, poses, scene, views),
         "scene": scene.to_dict(),
         "unit": "m" if scene.metric else "units",
@@ -174,7 +174,7 @@ def put(job: Any, swept: Any, capture: Any, poses: Any, scene: Any, views: Any, 
 
 
 def unbounded(command: str) -> str:
-    """The command without `--budget`, which only bounds one call: of a sweep that is whole, every row is made by this one."""
+    """The command without `--budget`, which bounds one call of several: this one makes every row at once."""
     parts = shlex.split(command)
     named = [index for index, part in enumerate(parts) if part == "--budget"]
     drop = {*named, *(index + 1 for index in named), *(index for index, part in enumerate(parts) if part.startswith("--budget="))}

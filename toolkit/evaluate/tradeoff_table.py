@@ -21,6 +21,9 @@ def tradeoff_table(data: dict[str, Any], name: str) -> str:
     lines += ["| " + " | ".join(head) + " |", "| " + " | ".join(["---"] * len(head)) + " |"]
     lines += ["| " + " | ".join(_cells(point, fronts, depth, unit)) + " |" for point in in_order(points) if not point.shown_otherwise]
     lines += ["", *(f"- {sentence(step, unit)}" for step in steps(points))]
+    if data.get("left_out"):
+        lines.append(f"- Not measured for want of time: {', '.join(name.removesuffix('-seed0') for name in data['left_out'])}.")
+    lines += [f"- {text}" for text in data.get("refused") or []]
     return "\n".join(lines).rstrip() + "\n"
 
 
