@@ -44,7 +44,10 @@ MEASURED_POINT = {"key": TEXT, "crashed": FLAG, "wall_seconds": NUMBER, "rows": 
 EXPORT_FACTS = {"mesh": (None, MESH), "?note": TEXT}
 TIMELINE = [{"seconds": NUMBER, "psnr": (None, NUMBER), "*": (None, NUMBER, TEXT)}]
 NOTES = [TEXT]
-NETWORK = {"key_frames": NUMBER, "seconds": NUMBER, "encode_seconds": NUMBER, "first_preview_seconds": NUMBER, "resolution": NUMBER}
+NETWORK = {
+    "key_frames": NUMBER, "seconds": NUMBER, "?fusion_seconds": NUMBER, "encode_seconds": NUMBER, "first_preview_seconds": NUMBER,
+    "resolution": NUMBER,
+}  # fmt: skip
 HELD_OUT = {"before": NUMBER, "after": NUMBER, "unit": TEXT, "*": ANY}
 FINDING = {
     "effect": TEXT, "there": FLAG, "number": NUMBER, "threshold": NUMBER, "reason": TEXT, "?held_out": (None, HELD_OUT),

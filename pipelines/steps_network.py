@@ -83,6 +83,7 @@ def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
         facts = {
             "key_frames": inference.done,
             "seconds": round(inference.seconds, 3),
+            "fusion_seconds": round(inference.fusion_seconds, 3),  # of these, without making fields for previews
             "encode_seconds": round(inference.encode_seconds, 3),
             "first_preview_seconds": first,
             "resolution": inference.lattice.resolution,

@@ -67,7 +67,7 @@ def test_few_pictures_start_from_the_networks_and_the_report_says_what_they_gave
     assert {"keyframes", "network", "direct", "field", "render"} <= set(stages(data))
     network, field = data["evaluation"]["network"], data["evaluation"]["field"]
     assert network["views"] == field["views"] == 2 and network["key_frames"] >= 3
-    assert 0 < network["encode_seconds"] < network["seconds"] and network["first_preview_seconds"] > 0
+    assert 0 < network["encode_seconds"] < network["fusion_seconds"] < network["seconds"] and network["first_preview_seconds"] > 0
     assert field["psnr"] > network["psnr"] > data["evaluation"]["nearest_image"]["psnr"]
     picture = cv2.imread(str(out / "preview.png"))
     assert picture.shape == (72, 3 * 96, 3) and np.ptp(picture[:, 96:192]) > 20

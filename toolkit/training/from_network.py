@@ -126,7 +126,7 @@ class Inference:
         voxels = self.options.voxels or voxels_to_median(self.train)
         self.lattice = lattice_of(space_of(views, scene, background), scene, voxels, self.options.levels)
         self.behind = colour_behind(views).to(model.device)
-        self.seconds = self.encode_seconds = 0.0
+        self.seconds = self.fusion_seconds = self.encode_seconds = 0.0
         self.done = 0
         self._latest: Fused | None = None
 
@@ -140,6 +140,7 @@ class Inference:
         for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress):
             self._latest = fused
             self.seconds += fused.seconds
+            self.fusion_seconds += fused.seconds
             self.encode_seconds += fused.encode_seconds
             self.done += 1
             yield fused.frame

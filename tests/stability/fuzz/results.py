@@ -60,7 +60,14 @@ def make_results(root: Path) -> None:
     write_json(root / "timeline.json", [{"seconds": 1.0 + i, "psnr": 20.0 + i} for i in range(4)])
     write_json(root / "exports" / "facts.json", {"mesh": mesh, "note": "points and meshes were left out"})
     write_json(root / "fit_notes.json", ["step 3 of the fit was not finite", "the field stayed at 64³"])
-    network = {"key_frames": 4, "seconds": 0.3, "encode_seconds": 0.1, "first_preview_seconds": 0.2, "resolution": 48}
+    network = {
+        "key_frames": 4,
+        "seconds": 0.3,
+        "fusion_seconds": 0.2,
+        "encode_seconds": 0.1,
+        "first_preview_seconds": 0.2,
+        "resolution": 48,
+    }
     write_json(root / "network.json", network)
     held = {"before": 2.0, "after": 1.0, "unit": "%"}
     names = ("exposure", "vignetting", "distortion", "rolling_shutter", "background", "motion_blur", "poses")
