@@ -82,8 +82,18 @@ def _extended(topology: Topology, occupied: Tensor) -> tuple[Topology, Tensor]:
 def erase_empty_blocks(topology: Topology, occupied: Tensor, rows: Sequence[Tensor]) -> tuple[Topology, Tensor, list[Tensor]]:
     """Without the blocks that hold neither an occupied voxel nor a corner of one; the others keep their order."""
     kept = corner_nodes(topology, occupied).view(-1, VOXELS).any(1).nonzero().view(-1)
-    chosen = torch.cat([(kept[:, None] * VOXELS + torch.arange(VOXELS, device=kept.device)).view(-1), kept.new_tensor([topology.zero_row])])
-    return Topology(topology.keys[kept]), occupied[chosen[:-1]], [values[chosen] for values in rows]
+    return Topology(topology.keys[kept]), occupied.view(-1, VOXELS)[kept].view(-1), [_of_blocks(values, kept) for values in rows]
+
+
+def _of_blocks(values: Tensor, kept: Tensor) -> Tensor:
+    """(M · 512 + 1, …) rows → those of the blocks `kept`, and the last one. Whole blocks are copied, once: the end of a fit is when it
+    takes most memory."""
+    out = values.new_empty((len(kept) * VOXELS + 1, *values.shape[1:]))
+    width = VOXELS * values[0].numel()
+    with torch.no_grad():
+        torch.index_select(values[:-1].reshape(-1 if len(values) > 1 else 0, width), 0, kept, out=out[:-1].view(len(kept), width))
+        out[-1] = values[-1]
+    return out
 
 
 def trilinear_density(topology: Topology, density: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
