@@ -80,7 +80,7 @@ class FitSettings:
     rate_decoder: float = 5e-3
     distortion: float = 0.015  # weight of the distortion loss
     opacity: float = 0.05  # weight of (1 - opacity)² where every ray must end somewhere (captures without alpha)
-    depth: float = 0.02  # weight of the depth term where the depth of a picture is known; 0: colours alone
+    depth: float = 0.03  # weight of the depth term where the depth of a picture is known; 0: colours alone
     depth_from: str = "sensor"  # sensor (if the capture has one) | any (that, else by matching the pictures, which takes time) | off
     patience: bool = False  # end before the budget when the validation views stop improving
     prune_weight: float = 0.05  # voxels whose largest seen weight stays below are removed

@@ -18,7 +18,7 @@ from toolkit.camera import Array, Intrinsics
 
 Tensor = torch.Tensor
 REACH = 0.05  # r: share of the distance, beyond the noise, within which a sample counts as near the surface
-NOISE = 0.01  # e: share of the distance by which a measured depth may be off: noise, and pictures that are not quite registered
+NOISE = 0.004  # e: share of the distance by which a measured depth may be off: noise, and pictures that are not quite registered
 
 
 def ray_distances(depth: Array, camera: Intrinsics) -> Array:
