@@ -102,6 +102,7 @@ class TotalBudget:
                 self.choice.fit_seconds, self.speed.units["fit"] * pace, finest(job, views, scene)
             )
         job.settings.fit.budget = self.choice.fit_seconds
+        job.settings.fit.passes = None  # so many seconds were asked for
         job.settings.field.resolution = self.choice.resolution
 
     def choose_exports(self, job: Job) -> None:

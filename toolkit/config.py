@@ -83,6 +83,7 @@ class FitSettings:
     depth: float = 0.03  # weight of the depth term where the depth of a picture is known; 0: colours alone
     depth_from: str = "sensor"  # sensor (if the capture has one) | any (that, else by matching the pictures, which takes time) | off
     patience: bool = False  # end before the budget when the validation views stop improving
+    passes: float | None = 50.0  # over the pixels, where there are too few views to keep some aside for validation; None: the whole budget
     prune_weight: float = 0.05  # voxels whose largest seen weight stays below are removed
 
 
@@ -278,6 +279,7 @@ def _check_ranges(settings: Settings) -> None:
     positive = {
         "capture.image_size": settings.capture.image_size,
         "fit.budget": settings.fit.budget,
+        "fit.passes": settings.fit.passes,
         "threads": settings.threads,
         "field.channels": settings.field.channels,
         "field.hidden": settings.field.hidden,

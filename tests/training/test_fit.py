@@ -88,6 +88,18 @@ def test_budget_is_kept() -> None:
     assert time.perf_counter() - start < 20
 
 
+def test_a_fit_of_few_views_ends_with_its_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("toolkit.training.schedule.LEAST_RAYS", 0.0)
+    ticking(monkeypatch, 1e-3)
+    views = sphere_views(8)  # too few for a validation split
+    pixels = 7 * SIZE * SIZE
+    result = fit_field(views, scene(), wanted("budget=60", "fit.passes=20"))
+    assert 20 * pixels <= result.rays < 20 * pixels + 2048 and result.seconds < 30
+    assert result.timeline[-1]["psnr"] > 14
+    longer = fit_field(views, scene(), wanted("budget=2", "fit.passes=null"))
+    assert longer.rays > 25 * pixels
+
+
 def test_held_out_views_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """With their pictures replaced by noise the same steps give the same field, bit for bit."""
     ticks = ticking(monkeypatch, 0.05)

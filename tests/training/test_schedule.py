@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from toolkit.config import FitSettings
-from toolkit.training.schedule import COARSE_GAIN, LEVEL_STEPS, RUNGS, WINDOW, Schedule
+from toolkit.training.schedule import COARSE_GAIN, LEAST_RAYS, LEVEL_STEPS, RUNGS, WINDOW, Schedule, most_rays
 
 
 def plan() -> Schedule:
@@ -37,3 +39,16 @@ def test_a_level_that_would_see_too_few_rays_is_not_entered() -> None:
     schedule = plan()
     assert schedule.worth(1000, 1000) and schedule.ladder == [32, 64, 128]
     assert not schedule.worth(1000, 100) and schedule.ladder == [32] and schedule.finest
+
+
+def test_few_views_bound_the_rays_and_many_do_not() -> None:
+    assert most_rays(400_000, False, 50) == 2e7 and most_rays(1000, False, 50) == LEAST_RAYS
+    assert most_rays(400_000, True, 50) == math.inf and most_rays(400_000, False, None) == math.inf
+
+
+def test_a_fit_ends_with_its_seconds_or_its_rays_whichever_are_spent_first() -> None:
+    free, bound = plan(), plan()
+    bound.most_rays = 1000
+    assert free.position(4.0, 10**9) == bound.position(4.0, 100) == 0.4
+    assert bound.position(4.0, 700) == 0.7 and bound.position(4.0, 1000) == 1
+    assert free.rays_left(4.0, 800) == pytest.approx(1200) and bound.rays_left(4.0, 800) == 200

@@ -29,7 +29,7 @@ from toolkit.training.finite import NotFiniteError
 from toolkit.training.guard import Guard, refuse_broken
 from toolkit.training.levels import all_places, finer, first_field, pruned, visible
 from toolkit.training.rays import PixelPool
-from toolkit.training.schedule import Schedule
+from toolkit.training.schedule import Schedule, most_rays
 from toolkit.training.start import colour_behind, finest_resolution, levels, possible, space_of
 from toolkit.training.view import limit
 from toolkit.volume.host import Host, TorchHost
@@ -143,19 +143,21 @@ def fit_field(
         if coarse:
             ladder += [resolution for resolution in _ladder(views, train, scene, settings)[1] if resolution > start.resolution]
     engine = make_engine(settings, current, pool)
-    plan = Schedule(ladder, budget, settings.fit, views.background is None, settings.fit.patience)
+    limit_rays = most_rays(len(pool), bool(aside.any()), settings.fit.passes)
+    plan = Schedule(ladder, budget, settings.fit, views.background is None, settings.fit.patience, limit_rays)
     guard = Guard()
     result = FitResult(current, notes=guard.notes)
     marks = [budget * 0.02 * 50 ** (i / (TIMELINE_POINTS - 1)) for i in range(TIMELINE_POINTS - 1)]
 
-    while (done := plan.position(now := clock.seconds())) < 1 and not progress.stopping():
+    while (done := plan.position(now := clock.seconds(), result.rays)) < 1 and not progress.stopping():
         if plan.wants_finer(done):
             keep = visible(current, engine.seen, engine.visits, settings.fit.prune_weight)
             growth = (ladder[plan.level + 1] / current.resolution) ** 3
             if int(keep.sum()) * growth > MANY_VOXELS:
                 keep &= engine.visits > 0  # memory is bounded: what no ray came to is the first to go
-            rays_left = (budget - now) * result.rays / max(now, 1e-3)
-            if plan.worth(int(keep.sum()) * growth, rays_left) and room.fits(current, keep, plan, settings, guard.notes):
+            if plan.worth(int(keep.sum()) * growth, plan.rays_left(now, result.rays)) and room.fits(
+                current, keep, plan, settings, guard.notes
+            ):
                 plan.climb()
                 engine.let_go()
                 current = finer(current, keep, plan.resolution, host)

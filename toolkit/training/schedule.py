@@ -6,6 +6,7 @@ decide the validation views are fitted like all others, so that no picture is wa
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from dataclasses import field as default
 
@@ -26,7 +27,16 @@ FINEST_LOOK_STEPS = 250  # … and at the finest level
 WINDOW = 4  # looks that a plateau is judged by
 GAIN = 0.04  # decibels over a window that still count as progress at the finest level …
 COARSE_GAIN = 0.1  # … and before it, where the next level gains more in the same time
+LEAST_RAYS = 5e6  # of a fit that ends after so many passes over its pixels
 DROPS = 2  # halvings of the step sizes on plateaus of the finest level, before the end
+
+
+def most_rays(pixels: int, validated: bool, passes: float | None) -> float:
+    """Rays after which a fit to so many pixels ends; ∞ where validation views tell how it goes, or `passes` is None.
+
+    With few views nobody tells, and what comes later is learned by heart.
+    """
+    return math.inf if validated or passes is None else max(LEAST_RAYS, passes * pixels)
 
 
 @dataclass
@@ -37,6 +47,7 @@ class Schedule:
         ladder: resolutions from coarse to fine.
         budget: seconds.
         patient: end when the validation views stop improving, before the budget does.
+        most_rays: rays after which the fit ends, if the budget has not ended it before.
     """
 
     ladder: list[int]
@@ -44,6 +55,7 @@ class Schedule:
     settings: FitSettings
     opaque: bool
     patient: bool = False
+    most_rays: float = math.inf
     level: int = 0
     steps_here: int = 0
     slower: float = 1.0
@@ -64,12 +76,19 @@ class Schedule:
         """Rays of the next step."""
         return min(FIRST_BATCH << self.level, self.settings.max_rays)
 
-    def position(self, seconds: float) -> float:
-        """0 … 1: how far the fit is. After patience has ended the search, a fifth of the time spent is left for polish."""
-        done = seconds / self.budget
+    def position(self, seconds: float, rays: int = 0) -> float:
+        """0 … 1: how far the fit is, by its seconds or its rays, whichever are spent first.
+
+        After patience has ended the search, a fifth of the time spent is left for polish.
+        """
+        done = max(seconds / self.budget, rays / self.most_rays)
         if self.ended is None:
             return done
         return LAST_PRUNE + (done - self.ended) / max(self.ended * (1 / LAST_PRUNE - 1), 1e-9) * (1 - LAST_PRUNE)
+
+    def rays_left(self, seconds: float, rays: int) -> float:
+        """Rays that the rest of the fit will have, at the pace so far."""
+        return min((self.budget - seconds) * rays / max(seconds, 1e-3), self.most_rays - rays)
 
     def decided(self, done: float) -> bool:
         """Whether the validation views have nothing more to say, so that they can be fitted too."""
