@@ -51,7 +51,7 @@ def direct_field(
         kept = np.unique(np.linspace(0, len(keys.indices) - 1, max(1, round(share * len(keys.indices)))).round().astype(int))
         keys = KeyFrames(keys.indices[kept], keys.neighbours[kept])
     options = NetworkOptions.of(settings.network)
-    options = replace(options, voxels=(options.voxels or voxels_to_median(views)) / voxel_factor)
+    options = replace(options, voxels=(options.voxels or voxels_to_median(views, options.measured)) / voxel_factor)
     model = load_networks(weights_of(settings), settings.device)
     inference = Inference(model, views, scene, keys, settings.field.background, options)
     for _ in inference.frames(progress):

@@ -37,7 +37,7 @@ def test_killed_at_several_moments_the_run_goes_on(done: Path, tmp_path: Path) -
 
 def test_ctrl_c_while_fitting_keeps_the_field_and_reports(tmp_path: Path) -> None:
     make_room(tmp_path / "room", 10)
-    process = start("run", tmp_path / "room", "--out", tmp_path / "out", *FAST, "--budget", "60")
+    process = start("run", tmp_path / "room", "--out", tmp_path / "out", *FAST, "--budget", "60", "--set", "fit.passes=null")
     wait_for(tmp_path / "out" / "stages" / "views.json", process)
     time.sleep(3)
     began = time.monotonic()
@@ -68,7 +68,7 @@ def test_ctrl_c_before_the_field_says_how_to_go_on(tmp_path: Path) -> None:
 
 def test_ctrl_c_twice_ends_at_once(tmp_path: Path) -> None:
     make_room(tmp_path / "room", 10)
-    process = start("run", tmp_path / "room", "--out", tmp_path / "out", *FAST, "--budget", "60")
+    process = start("run", tmp_path / "room", "--out", tmp_path / "out", *FAST, "--budget", "60", "--set", "fit.passes=null")
     wait_for(tmp_path / "out" / "stages" / "views.json", process)
     time.sleep(1)
     for _ in range(2):

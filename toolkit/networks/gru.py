@@ -38,17 +38,15 @@ class _Gate(nn.Module):
         with torch.no_grad():
             last.weight.mul_(0.1)
 
-    def forward(self, rows: Tensor, topology: Topology, inside: Tensor) -> Tensor:
-        return self.after(self.first(rows, topology, inside), topology, inside)
-
     @property
     def first(self) -> BlockConv3d:
         first = self.convolutions[0]
         assert isinstance(first, BlockConv3d)
         return first
 
-    def after(self, rows: Tensor, topology: Topology, inside: Tensor) -> Tensor:
-        """The output, from that of the first convolution."""
+    def forward(self, rows: Tensor, topology: Topology, inside: Tensor, begun: Tensor | None = None) -> Tensor:
+        """`begun`: what the first convolution gives for `rows`, if that is known already."""
+        rows = self.first(rows, topology, inside) if begun is None else begun
         for convolution in self.convolutions[1:]:
             rows = convolution(torch.relu(rows), topology, inside)
         return rows
@@ -94,7 +92,7 @@ class FusionGRU(nn.Module):
         assert one.bias is not None and other.bias is not None
         weight, bias = torch.cat([one.weight, other.weight]), torch.cat([one.bias, other.bias])
         rows = block_conv3d(both, topology, weight, bias, inside, one.chunk)
-        return [gate.after(part, topology, inside) for gate, part in zip((self.update, self.reset), rows.chunk(2, 1), strict=True)]
+        return [gate(both, topology, inside, part) for gate, part in zip((self.update, self.reset), rows.chunk(2, 1), strict=True)]
 
 
 def mean_gate(count: Tensor, weight: Tensor, most: int = MOST) -> Tensor:

@@ -35,7 +35,7 @@ SHIPPED = Path(weights.__file__).parent / "weights" / "nerfusion.safetensors"
 # Voxels that make up the median depth at least, on the finer of two lattices. One lattice of 24 alone loses 1.5 to 2.5 dB, while 104
 # gain 0.25 dB for about three times the seconds (docs/few_views.md), so no voxel need be smaller than some pixels; a larger one shows.
 VOXELS_TO_MEDIAN, LEVELS = 48.0, 2
-PIXELS = 5.0
+PIXELS, MEASURED_PIXELS = 5.0, 3.0  # that a voxel spans at most; a sensor's depth is exact enough for smaller ones
 GAMMA = 0.95  # the paper's 0.6 cuts holes where the networks are in doubt
 LEAST, MOST = 32, 384  # resolution of the lattice
 
@@ -71,9 +71,11 @@ def load_networks(path: Path | str | None = None, device: torch.device | str = "
     return load_model(SHIPPED if path is None else path, device)
 
 
-def voxels_to_median(views: Views) -> float:
-    """Voxels that make up the median depth: 48, or as many as let a voxel there span no more than five pixels of the views."""
-    return max(VOXELS_TO_MEDIAN, float(np.median([lens.fx for lens in views.intrinsics])) / PIXELS)
+def voxels_to_median(views: Views, measured: bool = False) -> float:
+    """Voxels that make up the median depth: 48, or as many as let a voxel there span no more than five pixels of the views, or three when
+    their depth is measured and asked."""
+    known = measured and any(depth is not None for depth in views.depths)
+    return max(VOXELS_TO_MEDIAN, float(np.median([lens.fx for lens in views.intrinsics])) / (MEASURED_PIXELS if known else PIXELS))
 
 
 def lattice_of(space: Space, scene: Scene, voxels: float, levels: int) -> Lattice:
@@ -123,7 +125,7 @@ class Inference:
         self.model, self.keys, self.options = model, keys, options or NetworkOptions()
         self.train = views.subset(train)
         self.near, self.far = scene.near, scene.far
-        voxels = self.options.voxels or voxels_to_median(self.train)
+        voxels = self.options.voxels or voxels_to_median(self.train, self.options.measured)
         self.lattice = lattice_of(space_of(views, scene, background), scene, voxels, self.options.levels)
         self.behind = colour_behind(views).to(model.device)
         self.seconds = self.fusion_seconds = self.encode_seconds = 0.0
