@@ -6,6 +6,7 @@ Exit codes: 0 done; 1 something unexpected, with a log file; 2 bad input, settin
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import traceback
 from typing import Annotated
@@ -92,6 +93,17 @@ def main() -> None:
         _fail(f"something unexpected went wrong ({type(error).__name__}); {place}", 1, error)
 
 
+def program() -> None:
+    """The command line as a process of its own: while it ends, one more Ctrl-C changes nothing."""
+    try:
+        main()
+    except KeyboardInterrupt:  # it came when `main` was ending already
+        sys.exit(130)
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+
+
 def _fail(text: str, code: int, error: BaseException | None = None) -> None:
     if error is not None and os.environ.get("FIELDFUSE_DEBUG") == "1":
         traceback.print_exception(error)
@@ -124,4 +136,4 @@ app.add_typer(bench.app, name="bench")
 
 
 if __name__ == "__main__":
-    main()
+    program()

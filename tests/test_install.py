@@ -88,7 +88,7 @@ def test_the_command_is_declared_and_the_version_is_one() -> None:
     import toolkit
     from pipelines import cli
 
-    assert setup()["options.entry_points"]["console_scripts"].strip() == "fieldfuse = pipelines.cli:main"
+    assert setup()["options.entry_points"]["console_scripts"].strip() == "fieldfuse = pipelines.cli:program"
     assert callable(cli.main)
     assert setup()["metadata"]["version"] == "attr: toolkit.__version__"
     try:
