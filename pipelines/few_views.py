@@ -145,7 +145,6 @@ def _job(source: Path, out: Path, options: dict[str, Any], quiet: bool) -> Itera
     with open_job(source, out, options, make_progress(quiet)) as job:
         capture = choose_frames(job, find_capture(job))
         posed = find_camera_poses(job, capture).apply(capture)
-        job.settings.effects.off.append("blur")  # of three pictures none is left out
         corrections = find_effects(job, posed)
         yield job, corrections.on_capture(posed), corrections
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,10 +41,11 @@ def same(a: list, b: list) -> bool:
 
 
 def test_views_survive_the_file(tmp_path: Path) -> None:
-    views = some_views(tmp_path)
+    views = replace(some_views(tmp_path), weight=[1.0, 0.25, 0.5])
     save_views(tmp_path / "run" / "views.safetensors", views)
     back = load_views(tmp_path / "run" / "views.safetensors")
     assert back.names == ["a", "b", "c"] == views.names and back.intrinsics == views.intrinsics and back.background == (1.0, 1.0, 1.0)
+    assert back.weight == [1.0, 0.25, 0.5]
     np.testing.assert_array_equal(back.world_from_camera, views.world_from_camera)
     np.testing.assert_array_equal(back.test, [True, False, True])
     for name in ("images", "valid", "alpha", "depths"):
@@ -57,14 +59,14 @@ def test_views_without_optional_lists_survive(tmp_path: Path) -> None:
     bare = Views(views.names, views.images, views.intrinsics, views.world_from_camera, views.test)
     save_views(tmp_path / "v.safetensors", bare)
     back = load_views(tmp_path / "v.safetensors")
-    assert back.depths == [None] * 3 and back.background is None and len(back.subset([2])) == 1
+    assert back.depths == [None] * 3 and back.background is None and back.weight == [] and len(back.subset([2])) == 1
 
 
 def test_damaged_and_tampered_views_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "v.safetensors"
     with pytest.raises(InputError, match="no prepared views"):
         load_views(path)
-    save_views(path, some_views(tmp_path))
+    save_views(path, replace(some_views(tmp_path), weight=[1.0, 0.25, 0.5]))
     data = path.read_bytes()
     for bad in (
         data[: len(data) // 2],
@@ -72,6 +74,8 @@ def test_damaged_and_tampered_views_are_refused(tmp_path: Path) -> None:
         b"\xff" * 64,
         data.replace(b'\\"width\\": 48', b'\\"width\\": 47'),
         data.replace(b'\\"fx\\": 40.0', b'\\"fx\\": -9.0'),
+        data.replace(b"[1.0, 0.25, 0.5]", b"[1.0, 0.25, 1.5]"),
+        data.replace(b"[1.0, 0.25, 0.5]", b"[1.0, 0.25     ]"),
     ):
         assert bad != data
         path.write_bytes(bad)

@@ -13,6 +13,7 @@ from toolkit.capture.types import Capture, Frame, Views
 from toolkit.effects import transfer, vignetting
 from toolkit.effects.correct import Corrections, bent, canonical, correctable
 from toolkit.errors import InputError
+from toolkit.training.rays import PixelPool
 
 CAMERA = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
 
@@ -55,15 +56,26 @@ def test_clipped_pixels_that_become_darker_are_not_valid() -> None:
     assert after.images[0] is before.images[0]
 
 
-def test_weights_are_shares_of_the_valid_pixels_but_for_test_views() -> None:
+def test_weights_are_of_training_views_and_change_no_pixel() -> None:
     before = views()
     before.valid = [None, None, np.arange(64)[None].repeat(48, 0) < 32]
     after = Corrections(weight={"a": 0.3, "b": 0.3, "c": 0.5}).on_views(before)
-    assert after.valid[0] is None
-    assert after.valid[1] is not None and abs(after.valid[1].mean() - 0.3) < 0.03
-    assert after.valid[2] is not None and abs(after.valid[2][:, :32].mean() - 0.5) < 0.05 and not after.valid[2][:, 32:].any()
-    again = Corrections(weight={"b": 0.3}).on_views(views())
-    np.testing.assert_array_equal(again.valid[1], after.valid[1])
+    assert after.weight == [1.0, 0.3, 0.5] and after.subset([2, 0]).weight == [0.5, 1.0]
+    assert all(one is other for one, other in zip(after.valid, before.valid, strict=True))
+    assert all(one is other for one, other in zip(after.images, before.images, strict=True))
+    assert Corrections(gain={"b": (2.0, 2.0, 2.0)}).on_views(before).weight == []
+
+
+def test_weights_are_shares_of_the_valid_pixels_that_rays_are_drawn_from() -> None:
+    whole = views()
+    whole.valid = [None, None, np.arange(64)[None].repeat(48, 0) < 32]
+    pool = PixelPool(Corrections(weight={"b": 0.3, "c": 0.5}).on_views(whole))
+    drawn = np.bincount(pool.view.numpy())
+    assert drawn[0] == 48 * 64
+    assert abs(drawn[1] / (48 * 64) - 0.3) < 0.03 and abs(drawn[2] / (48 * 32) - 0.5) < 0.05
+    assert bool((pool.place[pool.view == 2] % 64 < 32).all())
+    alone = PixelPool(Corrections(weight={"b": 0.3}).on_views(views()).subset([1]))
+    torch.testing.assert_close(alone.place, pool.place[pool.view == 1])
 
 
 def test_a_lens_is_added_to_what_is_given() -> None:

@@ -100,8 +100,8 @@ def test_reported_numbers_are_marked_as_such() -> None:
 
 
 def test_commands_lose_the_places_of_this_machine() -> None:
-    command = "fieldfuse tradeoff /data/sets/fox --out /tmp/x/fox --times 1,3 --config /home/me/a.yaml"
-    assert portable(command, Path("/data")) == "fieldfuse tradeoff DATA/sets/fox --out runs/fox --times 1,3 --config a.yaml"
+    command = "fieldfuse tradeoff /captures/sets/fox --out /elsewhere/x/fox --times 1,3 --config /mine/a.yaml"
+    assert portable(command, Path("/captures")) == "fieldfuse tradeoff DATA/sets/fox --out runs/fox --times 1,3 --config a.yaml"
     assert portable("fieldfuse bench dtu sets/dtu --out 'my runs'", None) == "fieldfuse bench dtu sets/dtu --out 'my runs'"
 
 

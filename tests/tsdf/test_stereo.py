@@ -113,15 +113,6 @@ def test_masked_pixels_have_no_depth() -> None:
     assert not depths[1].depth[:50].any() and (depths[1].depth[50:] > 0).mean() > 0.2
 
 
-def test_pixels_that_a_fit_leaves_out_by_lot_have_depth() -> None:
-    views, _ = corner()
-    part = views.subset([0, 1, 2])
-    whole = stereo_depths(part, NEAR, FAR, MEDIAN)
-    part.valid = [np.random.default_rng(index).random((120, 160)) > 0.6 for index in range(3)]
-    for one, other in zip(stereo_depths(part, NEAR, FAR, MEDIAN), whole, strict=True):
-        assert np.mean((one.depth > 0) == (other.depth > 0)) > 0.99
-
-
 def test_bare_walls_give_no_depth() -> None:
     views, _ = corner()
     bare = views_of(views.world_from_camera, [np.full_like(picture, 130) for picture in views.images])

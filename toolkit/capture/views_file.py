@@ -40,6 +40,7 @@ def save_views(path: Path, views: Views) -> None:
         "names": views.names,
         "intrinsics": [intrinsics.to_dict() for intrinsics in views.intrinsics],
         "background": views.background,
+        "weight": views.weight,
     }
     with atomic_path(path) as temporary:
         try:
@@ -92,6 +93,8 @@ def _assemble(facts: dict[str, Any], keys: set[str], file: Any) -> Views:
         red, green, blue = (float(value) for value in facts["background"])
         _require(all(math.isfinite(value) and 0 <= value <= 1 for value in (red, green, blue)), "the background is no colour")
         views.background = (red, green, blue)
+    views.weight = [float(value) for value in facts.get("weight", [])]
+    _require(len(views.weight) in (0, count) and all(0 <= value <= 1 for value in views.weight), "a weight is no share, or one is missing")
     return views
 
 

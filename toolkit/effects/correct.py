@@ -7,7 +7,6 @@ come back.
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -53,10 +52,9 @@ class Corrections:
         return capture.with_frames(frames)
 
     def on_views(self, views: Views) -> Views:
-        """The views in canonical colour.
+        """The views in canonical colour, training views with their weights.
 
-        Not valid any more are clipped pixels that become darker (their colour is not known), and so many of a training frame's pixels, by
-        lot, that what is left is its weight: a fit draws its rays evenly from all that are valid.
+        Not valid any more are clipped pixels that become darker: their colour is not known.
         """
         if not self.photometric:
             return views
@@ -68,11 +66,8 @@ class Corrections:
             if lost is not None and lost.any():
                 before = valid[index]
                 valid[index] = ~lost if before is None else before & ~lost
-            if name in self.weight and not views.test[index]:
-                drawn = np.random.default_rng(zlib.crc32(name.encode())).random(image.shape[:2]) < self.weight[name]
-                before = valid[index]
-                valid[index] = drawn if before is None else before & drawn
-        return replace(views, images=images, valid=valid)
+        weight = [1.0 if test else self.weight.get(name, 1.0) for name, test in zip(views.names, views.test, strict=True)]
+        return replace(views, images=images, valid=valid, weight=weight if self.weight else [])
 
     def to_dict(self) -> dict[str, Any]:
         return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,10 @@ class Batch:
 
 
 class PixelPool:
-    """All valid pixels of some views, as uint8 on the device, with what is needed to make their rays."""
+    """The valid pixels of some views, as uint8 on the device, with what is needed to make their rays.
+
+    Of a view that counts for less, so many are drawn by lot (always the same ones) as its weight says: rays come evenly from what is kept.
+    """
 
     def __init__(self, views: Views, device: torch.device | str = "cpu", depth: bool = False) -> None:
         """With `depth` the distances of known surfaces are kept, too, if any view has depth."""
@@ -33,6 +37,8 @@ class PixelPool:
             image = views.images[index]
             valid = views.valid[index] if views.valid else None
             flat = np.arange(image.shape[0] * image.shape[1]) if valid is None else np.flatnonzero(valid)
+            if views.weight and views.weight[index] < 1:
+                flat = flat[np.random.default_rng(zlib.crc32(views.names[index].encode())).random(len(flat)) < views.weight[index]]
             colours.append(torch.from_numpy(np.ascontiguousarray(image.reshape(-1, 3)[flat])))
             places.append(torch.from_numpy(flat.astype(np.int32)))
             which.append(torch.full((len(flat),), index, dtype=torch.int32))

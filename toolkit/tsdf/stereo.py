@@ -35,7 +35,6 @@ STEP = (
     1.5  # pixels that the picture of the neighbour that moves most moves by from one plane to the next; refinement finds what lies between
 )
 PLANES = (32, 128)  # fewest and most planes
-LOT = 5  # pixels: invalid spots that are smaller are no mask
 MOST_WORKERS = 8
 COSTS_HELD = 3  # volumes of costs that a worker has room for: those of the sweep, those that are smoothed, and pictures
 
@@ -146,8 +145,6 @@ def _prepared(views: Views, index: int, long_side: int) -> _View:
     factor = min(1.0, long_side / max(camera.width, camera.height))
     camera = camera.scaled(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
     valid = views.valid[index] if views.valid else None
-    if valid is not None:  # single pixels are kept from a fit by lot, so that a blurred picture weighs less; they show surface all the same
-        valid = cv2.morphologyEx(valid.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((LOT, LOT), np.uint8)) > 0
     alpha = views.alpha[index] if views.alpha else None
     usable = valid
     if alpha is not None:

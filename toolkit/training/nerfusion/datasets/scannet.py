@@ -1,4 +1,4 @@
-"""ScanNet: `scans/sceneXXXX_YY/{color,depth,pose,intrinsic}` as the site's exporter writes them; video of rooms with depth, metres.
+"""ScanNet: `scans/scene0000_00/{color,depth,pose,intrinsic}` as the site's exporter writes them; video of rooms with depth, metres.
 
 A `scannetv2_train.txt` beside the scans names the training scenes; without it every scene is used.
 """
