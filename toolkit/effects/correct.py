@@ -1,8 +1,7 @@
 """What is taken out of a capture before anything is fitted to it, as plain data: colours, the lens, errors of poses, weights.
 
-Gains have geometric mean 1 over the training pictures, the vignetting is 1 in the middle, refined poses are those that lie closest to the
-given ones under a similarity: every freedom that pictures cannot tell is fixed. Where nothing is to be corrected, the very same objects
-come back.
+Gains have geometric mean 1 over the training pictures, the vignetting is 1 in the middle, refined poses are held to the given ones
+(`refine.believed`): every freedom that pictures cannot tell is fixed. Where nothing is to be corrected, the very same objects come back.
 """
 
 from __future__ import annotations
