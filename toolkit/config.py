@@ -52,7 +52,7 @@ class KeyframesSettings:
 @dataclass
 class NetworkSettings:
     weights: str | None = None  # file of trained networks; None: the shipped ones
-    voxels: float | None = None  # finest ones to the median depth; None: 48, or a voxel to five pixels there (with depth: three)
+    voxels: float | None = None  # finest ones to the median depth; None: 48, or more: a voxel to some pixels there
     levels: int = 2  # lattices, each of half the voxel size of the one before; 1: the paper's single one
     depth_from: str = "sensor"  # sensor (if the capture has one; the paper has none) | off
 

@@ -27,6 +27,7 @@ from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
 from toolkit.render.fused import make_field, without_empty_blocks
+from toolkit.training import start as classical
 from toolkit.training.start import colour_behind, emptied_by_views, space_of
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK
@@ -35,7 +36,9 @@ SHIPPED = Path(weights.__file__).parent / "weights" / "nerfusion.safetensors"
 # Voxels that make up the median depth at least, on the finer of two lattices. One lattice of 24 alone loses 1.5 to 2.5 dB, while 104
 # gain 0.25 dB for about three times the seconds (docs/few_views.md), so no voxel need be smaller than some pixels; a larger one shows.
 VOXELS_TO_MEDIAN, LEVELS = 48.0, 2
-PIXELS, MEASURED_PIXELS = 5.0, 3.0  # that a voxel spans at most; a sensor's depth is exact enough for smaller ones
+PIXELS = 5.0  # that a voxel spans at most …
+MEASURED_PIXELS = 2.5  # … where a sensor's depth says more exactly where surfaces are …
+OBJECT_PIXELS = PIXELS * classical.OBJECT_PIXELS / classical.PIXELS  # … and where alpha cuts the object out: as in a fit
 GAMMA = 0.95  # the paper's 0.6 cuts holes where the networks are in doubt
 LEAST, MOST = 32, 384  # resolution of the lattice
 
@@ -72,10 +75,11 @@ def load_networks(path: Path | str | None = None, device: torch.device | str = "
 
 
 def voxels_to_median(views: Views, measured: bool = False) -> float:
-    """Voxels that make up the median depth: 48, or as many as let a voxel there span no more than five pixels of the views, or three when
-    their depth is measured and asked."""
+    """Voxels that make up the median depth: 48, or as many as let a voxel there span no more than `PIXELS` of the views, `OBJECT_PIXELS`
+    where they have alpha, `MEASURED_PIXELS` where their depth is measured and asked."""
     known = measured and any(depth is not None for depth in views.depths)
-    return max(VOXELS_TO_MEDIAN, float(np.median([lens.fx for lens in views.intrinsics])) / (MEASURED_PIXELS if known else PIXELS))
+    pixels = MEASURED_PIXELS if known else OBJECT_PIXELS if any(alpha is not None for alpha in views.alpha) else PIXELS
+    return max(VOXELS_TO_MEDIAN, float(np.median([lens.fx for lens in views.intrinsics])) / pixels)
 
 
 def lattice_of(space: Space, scene: Scene, voxels: float, levels: int) -> Lattice:
