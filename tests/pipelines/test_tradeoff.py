@@ -56,7 +56,7 @@ def test_direct_inference_is_a_curve_over_key_frames_and_one_over_voxels() -> No
     ]
     lines = {axis: [point.id for point in line] for axis, line in series(points_of(rows))}
     assert lines["keyframes"] == ["direct-keyframes0.1", "direct-keyframes0.25", "direct-keyframes0.5", "direct"]
-    assert lines["voxel_size"] == ["direct-voxel2.0", "direct", "direct-voxel0.7"]
+    assert lines["voxel_size"] == ["direct-voxel2.0", "direct-voxel1.4", "direct"]
     only = [one.id for one in plan(["keyframes"], [30.0], 1, None) if one.method == "direct"]
     assert only == ["direct", "direct-keyframes0.1", "direct-keyframes0.25", "direct-keyframes0.5"]
 
