@@ -13,7 +13,7 @@ from dataclasses import field as default
 from toolkit.config import FitSettings
 from toolkit.training.step import Rates
 
-RUNGS = (0.05, 0.15, 0.35, 0.6, 0.8)  # share of the budget at which each level ends at the latest (32 … 512)
+RUNGS = (0.1, 0.3, 0.6, 0.8, 0.9)  # share of the budget at which each level ends at the latest (32 … 512)
 LEVEL_STEPS = 100  # a level is not left, nor pruned, before so many: what has not had time to grow is not empty
 PRUNE_EVERY = 150  # steps
 LAST_PRUNE = 0.8  # of the budget; from here on the field is only polished, on all views
