@@ -71,7 +71,7 @@ class Views:
     alpha: list[Array | None] = field(default_factory=list)  # (H, W) uint8, None: opaque
     depths: list[Array | None] = field(default_factory=list)  # (H, W) float32 along z, working units, 0 = missing; aligned to the picture
     background: tuple[float, float, float] | None = None  # colour behind everything for captures with alpha; None: unknown
-    weight: list[float] = field(default_factory=list)  # share of a view's pixels that a fit draws rays from, 0 to 1; empty: all of all views
+    weight: list[float] = field(default_factory=list)  # share of a view's pixels that a fit draws rays from; empty: all of all views
 
     def __len__(self) -> int:
         return len(self.names)
