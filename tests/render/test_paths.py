@@ -100,6 +100,17 @@ def test_an_arc_is_walked_to_and_fro_and_not_left(wraps: float) -> None:
     assert np.ptp(angle) > 2.0
 
 
+def test_a_walk_round_an_object_that_does_not_close_is_walked_back() -> None:
+    """60° were not walked, and three stray cameras stand in the quarter before them: fog would hang between them and the object."""
+    walk = ring(100, 3.0, 0.5, stop=np.deg2rad(210))
+    cameras = np.concatenate([walk, ring(3, 3.0, 0.5, start=np.deg2rad(215), stop=np.deg2rad(300))])
+    path = orbit(cameras, CENTRE, 90)
+    closed_and_smooth(path)
+    assert nearest(path, walk).max() < 0.25
+    angle = np.arctan2(*(path[:, :3, 3] - CENTRE)[:, 1::-1].T) % (2 * np.pi)
+    assert np.ptp(angle) > np.deg2rad(180) and angle.max() < np.deg2rad(215)
+
+
 def test_cameras_before_a_scene_give_a_small_ellipse() -> None:
     rng = np.random.default_rng(2)
     at = np.stack([rng.uniform(-1, 1, 20), np.full(20, -5.0), rng.uniform(-0.5, 0.5, 20) + 1], axis=1)

@@ -10,7 +10,8 @@ from toolkit.errors import InputError
 UP = (0.0, 0.0, 1.0)  # in the working frame
 FACING = 0.9  # length of the mean viewing direction above which all cameras look the same way (spread of about 25°)
 LOOKING_IN = 0.7  # median cosine between viewing direction and direction to the centre above which the cameras surround it
-FULL_CIRCLE = np.deg2rad(90)  # the largest gap in azimuth that a closed circle may cross
+FULL_CIRCLE = np.deg2rad(50)  # the largest gap in azimuth that a closed circle may cross
+ARC_ENDS = 0.04  # share of the cameras beyond either end of an arc: where hardly anybody stood, fog stands in the way
 KEY_CAMERAS = 12
 ARC_MARGIN = 0.02
 
@@ -104,8 +105,9 @@ def _around(positions: Array, target: Array, up: Array, phase: Array) -> Array:
     if gaps[widest] <= FULL_CIRCLE:
         angle = phase
     else:  # along the arc and back, never through the part that nobody saw
-        first = ordered[(widest + 1) % len(ordered)]
-        angle = first + (2 * np.pi - gaps[widest]) * (0.5 - (0.5 - ARC_MARGIN) * np.cos(phase))
+        start = ordered[(widest + 1) % len(ordered)]
+        first, last = start + np.quantile((azimuth - start) % (2 * np.pi), [ARC_ENDS, 1 - ARC_ENDS])
+        angle = first + (last - first) * (0.5 - (0.5 - ARC_MARGIN) * np.cos(phase))
     # Distance, and height, as a constant plus one wave round the circle, by least squares with a pull towards the constant:
     # it follows an off-centre or tilted ring of cameras and cannot swing out between them.
     waves = np.stack([np.ones_like(azimuth), np.cos(azimuth), np.sin(azimuth)], axis=1)
