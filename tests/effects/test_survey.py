@@ -101,6 +101,7 @@ def test_refined_poses_are_better_and_stay_in_the_given_frame() -> None:
         return float(np.sqrt(np.mean(np.arccos(np.clip(cosines, -1, 1)) ** 2)))
 
     assert off(poses) < 0.2 * off(wrong.poses)
+    np.testing.assert_allclose(aligned(poses[train], wrong.poses[train], np.ones(train.sum(), dtype=bool)), poses[train], atol=0.02)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
