@@ -12,6 +12,7 @@ import numpy as np
 
 from pipelines.job import Job
 from pipelines.steps_compare import Compared, common_voxel, depths_of_test_views, working_meshes
+from pipelines.steps_results import fit_matched
 from pipelines.summary import base_data, warnings_of
 
 if TYPE_CHECKING:
@@ -123,6 +124,8 @@ def depth_in_fit(job: Job, views: Views) -> tuple[tuple[str, ...], str]:
         return ("stereo",), "fitted to colours and matched depth"
     if fit.finetune and fit.depth > 0 and fit.depth_from != "off" and any(depth is not None for depth in views.depths):
         return (), "fitted to colours and the sensor's depth"
+    if fit_matched(job) is not None:
+        return (), "fitted to colours and depth by quick matching"
     return (), ""
 
 

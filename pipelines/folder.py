@@ -36,6 +36,7 @@ FILES = (
     "field.safetensors",
     "timeline.json",
     "fit_notes.json",
+    "fit_matched.json",
     "mesh.ply",
     "evaluation.json",
     "report.json",

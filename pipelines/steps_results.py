@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.job import Job, set_seeds
-from pipelines.kept import EVALUATION, EXPORT_FACTS, NOTES, TIMELINE, read_kept
+from pipelines.kept import EVALUATION, EXPORT_FACTS, MATCHED, NOTES, TIMELINE, read_kept
 from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture, write_pngs
 from pipelines.room import require_pictures, require_scores
 from pipelines.steps_capture import last_of, pixel_state
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from toolkit.poses.result import PoseResult
     from toolkit.poses.scene import Scene
     from toolkit.render.field import Field
+    from toolkit.training.fit import FitResult
 
 
 def wants_tsdf(job: Job, capture: Capture) -> bool:
@@ -69,6 +70,7 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
 
 
 FIT_NOTES = "fit_notes.json"  # what a reader of the numbers has to know of the fit; there only when there is something
+FIT_MATCHED = "fit_matched.json"  # what the fit's quick matching found; there only when it was made
 Fitted = tuple["Field", list[dict[str, Any]]]
 
 
@@ -81,16 +83,20 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     from pipelines.steps_network import make_network_field, uses_network
     from pipelines.steps_stereo import views_for_fit
     from toolkit.render.field import Field
-    from toolkit.training.fit import fit_field
+    from toolkit.training.guided import fit_guided
     from toolkit.training.network_start import network_start
     from toolkit.volume.grid_host import GridHost
 
     settings = job.settings
-    path, times, told = job.folder / "field.safetensors", job.folder / "timeline.json", job.folder / FIT_NOTES
-    notes: list[str] = []
+    path, times = job.folder / "field.safetensors", job.folder / "timeline.json"
+    told: dict[str, Any] = {}  # file → what it is to hold
     made = make_network_field(job, views, scene) if uses_network(job, views) else None
     views, known = views_for_fit(job, scene, views)
     start = job.stages.record("field") if go_on and job.stages.usable("field") and not job.other_field else None
+
+    def tell(result: FitResult) -> None:
+        told.update({FIT_NOTES: result.notes} if result.notes else {})
+        told.update({FIT_MATCHED: result.matched} if result.matched else {})
 
     def load() -> Fitted:
         return Field.load(path).to(settings.device), read_kept(times, TIMELINE)
@@ -101,12 +107,12 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
             return made.field, []
         if start is None:
             first = None if made is None else network_start(made.field, views, scene, settings)
-            result = fit_field(views, scene, settings, job.progress, GridHost(settings.device), start=first, coarse=first is not None)
-            notes.extend(result.notes)
+            result = fit_guided(views, scene, settings, job.progress, GridHost(settings.device), start=first, coarse=first is not None)
+            tell(result)
             return result.field, result.timeline
         field, timeline = load()
-        result = fit_field(views, scene, settings, job.progress, GridHost(settings.device), start=field)
-        notes.extend(result.notes)
+        result = fit_guided(views, scene, settings, job.progress, GridHost(settings.device), start=field)
+        tell(result)
         spent = timeline[-1]["seconds"] if timeline else 0.0
         return result.field, timeline + [{**point, "seconds": round(spent + point["seconds"], 3)} for point in result.timeline]
 
@@ -114,9 +120,9 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
         field, timeline = value
         field.save(path, scene.working_from_input, {"budget": settings.fit.budget, "seed": settings.seed})
         write_json(times, timeline)
-        if notes:
-            write_json(told, notes)
-        return [path, times, *([told] if notes else [])]
+        for name, content in told.items():
+            write_json(job.folder / name, content)
+        return [path, times, *(job.folder / name for name in told)]
 
     uses = [
         asdict(settings.field),
@@ -137,6 +143,12 @@ def fit_notes(job: Job) -> list[str]:
     """What the fit of this run's field had to say."""
     record = job.stages.records.get("field")
     return list(read_kept(job.folder / FIT_NOTES, NOTES)) if record is not None and FIT_NOTES in record.outputs else []
+
+
+def fit_matched(job: Job) -> dict[str, Any] | None:
+    """What this run's fit found by matching pictures before it began: pictures, long side, share of pixels with depth, seconds."""
+    record = job.stages.records.get("field")
+    return read_kept(job.folder / FIT_MATCHED, MATCHED) if record is not None and FIT_MATCHED in record.outputs else None
 
 
 def render_test_views(job: Job, field: Field, views: Views) -> Pictures:

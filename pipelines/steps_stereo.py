@@ -12,10 +12,9 @@ from pipelines.job import Job
 from toolkit.errors import InputError
 
 if TYPE_CHECKING:
-    from toolkit.camera import Array
     from toolkit.capture.types import Capture, Views
     from toolkit.poses.scene import Scene
-    from toolkit.tsdf.stereo import StereoDepth
+    from toolkit.stereo.match import StereoDepth
 
 
 def match_pictures(job: Job, scene: Scene, views: Views) -> list[StereoDepth]:
@@ -25,8 +24,8 @@ def match_pictures(job: Job, scene: Scene, views: Views) -> list[StereoDepth]:
         InputError: the pictures cannot be matched.
         Interrupted: the user asked to stop.
     """
-    from toolkit.tsdf.stereo import stereo_depths
-    from toolkit.tsdf.stereo_frames import load_stereo, save_stereo
+    from toolkit.stereo.maps import load_stereo, save_stereo
+    from toolkit.stereo.match import stereo_depths
 
     path = job.folder / "stereo" / "depths.safetensors"
     training = views.subset(np.flatnonzero(~views.test))
@@ -58,23 +57,16 @@ def views_for_fit(job: Job, scene: Scene, views: Views) -> tuple[Views, list[str
         InputError: the pictures are to be matched, and cannot be.
         Interrupted: the user asked to stop.
     """
+    from toolkit.stereo.quick import with_depths
+
     wanted = job.settings.fit.depth_from if job.settings.fit.depth > 0 else "off"
     if wanted == "off":
         return replace(views, depths=[]), []
-    if wanted == "sensor" or any(depth is not None for depth in views.depths):
-        return views, []
-    return with_matched(views, match_pictures(job, scene, views)), ["stereo"]
-
-
-def with_matched(views: Views, found: list[StereoDepth]) -> Views:
-    """Views whose training pictures have the depth that was found for them, one after the other."""
-    from toolkit.tsdf.stereo_frames import depth_at
-
-    depths: list[Array | None] = [None] * len(views)
-    for index, one in zip(np.flatnonzero(~views.test), found, strict=True):
-        camera = views.intrinsics[index]
-        depths[index] = depth_at(one, camera.width, camera.height)
-    return replace(views, depths=depths)
+    known = any(depth is not None for depth in views.depths)
+    full = wanted == "any" or (wanted == "auto" and job.settings.tsdf.enabled == "on")  # then it is there for the surface
+    if known or not full:
+        return views, []  # by `auto`, the fit matches pictures itself, quickly
+    return with_depths(views, np.flatnonzero(~views.test), match_pictures(job, scene, views)), ["stereo"]
 
 
 def reuse_matched(job: Job, scene: Scene, views: Views) -> None:
@@ -90,7 +82,7 @@ def exact_depths(posed: Capture, scene: Scene, views: Views) -> list[StereoDepth
         InputError: a training picture has none.
     """
     from toolkit.evaluate.compare_truth import find_truth, true_depths
-    from toolkit.tsdf.stereo import StereoDepth
+    from toolkit.stereo.match import StereoDepth
 
     truth = find_truth(posed)
     training = np.flatnonzero(~views.test)

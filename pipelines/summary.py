@@ -14,7 +14,7 @@ from pipelines.folder import command_line
 from pipelines.job import Job
 from pipelines.rendered import Pictures
 from pipelines.steps_effects import effects_part, effects_warnings
-from pipelines.steps_results import fit_notes
+from pipelines.steps_results import fit_matched, fit_notes
 from toolkit import __version__
 from toolkit.config import settings_dict
 from toolkit.files import write_json
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 
 SEEN_BY_SFM = (
     "poses were computed from all pictures, the held-out ones included, so scores are a little kinder than with poses known beforehand"
+)
+MATCHED = (
+    "The fit began by matching {views} training pictures of {pixels} pixels with each other ({seconds:.1f} s of its budget), so that it knew a"
+    " depth for {percent:.0f}% of their pixels."
 )
 OPENED = {".ply", ".obj", ".glb", ".mp4", ".txt", ".json"}
 NO_TEST_VIEWS = "no picture was held out, so there are no scores; give --holdout 8 to keep every 8th picture for testing"
@@ -126,8 +130,8 @@ def warnings_of(job: Job, capture: Capture, poses: PoseResult, scene: Scene, vie
     return unique(texts)
 
 
-def describe_field(field: Field | None) -> dict[str, Any] | None:
-    """The report's part `field`; the voxel size is in working units."""
+def describe_field(field: Field | None, matched: dict[str, Any] | None = None) -> dict[str, Any] | None:
+    """The report's part `field`; the voxel size is in working units. `matched` is what the fit's quick matching found."""
     if field is None:
         return None
     return {
@@ -136,6 +140,7 @@ def describe_field(field: Field | None) -> dict[str, Any] | None:
         "voxels": field.voxels,
         "bytes": field.bytes,
         "resolution": field.resolution,
+        **({"matched": matched} if matched is not None else {}),
     }
 
 
@@ -172,6 +177,7 @@ def put_report(
 
     notes = [export_facts["note"]] if export_facts and "note" in export_facts else []
     began, told = time.monotonic(), None if job.plan is None else job.plan.told(job)
+    matched = None if field is None else fit_matched(job)
     data = {
         **base_data(job, capture, poses),
         "warnings": warnings_of(job, capture, poses, scene, views) + notes,
@@ -183,7 +189,8 @@ def put_report(
             "width": views.intrinsics[0].width,
             "height": views.intrinsics[0].height,
         },
-        "field": describe_field(field),
+        "field": describe_field(field, matched),
+        "notes": [] if matched is None else [MATCHED.format(**matched, percent=100 * matched["share"])],
         "evaluation": {name: scores.get(name) for name in ("field", "tsdf", *(["network"] if "network" in scores else []))},
         "baseline": scores.get("nearest_image"),
         "timeline": timeline,
@@ -192,7 +199,7 @@ def put_report(
         "seconds_total": round(seconds + job.stages.fresh_seconds(), 3),
     }
     if job.plan is not None and told is not None:
-        data |= {"budget": told, "notes": [job.plan.note(told)]}
+        data |= {"budget": told, "notes": [job.plan.note(told), *data["notes"]]}
     shown = {name: [*found.pictures] for name, found in pictures.items()}
     unit = "m" if scene.metric else "units"
     tiles = method_pictures(views, np.flatnonzero(views.test), shown, unit)

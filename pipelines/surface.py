@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from toolkit.poses.result import PoseResult
     from toolkit.poses.scene import Scene
     from toolkit.render.field import Field
+    from toolkit.stereo.match import StereoDepth
     from toolkit.tsdf.fuse import Points
     from toolkit.tsdf.mesh import Mesh
-    from toolkit.tsdf.stereo import StereoDepth
 
 SMALL_PART = 0.002  # components of a mesh with less than this share of its area are specks
 MOST_TRIANGLES = 2_000_000
@@ -147,7 +147,7 @@ def export_surface(
     from toolkit.export.mesh import mesh_facts, write_mesh
     from toolkit.export.surface import field_volume
     from toolkit.render.image import make_renderer, render_view
-    from toolkit.tsdf.stereo_polish import Polisher
+    from toolkit.stereo.polish import Polisher
 
     shown = views.subset(np.flatnonzero(~views.test))  # held-out pictures are not looked at
     cameras = [at_most(camera, MESH_SIDE) for camera in shown.intrinsics]

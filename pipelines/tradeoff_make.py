@@ -113,7 +113,7 @@ class Cost:
 def make_field(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dict[str, Any]]:
     """Fit a field, then show it as it is kept (16-bit features) and in each of the variants."""
     from toolkit.render.field import Field
-    from toolkit.training.fit import fit_field
+    from toolkit.training.guided import fit_guided
     from toolkit.volume.grid_host import GridHost
 
     settings, wanted = ground.settings, spec["wanted"]
@@ -124,7 +124,7 @@ def make_field(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dict
     )
     path = scratch / "field.safetensors"
     with Cost(ground) as cost:
-        result = fit_field(ground.chosen, ground.scene, settings, host=GridHost(settings.device))
+        result = fit_guided(ground.chosen, ground.scene, settings, host=GridHost(settings.device))
         cost.lap("fit")
         result.field.save(path, ground.scene.working_from_input)
         cost.lap("save")
@@ -262,7 +262,8 @@ def fuse(ground: Ground, method: str, settings: TsdfSettings) -> TsdfVolume:
 
         with_depth = [int(index) for index in ground.used if ground.posed.frames[int(index)].depth is not None]
         return fuse_capture(ground.posed, ground.scene.working_from_input, with_depth, settings)
-    from toolkit.tsdf.stereo_frames import fuse_stereo, load_stereo
+    from toolkit.stereo.maps import load_stereo
+    from toolkit.tsdf.stereo_frames import fuse_stereo
 
     names, depths = load_stereo(ground.folder / "stereo" / "depths.safetensors")
     training = ground.views.subset(np.flatnonzero(~ground.views.test))

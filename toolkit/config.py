@@ -81,7 +81,9 @@ class FitSettings:
     distortion: float = 0.015  # weight of the distortion loss
     opacity: float = 0.05  # weight of (1 - opacity)² where every ray must end somewhere (captures without alpha)
     depth: float = 0.03  # weight of the depth term where the depth of a picture is known; 0: colours alone
-    depth_from: str = "sensor"  # sensor (if the capture has one) | any (that, else by matching the pictures, which takes time) | off
+    # Where depth comes from. auto: a sensor, or without one quick matching of the pictures in a share of the fit's seconds | any: a sensor,
+    # or without one matching in full, which takes time of its own | sensor | off
+    depth_from: str = "auto"
     patience: bool = False  # end before the budget when the validation views stop improving
     passes: float | None = 50.0  # over the pixels, where there are too few views to keep some aside for validation; None: the whole budget
     prune_weight: float = 0.05  # voxels whose largest seen weight stays below are removed
@@ -149,7 +151,7 @@ CHOICES = {
     "poses.matching": ("auto", "exhaustive", "sequential"),
     "field.decoder": ("deferred", "per_sample"),
     "network.depth_from": ("sensor", "off"),
-    "fit.depth_from": ("sensor", "any", "off"),
+    "fit.depth_from": ("auto", "any", "sensor", "off"),
     "field.background": ("auto", "on", "off"),
     "field.view": ("auto", "full", "low", "none"),
     "field.init": ("auto", "network", "classical"),

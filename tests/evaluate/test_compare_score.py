@@ -17,7 +17,7 @@ from toolkit.evaluate.compare_score import compare_views, depth_accuracy, depth_
 from toolkit.evaluate.compare_stereo import matched_depth_scores
 from toolkit.evaluate.compare_truth import find_truth, true_depths
 from toolkit.evaluate.images import psnr, ssim
-from toolkit.tsdf.stereo import StereoDepth
+from toolkit.stereo.match import StereoDepth
 
 CAMERA = Intrinsics(48, 36, 40.0, 40.0, 24.0, 18.0)
 

@@ -56,9 +56,19 @@ def test_a_surface_from_pictures_alone(tmp_path: Path, capsys: Capsys) -> None:
     assert kept["evaluation"]["field"]["psnr"] > 8
 
 
-def test_without_being_asked_nothing_is_matched(tmp_path: Path, capsys: Capsys) -> None:
+def test_without_being_asked_pictures_are_matched_for_the_fit_alone(tmp_path: Path, capsys: Capsys) -> None:
     make_corner(tmp_path / "corner", 6)
     out = tmp_path / "out"
-    options = ["--holdout", "3", "--quiet", "--set", "init=classical", "--set", "fit.budget=1", "--set", "field.resolution=32"]
-    assert call(capsys, "run", tmp_path / "corner", "--out", out, *options, "--set", "export.formats=[]").code == 0
-    assert not (out / "stereo").exists() and read_json(out / "report.json")["evaluation"]["tsdf"] is None
+    options = ["--holdout", "3", "--quiet", "--set", "init=classical", "--set", "fit.budget=2", "--set", "field.resolution=32"]
+    options += ["--set", "export.formats=[]"]
+    assert call(capsys, "run", tmp_path / "corner", "--out", out, *options).code == 0
+    for _ in range(2):
+        data = read_json(out / "report.json")
+        assert not (out / "stereo").exists() and data["evaluation"]["tsdf"] is None
+        assert data["field"]["matched"]["views"] == 4 and 0 < data["field"]["matched"]["share"] < 1
+        assert any("matching 4 training pictures" in note for note in data["notes"])
+        assert call(capsys, "run", tmp_path / "corner", "--out", out, *options).code == 0  # what was made before is told again
+    assert call(capsys, "run", tmp_path / "corner", "--out", out, *options, "--set", "fit.depth_from=sensor").code == 0
+    data = read_json(out / "report.json")
+    assert "matched" not in data["field"] and not any("matching" in note for note in data["notes"])
+    assert not (out / "fit_matched.json").exists()

@@ -18,8 +18,8 @@ from toolkit.config import PosesSettings, TsdfSettings
 from toolkit.errors import InputError
 from toolkit.evaluate.selftest.fits import texture, views_of
 from toolkit.poses import sfm
+from toolkit.stereo.match import stereo_depths
 from toolkit.tsdf.fuse import fuse_capture
-from toolkit.tsdf.stereo import stereo_depths
 from toolkit.tsdf.volume import BYTES_PER_BLOCK, TsdfVolume
 
 

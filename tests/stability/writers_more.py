@@ -29,13 +29,13 @@ from toolkit.render.bake import bake
 from toolkit.render.bake_file import write_baked
 from toolkit.simulate.settings import scene_file
 from toolkit.simulate.simulate import simulate
+from toolkit.stereo.maps import save_stereo
+from toolkit.stereo.match import StereoDepth
 from toolkit.training.nerfusion.caution import Caution
 from toolkit.training.nerfusion.checkpoint import save_checkpoint
 from toolkit.training.nerfusion.curve import Curve
 from toolkit.training.nerfusion.shards import write_shard
 from toolkit.training.nerfusion.train import make_model
-from toolkit.tsdf.stereo import StereoDepth
-from toolkit.tsdf.stereo_frames import save_stereo
 
 Write = Callable[[Path], object]
 

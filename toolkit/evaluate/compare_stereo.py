@@ -11,7 +11,7 @@ import numpy as np
 from toolkit.camera import Array
 from toolkit.capture.types import Views
 from toolkit.evaluate.depth import has_depth
-from toolkit.tsdf.stereo import StereoDepth
+from toolkit.stereo.match import StereoDepth
 
 WINDOW = 7  # pixels a side
 TEXTURE = 4.0  # grey levels: standard deviation in a window from which on a pixel counts as textured

@@ -95,7 +95,7 @@ def few_views_rows(
         starts: what is measured, a part of `STARTS`.
         done: (views, start, budget) of rows that are there already.
     """
-    from toolkit.training.fit import fit_field
+    from toolkit.training.guided import fit_guided
     from toolkit.training.network_start import network_start
 
     views, scene, settings, count = ground.views, ground.scene, ground.settings, ground.training
@@ -116,7 +116,7 @@ def few_views_rows(
             progress.check()
             settings.fit.budget = budget
             first = network_start(made, views, scene, settings) if start == "network" and made is not None else None
-            fitted = fit_field(views, scene, settings, progress, start=first, coarse=first is not None, ticks=time.process_time)
+            fitted = fit_guided(views, scene, settings, progress, start=first, coarse=first is not None, ticks=time.process_time)
             row = {"views": count, "start": start, "budget": budget, **measured(fitted.field, ground)}
             yield {**row, "steps": fitted.steps, "resolution": fitted.field.resolution}
 

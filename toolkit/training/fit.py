@@ -56,6 +56,7 @@ class FitResult:
     rays: int = 0
     interrupted: bool = False
     notes: list[str] = default(default_factory=list)  # a sentence on each step that was not finite
+    matched: dict[str, float] | None = None  # what was matched before the fit: pictures, pixels, share with depth, seconds (`guided.py`)
 
 
 class _Clock:

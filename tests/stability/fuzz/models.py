@@ -19,13 +19,13 @@ from toolkit.render.bake import bake
 from toolkit.render.bake_file import read_baked, write_baked
 from toolkit.render.bake_image import BakedRenderer
 from toolkit.simulate.settings import read_scene_file
+from toolkit.stereo.maps import load_stereo, save_stereo
+from toolkit.stereo.match import StereoDepth
 from toolkit.training.nerfusion.caution import Caution
 from toolkit.training.nerfusion.checkpoint import checkpoint_settings, load_caution, load_checkpoint, save_checkpoint
 from toolkit.training.nerfusion.settings import load_train_settings, train_settings_dict
 from toolkit.training.nerfusion.shards import ShardScene, write_shard
 from toolkit.training.nerfusion.train import make_model
-from toolkit.tsdf.stereo import StereoDepth
-from toolkit.tsdf.stereo_frames import load_stereo, save_stereo
 
 
 def make_models(root: Path) -> None:

@@ -13,11 +13,10 @@ from toolkit.capture.types import Views
 from toolkit.errors import InputError, Interrupted
 from toolkit.poses.overlap import parallax, spread_parallax
 from toolkit.progress import Progress
-from toolkit.tsdf.stereo import StereoDepth, inverse_depths, stereo_depths, usable_neighbours
-from toolkit.tsdf.stereo_cost import OUTSIDE, Matcher, best_half, grey_view, plane_homography, sweep
-from toolkit.tsdf.stereo_polish import Polisher
-from toolkit.tsdf.stereo_refine import warped_by_depth
-from toolkit.tsdf.stereo_smooth import PATHS, SOFT_EDGE, smoothed_planes
+from toolkit.stereo.cost import NOISE, UNKNOWN, GreyView, Matcher, best_half, between, grey_view, plane_homography, sweep
+from toolkit.stereo.match import StereoDepth, inverse_depths, stereo_depths, usable_neighbours
+from toolkit.stereo.polish import Polisher
+from toolkit.stereo.smooth import PATHS, SOFT_EDGE, smoothed_planes
 
 CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
 NEAR, FAR, MEDIAN = 1.0, 9.0, 3.4
@@ -154,34 +153,66 @@ def test_a_plane_maps_pixels_as_projection_does() -> None:
     assert np.allclose(mapped[:, :2] / mapped[:, 2:] + 0.5, expected, atol=1e-8)
 
 
-def test_warping_by_an_even_depth_is_warping_by_a_plane() -> None:
-    views, _ = corner()
+def slow_cost(view: GreyView, other: GreyView, inverse_depth: Array, half: int = 3) -> Array:
+    """`Matcher.cost` by its definition: points of the depth map are projected, and windows compared one by one."""
+    height, width = view.grey.shape
+    points = unproject(view.camera, view.world_from_camera, pixel_grid(width, height), 1 / inverse_depth.reshape(-1))
+    place, depth = project(other.camera, other.world_from_camera, points)
+    x, y = (place - 0.5).T
+    rows, columns = other.grey.shape
+    inside = (depth > 0) & (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1)
+    x, y = np.clip(np.where(inside, x, 0), 0, columns - 1), np.clip(np.where(inside, y, 0), 0, rows - 1)
+    i, j = np.minimum(x.astype(int), columns - 2), np.minimum(y.astype(int), rows - 2)
+    fx, fy, grey = x - i, y - j, other.grey.astype(float)
+    upper, lower = grey[j, i] * (1 - fx) + grey[j, i + 1] * fx, grey[j + 1, i] * (1 - fx) + grey[j + 1, i + 1] * fx
+    warped = np.where(inside, upper * (1 - fy) + lower * fy, 0).reshape(height, width)
+    own, theirs = (np.pad(picture.astype(float), half, mode="edge") for picture in (view.grey, warped))
+    out = np.full((height, width), -1.0)
+    for v, u in np.ndindex(height, width):
+        if inside[v * width + u]:
+            first, second = (picture[v : v + 2 * half + 1, u : u + 2 * half + 1] for picture in (own, theirs))
+            product = np.mean((first - first.mean()) * (second - second.mean()))
+            out[v, u] = 0.5 - 0.5 * product / np.sqrt((first.var() + NOISE) * (second.var() + NOISE))
+    return out
+
+
+def test_cost_is_what_its_definition_says() -> None:
+    views, truth = corner()
     first, second = (grey_view(views.images[i], CAMERA, views.world_from_camera[i]) for i in (0, 2))
-    volume = sweep(first, [second], np.array([0.3]))
-    warped = warped_by_depth(first, second, np.full((120, 160), 0.3, np.float32))
-    cost = Matcher(first.grey).cost(warped)
-    known = (cost >= 0) & (volume[:, :, 0] != 0.5)
-    assert known.mean() > 0.5
-    assert np.abs(cost - volume[:, :, 0])[known].max() < 0.02  # the two warps round positions differently
+    small = grey_view(views.images[2], CAMERA.scaled(80, 60), views.world_from_camera[2])
+    for other, inverse_depth in ((second, 1 / truth[0]), (second, np.full((120, 160), 0.3)), (small, 1 / truth[0])):
+        cost = Matcher(first).cost(other.grey, between(first, other), inverse_depth.astype(np.float32))
+        expected = slow_cost(first, other, inverse_depth)
+        alike = (cost < 0) == (expected < 0)
+        assert alike.mean() > 0.995 and (cost >= 0).mean() > 0.4  # a point on the very border may round either way
+        assert np.abs(cost - expected)[alike].max() < 2e-3
+    volume = sweep(first, [second], np.array([0.1, 0.3]))
+    cost = Matcher(first).cost(second.grey, between(first, second), np.full((120, 160), 0.3, np.float32))
+    assert np.array_equal(volume[:, :, 1], np.where(cost < 0, np.float32(UNKNOWN), cost))
 
 
 def test_cost_is_correlation() -> None:
     rng = np.random.default_rng(0)
+    camera = Intrinsics(40, 30, 30.0, 30.0, 20.0, 15.0)
     grey = rng.normal(0, 40, (30, 40)).astype(np.float32)
-    matcher = Matcher(grey, 5)
+    here, plane = GreyView(grey, camera, np.eye(4)), np.ones((30, 40), np.float32)
+    matcher, same = Matcher(here, 5), between(here, here)
     inner = slice(3, -3), slice(3, -3)
-    assert matcher.cost(0.5 * grey + 20)[inner].max() < 0.01  # brightness and contrast do not matter
-    assert matcher.cost(-grey)[inner].min() > 0.99
+    assert matcher.cost(0.5 * grey + 20, same, plane)[inner].max() < 0.01  # brightness and contrast do not matter
+    assert matcher.cost(-grey, same, plane)[inner].min() > 0.99
     other = rng.normal(0, 40, (30, 40)).astype(np.float32)
     expected = 0.5 - 0.5 * np.corrcoef(grey[8:13, 8:13].ravel(), other[8:13, 8:13].ravel())[0, 1]
-    assert matcher.cost(other.copy())[10, 10] == pytest.approx(expected, abs=0.005)
-    other[:, 20:] = OUTSIDE
-    assert (matcher.cost(other)[:, 20:] == -1).all()
+    assert matcher.cost(other, same, plane)[10, 10] == pytest.approx(expected, abs=0.005)
+    aside = np.eye(4)
+    aside[0, 3] = 20 / 30  # 20 pixels at a depth of 1: the left half of the picture was left behind
+    cost = matcher.cost(other, between(here, GreyView(other, camera, aside)), plane)
+    assert (cost[:, :19] == -1).all() and (cost[:, 21:] >= 0).all()
 
 
-def test_the_better_half_counts() -> None:
+@pytest.mark.parametrize("count", [1, 3, 4, 5])
+def test_the_better_half_counts(count: int) -> None:
     rng = np.random.default_rng(1)
-    costs = rng.random((5, 6, 7)).astype(np.float32)
+    costs = rng.random((count, 6, 7)).astype(np.float32)
     costs[rng.random(costs.shape) < 0.4] = -1
     costs[:, 0, 0] = -1
     out = np.empty((6, 7), np.float32)

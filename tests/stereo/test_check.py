@@ -1,4 +1,4 @@
-"""Views that confirm each other's depth, the surface fused from it, and its file."""
+"""Views that confirm each other's depth, and depth maps in their file."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.tsdf.scenes import CAMERA, all_round, plane_frame, ring, sphere_frame
+from tests.tsdf.scenes import CAMERA, plane_frame, ring, sphere_frame
 from toolkit.camera import Array
-from toolkit.capture.types import Views
 from toolkit.errors import InputError
-from toolkit.tsdf.stereo import StereoDepth
-from toolkit.tsdf.stereo_check import confirmed
-from toolkit.tsdf.stereo_frames import fuse_stereo, load_stereo, save_stereo, stereo_frames
+from toolkit.stereo.check import confirmed
+from toolkit.stereo.maps import load_stereo, save_stereo
+from toolkit.stereo.match import StereoDepth
 
 CENTRE, RADIUS = np.array([0.1, -0.2, 0.3]), 0.5
 POSES = ring(CENTRE, 1.6, 12)
@@ -77,42 +76,24 @@ def test_nothing_known_is_nothing_kept() -> None:
     assert not depth.any() and not confidence.any()
 
 
-def sphere_views() -> tuple[Views, list[StereoDepth]]:
-    poses = all_round(CENTRE, 1.6, 24)
-    frames = [sphere_frame(pose, CENTRE, RADIUS) for pose in poses]
-    views = Views([f"{i}" for i in range(24)], [frame.colour for frame in frames], [CAMERA] * 24, poses, np.zeros(24, bool))
-    depths = [StereoDepth(frame.depth, np.where(frame.depth > 0, 0.8, 0).astype(np.float32), CAMERA) for frame in frames]
-    return views, depths
-
-
-def test_the_surface_of_confident_depth() -> None:
-    views, depths = sphere_views()
-    doubtful = depths[3].depth.copy()
-    doubtful[40:80, 60:100] = 0.7
-    low = np.full_like(doubtful, 0.8)
-    low[40:80, 60:100] = 0.3
-    depths[3] = StereoDepth(doubtful, low, CAMERA)
-    mesh = fuse_stereo(views, depths, 0.02).mesh()
-    radius = np.linalg.norm(mesh.vertices - CENTRE, axis=1)
-    assert len(mesh.triangles) > 3000
-    assert np.abs(radius - RADIUS).max() < 0.06 and np.quantile(np.abs(radius - RADIUS), 0.95) < 0.01
-    assert not next(iter(stereo_frames(views.subset([3]), depths[3:4]))).depth[40:80, 60:100].any()
-
-
-def test_no_depth_at_all_is_refused() -> None:
-    views, depths = sphere_views()
-    nothing = [StereoDepth(np.zeros_like(one.depth), np.zeros_like(one.depth), CAMERA) for one in depths]
-    with pytest.raises(InputError, match="--poses sfm"):
-        fuse_stereo(views, nothing)
+def test_a_plane_far_from_zero_is_confirmed_too() -> None:
+    """Speckle removal works in shares of depth, whatever the unit."""
+    pose = np.eye(4)
+    shifted = [pose.copy() for _ in range(3)]
+    for index, one in enumerate(shifted):
+        one[0, 3] = 40.0 * index
+    depths = [plane_frame(one, np.array([0.0, 0, 1]), 99.0).depth * 1.0 for one in shifted]
+    kept, _ = confirmed(0, [1, 2], depths, [CAMERA] * 3, np.array(shifted), needed=1)
+    assert (kept > 0).mean() > 0.5 and kept.max() == pytest.approx(99, rel=1e-4)
 
 
 def test_depth_maps_come_back_from_their_file(tmp_path: Path) -> None:
-    _, depths = sphere_views()
+    depths = [StereoDepth(depth, np.where(depth > 0, 0.8, 0).astype(np.float32), CAMERA) for depth in EXACT[:2]]
     path = tmp_path / "depths.safetensors"
-    save_stereo(path, ["a", "b"], depths[:2])
+    save_stereo(path, ["a", "b"], depths)
     names, back = load_stereo(path)
     assert names == ["a", "b"]
-    for one, other in zip(depths, back, strict=False):
+    for one, other in zip(depths, back, strict=True):
         assert np.array_equal(one.depth, other.depth) and np.allclose(one.confidence, other.confidence, atol=0.002)
         assert one.intrinsics == other.intrinsics
     damaged = path.read_bytes()[:-500]
@@ -124,14 +105,3 @@ def test_depth_maps_come_back_from_their_file(tmp_path: Path) -> None:
     save_stereo(path, ["a"], [other_shape])
     with pytest.raises(InputError, match="does not fit its camera"):
         load_stereo(path)
-
-
-def test_a_plane_far_from_zero_is_confirmed_too() -> None:
-    """Speckle removal works in shares of depth, whatever the unit."""
-    pose = np.eye(4)
-    shifted = [pose.copy() for _ in range(3)]
-    for index, one in enumerate(shifted):
-        one[0, 3] = 40.0 * index
-    depths = [plane_frame(one, np.array([0.0, 0, 1]), 99.0).depth * 1.0 for one in shifted]
-    kept, _ = confirmed(0, [1, 2], depths, [CAMERA] * 3, np.array(shifted), needed=1)
-    assert (kept > 0).mean() > 0.5 and kept.max() == pytest.approx(99, rel=1e-4)

@@ -19,10 +19,10 @@ from toolkit.capture.types import Views
 from toolkit.errors import InputError
 from toolkit.poses.overlap import best_neighbours, overlap, parallax, spread_parallax
 from toolkit.progress import SILENT, Progress
-from toolkit.tsdf.stereo_check import confirmed
-from toolkit.tsdf.stereo_cost import GreyView, grey_view, plane_homography, sweep
-from toolkit.tsdf.stereo_refine import refined
-from toolkit.tsdf.stereo_smooth import smoothed_planes
+from toolkit.stereo.check import confirmed
+from toolkit.stereo.cost import GreyView, grey_view, plane_homography, sweep
+from toolkit.stereo.refine import refined
+from toolkit.stereo.smooth import smoothed_planes
 
 LONG_SIDE = 400  # pixels; cost grows with the third power of it
 MATCHED = 4  # neighbours that a picture is matched with

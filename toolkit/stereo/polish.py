@@ -8,9 +8,9 @@ import numpy as np
 
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture.types import Views
-from toolkit.tsdf.stereo import inverse_depths, usable_neighbours
-from toolkit.tsdf.stereo_cost import GreyView, grey_view
-from toolkit.tsdf.stereo_refine import refined
+from toolkit.stereo.cost import GreyView, grey_view
+from toolkit.stereo.match import inverse_depths, usable_neighbours
+from toolkit.stereo.refine import refined
 
 NEIGHBOURS = 6  # pictures that a view is compared with
 RECOGNISED = 0.3  # matching cost up to which a pixel was recognised in its neighbours; others keep the depth they had

@@ -8,27 +8,10 @@ import cv2
 import numpy as np
 
 from toolkit.camera import Array
-from toolkit.tsdf.stereo_cost import OUTSIDE, WINDOW, GreyView, Matcher, best_half, plane_homography
+from toolkit.stereo.cost import WINDOW, GreyView, Matcher, best_half, between
 
 EVEN = 5  # pixels a side of the median that the depth map is evened out with before pictures are warped by it
 LEAST_BEND = 1e-4  # of the costs' parabola; flatter ones have no lowest point worth moving to
-
-
-def warped_by_depth(view: GreyView, other: GreyView, inverse_depth: Array) -> Array:
-    """(H, W) float32: the picture of `other` where it shows the points at `inverse_depth` (H, W) of `view`; `OUTSIDE` where it does not."""
-    far = plane_homography(view, other, 0.0)
-    move = plane_homography(view, other, 1.0) - far
-    height, width = inverse_depth.shape
-    u, v = np.arange(width, dtype=np.float32)[None], np.arange(height, dtype=np.float32)[:, None]
-    x, y, z = (
-        (far[r, 0] * u + far[r, 1] * v + far[r, 2] + inverse_depth * (move[r, 0] * u + move[r, 1] * v + move[r, 2])).astype(np.float32)
-        for r in range(3)
-    )
-    behind = z <= 1e-6
-    z[behind] = 1
-    x, y = x / z, y / z
-    x[behind] = -1e3
-    return np.asarray(cv2.remap(other.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=OUTSIDE))
 
 
 def refined(
@@ -40,7 +23,8 @@ def refined(
     Returns:
         (H, W) float32 inverse depth, and (H, W) float32 the lowest of the last round's costs.
     """
-    matcher = Matcher(view.grey, window)
+    matcher = Matcher(view, window)
+    ways = [between(view, other) for other in others]
     now = inverse_depth.astype(np.float32)
     costs = np.empty((len(others), *now.shape), np.float32)
     three = np.empty((3, *now.shape), np.float32)
@@ -49,7 +33,7 @@ def refined(
         even = cv2.medianBlur(now, EVEN)
         for place, side in enumerate((-1, 0, 1)):
             for k, other in enumerate(others):
-                costs[k] = matcher.cost(warped_by_depth(view, other, even + side * reach))
+                matcher.cost(other.grey, ways[k], even + side * reach, costs[k])
             best_half(costs, three[place])
         low, mid, high = three
         bend = low - 2 * mid + high

@@ -1,0 +1,86 @@
+"""Quick matching for a fit: what is chosen, that it finds depth, and that it looks at nothing that it must not see."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.stereo.test_match import FAR, MEDIAN, NEAR, corner
+from toolkit.capture.types import Views
+from toolkit.stereo import quick
+from toolkit.stereo.match import LONG_SIDE
+
+
+@given(st.integers(2, 2000), st.floats(1, 2000))
+def test_size_and_number_follow_from_counts(views: int, budget: float) -> None:
+    chosen = quick.plan(views, budget)
+    if chosen is None:
+        assert views * quick.VIEW_SECONDS > quick.MOST_SHARE * budget
+        return
+    side, every = chosen
+    matched = -(-views // every)
+    assert quick.LEAST_SIDE <= side <= LONG_SIDE and every >= 1
+    assert every == 1 or (side == quick.LEAST_SIDE and views // every >= quick.FEWEST and every <= quick.SPARSEST)
+    seconds = matched * quick.VIEW_SECONDS * (side / quick.LEAST_SIDE) ** quick.GROWTH
+    assert seconds <= quick.MOST_SHARE * budget + quick.VIEW_SECONDS
+    longer = quick.plan(views, 2 * budget)
+    assert longer is not None and longer[0] >= side and longer[1] <= every
+
+
+def test_what_is_chosen_for_usual_captures() -> None:
+    assert quick.plan(1, 60) is None
+    assert quick.plan(8, 60) == (LONG_SIDE, 1)
+    assert quick.plan(50, 30) == (200, 1)
+    assert quick.plan(300, 10) == (quick.LEAST_SIDE, 4)
+    assert quick.plan(300, 5) is None
+    assert quick.plan(300, 20) == (quick.LEAST_SIDE, 2)
+
+
+def with_held_out() -> Views:
+    views, _ = corner()
+    return replace(views, test=np.arange(len(views)) == 3)
+
+
+def test_depth_is_found_and_held_out_pictures_are_not_looked_at() -> None:
+    views, truth = with_held_out(), corner()[1]
+    known, matched = quick.guided(views, NEAR, FAR, MEDIAN, 2.0)
+    assert matched is not None and matched.views == 6 and quick.LEAST_SIDE <= matched.pixels < 160
+    assert known.depths[3] is None and 0.3 < matched.share < 1
+    errors = [
+        np.abs(depth - truth[i])[depth > 0] / truth[i][depth > 0]
+        for i, depth in enumerate(known.depths)
+        if depth is not None and depth.shape == (120, 160)
+    ]
+    assert len(errors) == 6 and np.median(np.concatenate(errors)) < 0.01
+    other = replace(views, images=[np.zeros_like(image) if i == 3 else image for i, image in enumerate(views.images)])
+    again, _ = quick.guided(other, NEAR, FAR, MEDIAN, 2.0)
+    for one, two in zip(known.depths, again.depths, strict=True):
+        assert (one is None and two is None) or np.array_equal(one, two)  # type: ignore[arg-type]
+
+
+def test_some_pictures_are_left_out_of_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(quick, "FEWEST", 3)
+    known, matched = quick.guided(with_held_out(), NEAR, FAR, MEDIAN, 0.5)
+    assert matched is not None and matched.views == 3
+    assert [depth is not None for depth in known.depths] == [True, False, True, False, False, True, False]
+    views, matched = quick.guided(with_held_out(), NEAR, FAR, MEDIAN, 0.2)
+    assert matched is None and not any(depth is not None for depth in views.depths)
+
+
+def test_a_small_picture_takes_about_what_is_reckoned_with() -> None:
+    """Within a factor of eight, on whatever machine: the share of a fit's seconds must not be off by an order."""
+    views = with_held_out()
+    quick.guided(views, NEAR, FAR, MEDIAN, 1.0)
+    start = time.process_time()
+    _, matched = quick.guided(views, NEAR, FAR, MEDIAN, 1.0)
+    each = (time.process_time() - start) / 6
+    assert matched is not None and matched.pixels == quick.LEAST_SIDE and each < 8 * quick.VIEW_SECONDS
+
+
+def test_warming_up_finds_something_to_match() -> None:
+    quick.warm_up()

@@ -1,0 +1,74 @@
+"""Depth maps by matching at the size of a picture, and as a file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from toolkit.camera import Array, Intrinsics
+from toolkit.errors import InputError, first_line
+from toolkit.files import atomic_path
+from toolkit.stereo.match import StereoDepth
+
+LEAST_CONFIDENCE = 0.5  # two other views confirm a depth for each one that sees through it
+SMOOTH = 0.05  # share by which depths side by side may differ, to be interpolated
+
+
+def depth_at(found: StereoDepth, width: int, height: int, least_confidence: float = LEAST_CONFIDENCE) -> Array:
+    """(height, width) float32 depth of a view on more or fewer pixels than it was found on, 0 where it is unknown, not confident enough,
+    or beside an edge, where it would lie between two surfaces."""
+    depth = np.where(found.confidence >= least_confidence, found.depth, np.float32(0))
+    if depth.shape == (height, width):
+        return np.ascontiguousarray(depth, dtype=np.float32)
+    inverse: Array = np.where(depth > 0, 1 / np.maximum(depth, np.float32(1e-12)), 0).astype(np.float32)
+    window = np.ones((3, 3), np.uint8)
+    nearest, farthest = cv2.dilate(inverse, window), cv2.erode(inverse, window)
+    smooth: Array = ((farthest > 0) & (nearest <= (1 + SMOOTH) * farthest)).astype(np.uint8)
+    inverse = cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
+    smooth = cv2.resize(smooth, (width, height), interpolation=cv2.INTER_NEAREST)
+    return np.where(smooth > 0, 1 / np.maximum(inverse, np.float32(1e-12)), np.float32(0)).astype(np.float32)
+
+
+def save_stereo(path: Path | str, names: Sequence[str], depths: Sequence[StereoDepth]) -> None:
+    """Write the depth maps of the views `names` in full, their confidences in 8 bits.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    tensors = {}
+    for index, found in enumerate(depths):
+        tensors[f"depth.{index}"] = np.ascontiguousarray(found.depth, dtype=np.float32)
+        tensors[f"confidence.{index}"] = np.round(found.confidence * 255).astype(np.uint8)
+    about = {"names": list(names), "cameras": [found.intrinsics.to_dict() for found in depths]}
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, metadata={"stereo": json.dumps(about)})
+
+
+def load_stereo(path: Path | str) -> tuple[list[str], list[StereoDepth]]:
+    """What `save_stereo` wrote: names and depth maps.
+
+    Raises:
+        InputError: missing or damaged.
+    """
+    try:
+        with safe_open(str(path), framework="numpy") as file:
+            about = json.loads(file.metadata()["stereo"])
+            names, cameras = [str(name) for name in about["names"]], [Intrinsics.from_dict(camera) for camera in about["cameras"]]
+            out = []
+            for index, camera in enumerate(cameras):
+                depth, confidence = file.get_tensor(f"depth.{index}"), file.get_tensor(f"confidence.{index}")
+                shape = (camera.height, camera.width)
+                if depth.shape != shape or confidence.shape != shape or depth.dtype != np.float32 or not np.isfinite(depth).all():
+                    raise ValueError(f"the depth map {index} does not fit its camera")
+                out.append(StereoDepth(depth, confidence.astype(np.float32) / 255, camera))
+            if len(names) != len(out):
+                raise ValueError("there are not as many names as depth maps")
+            return names, out
+    except (InputError, SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+        raise InputError(f"{path} cannot be read ({first_line(error)}); remove it and run the command again") from error

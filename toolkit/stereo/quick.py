@@ -1,0 +1,94 @@
+"""Small depth maps in little time: what a fit of a capture without depth is guided by.
+
+Matching in full takes 0.2 to 0.6 s a picture, and most of what it is worth to a fit is there at a third of the pixels: light that ends
+about where the surface is, from the first steps on. Size and number of the pictures follow from counts alone, so that a run is the same on
+a slow machine, or a busy one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from toolkit.camera import Array, Intrinsics
+from toolkit.capture.types import Views
+from toolkit.progress import SILENT, Progress
+from toolkit.stereo.maps import depth_at
+from toolkit.stereo.match import LONG_SIDE, StereoDepth, stereo_depths
+
+SHARE = 0.15  # of the fit's seconds that matching is meant to take …
+MOST_SHARE = 0.25  # … and may take with the smallest pictures before some of them are left out
+LEAST_SIDE = 128
+VIEW_SECONDS = 0.03  # of a picture with the smallest side, one thread
+GROWTH = 2.4  # exponent of these seconds over the side
+FEWEST, SPARSEST = 24, 4  # at least so many pictures, and every so manieth, are matched when some are left out: neighbours must stay near
+
+
+@dataclass(frozen=True)
+class Matched:
+    """What matching gave a fit."""
+
+    views: int  # pictures that were matched
+    pixels: int  # long side of their depth maps
+    share: float  # of their pixels that have depth
+
+    def to_dict(self) -> dict[str, float]:
+        return {"views": self.views, "pixels": self.pixels, "share": round(self.share, 4)}
+
+
+def plan(views: int, budget: float) -> tuple[int, int] | None:
+    """Long side of the depth maps, and every so manieth picture is matched, for a fit to `views` pictures of `budget` seconds; None: they
+    are too many for so short a fit."""
+    if views < 2:
+        return None
+    side = LEAST_SIDE * (SHARE * budget / (views * VIEW_SECONDS)) ** (1 / GROWTH)
+    if side >= LEAST_SIDE:
+        return min(LONG_SIDE, int(side) // 8 * 8), 1
+    every = int(np.ceil(views * VIEW_SECONDS / (MOST_SHARE * budget)))
+    return (LEAST_SIDE, every) if every == 1 or (every <= SPARSEST and views // every >= FEWEST) else None
+
+
+def guided(
+    views: Views, near: float, far: float, median_depth: float, budget: float, progress: Progress = SILENT
+) -> tuple[Views, Matched | None]:
+    """The views with the depth of training pictures that matching finds within a share of a fit's `budget` seconds.
+
+    Held-out pictures are not looked at.
+
+    Args:
+        near, far, median_depth: of the scene, working units.
+
+    Raises:
+        InputError: no two training pictures can be matched, or there is no memory for it.
+        Interrupted: the user asked to stop.
+    """
+    training = np.flatnonzero(~views.test)
+    chosen = plan(len(training), budget)
+    if chosen is None:
+        return views, None
+    side, every = chosen
+    matched = training[::every]
+    found = stereo_depths(views.subset(matched), near, far, median_depth, long_side=side, progress=progress)
+    out = with_depths(views, matched, found)
+    share = float(np.mean([np.mean(out.depths[index] > 0) for index in matched]))
+    return out, Matched(len(matched), max(max(one.depth.shape) for one in found), share)
+
+
+def with_depths(views: Views, indices: Array, found: list[StereoDepth]) -> Views:
+    """Views where the pictures `indices` have the depth that was `found` for them, one after the other, and the others none."""
+    depths: list[Array | None] = [None] * len(views)
+    for index, one in zip(indices, found, strict=True):
+        camera = views.intrinsics[index]
+        depths[index] = depth_at(one, camera.width, camera.height)
+    return replace(views, depths=depths)
+
+
+def warm_up() -> None:
+    """Have the kernels compiled, or loaded, by matching three small pictures."""
+    noise = np.random.default_rng(0).integers(0, 256, (24, 48, 3)).astype(np.uint8)
+    camera = Intrinsics(32, 24, 32.0, 32.0, 16.0, 12.0)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = np.arange(3) / 8  # 4 pixels at a depth of 1
+    pictures = [np.ascontiguousarray(noise[:, 4 * i : 4 * i + 32]) for i in range(3)]
+    stereo_depths(Views(["a", "b", "c"], pictures, [camera] * 3, poses, np.zeros(3, bool)), 0.5, 4.0, 1.0)
