@@ -16,29 +16,27 @@ from toolkit.stereo import quick
 from toolkit.stereo.match import LONG_SIDE
 
 
-@given(st.integers(2, 2000), st.floats(1, 2000))
-def test_size_and_number_follow_from_counts(views: int, budget: float) -> None:
-    chosen = quick.plan(views, budget)
+@given(st.integers(2, 2000), st.floats(1, 2000), st.floats(0.3, 1))
+def test_size_and_number_follow_from_counts(views: int, budget: float, aspect: float) -> None:
+    chosen, least = quick.plan(views, budget, aspect), quick.view_seconds(quick.LEAST_SIDE, aspect)
     if chosen is None:
-        assert views * quick.VIEW_SECONDS > quick.MOST_SHARE * budget
+        assert views * least > quick.MOST_SHARE * budget
         return
     side, every = chosen
     matched = -(-views // every)
     assert quick.LEAST_SIDE <= side <= LONG_SIDE and every >= 1
     assert every == 1 or (side == quick.LEAST_SIDE and views // every >= quick.FEWEST and every <= quick.SPARSEST)
-    seconds = matched * quick.VIEW_SECONDS * (side / quick.LEAST_SIDE) ** quick.GROWTH
-    assert seconds <= quick.MOST_SHARE * budget + quick.VIEW_SECONDS
-    longer = quick.plan(views, 2 * budget)
+    assert matched * quick.view_seconds(side, aspect) <= quick.MOST_SHARE * budget + least
+    longer = quick.plan(views, 2 * budget, aspect)
     assert longer is not None and longer[0] >= side and longer[1] <= every
 
 
 def test_what_is_chosen_for_usual_captures() -> None:
     assert quick.plan(1, 60) is None
     assert quick.plan(8, 60) == (LONG_SIDE, 1)
-    assert quick.plan(50, 30) == (200, 1)
-    assert quick.plan(300, 10) == (quick.LEAST_SIDE, 4)
-    assert quick.plan(300, 5) is None
-    assert quick.plan(300, 20) == (quick.LEAST_SIDE, 2)
+    assert quick.plan(50, 30) == (184, 1) and quick.plan(50, 30, 9 / 16) == (208, 1)
+    assert quick.plan(300, 20) == (quick.LEAST_SIDE, 3)
+    assert quick.plan(300, 10) is None
 
 
 def with_held_out() -> Views:
@@ -79,7 +77,7 @@ def test_a_small_picture_takes_about_what_is_reckoned_with() -> None:
     start = time.process_time()
     _, matched = quick.guided(views, NEAR, FAR, MEDIAN, 1.0)
     each = (time.process_time() - start) / 6
-    assert matched is not None and matched.pixels == quick.LEAST_SIDE and each < 8 * quick.VIEW_SECONDS
+    assert matched is not None and matched.pixels == quick.LEAST_SIDE and each < 8 * quick.view_seconds(quick.LEAST_SIDE, 0.75)
 
 
 def test_warming_up_finds_something_to_match() -> None:

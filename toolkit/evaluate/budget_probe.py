@@ -22,9 +22,11 @@ def self_test(settings: Settings) -> Speed:
     """Units of every kind in seconds: a megapixel decoded, a picture's features found and matched, a ray rendered, a ray fitted, a
     megapixel scored."""
     from toolkit.progress import SILENT
+    from toolkit.stereo import quick
     from toolkit.training.engine import warm_up
 
     warm_up(settings, SILENT)
+    quick.warm_up()
     makers: dict[str, Callable[[], tuple[Callable[[], object], float]]] = {
         "decode": _decode,
         "features": _features,

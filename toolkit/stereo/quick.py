@@ -20,8 +20,8 @@ from toolkit.stereo.match import LONG_SIDE, StereoDepth, stereo_depths
 SHARE = 0.15  # of the fit's seconds that matching is meant to take …
 MOST_SHARE = 0.25  # … and may take with the smallest pictures before some of them are left out
 LEAST_SIDE = 128
-VIEW_SECONDS = 0.03  # of a picture with the smallest side, one thread
-GROWTH = 2.4  # exponent of these seconds over the side
+PIXEL_SECONDS = 3e-6  # of a pixel of the smallest pictures, one thread …
+GROWTH = 2.4  # … and the exponent of a picture's seconds over its side: larger ones take more planes, too
 FEWEST, SPARSEST = 24, 4  # at least so many pictures, and every so manieth, are matched when some are left out: neighbours must stay near
 
 
@@ -37,15 +37,21 @@ class Matched:
         return {"views": self.views, "pixels": self.pixels, "share": round(self.share, 4)}
 
 
-def plan(views: int, budget: float) -> tuple[int, int] | None:
+def view_seconds(side: float, aspect: float) -> float:
+    """Seconds that a nominal machine takes to match a picture with this long side, whose short side is `aspect` of it."""
+    return PIXEL_SECONDS * aspect * LEAST_SIDE**2 * (side / LEAST_SIDE) ** GROWTH
+
+
+def plan(views: int, budget: float, aspect: float = 0.75) -> tuple[int, int] | None:
     """Long side of the depth maps, and every so manieth picture is matched, for a fit to `views` pictures of `budget` seconds; None: they
     are too many for so short a fit."""
     if views < 2:
         return None
-    side = LEAST_SIDE * (SHARE * budget / (views * VIEW_SECONDS)) ** (1 / GROWTH)
+    least = view_seconds(LEAST_SIDE, aspect)
+    side = LEAST_SIDE * (SHARE * budget / (views * least)) ** (1 / GROWTH)
     if side >= LEAST_SIDE:
         return min(LONG_SIDE, int(side) // 8 * 8), 1
-    every = int(np.ceil(views * VIEW_SECONDS / (MOST_SHARE * budget)))
+    every = int(np.ceil(views * least / (MOST_SHARE * budget)))
     return (LEAST_SIDE, every) if every == 1 or (every <= SPARSEST and views // every >= FEWEST) else None
 
 
@@ -64,7 +70,8 @@ def guided(
         Interrupted: the user asked to stop.
     """
     training = np.flatnonzero(~views.test)
-    chosen = plan(len(training), budget)
+    sizes = [(views.intrinsics[index].width, views.intrinsics[index].height) for index in training]
+    chosen = plan(len(training), budget, float(np.median([min(size) / max(size) for size in sizes])) if sizes else 1.0)
     if chosen is None:
         return views, None
     side, every = chosen
