@@ -55,7 +55,7 @@ class FitResult:
     steps: int = 0
     rays: int = 0
     interrupted: bool = False
-    notes: list[str] = default(default_factory=list)  # a sentence on each step that was not finite
+    notes: list[str] = default(default_factory=list)  # a sentence on each step that was not finite, and on what it had to do without
     matched: dict[str, float] | None = None  # what was matched before the fit: pictures, pixels, share with depth, seconds (`guided.py`)
 
 

@@ -52,7 +52,7 @@ def fit_guided(
 ) -> FitResult:
     """`fit_field`, with quick matching before it where that is wanted. Its seconds are a part of the budget, and of the timeline.
 
-    What cannot be matched is fitted to colours alone.
+    What cannot be matched is fitted to colours alone, and `notes` says why.
 
     Raises:
         Interrupted: the user asked to stop while pictures were matched.
@@ -63,15 +63,18 @@ def fit_guided(
     warm_up(settings, progress)
     quick.warm_up()
     budget, began = settings.fit.budget or DEFAULT_BUDGET, ticks()
+    notes: list[str] = []
     try:
         part = Part(progress, 0.0, quick.SHARE * budget, budget)
         known, matched = quick.guided(views, scene.near, scene.far, scene.median_depth, budget, part)
-    except InputError:
+    except InputError as error:
         known, matched = views, None
+        notes.append(f"the field was fitted to colours alone: {error}")
     spent = ticks() - began
     rest = replace(settings, fit=replace(settings.fit, budget=max(budget - spent, 0.5 * budget)))
     result = fit_field(known, scene, rest, Part(progress, spent, budget, budget), host, start, coarse, ticks)
     result.timeline = [{**point, "seconds": round(spent + point["seconds"], 3)} for point in result.timeline]
     result.seconds += spent
+    result.notes = notes + result.notes
     result.matched = None if matched is None else {**matched.to_dict(), "seconds": round(spent, 2)}
     return result
