@@ -209,6 +209,22 @@ def test_cost_is_correlation() -> None:
     assert (cost[:, :19] == -1).all() and (cost[:, 21:] >= 0).all()
 
 
+@pytest.mark.parametrize("far", [1e3, 1e12, 1e25, 1e38])
+def test_cameras_out_of_this_world_are_not_read_at(far: float) -> None:
+    views, _ = corner()
+    first = grey_view(views.images[0], CAMERA, views.world_from_camera[0])
+    for axis in range(3):
+        pose = views.world_from_camera[0].copy()
+        pose[axis, 3] = far
+        other = grey_view(views.images[1], CAMERA, pose)
+        for inverse_depth in (1e-30, 0.3, 1e30):
+            with np.errstate(all="ignore"):
+                cost = Matcher(first).cost(other.grey, between(first, other), np.full((120, 160), inverse_depth, np.float32))
+            assert np.all((cost == -1) | ((cost >= -1e-3) & (cost <= 1.001)))
+    thin = grey_view(views.images[1][:1], CAMERA.scaled(160, 1), views.world_from_camera[1])
+    assert (Matcher(first).cost(thin.grey, between(first, thin), np.full((120, 160), 0.3, np.float32)) == -1).all()
+
+
 @pytest.mark.parametrize("count", [1, 3, 4, 5])
 def test_the_better_half_counts(count: int) -> None:
     rng = np.random.default_rng(1)

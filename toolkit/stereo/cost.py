@@ -58,7 +58,7 @@ def _places(other: Array, far: Array, move: Array, inverse: Array, v: int, place
     bottom, right = F(other.shape[0] - 1), F(other.shape[1] - 1)
     bx, by, bz = far[0, 1] * F(v) + far[0, 2], far[1, 1] * F(v) + far[1, 2], far[2, 1] * F(v) + far[2, 2]
     ax, ay, az, mx, my, mz = far[0, 0], far[1, 0], far[2, 0], move[0], move[1], move[2]
-    width = np.int32(other.shape[1])
+    height, width = np.int32(other.shape[0]), np.int32(other.shape[1])
     for u in range(len(place)):
         depth = inverse[v, u]
         z = az * F(u) + bz + depth * mz
@@ -66,7 +66,9 @@ def _places(other: Array, far: Array, move: Array, inverse: Array, v: int, place
         x, y = (ax * F(u) + bx + depth * mx) * scale, (ay * F(u) + by + depth * my) * scale
         x_in, y_in = min(max(x, zero), right), min(max(y, zero), bottom)
         inside[u] = one if (z > least) & (x == x_in) & (y == y_in) else zero
-        column, row = np.int32(min(x_in, right - one)), np.int32(min(y_in, bottom - one))
+        # Whole numbers are bounded once more: what is no number (a camera out of this world) must not be read at.
+        column = min(max(np.int32(min(x_in, right - one)), np.int32(0)), width - np.int32(2))
+        row = min(max(np.int32(min(y_in, bottom - one)), np.int32(0)), height - np.int32(2))
         share[0, u], share[1, u] = x_in - F(column), y_in - F(row)
         place[u] = row * width + column
 
@@ -80,7 +82,7 @@ def _take(pixels: Array, width: int, place: Array, share: Array, inside: Array, 
         left, right, lower_left, lower_right = pixels[at], pixels[at + one], pixels[at + below], pixels[at + below + one]
         upper = left + share[0, u] * (right - left)
         lower = lower_left + share[0, u] * (lower_right - lower_left)
-        out[u] = (upper + share[1, u] * (lower - upper)) * inside[u]
+        out[u] = upper + share[1, u] * (lower - upper) if inside[u] > F(0) else F(0)
 
 
 @numba.njit(**OPTIONS)
@@ -162,6 +164,9 @@ class Matcher:
             out: (H, W) float32 to be filled.
         """
         out = np.empty(self.view.grey.shape, np.float32) if out is None else out
+        if min(other.shape) < 2:  # nothing lies between its pixels
+            out[:] = -1
+            return out
         _compare(self.view.grey, self.mean, self.variance, self.half, other, *way, inverse_depth, out)
         return out
 
