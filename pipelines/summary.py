@@ -29,8 +29,8 @@ SEEN_BY_SFM = (
     "poses were computed from all pictures, the held-out ones included, so scores are a little kinder than with poses known beforehand"
 )
 MATCHED = (
-    "The fit began by matching {views} training pictures of {pixels} pixels with each other ({seconds:.1f} s of its budget), so that it knew"
-    " a depth for {percent:.0f}% of their pixels."
+    "The fit began by matching {views} training pictures of {pixels} pixels with each other ({seconds:.1f} s of its budget), so that it"
+    " knew a depth for {percent:.0f}% of their pixels."
 )
 OPENED = {".ply", ".obj", ".glb", ".mp4", ".txt", ".json"}
 NO_TEST_VIEWS = "no picture was held out, so there are no scores; give --holdout 8 to keep every 8th picture for testing"
