@@ -107,14 +107,15 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
             return made.field, []
         if start is None:
             first = None if made is None else network_start(made.field, views, scene, settings)
-            result = fit_guided(views, scene, settings, job.progress, GridHost(settings.device), start=first, coarse=first is not None)
+            coarse = first is not None
+            result = fit_guided(views, scene, settings, job.progress, host=GridHost(settings.device), start=first, coarse=coarse)
             tell(result)
             return result.field, result.timeline
         field, timeline = load()
-        result = fit_guided(views, scene, settings, job.progress, GridHost(settings.device), start=field)
+        result = fit_guided(views, scene, settings, job.progress, host=GridHost(settings.device), start=field)
         tell(result)
         spent = timeline[-1]["seconds"] if timeline else 0.0
-        return result.field, timeline + [{**point, "seconds": round(spent + point["seconds"], 3)} for point in result.timeline]
+        return result.field, timeline + result.after(spent)
 
     def save(value: Fitted) -> list[Path]:
         field, timeline = value

@@ -16,6 +16,7 @@ from toolkit.config import Settings, load_settings
 from toolkit.errors import Interrupted
 from toolkit.poses.scene import Scene
 from toolkit.progress import Progress
+from toolkit.render.field import Field
 from toolkit.render.image import make_renderer, render_view
 from toolkit.stereo import quick
 from toolkit.training.guided import fit_guided, wants_matching
@@ -38,10 +39,10 @@ def views() -> Views:
     return replace(made, test=np.arange(len(made)) == 3)
 
 
-def depth_error(field: object) -> float:
+def depth_error(field: Field) -> float:
     """Median relative depth error at the held-out view, where light is stopped."""
     made, truth = corner()
-    shown = render_view(field, made.intrinsics[3], made.world_from_camera[3], make_renderer(field))  # type: ignore[arg-type]
+    shown = render_view(field, made.intrinsics[3], made.world_from_camera[3], make_renderer(field))
     known = (truth[3] > 0) & (np.asarray(shown.depth) > 0)
     assert known.mean() > 0.5
     return float(np.median(np.abs(np.asarray(shown.depth) - truth[3])[known] / truth[3][known]))

@@ -83,7 +83,7 @@ def field_volume(
         voxel_size, depth_max: working units; None: from the rendered depth, the voxel size made coarser until it fits into memory.
         region: lowest and highest corner (3,) of the box that is kept, working frame.
         carve: views also empty what others put in front of their surface, which removes most floaters.
-        polish: for each pose what its rendered depth is made better by; see `stereo_polish`.
+        polish: for each pose what its rendered depth is made better by; see `stereo/polish.py`.
 
     Raises:
         InputError: no view shows a surface, or the voxel size that was asked for is too fine for the memory.

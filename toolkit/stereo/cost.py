@@ -14,9 +14,9 @@ from toolkit.camera import Array, Intrinsics, invert
 
 WINDOW = 7  # pixels a side that are compared
 NOISE = 4.0  # variance (grey levels²) below which a window holds nothing to compare: correlation is drawn to 0 there
+UNKNOWN = 0.5  # cost where no neighbour shows anything, which is that of no correlation
 F = np.float32
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}  # exact: the same whichever way a loop becomes vectors
-UNKNOWN = 0.5  # cost where no neighbour shows anything, which is that of no correlation
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Depth for captures that have none: each picture is matched with posed neighbours by a plane sweep, and views confirm each other.
 
-Steps: fronto-parallel planes at even steps of inverse depth (stereo_cost), semi-global matching over them (stereo_smooth), refinement
-between the planes (stereo_refine), agreement between views (stereo_check). Nothing is learned; what has no texture stays empty.
+Steps: fronto-parallel planes at even steps of inverse depth (`cost.py`), semi-global matching over them (`smooth.py`), refinement
+between the planes (`refine.py`), agreement between views (`check.py`). Nothing is learned; what has no texture stays empty.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class StereoDepth:
     """Depth of one view by matching."""
 
     depth: Array  # (H, W) float32 along z, working units, 0 = unknown
-    confidence: Array  # (H, W) float32 in [0, 1), 0 where depth is unknown; see `stereo_check.confirmed`
+    confidence: Array  # (H, W) float32 in [0, 1), 0 where depth is unknown; see `check.confirmed`
     intrinsics: Intrinsics  # pinhole, of the depth map's size
 
 

@@ -1,6 +1,6 @@
 """Small depth maps in little time: what a fit of a capture without depth is guided by.
 
-Matching in full takes 0.2 to 0.6 s a picture, and most of what it is worth to a fit is there at a third of the pixels: light that ends
+Matching in full takes 0.2 to 0.8 s a picture, and most of what it is worth to a fit is there at a third of the pixels: light that ends
 about where the surface is, from the first steps on. Size and number of the pictures follow from counts alone, so that a run is the same on
 a slow machine, or a busy one.
 """

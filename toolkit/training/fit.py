@@ -58,6 +58,10 @@ class FitResult:
     notes: list[str] = default(default_factory=list)  # a sentence on each step that was not finite, and on what it had to do without
     matched: dict[str, float] | None = None  # what was matched before the fit: pictures, pixels, share with depth, seconds (`guided.py`)
 
+    def after(self, seconds: float) -> list[dict[str, float]]:
+        """The timeline, with so many seconds before it."""
+        return [{**point, "seconds": round(seconds + point["seconds"], 3)} for point in self.timeline]
+
 
 class _Clock:
     """Fitting seconds; stands still while something else is measured."""

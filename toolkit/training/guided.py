@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TypedDict, Unpack
 
 from toolkit.capture.types import Views
 from toolkit.config import Settings
@@ -16,6 +17,14 @@ from toolkit.stereo import quick
 from toolkit.training.engine import warm_up
 from toolkit.training.fit import DEFAULT_BUDGET, FitResult, fit_field
 from toolkit.volume.host import Host
+
+
+class Begin(TypedDict, total=False):
+    """What a fit begins with besides its views; see `fit_field`."""
+
+    host: Host | None
+    start: Field | None
+    coarse: bool
 
 
 class Part(Progress):
@@ -45,10 +54,8 @@ def fit_guided(
     scene: Scene,
     settings: Settings,
     progress: Progress = SILENT,
-    host: Host | None = None,
-    start: Field | None = None,
-    coarse: bool = False,
     ticks: Callable[[], float] = time.perf_counter,
+    **begin: Unpack[Begin],
 ) -> FitResult:
     """`fit_field`, with quick matching before it where that is wanted. Its seconds are a part of the budget, and of the timeline.
 
@@ -59,7 +66,7 @@ def fit_guided(
         InputError: as `fit_field`.
     """
     if not wants_matching(views, settings):
-        return fit_field(views, scene, settings, progress, host, start, coarse, ticks)
+        return fit_field(views, scene, settings, progress, ticks=ticks, **begin)
     warm_up(settings, progress)
     quick.warm_up()
     budget, began = settings.fit.budget or DEFAULT_BUDGET, ticks()
@@ -72,8 +79,8 @@ def fit_guided(
         notes.append(f"the field was fitted to colours alone: {error}")
     spent = ticks() - began
     rest = replace(settings, fit=replace(settings.fit, budget=max(budget - spent, 0.5 * budget)))
-    result = fit_field(known, scene, rest, Part(progress, spent, budget, budget), host, start, coarse, ticks)
-    result.timeline = [{**point, "seconds": round(spent + point["seconds"], 3)} for point in result.timeline]
+    result = fit_field(known, scene, rest, Part(progress, spent, budget, budget), ticks=ticks, **begin)
+    result.timeline = result.after(spent)
     result.seconds += spent
     result.notes = notes + result.notes
     result.matched = None if matched is None else {**matched.to_dict(), "seconds": round(spent, 2)}
