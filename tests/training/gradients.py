@@ -13,9 +13,19 @@ from toolkit.networks.decoder import PerSample
 from toolkit.render.field import Field
 from toolkit.render.march import march
 from toolkit.training import step as step_module
-from toolkit.training.rays import Batch
+from toolkit.training.rays import Batch, PixelPool
 from toolkit.training.step import Optimiser, Rates
 from toolkit.volume.lookup import corners, gather
+
+
+def some_weights(count: int) -> torch.Tensor:
+    """(count,) what rays count, some of them twice as much as others."""
+    return 0.7 + 0.7 * torch.rand(count, generator=torch.Generator().manual_seed(5))
+
+
+def weighed(pool: PixelPool, picks: torch.Tensor) -> Batch:
+    """The rays of `picks` with `some_weights`."""
+    return replace(pool.take(picks), weight=some_weights(len(picks)))
 
 
 def torch_gradients(field: Field, batch: Batch, rates: Rates) -> tuple[torch.Tensor, ...]:
@@ -45,7 +55,8 @@ def doubled(field: Field) -> Field:
 
 def doubled_rays(batch: Batch) -> Batch:
     distance = None if batch.distance is None else batch.distance.double()
-    return Batch(batch.origins.double(), batch.directions.double(), batch.colour.double(), batch.view, distance)
+    weight = None if batch.weight is None else batch.weight.double()
+    return Batch(batch.origins.double(), batch.directions.double(), batch.colour.double(), batch.view, distance, weight)
 
 
 def clear_of_zero(field: Field, batch: Batch, margin: float) -> torch.Tensor:

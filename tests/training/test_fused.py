@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.render.made import random_field, random_rays
-from tests.training.gradients import exact_gradients, torch_gradients
+from tests.training.gradients import exact_gradients, some_weights, torch_gradients, weighed
 from toolkit.camera import Intrinsics
 from toolkit.capture.types import Views
 from toolkit.render.compiled import CompiledRenderer
@@ -73,7 +73,7 @@ def gradients(engine: FusedOptimiser, picks: torch.Tensor) -> list[torch.Tensor]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("toolkit.training.fused.moves.adam_pass", keep_sums)
-        engine.step_on(picks.numpy(), np.zeros(len(picks), np.float32), RATES)
+        engine.step_on(picks.numpy(), np.zeros(len(picks), np.float32), RATES, some_weights(len(picks)).numpy())
     assert len(counts) == engine.threads
     dense = [torch.zeros_like(field.density_rows), torch.zeros_like(field.feature_rows)]
     for thread, used in counts.items():
@@ -92,8 +92,8 @@ def test_gradients_agree(shell: float, seed: int, threads: int) -> None:
     field = random_field(shell, 32, keep=0.5, raw=-2.5, seed=seed)
     pool = PixelPool(made_views(), depth=True)
     picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(seed))[:300]
-    exact = exact_gradients(field, pool.take(picks), RATES)
-    reference = torch_gradients(field, pool.take(picks), RATES)
+    exact = exact_gradients(field, weighed(pool, picks), RATES)
+    reference = torch_gradients(field, weighed(pool, picks), RATES)
     compiled = gradients(FusedOptimiser(field, pool, threads=threads), picks)
     for wanted, of_torch, of_ours in zip(exact, reference, compiled, strict=True):
         scale = float(wanted.abs().max())

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.render.made import random_field, random_rays
-from tests.training.gradients import clear_of_zero, exact_gradients, torch_gradients
+from tests.training.gradients import clear_of_zero, exact_gradients, some_weights, torch_gradients, weighed
 from tests.training.test_fused import made_views
 from toolkit.networks.decoder import PerSample
 from toolkit.networks.encoding import positional
@@ -102,7 +102,7 @@ def gradients(engine: FusedPerSampleOptimiser, picks: torch.Tensor, monkeypatch:
 
     with monkeypatch.context() as patch:
         patch.setattr("toolkit.training.fused.moves.adam_pass", keep_sums)
-        engine.step_on(picks.numpy(), np.zeros(len(picks), np.float32), RATES)
+        engine.step_on(picks.numpy(), np.zeros(len(picks), np.float32), RATES, some_weights(len(picks)).numpy())
     assert len(counts) == engine.threads
     dense = [torch.zeros_like(field.density_rows), torch.zeros_like(field.feature_rows)]
     for thread, used in counts.items():
@@ -134,11 +134,11 @@ def test_gradients_agree(shell: float, seed: int, threads: int, every_sample: No
     picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(seed))[:600]
     picks = picks[clear_of_zero(field, pool.take(picks), CLEAR)]
     assert len(picks) > 60
-    exact = exact_gradients(field, pool.take(picks), RATES)
+    exact = exact_gradients(field, weighed(pool, picks), RATES)
     with monkeypatch.context() as patch:
         # In float32 the reference's own angles are off by 1e-5.
         patch.setattr("toolkit.networks.decoder.positional", lambda values, count: positional(values.double(), count).float())
-        reference = torch_gradients(field, pool.take(picks), RATES)
+        reference = torch_gradients(field, weighed(pool, picks), RATES)
     compiled = gradients(FusedPerSampleOptimiser(field, pool, threads=threads), picks, monkeypatch)
     names = ["density_rows", "feature_rows", *(name for name, _ in field.decoder.named_parameters())]
     for name, wanted, of_torch, of_ours in zip(names, exact, reference, compiled, strict=True):

@@ -49,11 +49,11 @@ def reference_loss(field: Field, samples: Samples, batch: Batch, rates: Rates, r
         spread = (w[:, None] * w[None] * (place[:, None] - place[None]).abs()).sum() + (w**2).sum() * field.grid.voxel * 4 / field.fine / (
             2 * field.space.extent
         ) / 3
-        total = total + ((mixed - batch.colour[ray]) ** 2).sum() / (3 * count)
-        total = total + (rates.distortion * spread + rates.opacity * (1 - opacity) ** 2) / count
+        own = ((mixed - batch.colour[ray]) ** 2).sum() / 3 + rates.distortion * spread + rates.opacity * (1 - opacity) ** 2
         if batch.distance is not None and batch.distance[ray] > 0:
             away = (samples.distance[mine] - batch.distance[ray]).abs() / (REACH * batch.distance[ray])
-            total = total + rates.depth * (w * (away.clamp_max(1) - 1)).sum() / count
+            own = own + rates.depth * (w * (away.clamp_max(1) - 1)).sum()
+        total = total + own * (1.0 if batch.weight is None else batch.weight[ray]) / count
     return total
 
 
@@ -69,7 +69,8 @@ def test_gradients_match_autograd(decoder: str, shell: float, monkeypatch: pytes
     distance[samples.ray] = samples.distance  # the last one of each ray …
     distance *= torch.rand(24, generator=generator) > 0.4  # … and of some nothing is known
     assert bool((distance > 0).any()) and bool((distance == 0).any())
-    batch = Batch(origins, directions, torch.rand(24, 3, generator=generator), torch.zeros(24, dtype=torch.int64), distance)
+    weight = torch.rand(24, generator=generator) + 0.5
+    batch = Batch(origins, directions, torch.rand(24, 3, generator=generator), torch.zeros(24, dtype=torch.int64), distance, weight)
     rates = Rates(0.0, 0.0, 0.0, 0.01, 0.03, colour_threshold=-1.0, depth=0.05)
     monkeypatch.setattr(step_module, "march", lambda *arguments: samples)  # the same samples for both, without jitter
     raw_rows = field.density_rows.clone().requires_grad_(True)

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol
 
 import torch
@@ -16,6 +17,7 @@ from toolkit.progress import Progress
 from toolkit.render.field import Field
 from toolkit.render.rays import render_rays
 from toolkit.training.adam import LazyAdam
+from toolkit.training.importance import Errors
 from toolkit.training.rays import PixelPool
 from toolkit.training.step import Optimiser, Rates
 
@@ -69,11 +71,14 @@ class TorchEngine(Optimiser):
     """The reference, on any device."""
 
     def __init__(self, field: Field, pool: PixelPool, seed: int) -> None:
-        self.pool, self.generator = pool, torch.Generator().manual_seed(seed)
+        self.pool, self.generator, self.drawn_by = pool, torch.Generator().manual_seed(seed), Errors(pool)
         super().__init__(field)
 
     def step(self, rays: int, rates: Rates) -> tuple[float, int]:  # type: ignore[override]
-        return super().step(self.pool.batch(rays, self.generator), rates, self.generator)
+        picks, weight = self.drawn_by.draw(rays, self.generator)
+        out = super().step(replace(self.pool.take(picks), weight=weight), rates, self.generator)
+        self.drawn_by.remember(picks, self.errors)
+        return out
 
     def colours(self, origins: Tensor, directions: Tensor) -> Tensor:
         return render_rays(self.field, origins, directions).colour

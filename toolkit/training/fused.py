@@ -115,14 +115,15 @@ class FusedOptimiser:
         self.next = self._draw(rays)
         return self._step(batch, self.next, rates)
 
-    def step_on(self, picks: Array, jitter: Array, rates: Rates) -> tuple[float, int]:
-        """One step on the pixels `picks` (B,) with the rays' lattices moved by `jitter` (B,)."""
-        return self._step(Batch(picks, jitter, self.threads), None, rates)
+    def step_on(self, picks: Array, jitter: Array, rates: Rates, weights: Array | None = None) -> tuple[float, int]:
+        """One step on the pixels `picks` (B,), each counted `weights` (B,) times, with the rays' lattices moved by `jitter` (B,)."""
+        weights = np.ones(len(picks), np.float32) if weights is None else weights
+        return self._step(Batch(picks, jitter, weights, self.threads), None, rates)
 
     def _draw(self, rays: int) -> Batch:
-        """Random pixels."""
-        picks = self.generator.integers(0, self.pool.limit, rays)
-        return Batch(picks, self.generator.random(rays, np.float32), self.threads, self.pool.limit)
+        """Random pixels, more of those where the field was wrong lately (`importance`)."""
+        picks, weights = self.met.draw(self.pixels, self.pool.limit, rays, int(self.generator.integers(2**63)))
+        return Batch(picks, self.generator.random(rays, np.float32), weights, self.threads, self.pool.limit)
 
     def _step(self, batch: Batch, following: Batch | None, rates: Rates) -> tuple[float, int]:
         """One step on `batch`; the order of the `following` one is found beside it."""
@@ -134,13 +135,13 @@ class FusedOptimiser:
         picks, jitter = batch.picks, batch.jitter
         weights = (rates.distortion, rates.opacity, rates.depth, rates.colour_threshold, STOP)
         losses = kernels.Losses(*(np.float32(weight) for weight in weights))
-        met = np.empty((rays, 2), np.float32)
+        shares, met = batch.weights / np.float32(rays), np.empty((rays, 3), np.float32)
         self._make_room(rays)
 
         def gradients(thread: int) -> tuple[int, float, int, tuple[Array, ...], str | None]:
             part = batch.part(thread)
             moves.forget(self.index, thread, self.touched[thread, : self.used[thread]])
-            self.used[thread], error, looked = self._gradients(thread, part, picks, jitter, losses, met)
+            self.used[thread], error, looked = self._gradients(thread, part, picks, jitter, shares, losses, met)
             weights = self._weight_gradients(thread, part)
             if following is not None:
                 following.look(thread, self.space, self.pixels, self.met)
@@ -163,7 +164,7 @@ class FusedOptimiser:
                     following.sort(self.met)
 
         self._each(move)
-        return sum(result[1] for result in results) / (3 * rays), sum(result[2] for result in results)
+        return sum(result[1] for result in results), sum(result[2] for result in results)
 
     def colours(self, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
         """(B, 3) colours that the field has now."""
@@ -212,12 +213,12 @@ class FusedOptimiser:
             self.tape = tuple(np.zeros((rays, width), np.float32) for width in widths)
 
     def _gradients(
-        self, thread: int, part: slice, picks: Array, jitter: Array, losses: kernels.Losses, met: Array
+        self, thread: int, part: slice, picks: Array, jitter: Array, shares: Array, losses: kernels.Losses, met: Array
     ) -> tuple[int, float, int]:
-        """The part of a batch that is `thread`'s → rows touched, sum of squared errors, samples looked up."""
+        """The part of a batch that is `thread`'s → rows touched, its part of the mean squared error, samples looked up."""
         rows = (self.touched[thread], self.density_sums[thread], self.feature_sums[thread])
         own = kernels.Gradients(*rows, *(array[part] for array in self.tape))
-        arguments = (self.pixels, picks[part], jitter[part], len(picks), losses, self.marks[thread], self.index, thread, own, met[part])
+        arguments = (self.pixels, picks[part], jitter[part], shares[part], losses, self.marks[thread], self.index, thread, own, met[part])
         out: tuple[int, float, int] = kernels.gradient_pass(self.space, self.volume, self.decoder, self.background, *arguments)
         return out
 

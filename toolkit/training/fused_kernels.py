@@ -111,7 +111,7 @@ def gradient_pass(
     pixels: Any,
     picks: Any,
     jitter: Any,
-    count: Any,
+    shares: Any,
     losses: Any,
     marks: Any,
     index: Any,
@@ -122,14 +122,15 @@ def gradient_pass(
     """Forward and backward over the rays of pixels `picks`.
 
     Args:
-        count: rays of the whole batch, of which these may be a part.
+        shares: (len(picks),) float32 what each ray counts in the means over the whole batch, of which these may be a part.
         marks: (M · 512,) uint16, this thread's own, or of length 0.
         index: (M · 512 + 1, threads + 1) int32; column 1 + `thread` is where a row's sums are in `gradients`, −1: not touched, as all are
             on entry.
-        met: (len(picks), 2) distance where half of the light was stopped, and work in samples, for those that ask; or of length 0.
+        met: (len(picks), 3) distance where half of the light was stopped, work in samples, and squared colour error, for those that ask;
+            or of length 0.
 
     Returns:
-        rows touched, sum of squared colour errors, samples looked up.
+        rows touched, part of the mean over the batch of squared colour errors, samples looked up.
     """
     channels = len(space.width)
     most = 1024
@@ -142,10 +143,7 @@ def gradient_pass(
     touched, density_sums, feature_sums = gradients.touched, gradients.density, gradients.feature
     column = thread + 1
     zero_row = volume.density.shape[0] - 1
-    per_value = TWO / (F(3) * F(count))
     spread = F(4) / (F(space.fine) * F(space.resolution))
-    distortion, opacity_loss = losses.distortion / F(count), TWO * losses.opacity / F(count)
-    depth_loss = losses.depth / F(count)
     used, looked = 0, 0
     error = 0.0
     for number in range(len(picks)):
@@ -192,13 +190,18 @@ def gradient_pass(
         encode_direction(ray[3], ray[4], ray[5], given[channels:])
         decode(space, decoder, given, h1, h2, colour)
         # loss: mean over rays and channels of the squared error
-        g_opacity = -(ONE - opacity) * opacity_loss
+        share = shares[number]
+        g_opacity = -(ONE - opacity) * (TWO * losses.opacity * share)
+        own_error = ZERO
         for k in range(3):
             residual = opacity * colour[k] + (ONE - opacity) * background[k] - F(pixels.colour[pick, k]) * F(1 / 255)
-            error += residual * residual
-            g_mixed = residual * per_value
+            own_error += residual * residual * K.THIRD
+            g_mixed = residual * (TWO * K.THIRD * share)
             g_opacity += g_mixed * (colour[k] - background[k])
             g_logit[k] = g_mixed * opacity * colour[k] * (ONE - colour[k])
+        error += own_error * share
+        if met.shape[0] > 0:
+            met[number, 2] = own_error
         _decoder_backward(space, decoder, h1, h2, g_logit, g1, g2, g_given)
         if kept == 0:
             continue
@@ -212,6 +215,7 @@ def gradient_pass(
         for i in range(kept):
             total += values[i, K.WEIGHT]
             total_place += values[i, K.WEIGHT] * values[i, K.PLACE]
+        distortion, depth_loss = losses.distortion * share, losses.depth * share
         distance = pixels.distance[pick] if pixels.distance.shape[0] > 0 else ZERO
         before, before_place = ZERO, ZERO
         for i in range(kept):
@@ -246,11 +250,11 @@ def gradient_pass(
                     for c in range(channels):
                         feature_sums[at, c] = ZERO
                     used += 1
-                share = weights[i, corner]
-                density_sums[at] += share * g_raw
-                share *= weight
+                part = weights[i, corner]
+                density_sums[at] += part * g_raw
+                part *= weight
                 for c in range(channels):
-                    feature_sums[at, c] += share * g_given[c]
+                    feature_sums[at, c] += part * g_given[c]
     return used, error, looked
 
 

@@ -8,13 +8,16 @@ import numpy as np
 from numba import njit
 
 from toolkit.render import kernels as K
+from toolkit.training import fused_draw
 from toolkit.training.fused_kernels import pixel_ray
+from toolkit.training.importance import KEEP as KEEP_
+from toolkit.training.importance import RENEW, tile_grid
 from toolkit.training.rays import PixelPool
 
 Array = np.ndarray[Any, Any]
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
 RAY_WORK = F(7)  # what a ray costs beside its samples and coarse steps, in samples
-CELL = 8  # pixels a side of the tiles that remember what rays met
+KEEP = F(KEEP_)
 AHEAD = 8  # pixels for which memory is asked before they are needed
 
 
@@ -39,7 +42,7 @@ def hit_codes(space: Any, pixels: Any, picks: Any, memory: Any, grid: Any, codes
     """
     ray = np.empty(6, np.float32)
     top = F(1023)
-    high, wide, cell = np.int32(grid[0]), np.int32(grid[1]), np.int32(grid[2])
+    high, wide = np.int32(grid[0]), np.int32(grid[1])
     for index in range(len(picks)):
         if index + AHEAD < len(picks):
             later = picks[index + AHEAD]
@@ -48,11 +51,7 @@ def hit_codes(space: Any, pixels: Any, picks: Any, memory: Any, grid: Any, codes
             K.prefetch(pixels.colour, later)
         pick = picks[index]
         pixel_ray(pixels, pick, ray)
-        view, place = pixels.source[pick], pixels.place[pick]
-        width = np.int32(pixels.camera[view, 4])
-        row = place // width
-        column = place - row * width
-        tile = (view * high + row // cell) * wide + column // cell
+        tile = fused_draw.tile_of(pixels, pick, high, wide)
         tiles[index] = tile
         t = memory[tile, 0] / space.half
         x = (ray[0] - space.cx) / space.half + t * ray[3]
@@ -68,12 +67,14 @@ def hit_codes(space: Any, pixels: Any, picks: Any, memory: Any, grid: Any, codes
 
 
 @njit(**K.OPTIONS)
-def _remember(tiles: Any, met: Any, memory: Any) -> None:
-    """Write what a batch met (B, 2) into `memory`, at its tiles (B,)."""
+def _remember(tiles: Any, met: Any, memory: Any, error: Any) -> None:
+    """Write what a batch met (B, 3) into `memory` and `error`, at its tiles (B,)."""
     for index in range(len(tiles)):
         if met[index, 0] > ZERO:
             memory[tiles[index], 0] = met[index, 0]
         memory[tiles[index], 1] = met[index, 1]
+        old = error[tiles[index]]
+        error[tiles[index]] = KEEP * old + (ONE - KEEP) * met[index, 2] if old > ZERO else met[index, 2]
 
 
 @njit(**K.OPTIONS)
@@ -95,20 +96,33 @@ def share(tiles: Any, memory: Any, cuts: Any) -> None:
 
 
 class Tiles:
-    """What rays from each tile of CELL by CELL pixels of a training picture met last.
+    """What rays from each tile of a training picture met last, and pixels drawn by it.
 
     Attributes:
-        grid: rows and columns of tiles of the largest picture, and CELL.
+        grid: rows and columns of tiles of the largest picture.
         met: (V · rows · columns, 2) float32 distance where half of the light was stopped (0: unknown), and work.
+        error: (V · rows · columns,) float32 squared error of late (0: no ray yet); density: how often pixels are drawn, see `importance`.
     """
 
     def __init__(self, pool: PixelPool) -> None:
-        self.grid = (int(pool.height) // CELL + 1, int(pool.camera[:, 4].max()) // CELL + 1, CELL)
-        self.met = np.zeros((len(pool.pose) * self.grid[0] * self.grid[1], 2), np.float32)
+        self.grid = tile_grid(pool)
+        count = len(pool.pose) * self.grid[0] * self.grid[1]
+        self.met = np.zeros((count, 2), np.float32)
+        self.error, self.density = np.zeros(count, np.float32), np.ones(count, np.float32)
+        self.drawn = 0
+
+    def draw(self, pixels: Any, limit: int, count: int, seed: int) -> tuple[Array, Array]:
+        """(count,) int64 pixels before `limit`, and (count,) float32 what each of them counts."""
+        if self.drawn % RENEW == 0:
+            fused_draw.densities(self.error, self.density)
+        self.drawn += 1
+        picks, weights = np.empty(count, np.int64), np.empty(count, np.float32)
+        fused_draw.draw(pixels, limit, seed, self.density, *self.grid, picks, weights)
+        return picks, weights
 
     def remember(self, tiles: Array, met: Array) -> None:
-        """What a batch met (B, 2) at its tiles (B,)."""
-        _remember(tiles, met, self.met)
+        """What a batch met (B, 3) at its tiles (B,)."""
+        _remember(tiles, met, self.met, self.error)
 
 
 class Batch:
@@ -118,15 +132,15 @@ class Batch:
     by every thread for its part, `sort` by one of them.
 
     Attributes:
-        picks: (B,) int64 pixels; jitter: (B,) float32 by which the rays' lattices are moved.
+        picks: (B,) int64 pixels; jitter: (B,) float32 by which the rays' lattices are moved; weights: (B,) float32 what they count.
         limit: pixels that `picks` were drawn from.
         tiles: (B,) int32 places in `Tiles.met`.
         cuts: (threads + 1,) int64 where each thread's part begins and ends: equal numbers as drawn, equal expected work once sorted.
     """
 
-    def __init__(self, picks: Array, jitter: Array, threads: int, limit: int = 0) -> None:
+    def __init__(self, picks: Array, jitter: Array, weights: Array, threads: int, limit: int = 0) -> None:
         count = len(picks)
-        self.picks, self.jitter, self.limit = picks, jitter, limit
+        self.picks, self.jitter, self.weights, self.limit = picks, jitter, weights, limit
         self.codes, self.tiles = np.empty(count, np.uint32), np.empty(count, np.int32)
         self.cuts = np.array([count * t // threads for t in range(threads + 1)], np.int64)
         self.sorted = False
@@ -143,6 +157,6 @@ class Batch:
     def sort(self, tiles: Tiles) -> None:
         """Once all threads have looked."""
         order = np.argsort(self.codes)
-        self.picks, self.jitter, self.tiles = self.picks[order], self.jitter[order], self.tiles[order]
+        self.picks, self.jitter, self.weights, self.tiles = (of[order] for of in (self.picks, self.jitter, self.weights, self.tiles))
         share(self.tiles, tiles.met, self.cuts)
         self.sorted = True

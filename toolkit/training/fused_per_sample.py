@@ -47,10 +47,12 @@ class FusedPerSampleOptimiser(FusedOptimiser):
     def _make_room(self, rays: int) -> None:
         """What a thread needs does not depend on the size of a batch."""
 
-    def _gradients(self, thread: int, part: slice, picks: Array, jitter: Array, losses: Losses, met: Array) -> tuple[int, float, int]:
+    def _gradients(
+        self, thread: int, part: slice, picks: Array, jitter: Array, shares: Array, losses: Losses, met: Array
+    ) -> tuple[int, float, int]:
         rows = (self.touched[thread], self.density_sums[thread], self.feature_sums[thread])
         losses = losses._replace(threshold=np.float32(NEGLIGIBLE))
-        arguments = (self.pixels, picks[part], jitter[part], len(picks), losses, self.marks[thread], self.index, thread, rows)
+        arguments = (self.pixels, picks[part], jitter[part], shares[part], losses, self.marks[thread], self.index, thread, rows)
         given = (self.space, self.volume, self.net, self.background)
         out: tuple[int, float, int] = kernels.gradient_pass(*given, *arguments, self.scratch[thread], met[part])
         return out

@@ -119,7 +119,7 @@ def ray_backward(
     background: Any,
     target: Any,
     surface: Any,
-    count: Any,
+    share: Any,
     losses: Any,
     g_logit: Any,
     g_raw: Any,
@@ -127,10 +127,10 @@ def ray_backward(
     """Loss of one ray whose samples are first … last − 1 of the tape, and its gradients g_logit (S, 3) and g_raw (S,) there.
 
     Args:
-        target: (3,) uint8 colour; surface: distance where the ray ends, 0: unknown; count: rays of the whole batch.
+        target: (3,) uint8 colour; surface: distance where the ray ends, 0: unknown; share: what the ray counts in the batch's means.
 
     Returns:
-        sum of squared colour errors.
+        mean of squared colour errors.
     """
     total, total_place = ZERO, ZERO
     red, green, blue = ZERO, ZERO, ZERO
@@ -145,11 +145,11 @@ def ray_backward(
     red += left * background[0] - F(target[0]) * F(1 / 255)
     green += left * background[1] - F(target[1]) * F(1 / 255)
     blue += left * background[2] - F(target[2]) * F(1 / 255)
-    per_value = TWO / (F(3) * F(count))
+    per_value = TWO * K.THIRD * share
     g_red, g_green, g_blue = red * per_value, green * per_value, blue * per_value
-    constant = -(g_red * background[0] + g_green * background[1] + g_blue * background[2]) - left * (TWO * losses.opacity / F(count))
+    constant = -(g_red * background[0] + g_green * background[1] + g_blue * background[2]) - left * (TWO * losses.opacity * share)
     spread = F(4) / (F(space.fine) * F(space.resolution))
-    distortion, depth_loss = losses.distortion / F(count), losses.depth / F(count)
+    distortion, depth_loss = losses.distortion * share, losses.depth * share
     before, before_place = ZERO, ZERO
     for i in range(first, last):
         weight, place = tape.values[i, K.WEIGHT], tape.values[i, K.PLACE]
@@ -171,7 +171,7 @@ def ray_backward(
         g = g_raw[i]
         g_raw[i] = (values[K.AFTER] * g - behind) * values[K.TAU] if values[K.RAW] < K.RAW_MAX else ZERO
         behind += values[K.WEIGHT] * g
-    return red * red + green * green + blue * blue
+    return (red * red + green * green + blue * blue) * K.THIRD
 
 
 @njit(**K.OPTIONS)
@@ -211,7 +211,7 @@ def gradient_pass(
     pixels: Any,
     picks: Any,
     jitter: Any,
-    count: Any,
+    shares: Any,
     losses: Any,
     marks: Any,
     index: Any,
@@ -228,7 +228,7 @@ def gradient_pass(
         others as in `fused_kernels.gradient_pass`.
 
     Returns:
-        rows touched, sum of squared colour errors, samples decoded.
+        rows touched, part of the mean over the batch of squared colour errors, samples decoded.
     """
     tape, total = scratch.tape, scratch.total
     for array in (total.w1, total.w2, total.w3, total.w4):
@@ -259,8 +259,11 @@ def gradient_pass(
         for r in range(rays):
             pick = picks[begun + r]
             surface = pixels.distance[pick] if pixels.distance.shape[0] > 0 else ZERO
-            arguments = (background, pixels.colour[pick], surface, count, losses, scratch.g_logit, scratch.g_raw)
-            error += ray_backward(space, tape, starts[r], starts[r + 1], *arguments)
+            arguments = (background, pixels.colour[pick], surface, shares[begun + r], losses, scratch.g_logit, scratch.g_raw)
+            own_error = ray_backward(space, tape, starts[r], starts[r + 1], *arguments)
+            error += own_error * shares[begun + r]
+            if met.shape[0] > 0:
+                met[begun + r, 2] = own_error
         decoder_backward(space.width, net, scratch, samples)
         used = _scatter(tape, samples, scratch, index, thread + 1, zero_row, gradients, space.width, used)
     return used, error, looked

@@ -21,6 +21,7 @@ class Batch:
     colour: Tensor  # (B, 3) in [0, 1]
     view: Tensor  # (B,) int64, which of the pool's views
     distance: Tensor | None = None  # (B,) to the surface along the ray, working units, 0: unknown
+    weight: Tensor | None = None  # (B,) what each ray counts in the means over the batch; None: 1
 
 
 class PixelPool:

@@ -71,11 +71,21 @@ class Optimiser:
         """Interval of every sample in the units of `Samples.place`."""
         return torch.full_like(weight, BRICK / (self.field.fine * self.field.resolution))
 
+    def _shares(self, batch: Batch) -> Tensor:
+        """(B,) what each ray counts in a mean over the batch."""
+        count = len(batch.origins)
+        return torch.full_like(batch.colour[:, 0], 1 / count) if batch.weight is None else batch.weight / count
+
+    def _mean_error(self, residual: Tensor, shares: Tensor) -> float:
+        """The mean squared colour error; each ray's own is kept for whoever draws the next batch."""
+        self.errors = residual.square().mean(1)
+        return float((self.errors * shares).sum())
+
     def _depth(self, batch: Batch, samples: Samples, rates: Rates) -> Tensor | float:
         """The depth term's gradient for the samples' weights."""
         if rates.depth <= 0 or batch.distance is None:
             return 0.0
-        return depth_gradient(samples.distance, batch.distance[samples.ray]) * (rates.depth / len(batch.origins))
+        return depth_gradient(samples.distance, batch.distance[samples.ray]) * (rates.depth * self._shares(batch)[samples.ray])
 
     def _move(self, rows: Tensor, corner_weights: Tensor, g_density: Tensor, g_feature: Tensor, rates: Rates, residual: Tensor) -> None:
         """From gradients of what was looked up to a step of the rows that it was looked up from.
@@ -140,24 +150,25 @@ class Optimiser:
         mixed = opacity[:, None] * colour + (1 - opacity)[:, None] * behind
         residual = (mixed - batch.colour).detach()
         # L = mean over rays and channels of the squared error; ∂L/∂mixed in closed form, the rest from the decoder's graph.
-        g_mixed = residual * (2 / residual.numel())
+        shares = self._shares(batch)
+        g_mixed = residual * (2 / 3 * shares)[:, None]
         colour.backward(g_mixed * opacity[:, None])
         g_mean = mean.grad
         assert g_mean is not None
         colour = colour.detach()
-        g_opacity = (g_mixed * (colour - behind)).sum(1) - (1 - opacity) * (2 * rates.opacity / count)
+        g_opacity = (g_mixed * (colour - behind)).sum(1) - (1 - opacity) * (2 * rates.opacity * shares)
         # mean = Σ w f / A and A = Σ w: ∂mean/∂w_i = (f_i - mean) / A
         g_sum = g_mean / opacity.clamp_min(OPACITY_FLOOR)[:, None]
         per_ray = torch.cat([g_sum, (g_opacity - (g_sum * mean.detach()).sum(1))[:, None]], 1)[kept.ray]
         g_weight = (features * per_ray[:, :-1]).sum(1) + per_ray[:, -1]
         if rates.distortion > 0:
             _, g_distortion = distortion(weight, kept.place, self._spread(weight), kept.first, kept.ray, count)
-            g_weight = g_weight + g_distortion * (rates.distortion / count)
+            g_weight = g_weight + g_distortion * (rates.distortion * shares[kept.ray])
         g_weight = g_weight + self._depth(batch, kept, rates)
         g_thickness = thickness_gradient(weight, transmittance, thickness, g_weight, kept.first, kept.ray, count)
         g_raw = torch.where(raw < RAW_MAX, g_thickness * thickness, torch.zeros_like(raw))  # ∂τ/∂raw = τ
         self._move(rows, corner_weights, g_raw, per_ray[:, :-1] * weight[:, None], rates, residual)
-        return float(residual.square().mean())
+        return self._mean_error(residual, shares)
 
     def _per_sample(self, batch: Batch, samples: Samples, rates: Rates, behind: Tensor) -> float:
         """The paper's decoder at every sample: autograd from looked-up features to loss, then our scatter and lazy Adam."""
@@ -174,16 +185,17 @@ class Optimiser:
         opacity = ray_sum(weight, samples.ray, count)
         mixed = ray_sum(weight[:, None] * colour.detach(), samples.ray, count) + (1 - opacity)[:, None] * behind
         residual = mixed - batch.colour
-        g_rays = residual * (2 / residual.numel())
-        g_opacity = -(g_rays * behind).sum(1) - (1 - opacity) * (2 * rates.opacity / count)
+        shares = self._shares(batch)
+        g_rays = residual * (2 / 3 * shares)[:, None]
+        g_opacity = -(g_rays * behind).sum(1) - (1 - opacity) * (2 * rates.opacity * shares)
         g_mixed = g_rays[samples.ray]
         g_weight = (g_mixed * colour.detach()).sum(1) + g_opacity[samples.ray]
         if rates.distortion > 0:
             _, g_distortion = distortion(weight, samples.place, self._spread(weight), samples.first, samples.ray, count)
-            g_weight = g_weight + g_distortion * (rates.distortion / count)
+            g_weight = g_weight + g_distortion * (rates.distortion * shares[samples.ray])
         g_weight = g_weight + self._depth(batch, samples, rates)
         g_thickness = thickness_gradient(weight, transmittance, tau, g_weight, samples.first, samples.ray, count)
         torch.autograd.backward([thickness, colour], [g_thickness, weight[:, None] * g_mixed])
         assert features.grad is not None and base.grad is not None
         self._move(rows, corner_weights, base.grad, features.grad, rates, residual)
-        return float(residual.square().mean())
+        return self._mean_error(residual, shares)
