@@ -47,8 +47,11 @@ def drawn(kind: str, pool: PixelPool, errors: Errors) -> tuple[np.ndarray, np.nd
         return np.concatenate([p.numpy() for p, _ in parts]), np.concatenate([w.numpy() for _, w in parts])
     tiles, pixels = Tiles(pool), FusedOptimiser(random_field(0.0, 16, keep=0.1), pool, threads=1).pixels
     tiles.error[:] = errors.error.numpy()
-    both = [tiles.draw(pixels, pool.limit, 1000, seed) for seed in range(ROUNDS)]
-    return np.concatenate([p for p, _ in both]), np.concatenate([w for _, w in both])
+    tiles.renew()
+    picks, weights = np.empty((ROUNDS, 1000), np.int64), np.empty((ROUNDS, 1000), np.float32)
+    for round_ in range(ROUNDS):
+        tiles.draw(pixels, pool.limit, round_, picks[round_], weights[round_])
+    return picks.reshape(-1), weights.reshape(-1)
 
 
 @pytest.mark.parametrize("kind", ["torch", "compiled"])

@@ -122,8 +122,9 @@ class FusedOptimiser:
 
     def _draw(self, rays: int) -> Batch:
         """Random pixels, more of those where the field was wrong lately (`importance`)."""
-        picks, weights = self.met.draw(self.pixels, self.pool.limit, rays, int(self.generator.integers(2**63)))
-        return Batch(picks, self.generator.random(rays, np.float32), weights, self.threads, self.pool.limit)
+        self.met.renew()
+        jitter, seed = self.generator.random(rays, np.float32), int(self.generator.integers(2**62))
+        return Batch(np.empty(rays, np.int64), jitter, np.empty(rays, np.float32), self.threads, self.pool.limit, seed)
 
     def _step(self, batch: Batch, following: Batch | None, rates: Rates) -> tuple[float, int]:
         """One step on `batch`; the order of the `following` one is found beside it."""

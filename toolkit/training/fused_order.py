@@ -109,16 +109,17 @@ class Tiles:
         count = len(pool.pose) * self.grid[0] * self.grid[1]
         self.met = np.zeros((count, 2), np.float32)
         self.error, self.density = np.zeros(count, np.float32), np.ones(count, np.float32)
-        self.drawn = 0
+        self.steps = 0
 
-    def draw(self, pixels: Any, limit: int, count: int, seed: int) -> tuple[Array, Array]:
-        """(count,) int64 pixels before `limit`, and (count,) float32 what each of them counts."""
-        if self.drawn % RENEW == 0:
-            fused_draw.densities(self.error, self.density)
-        self.drawn += 1
-        picks, weights = np.empty(count, np.int64), np.empty(count, np.float32)
+    def draw(self, pixels: Any, limit: int, seed: int, picks: Array, weights: Array) -> None:
+        """Fill `picks` (B,) int64 with pixels before `limit`, and `weights` (B,) float32 with what each of them counts."""
         fused_draw.draw(pixels, limit, seed, self.density, *self.grid, picks, weights)
-        return picks, weights
+
+    def renew(self) -> None:
+        """Renew the densities from the errors, now and then; called once a step."""
+        if self.steps % RENEW == 0:
+            fused_draw.densities(self.error, self.density)
+        self.steps += 1
 
     def remember(self, tiles: Array, met: Array) -> None:
         """What a batch met (B, 3) at its tiles (B,)."""
@@ -129,18 +130,18 @@ class Batch:
     """Rays of one step, and the order that they are worked on in.
 
     To find the order would take two threads a twentieth of a step, one of them waiting; so it is found beside the step before: `look`
-    by every thread for its part, `sort` by one of them.
+    by every thread for its part, which is drawn there as well, and `sort` by one of them.
 
     Attributes:
         picks: (B,) int64 pixels; jitter: (B,) float32 by which the rays' lattices are moved; weights: (B,) float32 what they count.
-        limit: pixels that `picks` were drawn from.
+        limit: pixels that `picks` are drawn from; seed: of the draw, None: the picks are given.
         tiles: (B,) int32 places in `Tiles.met`.
         cuts: (threads + 1,) int64 where each thread's part begins and ends: equal numbers as drawn, equal expected work once sorted.
     """
 
-    def __init__(self, picks: Array, jitter: Array, weights: Array, threads: int, limit: int = 0) -> None:
+    def __init__(self, picks: Array, jitter: Array, weights: Array, threads: int, limit: int = 0, seed: int | None = None) -> None:
         count = len(picks)
-        self.picks, self.jitter, self.weights, self.limit = picks, jitter, weights, limit
+        self.picks, self.jitter, self.weights, self.limit, self.seed = picks, jitter, weights, limit, seed
         self.codes, self.tiles = np.empty(count, np.uint32), np.empty(count, np.int32)
         self.cuts = np.array([count * t // threads for t in range(threads + 1)], np.int64)
         self.sorted = False
@@ -150,8 +151,10 @@ class Batch:
         return slice(int(self.cuts[thread]), int(self.cuts[thread + 1]))
 
     def look(self, thread: int, space: Any, pixels: Any, tiles: Tiles) -> None:
-        """Codes and tiles of one thread's part, as drawn."""
+        """Codes and tiles of one thread's part, which is drawn first."""
         part = self.part(thread)
+        if self.seed is not None:
+            tiles.draw(pixels, self.limit, self.seed + thread, self.picks[part], self.weights[part])
         hit_codes(space, pixels, self.picks[part], tiles.met, tiles.grid, self.codes[part], self.tiles[part])
 
     def sort(self, tiles: Tiles) -> None:
