@@ -74,7 +74,7 @@ class FieldSettings:
 class FitSettings:
     finetune: bool = True  # False: the networks' field is the result, nothing is fitted
     budget: float | None = None  # seconds; None: by preset
-    max_rays: int = 2048  # rays a step at the finest level; many small steps beat few large ones
+    max_rays: int = 4096  # rays a step at most, which the fifth level reaches; many small steps beat few large ones
     rate_density: float = 0.15
     rate_feature: float = 0.05
     rate_decoder: float = 5e-3
