@@ -172,8 +172,10 @@ def plain_operations(count: int) -> None:
 
 
 def test_a_picture_is_cheap() -> None:
-    """At 320×240 with one ray more at edges, at most four times as long as a hundred rounds of arithmetic on its rays: a slow or busy machine
-    does not count against it. Twice as long was measured, which was five pictures a second of one thread."""
+    """At 320×240 with one ray more at edges: at most four times as long as a hundred rounds of arithmetic on its rays.
+
+    Twice as long was measured, five pictures a second of one thread. A slow or busy machine does not count against it.
+    """
     scene = random_scene("room", np.random.default_rng(0))
     camera = Intrinsics(320, 240, 250.0, 250.0, 160.0, 120.0)
     poses = [looking(standing(scene, seed), scene.focus) for seed in range(5)]
