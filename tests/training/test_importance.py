@@ -11,10 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.render.made import random_field
+from tests.training.test_fit import scene, wanted
 from tests.training.test_fused import RATES, made_views
 from toolkit.config import Settings
+from toolkit.errors import InputError
 from toolkit.training import fused_draw
 from toolkit.training.engine import TorchEngine, make_engine
+from toolkit.training.fit import fit_field
 from toolkit.training.fused import FusedOptimiser
 from toolkit.training.fused_order import Tiles
 from toolkit.training.importance import MOST, SHARE, TILE, TOP, Errors, densities
@@ -88,6 +91,19 @@ def test_nothing_known_draws_evenly() -> None:
     picks, weights = Errors(pool).draw(500, torch.Generator().manual_seed(0))
     assert len(picks) == 500 and bool((weights == 1).all())
     assert MOST > 1 and TILE > 1
+
+
+@pytest.mark.parametrize("engine", ["torch", "numba"])
+def test_pictures_that_are_masked_away_are_refused(engine: str) -> None:
+    """By one sentence from a fit, and before compiled code looks at pixels that are not there."""
+    views = replace(made_views(5, 24), valid=[np.zeros((24, 24), bool)] * 5)
+    with pytest.raises(InputError, match="every pixel of the training pictures is masked"):
+        fit_field(views, scene(), wanted("budget=1", f"engine={engine}"))
+    pool = masked_pool()
+    pool.limit = 0
+    fit = make_engine(wanted(f"engine={engine}"), random_field(0.0, 16, keep=0.1), pool)
+    with pytest.raises((ValueError, RuntimeError)):
+        fit.step(10, RATES)
 
 
 @pytest.mark.parametrize("engine", ["torch", "numba"])

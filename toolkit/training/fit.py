@@ -120,7 +120,7 @@ def fit_field(
         ticks: the clock, in seconds, that the budget is counted on; a benchmark beside other work takes `time.process_time`.
 
     Raises:
-        InputError: there is no training view, `start` is not finite, not one step was, or it does not fit into memory.
+        InputError: there is no training view or pixel, `start` is not finite, not one step was, or it does not fit into memory.
     """
     device = torch.device(settings.device if settings.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu")
     train = views.subset(np.flatnonzero(~views.test))
@@ -136,6 +136,8 @@ def fit_field(
     # Views that are kept aside come last, so that joining them is a matter of a limit.
     pool = PixelPool(train.subset(np.argsort(aside, kind="stable")), device, depth=settings.fit.depth > 0)
     pool.limit = int((pool.view < np.count_nonzero(~aside)).sum())
+    if pool.limit == 0:
+        raise InputError("every pixel of the training pictures is masked away; look at the capture's masks (black is left out)")
     budget = settings.fit.budget or DEFAULT_BUDGET
     warm_up(settings, progress)
     clock = _Clock(ticks)

@@ -113,6 +113,8 @@ class Tiles:
 
     def draw(self, pixels: Any, limit: int, seed: int, picks: Array, weights: Array) -> None:
         """Fill `picks` (B,) int64 with pixels before `limit`, and `weights` (B,) float32 with what each of them counts."""
+        if not 0 < limit <= len(pixels.place):  # compiled code looks where it is told to
+            raise ValueError(f"pixels are to be drawn from the first {limit} of {len(pixels.place)}")
         fused_draw.draw(pixels, limit, seed, self.density, *self.grid, picks, weights)
 
     def renew(self) -> None:

@@ -75,8 +75,8 @@ class Errors:
 
 def densities(error: Tensor) -> Tensor:
     """(T,) squared errors, 0 where no ray came to → (T,) q, between 1 − S and `TOP`."""
-    root = error.sqrt()
     known = error > 0
+    root = torch.where(known, error, torch.zeros_like(error)).sqrt()
     mean = root.sum() / known.sum().clamp_min(1)
     ratio = torch.where(known, (root / mean.clamp_min(1e-12)).clamp_max(MOST), torch.ones_like(root))
     return 1 - SHARE + SHARE * ratio
