@@ -172,9 +172,9 @@ def plain_operations(count: int) -> None:
 
 
 def test_a_picture_is_cheap() -> None:
-    """At 320×240 with one ray more at edges: at most four times as long as a hundred rounds of arithmetic on its rays.
+    """At 320×240 with one ray more at edges: at most 2.75 times as long as a hundred rounds of arithmetic on its rays.
 
-    Twice as long was measured, five pictures a second of one thread. A slow or busy machine does not count against it.
+    That is five pictures a second of one thread where it was measured (1.8 to 2.3). A slow or busy machine does not count against it.
     """
     scene = random_scene("room", np.random.default_rng(0))
     camera = Intrinsics(320, 240, 250.0, 250.0, 160.0, 120.0)
@@ -187,7 +187,7 @@ def test_a_picture_is_cheap() -> None:
         plain_operations(320 * 240)
         spent.append(between - began)
         plain.append(time.process_time() - between)
-    assert np.median(spent) < 4 * np.median(plain)
+    assert np.median(spent) < 2.75 * np.median(plain)
 
 
 def test_unknown_kinds_are_refused() -> None:
