@@ -15,8 +15,9 @@ from toolkit.render.bake import bake
 from toolkit.render.bake_image import BakedRenderer
 from toolkit.render.compiled import CompiledRenderer
 from toolkit.render.rays import render_rays
+from toolkit.training.engine import TorchEngine
 from toolkit.training.fused import FusedOptimiser
-from toolkit.training.step import Optimiser, Rates
+from toolkit.training.step import Rates
 
 SIZES = (64, 128, 256)
 BATCH = 2048
@@ -28,11 +29,10 @@ def step_cases(sizes: tuple[int, ...] = SIZES, repetitions: int = 5) -> Iterator
     pool = sphere_pixels()
     with pinned(1):
         for size in sizes:
-            engine, reference = FusedOptimiser(sphere_field(size), pool, threads=1), Optimiser(sphere_field(size))
-            generator = torch.Generator().manual_seed(0)
+            engine, reference = FusedOptimiser(sphere_field(size), pool, threads=1), TorchEngine(sphere_field(size), pool, 0)
             times = compare(
                 lambda e=engine: e.step(BATCH, RATES),  # type: ignore[misc]
-                lambda r=reference, g=generator: r.step(pool.batch(BATCH, g), RATES, g),  # type: ignore[misc]
+                lambda r=reference: r.step(BATCH, RATES),  # type: ignore[misc]
                 repetitions,
             )
             yield Case("training step", f"{size}³", "ray", BATCH, *times, against="torch engine", counts=step_counts(engine))

@@ -1,4 +1,4 @@
-"""The pixels that a fit may look at, and random batches of rays through them."""
+"""The pixels that a fit may look at, and rays through them; `importance` draws them."""
 
 from __future__ import annotations
 
@@ -61,11 +61,6 @@ class PixelPool:
 
     def __len__(self) -> int:
         return len(self.colour)
-
-    def batch(self, count: int, generator: torch.Generator) -> Batch:
-        """`count` rays, uniformly over the pixels before `limit`, with replacement."""
-        pick = torch.randint(self.limit, (count,), generator=generator).to(self.colour.device)
-        return self.take(pick)
 
     def take(self, pick: Tensor) -> Batch:
         """The rays of the pixels `pick` (B,)."""
