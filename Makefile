@@ -36,8 +36,9 @@ help:
 demo: $(VENV)/.installed
 	@$(BIN)/python -m pipelines.demo
 
-# `make test WORKERS=2` runs the tests in two processes; those of a file stay together, since they share what takes long to make.
-WORKERS ?= 0
+# Tests run in two processes where there are two cores; those of a file stay together, since they share what takes long to make.
+# `make test WORKERS=0` runs them in one.
+WORKERS ?= $(if $(filter-out 0 1,$(shell nproc 2>/dev/null)),2,0)
 
 test: lint
 	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile

@@ -266,6 +266,7 @@ def changed(place: tuple[int, int], value: float) -> Array:
         (changed((0, 0), 1.1), "not rigid"),
         (changed((0, 1), 0.3), "not rigid"),
         (2.0 * np.eye(4), "not rigid"),
+        ([[1e160, 1e160, 0, 0], [-1e160, 1e160, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "not rigid"),  # its square is ∞ − ∞
         (np.eye(3), "shape"),
         ([[1, 2], [3]], "not a matrix"),
         ([["a", "b", "c", "d"]] * 4, "not a matrix"),

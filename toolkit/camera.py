@@ -219,14 +219,15 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     if not np.all(np.isfinite(pose)):
         raise InputError(f"{where}: the pose holds a value that is not finite; remove this frame or correct it")
     rotation = pose[:3, :3]
-    if abs(np.linalg.det(rotation)) < 1e-6:
+    with np.errstate(over="ignore", invalid="ignore"):  # of damaged files: huge numbers are no rotation either
+        size, off = np.linalg.det(rotation), np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if abs(size) < 1e-6:
         raise InputError(f"{where}: the pose's rotation is singular; remove this frame or correct it")
-    if np.linalg.det(rotation) < 0:
+    if size < 0:
         raise InputError(
             f"{where}: the pose mirrors space (its rotation has determinant < 0); its axis convention is not what this kind of capture uses"
         )
-    off = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if off > tolerance:
+    if not off <= tolerance:  # NaN, too
         raise InputError(f"{where}: the pose is not rigid (its rotation is scaled or sheared by more than {tolerance:g}); correct it")
     out = np.eye(4)
     if off > RIGID:

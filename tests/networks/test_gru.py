@@ -157,7 +157,7 @@ def test_what_the_sweep_is_sure_of_stays_whatever_was_learned() -> None:
         for _ in range(3):
             state = gru(state, count, torch.tanh(raw), raw, weight, topology, seen).detach()
             count += 1
-        thickness = torch.exp(head.thickness(state[:-1]))
+        thickness = torch.exp(head.thickness(state[:-1])).detach()
         assert thinnest <= float(thickness.min()) and float(thickness.max()) <= thickest
 
 
