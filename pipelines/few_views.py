@@ -49,6 +49,7 @@ def few_views(
         rows: list[dict[str, Any]] = read_kept(path, FEW_VIEWS)["rows"] if path.is_file() else []
         model = load_networks(job.settings.network.weights, job.settings.device)
         for count in counts:
+            job.progress.begin(f"{count or ALL} views")
             ground = ground_of(job, posed, count, corrections)
             done = {(row["views"], row["start"], row["budget"]) for row in rows}
             for row in few_views_rows(ground, model, seconds, done, measured, job.progress):
@@ -76,6 +77,7 @@ def ablations(
     rows = []
     with _job(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as (job, posed, corrections):
         model = load_networks(job.settings.network.weights, job.settings.device)
+        job.progress.begin(ABLATIONS)
         for row in ablation_rows(ground_of(job, posed, count, corrections), model, job.progress):
             rows.append(row)
             _keep(job, ABLATIONS, rows, ablation_table(rows))
