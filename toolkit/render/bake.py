@@ -33,6 +33,7 @@ class BakedField:
         background: (3,) float32.
         arrays: see `bake_kernels.Baked`; they may be windows into a file.
         decoder: the weights, float32.
+        sky: (9, 3) float32, see `Field`; None: there is none.
     """
 
     space: Space
@@ -43,6 +44,7 @@ class BakedField:
     background: Array
     arrays: Baked
     decoder: K.Decoder
+    sky: Array | None = None
 
     @property
     def voxels(self) -> int:
@@ -139,7 +141,9 @@ def bake(field: Field, keep: torch.Tensor | None = None) -> BakedField:
     x, y, z = topology.table_origin
     background = field.background.numpy().astype(np.float32)
     assert isinstance(field.decoder, Deferred)
-    return BakedField(field.space, field.resolution, field.near, field.fine, (x, y, z), background, arrays, decoder_arrays(field.decoder))
+    sky = None if field.sky is None else field.sky.numpy()
+    decoder = decoder_arrays(field.decoder)
+    return BakedField(field.space, field.resolution, field.near, field.fine, (x, y, z), background, arrays, decoder, sky)
 
 
 def _ordered(field: Field, keep: torch.Tensor | None) -> Field:

@@ -22,6 +22,7 @@ from toolkit.files import atomic_path
 from toolkit.render import kernels as K
 from toolkit.render.bake import BakedField
 from toolkit.render.bake_kernels import CORNERS, FINER, LEVELS, Baked
+from toolkit.render.sky import checked_sky
 from toolkit.volume.space import Space
 
 Array = np.ndarray[Any, Any]
@@ -63,6 +64,7 @@ def write_baked(path: Path | str, field: BakedField, working_from_input: Similar
         "fine": field.fine,
         "table_origin": list(field.table_origin),
         "background": field.background.tolist(),
+        "sky": None if field.sky is None else field.sky.tolist(),
         "working_from_input": (working_from_input or Similarity.identity()).to_dict(),
     }
     with atomic_path(path) as temporary:
@@ -119,6 +121,7 @@ def _checked(arrays: dict[str, Array], about: dict[str, Any]) -> BakedField:
     _require(max(abs(v) for v in (x, y, z)) <= resolution, "its block table lies outside the lattice")
     background = np.array([float(v) for v in about["background"]], np.float32)
     _require(background.shape == (3,) and bool(np.isfinite(background).all()), "its background is not a colour")
+    sky = checked_sky(about.get("sky"))
     _check_arrays(arrays, resolution)
     channels = arrays["feature"].shape[1]
     hidden = len(arrays["decoder.b1"])
@@ -132,7 +135,7 @@ def _checked(arrays: dict[str, Array], about: dict[str, Any]) -> BakedField:
         _require(array.dtype != np.float32 or bool(np.isfinite(array).all()), f"its tensor {name!r} holds values that are not finite")
     baked = Baked(**{name: arrays[name] for name in Baked._fields if name not in ("bits", "packed")}, **_words(arrays))
     decoder = K.Decoder(*(arrays[f"decoder.{name}"] for name in K.Decoder._fields))
-    return BakedField(space, resolution, near, fine, (x, y, z), background, baked, decoder)
+    return BakedField(space, resolution, near, fine, (x, y, z), background, baked, decoder, None if sky is None else sky.numpy())
 
 
 def _words(arrays: dict[str, Array]) -> dict[str, Array]:

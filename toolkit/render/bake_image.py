@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics
+from toolkit.camera import Array, Intrinsics, pixel_grid, rays
 from toolkit.errors import InputError
 from toolkit.render.bake import BakedField
 from toolkit.render.bake_tiles import TILE, render_tiles
 from toolkit.render.image import SOLID, Rendered
+from toolkit.render.sky import on_sky
 
 STOP = 1e-2  # a ray ends where less than this part of the light is left, and what it saw stands for all of it
 THRESHOLD = 5e-3  # samples of smaller weight lend no colour
@@ -68,6 +69,10 @@ class BakedRenderer:
             with ThreadPoolExecutor(self.threads) as pool:
                 counts = list(pool.map(part, range(pieces)))
         looked, coloured, walked = (sum(count[i] for count in counts) for i in range(3))
+        if self.field.sky is not None:
+            _, directions, _ = rays(intrinsics, world_from_camera, pixel_grid(width, height))
+            behind, sky = torch.from_numpy(self.field.background), torch.from_numpy(self.field.sky)
+            out[:, :3] = on_sky(torch.from_numpy(out[:, :3]), torch.from_numpy(out[:, 4]), directions, behind, sky).numpy()
         depth = np.where(out[:, 4] >= SOLID, out[:, 3], np.float32(0)).reshape(height, width)
         picture = Rendered(np.ascontiguousarray(out[:, :3]).reshape(height, width, 3), depth, out[:, 4].reshape(height, width).copy())
         return picture, Work(width * height, looked, coloured, walked)

@@ -13,6 +13,7 @@ from toolkit.errors import InputError, first_line
 from toolkit.networks.decoder import Deferred, PerSample, make_decoder
 from toolkit.render.composite import RAW_MAX, UNITS
 from toolkit.render.march import MarchGrid
+from toolkit.render.sky import checked_sky
 from toolkit.volume.edit import corner_nodes, erase_empty_blocks
 from toolkit.volume.space import Space
 from toolkit.volume.store import FieldFile, compact, expand, read_field, write_field
@@ -40,6 +41,8 @@ class Field:
         decoder: deferred or per sample.
         background: (3,) colour behind everything.
         near: distance before which nothing is sampled.
+        sky: (9, 3) harmonics of the colour behind everything, which whole pictures show instead of `background`; None: there is none. It
+            stays on the CPU, where pictures are put together.
     """
 
     space: Space
@@ -52,6 +55,7 @@ class Field:
     background: Tensor
     near: float = 0.0
     fine: int = 4
+    sky: Tensor | None = None
 
     def __post_init__(self) -> None:
         self.grid = MarchGrid(self.space, self.resolution, self.topology, self.occupied)
@@ -114,6 +118,7 @@ class Field:
             "background": self.background.tolist(),
             "near": self.near,
             "fine": self.fine,
+            "sky": None if self.sky is None else self.sky.tolist(),
         }
         x, y, z = (c - self.space.extent * self.space.half for c in self.space.centre)
         data = FieldFile(
@@ -147,7 +152,7 @@ class Field:
             config = data.config
             space, resolution = Space.from_dict(config["space"]), int(config["resolution"])
             kind, hidden, fine, near = str(config["decoder"]), int(config["hidden"]), int(config["fine"]), float(config["near"])
-            background = torch.tensor([float(v) for v in config["background"]])
+            background, sky = torch.tensor([float(v) for v in config["background"]]), checked_sky(config.get("sky"))
             sane = kind in ("deferred", "per_sample") and 8 <= resolution <= 8192 and 1 <= hidden <= 4096 and 1 <= fine <= 64 and near >= 0
             if not sane or len(background) != 3 or not space.half > 0 or not 0 <= space.shell <= 16:
                 raise ValueError("a setting is out of range")
@@ -170,4 +175,5 @@ class Field:
             background,
             near,
             fine,
+            sky,
         )

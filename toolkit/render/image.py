@@ -13,6 +13,7 @@ from toolkit.camera import Array, Intrinsics, pixel_grid, rays
 from toolkit.networks.decoder import Deferred
 from toolkit.render.field import Field
 from toolkit.render.rays import RayValues, render_rays
+from toolkit.render.sky import on_sky
 
 CHUNK = 8192  # rays that torch renders at a time
 SOLID = 0.5  # depth is given where at least this much of the light is stopped
@@ -70,9 +71,10 @@ def render_view(field: Field, intrinsics: Intrinsics, world_from_camera: Array, 
     view = view or make_renderer(field)
     values = view(origins, directions)
     depth = torch.where(values.opacity >= SOLID, values.distance * cosine, torch.zeros(1))
+    colour = on_sky(values.colour, values.opacity, directions, field.background.cpu(), field.sky)
     shape = (height, width)
     return Rendered(
-        values.colour.reshape(*shape, 3).numpy().astype(np.float32),
+        colour.reshape(*shape, 3).numpy().astype(np.float32),
         depth.view(shape).numpy().astype(np.float32),
         values.opacity.reshape(shape).numpy().astype(np.float32),
     )

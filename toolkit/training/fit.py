@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as default
 
 import numpy as np
@@ -24,6 +24,7 @@ from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
 from toolkit.training import room
+from toolkit.training.behind import sky_behind
 from toolkit.training.engine import Engine, make_engine, warm_up
 from toolkit.training.finite import NotFiniteError
 from toolkit.training.guard import Guard, refuse_broken
@@ -200,7 +201,7 @@ def fit_field(
     _measure(result, held_out, engine, result.seconds)
     current = engine.sync()
     engine.let_go()
-    result.field = current.settled()
+    result.field = replace(current.settled(), sky=sky_behind(views))
     host.close()
     return result
 

@@ -28,6 +28,7 @@ from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
 from toolkit.render.fused import make_field, without_empty_blocks
 from toolkit.training import start as classical
+from toolkit.training.behind import sky_behind
 from toolkit.training.start import colour_behind, emptied_by_views, space_of
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK
@@ -131,7 +132,7 @@ class Inference:
         self.near, self.far = scene.near, scene.far
         voxels = self.options.voxels or voxels_to_median(self.train, self.options.measured)
         self.lattice = lattice_of(space_of(views, scene, background), scene, voxels, self.options.levels)
-        self.behind = colour_behind(views).to(model.device)
+        self.behind, self.sky = colour_behind(views).to(model.device), sky_behind(views)
         self.seconds = self.fusion_seconds = self.encode_seconds = 0.0
         self.done = 0
         self._latest: Fused | None = None
@@ -168,6 +169,6 @@ class Inference:
         made = make_field(self.model, self._latest.volume, self.behind, gamma, 0.5 * self.near, allowed=allowed)
         if carved and self.train.background is not None:
             made = inside_silhouettes(made, self.train)
-        made = without_empty_blocks(made)
+        made = replace(without_empty_blocks(made), sky=self.sky)
         self.seconds += time.perf_counter() - start
         return made
