@@ -5,10 +5,12 @@ Exit codes: 0 done; 1 something unexpected, with a log file; 2 bad input, settin
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
 import traceback
+from contextlib import suppress
 from typing import Annotated
 
 import typer
@@ -35,6 +37,8 @@ from pipelines import (
 from pipelines.options import Json
 from toolkit import __version__
 from toolkit.errors import FieldfuseError, Interrupted
+
+STOPPED = 130
 
 app = typer.Typer(
     name="fieldfuse",
@@ -80,11 +84,11 @@ def main() -> None:
     try:
         app()
     except Interrupted as error:
-        _fail(f"{error}", 130)
+        _fail(f"{error}", STOPPED)
     except FieldfuseError as error:
         _fail(f"{error}", 2, error)
     except KeyboardInterrupt:
-        _fail("stopped", 130)
+        _fail("stopped", STOPPED)
     except MemoryError as error:
         _fail("there is not enough memory for this; use a smaller --image-size", 1, error)
     except Exception as error:  # whatever it is, a user gets a sentence and a log
@@ -95,16 +99,34 @@ def main() -> None:
 
 def program() -> None:
     """The command line as a process of its own: while it ends, one more Ctrl-C changes nothing."""
+    interrupted = True
     try:
         main()
+        interrupted = False
     except KeyboardInterrupt:  # it came when `main` was ending already
-        sys.exit(130)
+        pass
+    except SystemExit as end:
+        interrupted = end.code == STOPPED
+        if not interrupted:
+            raise
     finally:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
-        # A Ctrl-C that comes while code is made from text (every dataclass is) leaves a mark in CPython, caught or not, and with
-        # `python -m` the process would end by a signal instead of its exit code. Any further text evaluated takes the mark away.
-        eval("0")  # noqa: S307
+    if interrupted:
+        _leave(STOPPED)
+
+
+def _leave(code: int) -> None:
+    """End here, after what is registered for the end (temporary folders, processes of ours).
+
+    After a Ctrl-C the interpreter cannot be trusted to end with the code that it is told: CPython ends `python -m` by the signal when code
+    was being made from text (every dataclass is), and Open3D, interrupted while it loads, ends the process with 1.
+    """
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):  # closed by whoever read it
+            stream.flush()
+    os._exit(code)
 
 
 def _fail(text: str, code: int, error: BaseException | None = None) -> None:

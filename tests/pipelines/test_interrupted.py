@@ -92,13 +92,14 @@ def test_ctrl_c_twice_ends_at_once(tmp_path: Path) -> None:
 def test_ctrl_c_while_code_is_made_from_text(tmp_path: Path) -> None:
     """Many imports do that. CPython then ends `python -m` by the signal, although the interrupt was caught."""
     (tmp_path / "interrupted.py").write_text(
-        "import pipelines.cli\n"
+        "import atexit, pipelines.cli\n"
+        "atexit.register(print, 'tidied')\n"
         "pipelines.cli.app = lambda: exec('import signal; signal.raise_signal(signal.SIGINT)')\n"
         "pipelines.cli.program()\n"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])}
     answer = subprocess.run([sys.executable, "-m", "interrupted"], env=environment, capture_output=True, text=True, timeout=60)
-    assert answer.returncode == 130 and answer.stderr == "fieldfuse: stopped\n"
+    assert answer.returncode == 130 and answer.stderr == "fieldfuse: stopped\n" and answer.stdout == "tidied\n"
 
 
 def test_two_runs_in_one_folder(tmp_path: Path, capsys: Capsys) -> None:
