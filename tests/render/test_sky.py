@@ -94,6 +94,44 @@ def test_where_nobody_looked_it_stays_a_colour_near_those_beside() -> None:
     assert float((colours - torch.tensor([40, 200, 60]) / 255).abs().max()) < 0.02
 
 
+def mean_error(sky: torch.Tensor, views: Views, indices: range) -> float:
+    """Mean squared error of the sky at these pictures."""
+    errors = []
+    for index in indices:
+        _, directions, _ = rays(CAMERA, views.world_from_camera[index], pixel_grid(40, 30))
+        colours = torch.from_numpy(views.images[index].reshape(-1, 3) / 255).float()
+        errors.append(float((sky_colours(sky, directions) - colours).square().mean()))
+    return float(np.mean(errors))
+
+
+def test_pictures_that_tell_nothing_of_others_leave_the_mean_colour() -> None:
+    """Each picture has a colour of its own, without any order: nine harmonics fit that, and predict nothing."""
+    views = views_of(gentle_sky(), all_around()[:6])
+    colours = [(250, 10, 10), (10, 250, 10), (10, 10, 250), (10, 250, 10), (250, 10, 10), (10, 10, 250)]
+    for picture, colour in zip(views.images, colours, strict=True):
+        picture[:] = colour
+    found = sky_behind(views)
+    assert found is not None
+    mean = torch.tensor(np.mean(colours, axis=0) / 255).float()
+    assert float((found[0] * SH[0] - mean).abs().max()) < 0.03 and float(found[4:].abs().max()) < 0.02
+
+
+@pytest.mark.parametrize("pictures", [3, 5, 9])
+def test_what_is_chosen_predicts_unseen_pictures_no_worse_than_the_mean_colour(pictures: int) -> None:
+    """Few noisy pictures of one side of a sky; the others are elsewhere."""
+    noise = np.random.default_rng(0)
+    everywhere = all_around()
+    order = [*range(8, 8 + pictures), *(i for i in range(32) if not 8 <= i < 8 + pictures)]
+    views = views_of(gentle_sky(3), [everywhere[i] for i in order], test=32 - pictures)
+    for picture in views.images[:pictures]:
+        picture[:] = (picture + noise.normal(0, 60, picture.shape)).clip(0, 255).astype(np.uint8)
+    found = sky_behind(views)
+    assert found is not None
+    mean = torch.zeros(9, 3)
+    mean[0] = torch.tensor(np.mean([picture.reshape(-1, 3).mean(0) for picture in views.images[:pictures]], 0) / 255).float() / SH[0]
+    assert mean_error(found, views, range(pictures, 32)) < 1.2 * mean_error(mean, views, range(pictures, 32))
+
+
 def test_alpha_has_a_background_of_its_own() -> None:
     assert sky_behind(replace(views_of(gentle_sky(), all_around()), background=(1.0, 1.0, 1.0))) is None
 
