@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ CHOICES = ((1, 0.1), (4, 0.1), (4, 0.01), (4, 0.001), (9, 0.1), (9, 0.01), (9, 0
 
 @dataclass(frozen=True)
 class Sums:
-    """Of pixels: harmonics of their directions Y and colours c, in float64: Σ Y Yᵀ (9, 9), Σ Y cᵀ (9, 3), Σ Y (9,), Σ c (3,), their number."""
+    """Over pixels with colours c and harmonics Y of their directions, float64: Σ Y Yᵀ (9, 9), Σ Y cᵀ (9, 3), Σ Y (9,), Σ c (3,)."""
 
     square: Tensor
     product: Tensor
@@ -62,7 +63,7 @@ def sky_behind(views: Views) -> Tensor | None:
     """
     if views.background is not None:
         return None
-    pictures = [sums for sums in (_sums_of(views, index) for index in np.flatnonzero(~np.asarray(views.test))) if sums.count > 0]
+    pictures = [sums for sums in (_sums_of(views, int(index)) for index in np.flatnonzero(~np.asarray(views.test))) if sums.count > 0]
     if not pictures:
         return None
     whole = _total(pictures)
@@ -99,4 +100,4 @@ def _total(sums: Iterable[Sums]) -> Sums:
 def _divided(pictures: list[Sums]) -> list[list[Sums]]:
     """Neighbours stay together: the next picture of a video tells nothing of places that nobody looked at."""
     ends = np.linspace(0, len(pictures), min(PARTS, len(pictures)) + 1).round().astype(int)
-    return [pictures[start:end] for start, end in zip(ends[:-1], ends[1:], strict=True)]
+    return [pictures[start:end] for start, end in pairwise(ends)]
