@@ -80,6 +80,7 @@ def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
         model = load_networks(weights, settings.device)
         inference = Inference(model, views, scene, keys, settings.field.background, options)
         first = _stream(job, inference, start)
+        field = inference.field(progress=job.progress)
         facts = {
             "key_frames": inference.done,
             "seconds": round(inference.seconds, 3),
@@ -88,7 +89,7 @@ def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
             "first_preview_seconds": first,
             "resolution": inference.lattice.resolution,
         }
-        return NetworkField(inference.field(), facts)
+        return NetworkField(field, facts)
 
     def save(value: NetworkField) -> list[Path]:
         value.field.save(path, scene.working_from_input, value.facts)
@@ -132,7 +133,7 @@ def preview(inference: Inference, frame: int) -> Any:
     camera, photo = inference.train.intrinsics[frame], inference.train.images[frame]
     shrink = min(1.0, PREVIEW_SIDE / max(camera.width, camera.height))
     camera = camera.scaled(max(1, round(shrink * camera.width)), max(1, round(shrink * camera.height)))
-    field = inference.field(carved=False)
+    field = inference.field(finished=False)
     # The compiled renderer is faster, but the first picture must not wait for a compiler.
     shown = to_picture(render_view(field, camera, inference.train.world_from_camera[frame], make_renderer(field, "torch")))
     small = cv2.resize(photo, (camera.width, camera.height), interpolation=cv2.INTER_AREA)

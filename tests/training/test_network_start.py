@@ -168,7 +168,7 @@ def test_what_lies_outside_of_the_silhouettes_is_left_out() -> None:
     views = replace(views, alpha=[alpha] * len(views), background=(1.0, 1.0, 1.0))
     running = Inference(inference().model, views, scene(), KeyFrames(np.array([0, 2]), np.array([[1], [1]])), options=NetworkOptions(32.0))
     list(running.frames())
-    whole, carved = running.field(carved=False), running.field()
+    whole, carved = running.field(finished=False), running.field()
     assert 0 < carved.voxels < whole.voxels
     for index in (0, 2, 3):
         full, rest = (

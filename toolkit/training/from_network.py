@@ -27,6 +27,7 @@ from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
 from toolkit.render.fused import make_field, without_empty_blocks
+from toolkit.render.recolour import recoloured
 from toolkit.training import start as classical
 from toolkit.training.behind import sky_behind
 from toolkit.training.start import colour_behind, emptied_by_views, space_of
@@ -53,17 +54,19 @@ class NetworkOptions:
         levels: lattices, each of half the voxel size of the one before; 1: the paper's single one.
         gamma: see-through voxels (exp(−optical thickness) above it) are not rendered; None: all are.
         measured: the views' depth goes into the key frames' sweeps.
+        recolour: the finished field's colours are looked up again in the training pictures (`render.recolour`).
     """
 
     voxels: float | None = None
     levels: int = LEVELS
     gamma: float | None = GAMMA
     measured: bool = False
+    recolour: bool = True
 
     @classmethod
     def of(cls, settings: NetworkSettings) -> NetworkOptions:
         """As the settings say."""
-        return cls(settings.voxels, settings.levels, measured=settings.depth_from == "sensor")
+        return cls(settings.voxels, settings.levels, measured=settings.depth_from == "sensor", recolour=settings.recolour)
 
 
 def load_networks(path: Path | str | None = None, device: torch.device | str = "cpu") -> NerfusionModel:
@@ -129,7 +132,7 @@ class Inference:
             raise InputError("no training view is left for the networks; lower --holdout or give more pictures")
         self.model, self.keys, self.options = model, keys, options or NetworkOptions()
         self.train = views.subset(train)
-        self.near, self.far = scene.near, scene.far
+        self.near, self.far, self.median_depth = scene.near, scene.far, scene.median_depth
         voxels = self.options.voxels or voxels_to_median(self.train, self.options.measured)
         self.lattice = lattice_of(space_of(views, scene, background), scene, voxels, self.options.levels)
         self.behind, self.sky = colour_behind(views).to(model.device), sky_behind(views)
@@ -153,22 +156,26 @@ class Inference:
             yield fused.frame
 
     @torch.no_grad()
-    def field(self, carved: bool = True) -> Field:
+    def field(self, finished: bool = True, progress: Progress = SILENT) -> Field:
         """The field of the key frames so far, in memory of its own; it shares the networks' decoder.
 
         Args:
-            carved: captures with alpha: without what lies outside of the silhouettes of all training views, which takes a second or two.
+            finished: no more key frame will come: colours are looked up again if the options say so, and captures with alpha lose what lies
+                outside of the silhouettes of all training views; some seconds.
 
         Raises:
             InputError: no key frame has been fused yet.
+            Interrupted: the user asked to stop.
         """
         if self._latest is None:
             raise InputError("no key frame has been fused yet, so there is no field; fuse one first")
         start = time.perf_counter()
         gamma, allowed = self.options.gamma, self._latest.allowed
         made = make_field(self.model, self._latest.volume, self.behind, gamma, 0.5 * self.near, allowed=allowed)
-        if carved and self.train.background is not None:
+        if finished and self.train.background is not None:
             made = inside_silhouettes(made, self.train)
         made = replace(without_empty_blocks(made), sky=self.sky)
+        if finished and self.options.recolour:
+            made = recoloured(made, self.train, self.median_depth, progress)
         self.seconds += time.perf_counter() - start
         return made

@@ -1,0 +1,165 @@
+"""Colours looked up again in the pictures: against a slow loop, on fields whose right colours are known, and what must not take part."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.render.made import random_field, random_rays
+from toolkit.capture.types import Views
+from toolkit.errors import Interrupted
+from toolkit.evaluate.speed_state import around, lens, sphere_field
+from toolkit.progress import Progress
+from toolkit.render.differentiable import render_with_gradients
+from toolkit.render.field import Field
+from toolkit.render.image import render_view
+from toolkit.render.recolour import COLOURS, LIGHT, MOST, SOLID, STEEPEST, _project_back, recoloured
+from toolkit.volume.lookup import corners
+
+DEPTH = 2.4  # of the cameras around the sphere
+
+
+def painted() -> Field:
+    """A dense sphere with stripes of colour a few voxels wide, and nothing else that a decoder could see."""
+    field = sphere_field(48)
+    rows = field.topology.keys.repeat_interleave(512, 0) * 8
+    local = torch.arange(512).repeat(field.blocks)
+    corner = rows + torch.stack([local & 7, (local >> 3) & 7, local >> 6], 1)
+    features = torch.zeros_like(field.feature_rows)
+    features[:-1, :COLOURS] = 2 * torch.sin(corner.float() * torch.tensor([0.5, 0.7, 0.3]))
+    for parameter in field.decoder.parameters():
+        parameter.data.zero_()
+    return replace(field, feature_rows=features, density_rows=field.density_rows + 2.5)
+
+
+def pictures_of(field: Field, count: int = 8, side: int = 64, test: int = 0) -> Views:
+    camera, poses = lens(side, side), around(count)
+    images = [(render_view(field, camera, pose).rgb * 255).round().astype(np.uint8) for pose in poses]
+    return Views([f"{i}" for i in range(count)], images, [camera] * count, poses, np.arange(count) >= count - test)
+
+
+def decibel(field: Field, views: Views) -> float:
+    errors = [
+        np.square(render_view(field, camera, pose).rgb - picture / 255).mean()
+        for camera, pose, picture in zip(views.intrinsics, views.world_from_camera, views.images, strict=True)
+    ]
+    return -10 * math.log10(float(np.mean(errors)))
+
+
+def grey(field: Field) -> Field:
+    return replace(field, feature_rows=torch.zeros_like(field.feature_rows))
+
+
+@pytest.mark.parametrize("decoder", ["deferred", "per_sample"])
+def test_a_slow_loop_gives_the_same(decoder: str) -> None:
+    field = random_field(resolution=16, decoder=decoder, keep=0.5, raw=0.5)
+    origins, directions = random_rays(40)
+    colours = torch.rand(40, 3, generator=torch.Generator().manual_seed(1))
+    size = len(field.density_rows)
+    wanted, weight = torch.zeros(size, 3), torch.zeros(size)
+    with torch.no_grad():
+        shown = render_with_gradients(field, origins, directions, threshold=LIGHT)
+        _project_back(field, origins, directions, colours, wanted, weight)
+    slow, slow_weight = np.zeros((size, 3)), np.zeros(size)
+    rows, parts = corners(field.topology, shown.samples.cell, shown.samples.inside)
+    for sample in range(len(shown.samples)):
+        ray, light = int(shown.samples.ray[sample]), float(shown.weight[sample])
+        opacity = float(shown.opacity[ray])
+        if light <= LIGHT or opacity < SOLID:
+            continue
+        for channel in range(3):
+            own = (float(shown.colour[ray, channel]) - (1 - opacity) * float(field.background[channel])) / opacity
+            own = min(max(own, 0.0), 1.0)
+            asked = (float(colours[ray, channel]) - own) / max(own * (1 - own), STEEPEST)
+            for row, part in zip(rows[sample].tolist(), parts[sample].tolist(), strict=True):
+                slow[row, channel] += light * part * min(max(asked, -MOST), MOST)
+        for row, part in zip(rows[sample].tolist(), parts[sample].tolist(), strict=True):
+            slow_weight[row] += light * part
+    assert slow_weight.max() > 0.1
+    np.testing.assert_allclose(weight, slow_weight, atol=1e-5)
+    np.testing.assert_allclose(wanted, slow, atol=1e-4)
+
+
+def test_from_grey_to_the_colours_of_the_pictures() -> None:
+    """Stripes of four to ten voxels; seen between the cameras, too."""
+    field = painted()
+    views = pictures_of(field, 16)
+    between = views.subset([1, 6, 11])
+    start, found = grey(field), recoloured(grey(field), views.subset([i for i in range(16) if i not in (1, 6, 11)]), DEPTH)
+    assert decibel(start, between) < 16
+    assert decibel(found, between) > decibel(start, between) + 10
+    assert torch.equal(found.density_rows, field.density_rows) and found.decoder is field.decoder
+    assert not start.feature_rows.any() and not found.feature_rows[-1].any()  # what was given is left, and the zero row is zero
+
+
+def test_right_colours_stay() -> None:
+    field = painted()
+    views = pictures_of(field)
+    found = recoloured(field, views, 100.0)  # at the pictures' full size: nothing is averaged
+    assert decibel(found, views) > 40
+    assert float((found.feature_rows - field.feature_rows).abs().mean()) < 0.01
+
+
+def test_what_no_picture_shows_keeps_every_bit() -> None:
+    field = painted()
+    views = pictures_of(field).subset([0])
+    found = recoloured(grey(field), views, DEPTH)
+    changed = (found.feature_rows[:-1] != 0).any(1)
+    assert 0.05 < float(changed.float().mean()) < 0.6  # one side of the sphere
+    centre = torch.from_numpy(views.world_from_camera[0, :3, 3]).float()
+    rows = changed.nonzero().view(-1)
+    slot, local = rows // 512, rows % 512
+    corner = field.topology.keys[slot] * 8 + torch.stack([local & 7, (local >> 3) & 7, local >> 6], 1)
+    places = corner.float() * field.voxel_size - 1
+    assert float((places @ centre).min()) > -0.2 * float(centre.norm())  # the far half is hidden
+    assert not found.feature_rows[:, COLOURS:].any()
+
+
+def test_held_out_pictures_masked_pixels_and_those_with_alpha_are_not_looked_at() -> None:
+    field = painted()
+    views = pictures_of(field, test=2)
+    expected = recoloured(grey(field), views, DEPTH).feature_rows
+    spoilt = replace(views, images=[picture.copy() for picture in views.images])
+    spoilt.images[7][:] = 255
+    assert torch.equal(recoloured(grey(field), spoilt, DEPTH).feature_rows, expected)
+    left = np.zeros((64, 64), bool)
+    left[:, :32] = True
+    for named in ("valid", "alpha"):
+        mask = left if named == "valid" else left.astype(np.uint8) * 255
+        half = replace(views, **{named: [mask] * 8})
+        expected = recoloured(grey(field), half, 100.0).feature_rows
+        spoilt = replace(half, images=[picture.copy() for picture in views.images])
+        for picture in spoilt.images:
+            picture[:, 32:] = 0
+        assert torch.equal(recoloured(grey(field), spoilt, 100.0).feature_rows, expected)
+
+
+def test_rays_are_bounded_by_leaving_pictures_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    field = painted()
+    views = pictures_of(field)
+    monkeypatch.setattr("toolkit.render.recolour.MOST_RAYS", 3 * 64 * 64)
+    third = recoloured(grey(field), views, 100.0).feature_rows
+    monkeypatch.undo()
+    assert torch.equal(third, recoloured(grey(field), views.subset([0, 3, 6]), 100.0).feature_rows)
+
+
+def test_it_can_be_stopped() -> None:
+    class Stop(Progress):
+        def stopping(self) -> bool:
+            return True
+
+    with pytest.raises(Interrupted):
+        recoloured(painted(), pictures_of(painted(), 2), DEPTH, Stop())
+
+
+def test_an_empty_field_and_pictures_of_nothing() -> None:
+    field = painted()
+    empty = replace(field, occupied=torch.zeros_like(field.occupied))
+    views = pictures_of(field, 2)
+    assert torch.equal(recoloured(empty, views, DEPTH).feature_rows, empty.feature_rows)
+    nothing = replace(views, valid=[np.zeros((64, 64), bool)] * 2)
+    assert torch.equal(recoloured(field, nothing, DEPTH).feature_rows, field.feature_rows)
