@@ -34,6 +34,7 @@ class Job:
     progress: ConsoleProgress
     stages: Stages
     other_field: bool = False  # the settings of the field differ from those that the folder was made with
+    other_network: bool = False  # the same of the networks' field
     keys: KeyFrames | None = None  # the key frames, once chosen
     network: NetworkField | None = None  # the networks' field, once this command has made or loaded it
     plan: TotalBudget | None = None  # chooses settings as the run goes on, so that it takes as long as was asked for
@@ -68,7 +69,7 @@ def open_job(
         settings.device = choose_device(settings.device)
     with RunFolder(path) as folder, progress.listening():
         source = target.absolute()
-        other = False
+        other = other_network = False
         if again:
             about = folder.about()
             source = Path(about["source"])
@@ -77,8 +78,9 @@ def open_job(
             settings.device = choose_device(settings.device)
             before = read_settings({}, about["settings"])
             other = settings.field != before.field or settings.fit.finetune != before.fit.finetune
+            other_network = settings.network != before.network or settings.field.background != before.field.background
         folder.start(source, settings)
-        yield Job(folder, source, settings, progress, Stages(folder, progress, trusted if again else ()), other)
+        yield Job(folder, source, settings, progress, Stages(folder, progress, trusted if again else ()), other, other_network)
 
 
 def _no_out(target: Path) -> str:

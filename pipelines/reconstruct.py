@@ -78,7 +78,8 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
     start = time.monotonic()
     stages = job.stages
     stages.trust(set(RESULTS) - goals)
-    stages.trust(() if "field" in goals else FOR_FIELD)
+    # The field of --no-finetune is finer than what a fit begins with, and good for that, too.
+    stages.trust(FOR_FIELD if "field" not in goals or (go_on and not job.other_network) else ())
     capture, poses, posed, scene, views = stand(job)
     choose_keyframes(job, scene, views)
 

@@ -60,23 +60,23 @@ def uses_network(job: Job, views: Views) -> bool:
 def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
     """The stage `network`; made once a command."""
     from toolkit.render.field import Field
-    from toolkit.training.from_network import SHIPPED
+    from toolkit.training.from_network import SHIPPED, NetworkOptions
 
     if job.network is not None:
         return job.network
     keys = choose_keyframes(job, scene, views)
     settings = job.settings
+    options = NetworkOptions.of(settings.network, start=settings.fit.finetune and uses_network(job, views))
     path, about = job.folder / "network.safetensors", job.folder / "network.json"
     weights = Path(settings.network.weights) if settings.network.weights else SHIPPED
     if not weights.is_file():
         raise InputError(f"there are no trained networks at {weights}; leave network.weights out for the shipped ones")
 
     def make() -> NetworkField:
-        from toolkit.training.from_network import Inference, NetworkOptions, load_networks
+        from toolkit.training.from_network import Inference, load_networks
 
         set_seeds(settings.seed)
         start = time.monotonic()
-        options = NetworkOptions.of(settings.network)
         model = load_networks(weights, settings.device)
         inference = Inference(model, views, scene, keys, settings.field.background, options)
         first = _stream(job, inference, start)
@@ -99,7 +99,7 @@ def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
     def load() -> NetworkField:
         return NetworkField(Field.load(path).to(settings.device), read_kept(about, NETWORK))
 
-    uses = [asdict(settings.network), fingerprint(weights), settings.field.background, settings.device, settings.seed]
+    uses = [asdict(settings.network), options.start, fingerprint(weights), settings.field.background, settings.device, settings.seed]
     value = job.stages.run("network", make, save, load, uses=uses, after=["scene", "views", "keyframes"])
     # As with a fitted field, what is used is what everybody can load.
     job.network = value if job.stages.cached["network"] else load()

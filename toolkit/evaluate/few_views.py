@@ -67,18 +67,20 @@ def measured(field: Field, ground: Ground) -> dict[str, Any]:
     return {name: scores[name] for name in SHOWN}
 
 
-def infer(model: NerfusionModel, ground: Ground, pruned: bool = True, progress: Progress = SILENT) -> tuple[Field, dict[str, Any]]:
-    """The networks' field, and its seconds (processor time) and number of key frames."""
+def infer(
+    model: NerfusionModel, ground: Ground, pruned: bool = True, progress: Progress = SILENT, start: bool = False
+) -> tuple[Field, dict[str, Any]]:
+    """The networks' field, and its seconds (processor time) and number of key frames. `start`: as a fit begins with it."""
     from toolkit.training.from_network import Inference, NetworkOptions
 
-    options = NetworkOptions.of(ground.settings.network)
+    options = NetworkOptions.of(ground.settings.network, start)
     options = options if pruned else replace(options, gamma=None)
-    start = time.process_time()
+    began = time.process_time()
     inference = Inference(model, ground.views, ground.scene, ground.keys(), ground.settings.field.background, options)
     for _ in inference.frames(progress):
         pass
     field = inference.field()
-    return field, {"key_frames": inference.done, "seconds": round(time.process_time() - start, 2)}
+    return field, {"key_frames": inference.done, "seconds": round(time.process_time() - began, 2)}
 
 
 def few_views_rows(
@@ -106,7 +108,7 @@ def few_views_rows(
     made: Field | None = None
     alone = "direct" in starts and (count, "direct", 0) not in done
     if alone or ("network" in starts and any((count, "network", budget) not in done for budget in budgets)):
-        made, facts = infer(model, ground, progress=progress)
+        made, facts = infer(model, ground, progress=progress, start=True)
         if alone:
             yield {"views": count, "start": "direct", "budget": 0, **measured(made, ground), **facts}
     for budget in budgets:

@@ -38,9 +38,9 @@ SHIPPED = Path(weights.__file__).parent / "weights" / "nerfusion.safetensors"
 # Voxels that make up the median depth at least, on the finer of two lattices. One lattice of 24 alone loses 1.5 to 2.5 dB, while 104
 # gain 0.25 dB for about three times the seconds (docs/few_views.md), so no voxel need be smaller than some pixels; a larger one shows.
 VOXELS_TO_MEDIAN, LEVELS = 48.0, 2
-PIXELS = 5.0  # that a voxel spans at most …
+PIXELS, START_PIXELS = 3.5, 5.0  # that a voxel spans at most, and where a fit begins with the field, at a coarser level anyway …
 MEASURED_PIXELS = 2.5  # … where a sensor's depth says more exactly where surfaces are …
-OBJECT_PIXELS = PIXELS * classical.OBJECT_PIXELS / classical.PIXELS  # … and where alpha cuts the object out: as in a fit
+OBJECT = classical.OBJECT_PIXELS / classical.PIXELS  # … and times this where alpha cuts the object out: as in a fit
 GAMMA = 0.95  # the paper's 0.6 cuts holes where the networks are in doubt
 LEAST, MOST = 32, 384  # resolution of the lattice
 
@@ -55,6 +55,7 @@ class NetworkOptions:
         gamma: see-through voxels (exp(−optical thickness) above it) are not rendered; None: all are.
         measured: the views' depth goes into the key frames' sweeps.
         recolour: the finished field's colours are looked up again in the training pictures (`render.recolour`).
+        start: a fit begins with the field, so it may be coarser.
     """
 
     voxels: float | None = None
@@ -62,11 +63,12 @@ class NetworkOptions:
     gamma: float | None = GAMMA
     measured: bool = False
     recolour: bool = True
+    start: bool = False
 
     @classmethod
-    def of(cls, settings: NetworkSettings) -> NetworkOptions:
+    def of(cls, settings: NetworkSettings, start: bool = False) -> NetworkOptions:
         """As the settings say."""
-        return cls(settings.voxels, settings.levels, measured=settings.depth_from == "sensor", recolour=settings.recolour)
+        return cls(settings.voxels, settings.levels, measured=settings.depth_from == "sensor", recolour=settings.recolour, start=start)
 
 
 def load_networks(path: Path | str | None = None, device: torch.device | str = "cpu") -> NerfusionModel:
@@ -78,11 +80,14 @@ def load_networks(path: Path | str | None = None, device: torch.device | str = "
     return load_model(SHIPPED if path is None else path, device)
 
 
-def voxels_to_median(views: Views, measured: bool = False) -> float:
-    """Voxels that make up the median depth: 48, or as many as let a voxel there span no more than `PIXELS` of the views, `OBJECT_PIXELS`
-    where they have alpha, `MEASURED_PIXELS` where their depth is measured and asked."""
-    known = measured and any(depth is not None for depth in views.depths)
-    pixels = MEASURED_PIXELS if known else OBJECT_PIXELS if any(alpha is not None for alpha in views.alpha) else PIXELS
+def voxels_to_median(views: Views, measured: bool = False, start: bool = False) -> float:
+    """Voxels that make up the median depth: 48, or as many as let a voxel there span no more than `PIXELS` of the views (`START_PIXELS` for
+    the start of a fit), fewer pixels where the views have alpha, and `MEASURED_PIXELS` where their depth is measured and asked."""
+    pixels = START_PIXELS if start else PIXELS
+    if measured and any(depth is not None for depth in views.depths):
+        pixels = MEASURED_PIXELS
+    elif any(alpha is not None for alpha in views.alpha):
+        pixels *= OBJECT
     return max(VOXELS_TO_MEDIAN, float(np.median([lens.fx for lens in views.intrinsics])) / pixels)
 
 
@@ -133,7 +138,7 @@ class Inference:
         self.model, self.keys, self.options = model, keys, options or NetworkOptions()
         self.train = views.subset(train)
         self.near, self.far, self.median_depth = scene.near, scene.far, scene.median_depth
-        voxels = self.options.voxels or voxels_to_median(self.train, self.options.measured)
+        voxels = self.options.voxels or voxels_to_median(self.train, self.options.measured, self.options.start)
         self.lattice = lattice_of(space_of(views, scene, background), scene, voxels, self.options.levels)
         self.behind, self.sky = colour_behind(views).to(model.device), sky_behind(views)
         self.seconds = self.fusion_seconds = self.encode_seconds = 0.0
