@@ -23,7 +23,7 @@ from toolkit.volume.lookup import corners, scatter
 
 Tensor = torch.Tensor
 COLOURS = 3  # the first features are logits of the colour
-CHUNK = 8192  # rays at a time
+CHUNK = 2048  # rays at a time
 PER_VOXEL = 1.2  # rays along a voxel's side: 1.7 give 0.1 dB more for twice the time
 MOST_RAYS = 300_000  # pictures are left out evenly until there are no more
 SOLID = 0.5  # rays of which less is stopped say more of what is behind the field
