@@ -23,6 +23,7 @@ MODULES = (
     "lookup",
     "volume",
     "edit",
+    "colours",
     "network",
     "network_views",
     "network_fusion",
