@@ -69,7 +69,7 @@ def ablations(
     pairs: Pairs = None,
     quiet: Quiet = False,
 ) -> None:
-    """Direct inference with parts of the trained networks switched off: variance, direction code, GRU, pruning."""
+    """Direct inference with parts of the trained networks switched off: variance, direction code, GRU, pruning, second colours."""
     from toolkit.evaluate.few_views import ablation_rows, ablation_table
     from toolkit.training.from_network import load_networks
 

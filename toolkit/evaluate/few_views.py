@@ -27,7 +27,7 @@ from toolkit.render.image import make_renderer, render_view
 
 STARTS = ("direct", "network", "classical")
 SHOWN = ("psnr", "ssim", "lpips", "depth_abs_err")
-ABLATIONS = ("whole", "no variance", "no direction code", "mean instead of GRU", "no pruning")
+ABLATIONS = ("whole", "no variance", "no direction code", "mean instead of GRU", "no pruning", "colours of the fusion")
 
 
 @dataclass(frozen=True)
@@ -68,18 +68,26 @@ def measured(field: Field, ground: Ground) -> dict[str, Any]:
 
 
 def infer(
-    model: NerfusionModel, ground: Ground, pruned: bool = True, progress: Progress = SILENT, start: bool = False
+    model: NerfusionModel, ground: Ground, progress: Progress = SILENT, start: bool = False, without: str | None = None
 ) -> tuple[Field, dict[str, Any]]:
-    """The networks' field, and its seconds (processor time) and number of key frames. `start`: as a fit begins with it."""
+    """The networks' field, and its seconds (processor time) and number of key frames.
+
+    Args:
+        start: as a fit begins with it.
+        without: one of `ABLATIONS` that is a choice of direct inference and no part of the model.
+    """
     from toolkit.training.from_network import Inference, NetworkOptions
 
     options = NetworkOptions.of(ground.settings.network, start)
-    options = options if pruned else replace(options, gamma=None)
+    if without == "no pruning":
+        options = replace(options, gamma=None)
+    elif without == "colours of the fusion":
+        options = replace(options, recolour=False)
     began = time.process_time()
     inference = Inference(model, ground.views, ground.scene, ground.keys(), ground.settings.field.background, options)
     for _ in inference.frames(progress):
         pass
-    field = inference.field()
+    field = inference.field(progress=progress)
     return field, {"key_frames": inference.done, "seconds": round(time.process_time() - began, 2)}
 
 
@@ -108,7 +116,7 @@ def few_views_rows(
     made: Field | None = None
     alone = "direct" in starts and (count, "direct", 0) not in done
     if alone or ("network" in starts and any((count, "network", budget) not in done for budget in budgets)):
-        made, facts = infer(model, ground, progress=progress, start=True)
+        made, facts = infer(model, ground, progress, start=True)
         if alone:
             yield {"views": count, "start": "direct", "budget": 0, **measured(made, ground), **facts}
     for budget in budgets:
@@ -128,7 +136,7 @@ def ablation_rows(ground: Ground, model: NerfusionModel, progress: Progress = SI
     for name in ABLATIONS:
         progress.check()
         with _without(model, name):
-            field, facts = infer(model, ground, pruned=name != "no pruning", progress=progress)
+            field, facts = infer(model, ground, progress, without=name)
             yield {"views": ground.training, "part": name, **measured(field, ground), **facts}
 
 
