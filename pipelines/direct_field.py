@@ -33,7 +33,8 @@ def weights_state(settings: Settings) -> str:
 def direct_field(
     settings: Settings, views: Views, scene: Scene, progress: Progress, share: float = 1.0, voxel_factor: float = 1.0
 ) -> tuple[Field, int]:
-    """Fuse the key frames (about `share` of them, evenly spread) of the training views into a field; and how many they were.
+    """Fuse the key frames (about `share` of them, evenly spread) of the training views into a field; and how many they were. Key frames
+    are chosen as by a run but for sharpness.
 
     Args:
         voxel_factor: voxels this many times as large as `network.voxels` asks for.
@@ -46,7 +47,15 @@ def direct_field(
     from toolkit.training.from_network import Inference, NetworkOptions, load_networks, voxels_to_median
 
     train = np.flatnonzero(~np.asarray(views.test))
-    keys = select_keyframes(views.world_from_camera[train], [views.intrinsics[index] for index in train], scene.median_depth)
+    chosen = settings.keyframes
+    keys = select_keyframes(
+        views.world_from_camera[train],
+        [views.intrinsics[index] for index in train],
+        scene.median_depth,
+        method=chosen.method,
+        every=chosen.every,
+        most=chosen.most,
+    )
     if share < 1:
         kept = np.unique(np.linspace(0, len(keys.indices) - 1, max(1, round(share * len(keys.indices)))).round().astype(int))
         keys = KeyFrames(keys.indices[kept], keys.neighbours[kept])
