@@ -161,12 +161,12 @@ def render_directly(job: Job, views: Views, scene: Scene) -> Pictures:
     from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture
     from toolkit.render.image import render_view
 
-    kept = job.folder / "renders" / "direct.safetensors"
+    kept, settings = job.folder / "renders" / "direct.safetensors", job.settings
 
     def make() -> Pictures:
         import numpy as np
 
-        field, key_frames = direct_field(job.settings, views, scene, job.progress)
+        field, key_frames = direct_field(settings, views, scene, job.progress)
         pictures = Pictures()
         for index in np.flatnonzero(views.test):
             job.progress.check()
@@ -180,7 +180,7 @@ def render_directly(job: Job, views: Views, scene: Scene) -> Pictures:
         save_pictures(kept, pictures)
         return [kept]
 
-    uses = [asdict(job.settings.network), weights_state(job.settings), job.settings.field.background, job.settings.device]
+    uses = [asdict(settings.network), asdict(settings.keyframes), weights_state(settings), settings.field.background, settings.device]
     return job.stages.run("direct", make, save, lambda: load_pictures(kept), uses=uses, after=["scene", "views"])
 
 

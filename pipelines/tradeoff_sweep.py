@@ -71,7 +71,7 @@ def job_spec(job: Job, one: Wanted, stereo_seconds: float, base_voxel: float | N
     if one.is_surface:
         own: list[Any] = [asdict(settings.tsdf), base_voxel]
     elif one.method == "direct":
-        own = [asdict(settings.network), weights_state(settings), settings.field.background, settings.device]
+        own = [asdict(settings.network), asdict(settings.keyframes), weights_state(settings), settings.field.background, settings.device]
     else:
         own = [asdict(settings.field), asdict(replace(settings.fit, budget=None)), settings.engine, settings.device]
     uses = [made, own, settings.threads]
