@@ -43,19 +43,11 @@ def direct_field(
         InputError: there is no training view, or no weights.
         Interrupted: the user asked to stop.
     """
-    from toolkit.keyframes import KeyFrames, select_keyframes
+    from toolkit.evaluate.few_views import Ground
+    from toolkit.keyframes import KeyFrames
     from toolkit.training.from_network import Inference, NetworkOptions, load_networks, voxels_to_median
 
-    train = np.flatnonzero(~np.asarray(views.test))
-    chosen = settings.keyframes
-    keys = select_keyframes(
-        views.world_from_camera[train],
-        [views.intrinsics[index] for index in train],
-        scene.median_depth,
-        method=chosen.method,
-        every=chosen.every,
-        most=chosen.most,
-    )
+    keys = Ground(views, scene, settings).keys()
     if share < 1:
         kept = np.unique(np.linspace(0, len(keys.indices) - 1, max(1, round(share * len(keys.indices)))).round().astype(int))
         keys = KeyFrames(keys.indices[kept], keys.neighbours[kept])

@@ -14,10 +14,11 @@ from toolkit.capture.types import Views
 from toolkit.errors import Interrupted
 from toolkit.evaluate.speed_state import around, lens, sphere_field
 from toolkit.progress import Progress
+from toolkit.render.composite import SOLID, THRESHOLD
 from toolkit.render.differentiable import render_with_gradients
 from toolkit.render.field import Field
 from toolkit.render.image import render_view
-from toolkit.render.recolour import COLOURS, LIGHT, MOST, SOLID, STEEPEST, _project_back, recoloured
+from toolkit.render.recolour import COLOURS, MOST, STEEPEST, _project_back, recoloured
 from toolkit.volume.lookup import corners
 
 DEPTH = 2.4  # of the cameras around the sphere
@@ -62,14 +63,14 @@ def test_a_slow_loop_gives_the_same(decoder: str) -> None:
     size = len(field.density_rows)
     wanted, weight = torch.zeros(size, 3), torch.zeros(size)
     with torch.no_grad():
-        shown = render_with_gradients(field, origins, directions, threshold=LIGHT)
+        shown = render_with_gradients(field, origins, directions, threshold=THRESHOLD)
         _project_back(field, origins, directions, colours, wanted, weight)
     slow, slow_weight = np.zeros((size, 3)), np.zeros(size)
     rows, parts = corners(field.topology, shown.samples.cell, shown.samples.inside)
     for sample in range(len(shown.samples)):
         ray, light = int(shown.samples.ray[sample]), float(shown.weight[sample])
         opacity = float(shown.opacity[ray])
-        if light <= LIGHT or opacity < SOLID:
+        if light <= THRESHOLD or opacity < SOLID:
             continue
         for channel in range(3):
             own = (float(shown.colour[ray, channel]) - (1 - opacity) * float(field.background[channel])) / opacity

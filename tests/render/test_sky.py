@@ -83,10 +83,12 @@ def test_held_out_pictures_and_masked_pixels_are_not_looked_at() -> None:
     assert first is not None and torch.equal(sky_behind(left), first)  # type: ignore[arg-type]
 
 
-def test_where_nobody_looked_it_stays_a_colour_near_those_beside() -> None:
-    """Ridge and clamp: one picture of a green wall does not make the other side of the world blue."""
-    views = views_of(gentle_sky(), [turned(0.0, 0.0)])
-    views.images[0][:] = (40, 200, 60)
+@pytest.mark.parametrize("pictures", [1, 2, 5])
+def test_where_nobody_looked_it_stays_a_colour_near_those_beside(pictures: int) -> None:
+    """Pictures of a green wall do not make the other side of the world blue."""
+    views = views_of(gentle_sky(), [turned(0.1 * index, 0.0) for index in range(pictures)])
+    for picture in views.images:
+        picture[:] = (40, 200, 60)
     found = sky_behind(views)
     assert found is not None
     _, directions = random_rays(500)
@@ -117,7 +119,7 @@ def test_pictures_that_tell_nothing_of_others_leave_the_mean_colour() -> None:
 
 
 @pytest.mark.parametrize("pictures", [3, 5, 9])
-def test_what_is_chosen_predicts_unseen_pictures_no_worse_than_the_mean_colour(pictures: int) -> None:
+def test_what_is_chosen_predicts_unseen_pictures_better_than_the_mean_colour(pictures: int) -> None:
     """Few noisy pictures of one side of a sky; the others are elsewhere."""
     noise = np.random.default_rng(0)
     everywhere = all_around()
@@ -129,7 +131,7 @@ def test_what_is_chosen_predicts_unseen_pictures_no_worse_than_the_mean_colour(p
     assert found is not None
     mean = torch.zeros(9, 3)
     mean[0] = torch.tensor(np.mean([picture.reshape(-1, 3).mean(0) for picture in views.images[:pictures]], 0) / 255).float() / SH[0]
-    assert mean_error(found, views, range(pictures, 32)) < 1.2 * mean_error(mean, views, range(pictures, 32))
+    assert mean_error(found, views, range(pictures, 32)) < mean_error(mean, views, range(pictures, 32))
 
 
 def test_alpha_has_a_background_of_its_own() -> None:

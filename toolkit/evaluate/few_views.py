@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,9 +25,13 @@ from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
 from toolkit.render.image import make_renderer, render_view
 
+if TYPE_CHECKING:
+    from toolkit.training.from_network import NetworkOptions
+
 STARTS = ("direct", "network", "classical")
 SHOWN = ("psnr", "ssim", "lpips", "depth_abs_err")
-ABLATIONS = ("whole", "no variance", "no direction code", "mean instead of GRU", "no pruning", "colours of the fusion")
+OF_OPTIONS: dict[str, dict[str, Any]] = {"no pruning": {"gamma": None}, "colours of the fusion": {"recolour": False}}
+ABLATIONS = ("whole", "no variance", "no direction code", "mean instead of GRU", *OF_OPTIONS)
 
 
 @dataclass(frozen=True)
@@ -67,22 +71,10 @@ def measured(field: Field, ground: Ground) -> dict[str, Any]:
     return {name: scores[name] for name in SHOWN}
 
 
-def infer(
-    model: NerfusionModel, ground: Ground, progress: Progress = SILENT, start: bool = False, without: str | None = None
-) -> tuple[Field, dict[str, Any]]:
-    """The networks' field, and its seconds (processor time) and number of key frames.
+def infer(model: NerfusionModel, ground: Ground, options: NetworkOptions, progress: Progress = SILENT) -> tuple[Field, dict[str, Any]]:
+    """The networks' field, and its seconds (processor time) and number of key frames."""
+    from toolkit.training.from_network import Inference
 
-    Args:
-        start: as a fit begins with it.
-        without: one of `ABLATIONS` that is a choice of direct inference and no part of the model.
-    """
-    from toolkit.training.from_network import Inference, NetworkOptions
-
-    options = NetworkOptions.of(ground.settings.network, start)
-    if without == "no pruning":
-        options = replace(options, gamma=None)
-    elif without == "colours of the fusion":
-        options = replace(options, recolour=False)
     began = time.process_time()
     inference = Inference(model, ground.views, ground.scene, ground.keys(), ground.settings.field.background, options)
     for _ in inference.frames(progress):
@@ -105,6 +97,7 @@ def few_views_rows(
         starts: what is measured, a part of `STARTS`.
         done: (views, start, budget) of rows that are there already.
     """
+    from toolkit.training.from_network import NetworkOptions
     from toolkit.training.guided import fit_guided
     from toolkit.training.network_start import network_start
 
@@ -116,7 +109,7 @@ def few_views_rows(
     made: Field | None = None
     alone = "direct" in starts and (count, "direct", 0) not in done
     if alone or ("network" in starts and any((count, "network", budget) not in done for budget in budgets)):
-        made, facts = infer(model, ground, progress, start=True)
+        made, facts = infer(model, ground, NetworkOptions.of(settings.network, start=True), progress)
         if alone:
             yield {"views": count, "start": "direct", "budget": 0, **measured(made, ground), **facts}
     for budget in budgets:
@@ -133,10 +126,13 @@ def few_views_rows(
 
 def ablation_rows(ground: Ground, model: NerfusionModel, progress: Progress = SILENT) -> Iterable[dict[str, Any]]:
     """Direct inference with parts of the trained networks switched off, one at a time. Nothing is trained again without them."""
+    from toolkit.training.from_network import NetworkOptions
+
+    options = NetworkOptions.of(ground.settings.network)
     for name in ABLATIONS:
         progress.check()
         with _without(model, name):
-            field, facts = infer(model, ground, progress, without=name)
+            field, facts = infer(model, ground, replace(options, **OF_OPTIONS.get(name, {})), progress)
             yield {"views": ground.training, "part": name, **measured(field, ground), **facts}
 
 
@@ -148,8 +144,6 @@ class _without:
         self.config, self.fusion = model.config, model.fusion
 
     def __enter__(self) -> None:
-        from dataclasses import replace
-
         if self.name == "no variance":
             self.model.config = replace(self.config, variance=False)
         elif self.name == "mean instead of GRU":

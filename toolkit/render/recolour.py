@@ -17,6 +17,7 @@ import torch
 from toolkit.camera import Intrinsics, pixel_grid, rays
 from toolkit.capture.types import Views
 from toolkit.progress import SILENT, Progress
+from toolkit.render.composite import SOLID, THRESHOLD
 from toolkit.render.differentiable import render_with_gradients
 from toolkit.render.field import Field
 from toolkit.volume.lookup import corners, scatter
@@ -26,8 +27,6 @@ COLOURS = 3  # the first features are logits of the colour
 CHUNK = 2048  # rays at a time
 PER_VOXEL = 1.2  # rays along a voxel's side: 1.7 give 0.1 dB more for twice the time
 MOST_RAYS = 300_000  # pictures are left out evenly until there are no more
-SOLID = 0.5  # rays of which less is stopped say more of what is behind the field
-LIGHT = 1e-3  # samples of smaller weight show nothing
 STEEPEST = 0.05  # least slope of colour over logit that is divided by
 MOST = 2.0  # logits that a ray may ask for
 OPAQUE, VALID = 250, 0.99
@@ -64,18 +63,19 @@ def recoloured(field: Field, views: Views, depth: float, progress: Progress = SI
         for some in torch.arange(len(origins)).split(CHUNK):
             _project_back(field, origins[some].to(device), directions[some].to(device), colours[some].to(device), wanted, weight)
     features = field.feature_rows.clone()
-    features[:-1, :COLOURS] += (wanted / weight.clamp_min(LIGHT)[:, None])[:-1]
+    features[:-1, :COLOURS] += (wanted / weight.clamp_min(THRESHOLD)[:, None])[:-1]
     return replace(field, feature_rows=features)
 
 
 def _project_back(field: Field, origins: Tensor, directions: Tensor, colours: Tensor, wanted: Tensor, weight: Tensor) -> None:
     """Add Σ a (c − ĉ) / ĉ' and Σ a of these rays (B, 3) to `wanted` (M · 512 + 1, 3) and `weight` (M · 512 + 1,)."""
-    shown = render_with_gradients(field, origins, directions, threshold=LIGHT)
+    # Rays that are not stopped (SOLID) say more of what is behind the field, and weak samples (THRESHOLD) show nothing.
+    shown = render_with_gradients(field, origins, directions, threshold=THRESHOLD)
     opacity = shown.opacity[:, None]
     own = ((shown.colour - (1 - opacity) * field.background) / opacity.clamp_min(SOLID)).clamp(0, 1)
     asked = ((colours - own) / (own * (1 - own)).clamp_min(STEEPEST)).clamp(-MOST, MOST)
     samples = shown.samples
-    kept = ((shown.weight > LIGHT) & (shown.opacity >= SOLID)[samples.ray]).nonzero().view(-1)
+    kept = ((shown.weight > THRESHOLD) & (shown.opacity >= SOLID)[samples.ray]).nonzero().view(-1)
     if len(kept) == 0:
         return
     light, ray = shown.weight[kept], samples.ray[kept]
