@@ -33,6 +33,7 @@ class Job:
     settings: Settings
     progress: ConsoleProgress
     stages: Stages
+    again: bool = False  # it works on what an earlier command left there, and not on a source
     other_field: bool = False  # the settings of the field differ from those that the folder was made with
     other_network: bool = False  # the same of the networks' field
     keys: KeyFrames | None = None  # the key frames, once chosen
@@ -80,7 +81,7 @@ def open_job(
             other = settings.field != before.field or settings.fit.finetune != before.fit.finetune
             other_network = settings.network != before.network or settings.field.background != before.field.background
         folder.start(source, settings)
-        yield Job(folder, source, settings, progress, Stages(folder, progress, trusted if again else ()), other, other_network)
+        yield Job(folder, source, settings, progress, Stages(folder, progress, trusted if again else ()), again, other, other_network)
 
 
 def _no_out(target: Path) -> str:

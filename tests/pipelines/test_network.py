@@ -99,6 +99,24 @@ def test_without_fine_tuning_the_networks_field_is_the_result_until_it_is_fitted
     assert data["field"]["resolution"] == 64 and not any("nothing was fitted" in text for text in data["warnings"])
 
 
+def test_with_many_pictures_too_the_networks_field_is_fitted_further(
+    room: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By itself a run with so many pictures would start classically; what the folder has does not stand on that."""
+    monkeypatch.setattr("toolkit.training.start.FEW_VIEWS", 1)
+    out = tmp_path / "out"
+    assert stages(run(capsys, room, out, "--no-finetune", "--init", "auto"))["network"] is False
+    timelines = []
+    for verb in (["finetune", out, "--budget", 1.5], ["finetune", out, "--budget", 1.5], ["export", out]):
+        answer = call(capsys, *verb, "--json", "--quiet")
+        assert answer.code == 0, answer.err
+        data = json.loads(answer.out)
+        assert stages(data)["network"] and stages(data)["field"] == (verb[0] == "export")
+        timelines.append([point["seconds"] for point in data["timeline"]])
+    assert timelines[1][: len(timelines[0])] == timelines[0] and len(timelines[1]) > len(timelines[0]) and timelines[2] == timelines[1]
+    assert "network" not in stages(run(capsys, room, tmp_path / "other", "--init", "auto"))
+
+
 def test_the_classical_start_asks_no_network(room: Path, tmp_path: Path, capsys: Capsys) -> None:
     data = run(capsys, room, tmp_path / "out", "--init", "classical")
     assert "network" not in stages(data) and "network" not in data["evaluation"] and not (tmp_path / "out" / "preview.png").exists()
@@ -170,7 +188,7 @@ def test_parts_of_the_networks_can_be_switched_off(room: Path, tmp_path: Path, c
 def test_which_start_is_automatic(count: int, used: bool) -> None:
     settings = load_settings()
     views = SimpleNamespace(test=np.zeros(count, bool))
-    job = SimpleNamespace(settings=settings, plan=None)
+    job = SimpleNamespace(settings=settings, plan=None, again=False)
     assert uses_network(job, views) is used  # type: ignore[arg-type]
     job.plan = object()
     assert not uses_network(job, views)  # type: ignore[arg-type]
