@@ -12,6 +12,7 @@ import numpy as np
 
 from pipelines.job import Job
 from pipelines.steps_compare import Compared, common_voxel, depths_of_test_views, working_meshes
+from pipelines.steps_network import DIRECT
 from pipelines.steps_results import fit_matched
 from pipelines.summary import base_data, warnings_of
 
@@ -38,7 +39,7 @@ NOTES = {
     "tsdf_exact": "perfect depth",
 }
 OWN_STAGES = {"field": ("field", "render"), "direct": ("network", "direct"), "tsdf_stereo": ("stereo", "tsdf_stereo")}
-KEPT = {"field": "field.safetensors", "direct": "network.safetensors"}
+KEPT = {"field": "field.safetensors", "direct": DIRECT}
 
 
 def put_comparison(

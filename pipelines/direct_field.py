@@ -57,4 +57,4 @@ def direct_field(
     inference = Inference(model, views, scene, keys, settings.field.background, options)
     for _ in inference.frames(progress):
         pass
-    return inference.field(progress=progress), len(keys.indices)
+    return inference.result(progress, settings.engine), len(keys.indices)

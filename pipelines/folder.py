@@ -32,6 +32,7 @@ FILES = (
     "views.safetensors",
     "network.safetensors",
     "network.json",
+    "direct.safetensors",
     "preview.png",
     "field.safetensors",
     "timeline.json",

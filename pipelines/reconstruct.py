@@ -78,7 +78,7 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
     start = time.monotonic()
     stages = job.stages
     stages.trust(set(RESULTS) - goals)
-    # The field of --no-finetune is finer than what a fit begins with, and good for that, too.
+    # What the networks left is what a fit begins with, whether the folder's field was fitted or not.
     stages.trust(FOR_FIELD if "field" not in goals or (go_on and not job.other_network) else ())
     capture, poses, posed, scene, views = stand(job)
     choose_keyframes(job, scene, views)
@@ -93,7 +93,7 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
         if uses_network(job, views):
             made = make_network_field(job, views, scene)
             if job.settings.fit.finetune:  # else the field is this one
-                pictures["network"] = render_network_views(job, made, views)
+                pictures["network"] = render_network_views(job, made, views, scene)
         if job.plan is not None:
             job.plan.choose_fit(job, views, scene)
         field, timeline = fit_radiance_field(job, views, scene, go_on)

@@ -75,10 +75,7 @@ def not_fitted(job: Job, views: Views, scene: Scene) -> dict[str, Pictures]:
     settings = job.settings
     if settings.field.init == "classical" or not settings.fit.finetune or not weights_of(settings).is_file():
         return {}
-    made = make_network_field(job, views, scene)
-    pictures = render_network_views(job, made, views)
-    pictures.facts["bytes"] = made.field.bytes
-    return {"direct": pictures}
+    return {"direct": render_network_views(job, make_network_field(job, views, scene), views, scene, keep=True)}
 
 
 def measure(job: Job, all_of_it: Compared) -> dict[str, Any]:

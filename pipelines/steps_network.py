@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from toolkit.training.from_network import Inference
 
 PREVIEW = "preview.png"
+DIRECT = "direct.safetensors"  # the finished field of direct inference where another one is the result
 PREVIEW_SIDE = 160  # pixels of the preview's pictures
 FIRST_PREVIEW = 3  # key frames after which there is one; with fewer in all, after the last
 
@@ -61,7 +62,7 @@ def uses_network(job: Job, views: Views) -> bool:
 
 
 def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
-    """The stage `network`; made once a command."""
+    """The stage `network`: what a fit can start from; made once a command."""
     from toolkit.render.field import Field
     from toolkit.training.from_network import SHIPPED, NetworkOptions
 
@@ -69,7 +70,7 @@ def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
         return job.network
     keys = choose_keyframes(job, scene, views)
     settings = job.settings
-    options = NetworkOptions.of(settings.network, start=settings.fit.finetune and uses_network(job, views))
+    options = NetworkOptions.of(settings.network)
     path, about = job.folder / "network.safetensors", job.folder / "network.json"
     weights = Path(settings.network.weights) if settings.network.weights else SHIPPED
     if not weights.is_file():
@@ -83,7 +84,7 @@ def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
         model = load_networks(weights, settings.device)
         inference = Inference(model, views, scene, keys, settings.field.background, options)
         first = _stream(job, inference, start)
-        field = inference.field(progress=job.progress)
+        field = inference.field()
         facts = {
             "key_frames": inference.done,
             "seconds": round(inference.seconds, 3),
@@ -102,7 +103,7 @@ def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
     def load() -> NetworkField:
         return NetworkField(Field.load(path).to(settings.device), read_kept(about, NETWORK))
 
-    uses = [asdict(settings.network), options.start, fingerprint(weights), settings.field.background, settings.device, settings.seed]
+    uses = [asdict(settings.network), fingerprint(weights), settings.field.background, settings.device, settings.seed]
     value = job.stages.run("network", make, save, load, uses=uses, after=["scene", "views", "keyframes"])
     # As with a fitted field, what is used is what everybody can load.
     job.network = value if job.stages.cached["network"] else load()
@@ -143,27 +144,46 @@ def preview(inference: Inference, frame: int) -> Any:
     return np.concatenate([small, shown.rgb, depth_picture(shown.depth, depth_range([shown.depth]))], axis=1)
 
 
-def render_network_views(job: Job, made: NetworkField, views: Views) -> Pictures:
-    """The networks' field at the held-out views, before anything was fitted."""
+def direct_result(job: Job, made: NetworkField, views: Views, scene: Scene) -> Field:
+    """What direct inference gives, made of what the stage `network` left: colours are looked up again if the settings say so."""
+    from toolkit.training.finer_colours import finer_colours
+
+    if not job.settings.network.recolour:
+        return made.field
+    return finer_colours(made.field, views, scene.median_depth, job.progress, job.settings.engine)
+
+
+def render_network_views(job: Job, made: NetworkField, views: Views, scene: Scene, keep: bool = False) -> Pictures:
+    """What direct inference gives at the held-out views, before anything was fitted.
+
+    Args:
+        keep: the field becomes a file, `DIRECT`, beside its pictures.
+    """
     from toolkit.render.image import make_renderer, render_view
 
     kept = job.folder / "renders" / "network.safetensors"
 
     def make() -> Pictures:
-        pictures = Pictures(facts=dict(made.facts))
-        view = make_renderer(made.field, job.settings.engine)
+        begin = time.monotonic()
+        field = direct_result(job, made, views, scene)
+        seconds = round(made.facts["seconds"] + time.monotonic() - begin, 3)
+        pictures = Pictures(facts={**made.facts, "seconds": seconds, "bytes": field.bytes})
+        if keep:
+            field.save(job.folder / DIRECT, scene.working_from_input, pictures.facts)
+        view = make_renderer(field, job.settings.engine)
         indices = np.flatnonzero(views.test)
         require_pictures([views.intrinsics[index] for index in indices], kept=True, advice="run again with a lower --image-size")
         for count, index in enumerate(indices):
             job.progress.update(count, len(indices), views.names[index])
             job.progress.check()
             start = time.monotonic()
-            picture = to_picture(render_view(made.field, views.intrinsics[index], views.world_from_camera[index], view))
+            picture = to_picture(render_view(field, views.intrinsics[index], views.world_from_camera[index], view))
             pictures.add(views.names[index], picture, time.monotonic() - start)
         return pictures
 
     def save(pictures: Pictures) -> list[Path]:
         save_pictures(kept, pictures)
-        return [kept, *write_pngs(kept.parent, "network", pictures)]
+        return [kept, *([job.folder / DIRECT] if keep else []), *write_pngs(kept.parent, "network", pictures)]
 
-    return job.stages.run("direct", make=make, save=save, load=lambda: load_pictures(kept), after=["network", "views"])
+    uses = [job.settings.engine, keep]
+    return job.stages.run("direct", make, save, load=lambda: load_pictures(kept), uses=uses, after=["network", "views", "scene"])

@@ -80,7 +80,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     The start is classical, or the networks' field, which is the result itself without fine-tuning. With `go_on` the field that the folder
     has is the start, and the budget is for what is added.
     """
-    from pipelines.steps_network import make_network_field, uses_network
+    from pipelines.steps_network import direct_result, make_network_field, uses_network
     from pipelines.steps_stereo import views_for_fit
     from toolkit.render.field import Field
     from toolkit.training.guided import fit_guided
@@ -104,7 +104,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     def make() -> Fitted:
         set_seeds(settings.seed)
         if start is None and made is not None and not settings.fit.finetune:
-            return made.field, []
+            return direct_result(job, made, views, scene), []
         if start is None:
             first = None if made is None else network_start(made.field, views, scene, settings)
             coarse = first is not None

@@ -21,7 +21,16 @@ from toolkit.poses.scene import Scene
 from toolkit.render.field import Field
 from toolkit.render.image import render_view
 from toolkit.training.fit import fit_field
-from toolkit.training.from_network import Inference, NetworkOptions, inside_silhouettes, lattice_of, load_networks, voxels_to_median
+from toolkit.training.from_network import (
+    MEASURED_PIXELS,
+    PIXELS,
+    Inference,
+    NetworkOptions,
+    inside_silhouettes,
+    lattice_of,
+    load_networks,
+    voxels_to_median,
+)
 from toolkit.training.network_start import THICK, THIN, network_start, widened
 from toolkit.training.start import space_of
 from toolkit.volume.lookup import corners, gather
@@ -149,15 +158,16 @@ def test_a_voxel_spans_no_more_than_some_pixels_at_the_median_depth() -> None:
     views, about = wall_views(), scene()
     assert voxels_to_median(views) == 48
     long = replace(views, intrinsics=[Intrinsics(64, 64, 600.0, 600.0, 32.0, 32.0)] * len(views))
-    assert voxels_to_median(long, start=True) == pytest.approx(120) and voxels_to_median(long) == pytest.approx(600 / 3.5)
-    wide, fine = (lattice_of(space_of(views, about), about, voxels_to_median(v, start=True), 2) for v in (views, long))
-    assert DEPTH / fine.voxel_size / 600 == pytest.approx(1 / 5, rel=0.1) and fine.resolution > 2 * wide.resolution
+    assert voxels_to_median(long) == pytest.approx(600 / PIXELS)
+    wide, fine = (lattice_of(space_of(views, about), about, voxels_to_median(v), 2) for v in (views, long))
+    assert DEPTH / fine.voxel_size / 600 == pytest.approx(1 / PIXELS, rel=0.1) and fine.resolution > 2 * wide.resolution
     assert lattice_of(space_of(views, about), about, 1e5, 2).resolution == 384
     deep = replace(long, depths=[None, *[np.ones((1, 1), np.float32)] * (len(long) - 1)])
-    assert [voxels_to_median(v, known, True) for v in (long, deep) for known in (False, True)] == pytest.approx([120, 120, 120, 240])
+    assert [voxels_to_median(v, known) for v in (long, deep) for known in (False, True)] == pytest.approx(
+        [600 / PIXELS] * 3 + [600 / MEASURED_PIXELS]
+    )
     cut_out = replace(long, alpha=[np.full((64, 64), 255, np.uint8)] * len(long))
-    assert voxels_to_median(cut_out, start=True) == pytest.approx(120 * 2 / 1.3)
-    assert voxels_to_median(deep, True) == pytest.approx(240) and voxels_to_median(cut_out) == pytest.approx(600 / 3.5 * 2 / 1.3)
+    assert voxels_to_median(cut_out) == pytest.approx(600 / PIXELS * 2 / 1.3)
 
 
 def test_what_lies_outside_of_the_silhouettes_is_left_out() -> None:

@@ -26,7 +26,7 @@ from toolkit.render.field import Field
 from toolkit.render.image import make_renderer, render_view
 
 if TYPE_CHECKING:
-    from toolkit.training.from_network import NetworkOptions
+    from toolkit.training.from_network import Inference, NetworkOptions
 
 STARTS = ("direct", "network", "classical")
 SHOWN = ("psnr", "ssim", "lpips", "depth_abs_err")
@@ -71,16 +71,23 @@ def measured(field: Field, ground: Ground) -> dict[str, Any]:
     return {name: scores[name] for name in SHOWN}
 
 
-def infer(model: NerfusionModel, ground: Ground, options: NetworkOptions, progress: Progress = SILENT) -> tuple[Field, dict[str, Any]]:
-    """The networks' field, and its seconds (processor time) and number of key frames."""
+def infer(model: NerfusionModel, ground: Ground, options: NetworkOptions, progress: Progress = SILENT) -> tuple[Inference, dict[str, Any]]:
+    """Direct inference with all key frames fused, and its seconds (processor time) and number of key frames."""
     from toolkit.training.from_network import Inference
 
     began = time.process_time()
     inference = Inference(model, ground.views, ground.scene, ground.keys(), ground.settings.field.background, options)
     for _ in inference.frames(progress):
         pass
-    field = inference.field(progress=progress)
-    return field, {"key_frames": inference.done, "seconds": round(time.process_time() - began, 2)}
+    return inference, {"key_frames": inference.done, "seconds": round(time.process_time() - began, 2)}
+
+
+def measured_alone(inference: Inference, ground: Ground, facts: dict[str, Any], progress: Progress = SILENT) -> dict[str, Any]:
+    """What direct inference gives, measured, its facts with the seconds of its colours."""
+    began = time.process_time()
+    field = inference.result(progress, ground.settings.engine)
+    seconds = facts["seconds"] + time.process_time() - began
+    return {**measured(field, ground), **facts, "seconds": round(seconds, 2)}
 
 
 def few_views_rows(
@@ -109,9 +116,10 @@ def few_views_rows(
     made: Field | None = None
     alone = "direct" in starts and (count, "direct", 0) not in done
     if alone or ("network" in starts and any((count, "network", budget) not in done for budget in budgets)):
-        made, facts = infer(model, ground, NetworkOptions.of(settings.network, start=True), progress)
+        inference, facts = infer(model, ground, NetworkOptions.of(settings.network), progress)
+        made = inference.field()
         if alone:
-            yield {"views": count, "start": "direct", "budget": 0, **measured(made, ground), **facts}
+            yield {"views": count, "start": "direct", "budget": 0, **measured_alone(inference, ground, facts, progress)}
     for budget in budgets:
         for start in STARTS[1:]:
             if start not in starts or (count, start, budget) in done:
@@ -132,8 +140,8 @@ def ablation_rows(ground: Ground, model: NerfusionModel, progress: Progress = SI
     for name in ABLATIONS:
         progress.check()
         with _without(model, name):
-            field, facts = infer(model, ground, replace(options, **OF_OPTIONS.get(name, {})), progress)
-            yield {"views": ground.training, "part": name, **measured(field, ground), **facts}
+            inference, facts = infer(model, ground, replace(options, **OF_OPTIONS.get(name, {})), progress)
+            yield {"views": ground.training, "part": name, **measured_alone(inference, ground, facts, progress)}
 
 
 class _without:

@@ -8,7 +8,9 @@ every pixel's light is known to come from the samples of its ray, each by its we
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -16,29 +18,56 @@ import torch
 
 from toolkit.camera import Intrinsics, pixel_grid, rays
 from toolkit.capture.types import Views
+from toolkit.networks.decoder import Deferred
 from toolkit.progress import SILENT, Progress
-from toolkit.render.composite import SOLID, THRESHOLD
+from toolkit.render.composite import SOLID, STOP, THRESHOLD, ray_sum
 from toolkit.render.differentiable import render_with_gradients
 from toolkit.render.field import Field
 from toolkit.volume.lookup import corners, scatter
 
 Tensor = torch.Tensor
 COLOURS = 3  # the first features are logits of the colour
-CHUNK = 2048  # rays at a time
+CHUNK = 2048  # rays at a time, in torch
 PER_VOXEL = 1.2  # rays along a voxel's side: 1.7 give 0.1 dB more for twice the time
-MOST_RAYS = 300_000  # pictures are left out evenly until there are no more
+MOST_RAYS = 2_000_000  # pictures are left out evenly until there are no more
 STEEPEST = 0.05  # least slope of colour over logit that is divided by
 MOST = 2.0  # logits that a ray may ask for
 OPAQUE, VALID = 250, 0.99
 
 
+class Recoloured(NamedTuple):
+    """A field with other colours, and what the rays met on the way.
+
+    Attributes:
+        field: shares everything but its features with the one that was given.
+        seen: (M · 512,) largest weight T·α with which a ray saw each voxel; 1 for the strongest of a ray that ends somewhere.
+    """
+
+    field: Field
+    seen: Tensor
+
+
+class _Engine(Protocol):
+    """Adds up what rays ask for."""
+
+    def add(self, origins: Tensor, directions: Tensor, colours: Tensor) -> None:
+        """(B, 3) each, on the CPU."""
+        ...
+
+    def sums(self) -> tuple[Tensor, Tensor]:
+        """(M · 512 + 1, 4) Σ a (c − ĉ) / ĉ' and Σ a, and `seen`."""
+        ...
+
+
 @torch.no_grad()
-def recoloured(field: Field, views: Views, depth: float, progress: Progress = SILENT) -> Field:
-    """A field like `field`, sharing everything but its features, whose colours were looked up again.
+def recoloured(
+    field: Field, views: Views, depth: float, progress: Progress = SILENT, engine: str = "auto", relaxation: float = 1.0
+) -> Recoloured:
+    """A field like `field` whose colours were looked up again.
 
     For every corner n, over the rays r of the pictures, with a_rn the part of the ray's light that comes from it by the field's densities:
 
-        logit_n ← logit_n + Σ_r a_rn (c_r − ĉ_r) / ĉ'_r / Σ_r a_rn
+        logit_n ← logit_n + ω Σ_r a_rn (c_r − ĉ_r) / ĉ'_r / Σ_r a_rn
 
     c_r is what the picture shows, ĉ_r what the field shows there, ĉ'_r = ĉ (1 − ĉ) the slope of a colour over its logit. So what pictures
     agree on is right after one pass, and corners that no ray reaches keep every bit. Densities and decoder stay as they are.
@@ -46,12 +75,15 @@ def recoloured(field: Field, views: Views, depth: float, progress: Progress = SI
     Args:
         views: held-out ones are not looked at, nor masked pixels or those where alpha is not opaque.
         depth: at which a voxel's size in pixels tells how densely rays are taken, working units.
+        engine: auto | numba | torch. The compiled one runs on the CPU and knows the deferred decoder alone.
+        relaxation: ω. With 1 every corner gets what its rays ask for in the mean, which is too little where neighbours are asked for the
+            opposite. Below 2, passes one after the other do not diverge where the way from logits to colours is straight (as in SIRT).
 
     Raises:
         Interrupted: the user asked to stop.
     """
-    device, size = field.device, len(field.density_rows)
-    wanted, weight = torch.zeros(size, COLOURS, device=device), torch.zeros(size, device=device)
+    compiled = field.device.type == "cpu" and isinstance(field.decoder, Deferred) and engine != "torch"
+    worker: _Engine = _Compiled(field) if compiled else _Torch(field)
     train = [int(index) for index in np.flatnonzero(~np.asarray(views.test))]
     cameras = [_smaller(views.intrinsics[index], PER_VOXEL * depth / field.voxel_size) for index in train]
     every = max(1, math.ceil(sum(camera.width * camera.height for camera in cameras) / MOST_RAYS))
@@ -59,30 +91,83 @@ def recoloured(field: Field, views: Views, depth: float, progress: Progress = SI
     for count, (index, camera) in enumerate(chosen):
         progress.update(count, len(chosen), "colours")
         progress.check()
-        origins, directions, colours = _pixels(views, index, camera)
-        for some in torch.arange(len(origins)).split(CHUNK):
-            _project_back(field, origins[some].to(device), directions[some].to(device), colours[some].to(device), wanted, weight)
+        worker.add(*_pixels(views, index, camera))
+    sums, seen = worker.sums()
     features = field.feature_rows.clone()
-    features[:-1, :COLOURS] += (wanted / weight.clamp_min(THRESHOLD)[:, None])[:-1]
-    return replace(field, feature_rows=features)
+    features[:-1, :COLOURS] += relaxation * (sums[:, :COLOURS] / sums[:, COLOURS:].clamp_min(THRESHOLD))[:-1]
+    return Recoloured(replace(field, feature_rows=features), seen)
 
 
-def _project_back(field: Field, origins: Tensor, directions: Tensor, colours: Tensor, wanted: Tensor, weight: Tensor) -> None:
-    """Add Σ a (c − ĉ) / ĉ' and Σ a of these rays (B, 3) to `wanted` (M · 512 + 1, 3) and `weight` (M · 512 + 1,)."""
+class _Torch:
+    """The reference, on any device and with any decoder."""
+
+    def __init__(self, field: Field) -> None:
+        self.field = field
+        self.total = torch.zeros(len(field.density_rows), COLOURS + 1, device=field.device)
+        self.seen = torch.zeros(len(field.occupied), device=field.device)
+
+    def add(self, origins: Tensor, directions: Tensor, colours: Tensor) -> None:
+        given = (values.to(self.field.device).split(CHUNK) for values in (origins, directions, colours))
+        for o, d, c in zip(*given, strict=True):
+            project_back(self.field, o, d, c, self.total, self.seen)
+
+    def sums(self) -> tuple[Tensor, Tensor]:
+        return self.total, self.seen
+
+
+def project_back(field: Field, origins: Tensor, directions: Tensor, colours: Tensor, sums: Tensor, seen: Tensor) -> None:
+    """Add what these rays (B, 3) ask for to `sums` (M · 512 + 1, 4), and raise `seen` (M · 512,)."""
     # Rays that are not stopped (SOLID) say more of what is behind the field, and weak samples (THRESHOLD) show nothing.
     shown = render_with_gradients(field, origins, directions, threshold=THRESHOLD)
     opacity = shown.opacity[:, None]
     own = ((shown.colour - (1 - opacity) * field.background) / opacity.clamp_min(SOLID)).clamp(0, 1)
     asked = ((colours - own) / (own * (1 - own)).clamp_min(STEEPEST)).clamp(-MOST, MOST)
     samples = shown.samples
+    seen.scatter_reduce_(0, samples.cell, shown.weight, "amax")
+    solid = ray_sum(shown.weight, samples.ray, len(origins)) > 1 - SOLID
+    peak = torch.zeros(len(origins), device=field.device).scatter_reduce_(0, samples.ray, shown.weight, "amax")
+    seen[samples.cell[(shown.weight == peak[samples.ray]) & solid[samples.ray]]] = 1.0
     kept = ((shown.weight > THRESHOLD) & (shown.opacity >= SOLID)[samples.ray]).nonzero().view(-1)
     if len(kept) == 0:
         return
-    light, ray = shown.weight[kept], samples.ray[kept]
+    light, ray = shown.weight[kept, None], samples.ray[kept]
     rows, corner_weights = corners(field.topology, samples.cell[kept], samples.inside[kept])
-    touched, (more, part) = scatter(rows, corner_weights, (light[:, None] * asked[ray], light))
-    wanted[touched] += more
-    weight[touched] += part
+    touched, (more,) = scatter(rows, corner_weights, (torch.cat([light * asked[ray], light], 1),))
+    sums[touched] += more
+
+
+class _Compiled:
+    """The same by the CPU's kernels; each thread has sums of its own, so that they do not depend on who comes first."""
+
+    def __init__(self, field: Field) -> None:
+        from toolkit.render.compiled import decoder_arrays, make_space, make_volume
+
+        assert isinstance(field.decoder, Deferred)
+        self.threads = torch.get_num_threads()
+        self.space, self.volume, self.decoder = make_space(field), make_volume(field), decoder_arrays(field.decoder)
+        self.total = np.zeros((self.threads, len(field.density_rows), COLOURS + 1), np.float32)
+        self.marks = np.zeros((self.threads, len(field.occupied)), np.uint16)
+
+    def add(self, origins: Tensor, directions: Tensor, colours: Tensor) -> None:
+        from toolkit.render.kernels_recolour import project_back_pass
+
+        given = [values.float().contiguous().numpy() for values in (origins, directions, colours)]
+        limits = [np.float32(value) for value in (STOP, THRESHOLD, STEEPEST, MOST)]
+        edges = np.linspace(0, len(origins), self.threads + 1).astype(int)
+
+        def part(thread: int) -> None:
+            own = [values[edges[thread] : edges[thread + 1]] for values in given]
+            project_back_pass(self.space, self.volume, self.decoder, *own, *limits, self.marks[thread], self.total[thread])
+
+        if self.threads == 1:
+            part(0)
+        else:
+            with ThreadPoolExecutor(self.threads) as pool:
+                list(pool.map(part, range(self.threads)))
+
+    def sums(self) -> tuple[Tensor, Tensor]:
+        seen = (self.marks.max(0) >> 4).astype(np.float32) / 4095
+        return torch.from_numpy(self.total.sum(0) if self.threads > 1 else self.total[0]), torch.from_numpy(seen)
 
 
 def _smaller(full: Intrinsics, focal: float) -> Intrinsics:

@@ -27,9 +27,9 @@ from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
 from toolkit.render.fused import make_field, without_empty_blocks
-from toolkit.render.recolour import recoloured
 from toolkit.training import start as classical
 from toolkit.training.behind import sky_behind
+from toolkit.training.finer_colours import finer_colours
 from toolkit.training.start import colour_behind, emptied_by_views, space_of
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK
@@ -38,8 +38,8 @@ SHIPPED = Path(weights.__file__).parent / "weights" / "nerfusion.safetensors"
 # Voxels that make up the median depth at least, on the finer of two lattices. One lattice of 24 alone loses 1.5 to 2.5 dB, while 104
 # gain 0.25 dB for about three times the seconds (docs/few_views.md), so no voxel need be smaller than some pixels; a larger one shows.
 VOXELS_TO_MEDIAN, LEVELS = 48.0, 2
-PIXELS, START_PIXELS = 3.5, 5.0  # that a voxel spans at most, and where a fit begins with the field, at a coarser level anyway …
-MEASURED_PIXELS = 2.5  # … where a sensor's depth says more exactly where surfaces are …
+PIXELS = 5.0  # that a voxel spans at most: colours become finer afterwards (`finer_colours.py`) …
+MEASURED_PIXELS = 3.5  # … where a sensor's depth says more exactly where surfaces are …
 OBJECT = classical.OBJECT_PIXELS / classical.PIXELS  # … and times this where alpha cuts the object out: as in a fit
 GAMMA = 0.95  # the paper's 0.6 cuts holes where the networks are in doubt
 LEAST, MOST = 32, 384  # resolution of the lattice
@@ -54,8 +54,7 @@ class NetworkOptions:
         levels: lattices, each of half the voxel size of the one before; 1: the paper's single one.
         gamma: see-through voxels (exp(−optical thickness) above it) are not rendered; None: all are.
         measured: the views' depth goes into the key frames' sweeps.
-        recolour: the finished field's colours are looked up again in the training pictures (`render.recolour`).
-        start: a fit begins with the field, so it may be coarser.
+        recolour: `Inference.result` looks colours up again in the training pictures (`finer_colours`).
     """
 
     voxels: float | None = None
@@ -63,12 +62,11 @@ class NetworkOptions:
     gamma: float | None = GAMMA
     measured: bool = False
     recolour: bool = True
-    start: bool = False
 
     @classmethod
-    def of(cls, settings: NetworkSettings, start: bool = False) -> NetworkOptions:
+    def of(cls, settings: NetworkSettings) -> NetworkOptions:
         """As the settings say."""
-        return cls(settings.voxels, settings.levels, measured=settings.depth_from == "sensor", recolour=settings.recolour, start=start)
+        return cls(settings.voxels, settings.levels, measured=settings.depth_from == "sensor", recolour=settings.recolour)
 
 
 def load_networks(path: Path | str | None = None, device: torch.device | str = "cpu") -> NerfusionModel:
@@ -80,10 +78,10 @@ def load_networks(path: Path | str | None = None, device: torch.device | str = "
     return load_model(SHIPPED if path is None else path, device)
 
 
-def voxels_to_median(views: Views, measured: bool = False, start: bool = False) -> float:
-    """Voxels that make up the median depth: 48, or as many as let a voxel there span no more than `PIXELS` of the views (`START_PIXELS` for
-    the start of a fit), fewer pixels where the views have alpha, and `MEASURED_PIXELS` where their depth is measured and asked."""
-    pixels = START_PIXELS if start else PIXELS
+def voxels_to_median(views: Views, measured: bool = False) -> float:
+    """Voxels that make up the median depth: 48, or as many as let a voxel there span no more than `PIXELS` of the views, fewer pixels where
+    the views have alpha, and `MEASURED_PIXELS` where their depth is measured and asked."""
+    pixels = PIXELS
     if measured and any(depth is not None for depth in views.depths):
         pixels = MEASURED_PIXELS
     elif any(alpha is not None for alpha in views.alpha):
@@ -138,7 +136,7 @@ class Inference:
         self.model, self.keys, self.options = model, keys, options or NetworkOptions()
         self.train = views.subset(train)
         self.near, self.far, self.median_depth = scene.near, scene.far, scene.median_depth
-        voxels = self.options.voxels or voxels_to_median(self.train, self.options.measured, self.options.start)
+        voxels = self.options.voxels or voxels_to_median(self.train, self.options.measured)
         self.lattice = lattice_of(space_of(views, scene, background), scene, voxels, self.options.levels)
         self.behind, self.sky = colour_behind(views).to(model.device), sky_behind(views)
         self.seconds = self.fusion_seconds = self.encode_seconds = 0.0
@@ -161,16 +159,14 @@ class Inference:
             yield fused.frame
 
     @torch.no_grad()
-    def field(self, finished: bool = True, progress: Progress = SILENT) -> Field:
-        """The field of the key frames so far, in memory of its own; it shares the networks' decoder.
+    def field(self, finished: bool = True) -> Field:
+        """The field of the key frames so far, in memory of its own; it shares the networks' decoder. A fit can start from it.
 
         Args:
-            finished: no more key frame will come: colours are looked up again if the options say so, and captures with alpha lose what lies
-                outside of the silhouettes of all training views; some seconds.
+            finished: no more key frame will come: captures with alpha lose what lies outside of the silhouettes of all training views.
 
         Raises:
             InputError: no key frame has been fused yet.
-            Interrupted: the user asked to stop.
         """
         if self._latest is None:
             raise InputError("no key frame has been fused yet, so there is no field; fuse one first")
@@ -180,7 +176,20 @@ class Inference:
         if finished and self.train.background is not None:
             made = inside_silhouettes(made, self.train)
         made = replace(without_empty_blocks(made), sky=self.sky)
-        if finished and self.options.recolour:
-            made = recoloured(made, self.train, self.median_depth, progress)
+        self.seconds += time.perf_counter() - start
+        return made
+
+    def result(self, progress: Progress = SILENT, engine: str = "auto") -> Field:
+        """What direct inference gives, when no more key frame will come: the field with colours looked up again if the options say so;
+        some seconds.
+
+        Raises:
+            InputError: no key frame has been fused yet.
+            Interrupted: the user asked to stop.
+        """
+        made = self.field()
+        start = time.perf_counter()
+        if self.options.recolour:
+            made = finer_colours(made, self.train, self.median_depth, progress, engine)
         self.seconds += time.perf_counter() - start
         return made

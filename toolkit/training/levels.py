@@ -94,10 +94,10 @@ def visible(field: Field, seen: Tensor, visits: Tensor, threshold: float) -> Ten
     strong = seen > threshold
     if not bool(strong.any()):
         return field.occupied
-    return (_beside(field.topology, strong) | (visits < ENOUGH_VISITS)) & field.occupied
+    return (beside(field.topology, strong) | (visits < ENOUGH_VISITS)) & field.occupied
 
 
-def _beside(topology: Topology, strong: Tensor) -> Tensor:
+def beside(topology: Topology, strong: Tensor) -> Tensor:
     """(M · 512,) bool grown by one voxel."""
     if strong.device.type == "cpu":
         from toolkit.volume.compiled import dilated

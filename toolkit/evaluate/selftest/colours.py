@@ -42,7 +42,7 @@ def looked_up_again(folder: Path) -> list[Measure]:
     out = []
     for name, field in fields.items():
         for shown, views in (("black", pictures([0] * 6)), ("white", pictures([255] * 6)), ("both", pictures([0, 255] * 3))):
-            features = recoloured(field, views, DISTANCE).feature_rows
+            features = recoloured(field, views, DISTANCE).field.feature_rows
             moved = (features.double() - field.feature_rows.double())[:, :COLOURS].abs()
             rounding = 1e-6 * field.feature_rows.abs().max()
             out.append(Measure(f"{name}, {shown}: values that are not finite", not_finite(features), 0.0))
@@ -50,7 +50,7 @@ def looked_up_again(folder: Path) -> list[Measure]:
             others = absolute(features[:, COLOURS:], field.feature_rows[:, COLOURS:])
             out.append(Measure(f"{name}, {shown}: other features changed", others, 0.0))
     for name in ("all but empty", "no voxels"):
-        features = recoloured(fields[name], pictures([255] * 6), DISTANCE).feature_rows
+        features = recoloured(fields[name], pictures([255] * 6), DISTANCE).field.feature_rows
         out.append(Measure(f"{name}: changed", absolute(features, fields[name].feature_rows), 0.0))
     return out
 

@@ -1,0 +1,96 @@
+"""Colours on ever finer lattices: finer than the voxels they began with, within bounds, and from training pictures alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.render.test_recolour import DEPTH, decibel, grey, painted, pictures_of, stripes
+from toolkit.capture.types import Views
+from toolkit.errors import Interrupted
+from toolkit.progress import Progress
+from toolkit.render.field import Field
+from toolkit.render.image import render_view
+from toolkit.render.recolour import COLOURS, recoloured
+from toolkit.training import finer_colours as module
+from toolkit.training.finer_colours import PIXELS, finer_colours
+from toolkit.training.levels import finer
+from toolkit.volume.host import TorchHost
+
+
+@pytest.fixture(scope="module")
+def coarse() -> Field:
+    """The sphere of `painted`, grey."""
+    return grey(painted())
+
+
+@pytest.fixture(scope="module")
+def views() -> Views:
+    """Pictures of the same sphere with stripes that are finer than its voxels."""
+    field = painted()
+    fine = finer(field, torch.ones_like(field.occupied), 2 * field.resolution, TorchHost())
+    return pictures_of(replace(fine, feature_rows=stripes(fine)), 16, 128)
+
+
+@pytest.mark.parametrize("engine", ["numba", "torch"])
+def test_stripes_of_two_to_five_voxels_become_sharp(coarse: Field, views: Views, engine: str) -> None:
+    between, others = views.subset([1, 6, 11]), views.subset([i for i in range(16) if i not in (1, 6, 11)])
+    once = recoloured(coarse, others, DEPTH).field
+    found = finer_colours(coarse, others, DEPTH, engine=engine)
+    assert decibel(found, between) > decibel(once, between) + 3
+    spans = views.intrinsics[0].fx * found.voxel_size / DEPTH
+    assert spans == pytest.approx(PIXELS, rel=0.1) and found.resolution == 2 * coarse.resolution
+    assert found.decoder is coarse.decoder and not found.feature_rows[:, COLOURS:].any()
+
+
+def test_the_shape_stays_and_what_nobody_sees_goes(coarse: Field, views: Views) -> None:
+    """Opacity and depth of the pictures are what they were; the inside of the sphere is dropped."""
+    found = finer_colours(coarse, views, DEPTH)
+    for camera, pose in zip(views.intrinsics[:3], views.world_from_camera[:3], strict=True):
+        before, after = render_view(coarse, camera, pose), render_view(found, camera, pose)
+        assert float(np.abs(before.opacity - after.opacity).mean()) < 0.01
+        both = (before.depth > 0) & (after.depth > 0)
+        assert float(np.median(np.abs(before.depth - after.depth)[both])) < 0.3 * coarse.voxel_size  # samples lie elsewhere
+    whole = coarse.voxels * (found.resolution / coarse.resolution) ** 3
+    assert found.voxels < 0.9 * whole
+
+
+def test_held_out_pictures_are_not_looked_at(coarse: Field, views: Views) -> None:
+    views = replace(views, test=np.arange(16) >= 14)
+    expected = finer_colours(coarse, views, DEPTH)
+    spoilt = replace(views, images=[picture.copy() for picture in views.images])
+    spoilt.images[15][:] = 255
+    assert torch.equal(finer_colours(coarse, spoilt, DEPTH).feature_rows, expected.feature_rows)
+
+
+def test_voxels_are_bounded(coarse: Field, views: Views, monkeypatch: pytest.MonkeyPatch) -> None:
+    views = views.subset(range(8))
+    free = finer_colours(coarse, views, DEPTH)
+    for most in (free.voxels // 2, 10):
+        monkeypatch.setattr(module, "MOST_VOXELS", most)
+        found = finer_colours(coarse, views, DEPTH)
+        assert found.voxels <= max(most, coarse.voxels) and found.resolution < free.resolution
+    monkeypatch.undo()
+    monkeypatch.setattr("toolkit.memory.available", lambda: 0)  # nothing free: the lattice stays
+    found = finer_colours(coarse, views, DEPTH)
+    assert found.resolution == coarse.resolution and found.feature_rows.any()
+
+
+def test_a_field_that_is_fine_enough_or_empty_keeps_its_lattice(coarse: Field, views: Views) -> None:
+    views = views.subset([0, 5, 10])
+    fine = finer_colours(coarse, views, 100.0)  # far away a voxel is a small part of a pixel
+    assert fine.resolution == coarse.resolution and torch.equal(fine.topology.keys, coarse.topology.keys)
+    empty = replace(coarse, occupied=torch.zeros_like(coarse.occupied))
+    assert torch.equal(finer_colours(empty, views, DEPTH).feature_rows, empty.feature_rows)
+
+
+def test_it_can_be_stopped(coarse: Field, views: Views) -> None:
+    class Stop(Progress):
+        def stopping(self) -> bool:
+            return True
+
+    with pytest.raises(Interrupted):
+        finer_colours(coarse, views, DEPTH, Stop())

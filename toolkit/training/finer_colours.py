@@ -1,0 +1,76 @@
+"""Colours finer than the shape they lie on: the networks' field, its colours looked up in the pictures on ever finer lattices.
+
+The networks work on voxels of some pixels, since sparse convolutions cost most of direct inference. Shape is smooth at that scale, colours
+are not, and to look them up (`render.recolour`) costs little at any scale. So voxels that the pictures see are divided, which leaves the
+field the function it was, and what the coarser lattice could not show is projected back to the finer one. Nothing is learned: it is a fixed
+number of weighted means, from coarse to fine.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from toolkit import memory
+from toolkit.capture.types import Views
+from toolkit.progress import SILENT, Progress
+from toolkit.render.field import Field
+from toolkit.render.recolour import recoloured
+from toolkit.training.levels import beside, finer
+from toolkit.volume.host import TorchHost
+from toolkit.volume.topology import BLOCK
+
+Tensor = torch.Tensor
+PIXELS = 1.5  # of the training views that a voxel at the median depth spans in the end
+MOST_VOXELS = 3_000_000
+VOXEL_BYTES = 500  # at the worst: rows of half-empty blocks, those that replace them, sums of what rays ask for
+SEEN = 0.02  # weight T·α below which no ray sees a voxel: it hides behind others, and is not divided
+RELAXATION = 1.6  # of each back-projection: one is worth as much as two without
+STEP = 2.0  # most that a lattice is finer than the one before
+LEAST_STEP = 1.1  # what is gained by less is not worth a lattice
+
+
+@torch.no_grad()
+def finer_colours(field: Field, views: Views, depth: float, progress: Progress = SILENT, engine: str = "auto") -> Field:
+    """A field of about the same densities whose colours were looked up again on lattices of half the voxel size and half of that, until
+    a voxel spans `PIXELS`; on the last of them twice.
+
+    Voxels that no ray of the pictures saw, nor lie beside one that a ray saw, are dropped on the way.
+
+    Args:
+        views: held-out ones are not looked at.
+        depth: median depth, working units.
+        engine: as for `recoloured`.
+
+    Raises:
+        Interrupted: the user asked to stop.
+    """
+    train = np.flatnonzero(~np.asarray(views.test))
+    focal = float(np.median([views.intrinsics[index].fx for index in train]))
+    host = TorchHost(field.device)
+    most = memory.bounded(MOST_VOXELS * VOXEL_BYTES) // VOXEL_BYTES
+    while True:
+        field, seen = recoloured(field, views, depth, progress, engine, RELAXATION)
+        kept = beside(field.topology, (seen > SEEN) & field.occupied) & field.occupied
+        resolution = _next(field, focal / depth, int(kept.sum()), most)
+        if resolution is None:
+            return recoloured(field, views, depth, progress, engine, RELAXATION).field
+        field = finer(field, kept, resolution, host)
+
+
+def _next(field: Field, pixels: float, kept: int, most: int) -> int | None:
+    """Resolution of the next lattice, None when this one is the last.
+
+    Args:
+        pixels: that a working unit spans at the median depth.
+        kept: voxels that would be divided.
+        most: voxels that there may be afterwards.
+    """
+    if kept == 0:
+        return None
+    blocks = field.resolution / BLOCK
+    wanted, allowed = round(min(STEP, pixels * field.voxel_size / PIXELS) * blocks), math.floor((most / kept) ** (1 / 3) * blocks)
+    resolution = BLOCK * min(wanted, allowed)
+    return resolution if resolution >= LEAST_STEP * field.resolution else None
