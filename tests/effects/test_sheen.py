@@ -44,3 +44,11 @@ def test_wrong_depths_are_no_highlights_and_nothing_is_told_of_too_little() -> N
     assert not looked(wall(), wrong=0.3).found
     found = looked(replace(wall(lamp=0.08), poses=np.tile(np.eye(4), (FRAMES, 1, 1))))  # all from one place
     assert not found.found and found.evidence.number == 0 and found.before is None
+
+
+def test_points_that_lie_on_no_plane_tell_nothing() -> None:
+    """As on a small object between much that is empty: no patch has a depth."""
+    seen = wall(lamp=0.08)
+    depth = AWAY * np.random.default_rng(0).uniform(0.2, 5.0, len(seen.frame))
+    found = shiny(seen, problem_of(seen), depth, PLAIN)
+    assert not found.found and found.evidence.number == 0

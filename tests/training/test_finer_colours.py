@@ -94,3 +94,17 @@ def test_it_can_be_stopped(coarse: Field, views: Views) -> None:
 
     with pytest.raises(Interrupted):
         finer_colours(coarse, views, DEPTH, Stop())
+
+
+def test_what_bulges_over_a_silhouette_goes(coarse: Field, views: Views) -> None:
+    """Alpha cuts every picture's right half off; on the finer lattice that is sharp to a voxel of it."""
+    left = np.zeros((128, 128), np.uint8)
+    left[:, :64] = 255
+    images = [np.where(left[..., None] > 0, picture, 255).astype(np.uint8) for picture in views.images]
+    cut = replace(views, images=images, alpha=[left] * 16, background=(1.0, 1.0, 1.0)).subset([0, 1, 2])
+    field = replace(coarse, background=torch.ones(3))
+    found = finer_colours(field, cut, DEPTH)
+    assert 0 < found.voxels < 0.8 * finer_colours(field, replace(cut, alpha=[None] * 3), DEPTH).voxels
+    for camera, pose in zip(cut.intrinsics, cut.world_from_camera, strict=True):
+        shown = render_view(found, camera, pose).opacity
+        assert float(shown[:, 68:].mean()) < 0.01 < 0.2 < float(shown[:, :60].mean())

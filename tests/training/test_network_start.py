@@ -26,12 +26,12 @@ from toolkit.training.from_network import (
     PIXELS,
     Inference,
     NetworkOptions,
-    inside_silhouettes,
     lattice_of,
     load_networks,
     voxels_to_median,
 )
 from toolkit.training.network_start import THICK, THIN, network_start, widened
+from toolkit.training.silhouettes import inside_silhouettes
 from toolkit.training.start import space_of
 from toolkit.volume.lookup import corners, gather
 

@@ -107,6 +107,8 @@ def _excess(seen: Sightings, problem: Problem, depth: Array, pictures: list[_Pic
         return None
     nearness = _nearness(place, 1 / depth[mine], middle)
     some = np.flatnonzero(np.isfinite(nearness))
+    if len(some) == 0:
+        return None
     corner = np.array([[0, 0], [HALF, 0], [0, HALF]])
     rays = rays_of(seen, problem, one, (middle[some][:, None] + corner).reshape(-1, 2).astype(np.float64))
     steps = np.arange(-HALF, HALF + 1)

@@ -32,7 +32,7 @@ PER_VOXEL = 1.2  # rays along a voxel's side: 1.7 give 0.1 dB more for twice the
 MOST_RAYS = 2_000_000  # pictures are left out evenly until there are no more
 STEEPEST = 0.05  # least slope of colour over logit that is divided by
 MOST = 2.0  # logits that a ray may ask for
-OPAQUE, VALID = 250, 0.99
+VALID = 0.99
 
 
 class Recoloured(NamedTuple):
@@ -73,7 +73,8 @@ def recoloured(
     agree on is right after one pass, and corners that no ray reaches keep every bit. Densities and decoder stay as they are.
 
     Args:
-        views: held-out ones are not looked at, nor masked pixels or those where alpha is not opaque.
+        views: held-out ones are not looked at, nor masked pixels. Pictures with alpha ask for their background's colour where they are
+            see-through: what bulges over a silhouette shows best what is behind it.
         depth: at which a voxel's size in pixels tells how densely rays are taken, working units.
         engine: auto | numba | torch. The compiled one runs on the CPU and knows the deferred decoder alone.
         relaxation: ω. With 1 every corner gets what its rays ask for in the mean, which is too little where neighbours are asked for the
@@ -177,14 +178,12 @@ def _smaller(full: Intrinsics, focal: float) -> Intrinsics:
 
 
 def _pixels(views: Views, index: int, camera: Intrinsics) -> tuple[Tensor, Tensor, Tensor]:
-    """Origins, directions and colours (B, 3) of a picture made as small as `camera`, without what is masked or see-through."""
+    """Origins, directions and colours (B, 3) of a picture made as small as `camera`, without what is masked."""
     shape = (camera.width, camera.height)
     picture = cv2.resize(views.images[index], shape, interpolation=cv2.INTER_AREA).reshape(-1, COLOURS)
     kept = np.ones(len(picture), bool)
-    mask, alpha = views.valid[index] if views.valid else None, views.alpha[index] if views.alpha else None
+    mask = views.valid[index] if views.valid else None
     if mask is not None:
         kept &= cv2.resize(np.asarray(mask, np.float32), shape, interpolation=cv2.INTER_AREA).ravel() > VALID
-    if alpha is not None:
-        kept &= cv2.resize(alpha, shape, interpolation=cv2.INTER_AREA).ravel() >= OPAQUE
     origins, directions, _ = rays(camera, views.world_from_camera[index], pixel_grid(*shape)[kept])
     return origins, directions, torch.from_numpy(picture[kept].astype(np.float32) / 255)

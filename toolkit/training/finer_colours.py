@@ -19,6 +19,7 @@ from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
 from toolkit.render.recolour import recoloured
 from toolkit.training.levels import beside, finer
+from toolkit.training.silhouettes import inside_silhouettes
 from toolkit.volume.host import TorchHost
 from toolkit.volume.topology import BLOCK
 
@@ -28,6 +29,7 @@ MOST_VOXELS = 3_000_000
 VOXEL_BYTES = 500  # at the worst: rows of half-empty blocks, those that replace them, sums of what rays ask for
 SEEN = 0.02  # weight T·α below which no ray sees a voxel: it hides behind others, and is not divided
 RELAXATION = 1.6  # of each back-projection: one is worth as much as two without
+SILHOUETTE = 0.5  # voxels about a voxel's middle in which alpha must show nothing for it to go: what bulges over a silhouette costs most
 STEP = 2.0  # most that a lattice is finer than the one before
 LEAST_STEP = 1.1  # what is gained by less is not worth a lattice
 
@@ -58,6 +60,8 @@ def finer_colours(field: Field, views: Views, depth: float, progress: Progress =
         if resolution is None:
             return recoloured(field, views, depth, progress, engine, RELAXATION).field
         field = finer(field, kept, resolution, host)
+        if any(alpha is not None for alpha in views.alpha):
+            field = inside_silhouettes(field, views, SILHOUETTE)
 
 
 def _next(field: Field, pixels: float, kept: int, most: int) -> int | None:

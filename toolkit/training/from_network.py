@@ -30,7 +30,8 @@ from toolkit.render.fused import make_field, without_empty_blocks
 from toolkit.training import start as classical
 from toolkit.training.behind import sky_behind
 from toolkit.training.finer_colours import finer_colours
-from toolkit.training.start import colour_behind, emptied_by_views, space_of
+from toolkit.training.silhouettes import inside_silhouettes
+from toolkit.training.start import colour_behind, space_of
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK
 
@@ -94,19 +95,6 @@ def lattice_of(space: Space, scene: Scene, voxels: float, levels: int) -> Lattic
     unit = BLOCK * 2 ** (levels - 1)
     wanted = 2 * space.extent * space.half / (scene.median_depth / voxels)
     return Lattice(space, int(np.clip(unit * round(wanted / unit), max(LEAST, unit), MOST)))
-
-
-def inside_silhouettes(field: Field, views: Views) -> Field:
-    """The field without the voxels that the views' alpha says are empty: nothing there has a colour for the networks to match."""
-    rows = field.occupied.nonzero().view(-1)
-    if len(rows) == 0:
-        return field
-    corner = Lattice(field.space, field.resolution).contracted(field.topology.keys, rows)
-    places = ((corner + field.space.extent) / (2 * field.space.extent / field.resolution)).round().long().cpu()
-    empty = emptied_by_views(field.space, field.resolution, places, views).to(rows.device)
-    occupied = field.occupied.clone()
-    occupied[rows[empty]] = False
-    return field if bool(empty.all()) else replace(field, occupied=occupied)
 
 
 class Inference:

@@ -32,6 +32,7 @@ SEEN_BY = 3  # training views that must see a voxel: fewer cannot tell its depth
 # also start from the networks.
 FEW_VIEWS = 24
 EMPTIED = 0.02  # share of the views that may err when they say that a voxel is empty
+WHOLE = 0.87  # voxels from the middle of one to its corners: half the diagonal
 
 
 def make_space(scene: Scene, background: bool, margin: float = MARGIN) -> Space:
@@ -89,21 +90,25 @@ def possible(space: Space, resolution: int, places: Tensor, views: Views) -> Ten
     return places[torch.from_numpy(keep)] if keep.any() else places
 
 
-def emptied_by_views(space: Space, resolution: int, places: Tensor, views: Views) -> Tensor:
-    """(N, 3) voxels → (N,) bool, those where alpha (or, without it, measured depth) of the training views says that there is nothing."""
-    _, emptied, count = _judged(space, resolution, places, views)
+def emptied_by_views(space: Space, resolution: int, places: Tensor, views: Views, reach: float = WHOLE) -> Tensor:
+    """(N, 3) voxels → (N,) bool, those where alpha (or, without it, measured depth) of the training views says that there is nothing.
+
+    Args:
+        reach: voxels about the middle of each that have to be empty.
+    """
+    _, emptied, count = _judged(space, resolution, places, views, reach)
     return torch.from_numpy(emptied > EMPTIED * count)
 
 
-def _judged(space: Space, resolution: int, places: Tensor, views: Views) -> tuple[Array, Array, int]:
+def _judged(space: Space, resolution: int, places: Tensor, views: Views, reach: float = WHOLE) -> tuple[Array, Array, int]:
     """(N, 3) voxels → (N,) how many training views see each, and how many say that it is empty; and how many there are."""
     voxel = 2 * space.extent / resolution
     centre = (places.double() + 0.5) * voxel - space.extent
     points = space.to_working(centre).numpy()
-    # Half the diagonal of a voxel in working units; contracted voxels are larger the farther out they are.
+    # `reach` in working units; contracted voxels are larger the farther out they are.
     norm = np.maximum(centre.abs().amax(1).numpy(), 1.0)
     stretch = 1.0 if space.shell == 0 else np.minimum((space.shell / np.maximum(space.extent - norm, voxel)) ** 2 / space.shell, 1e6)
-    radius = 0.87 * voxel * space.half * np.maximum(stretch, 1.0)
+    radius = reach * voxel * space.half * np.maximum(stretch, 1.0)
     train = np.flatnonzero(~views.test)
     seen, emptied = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for index in train:
