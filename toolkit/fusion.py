@@ -27,6 +27,7 @@ from toolkit.networks.lattice import LatentVolume, Lattice
 from toolkit.networks.model import NerfusionModel
 from toolkit.networks.refine import adopt, children, merged, part, solid_cells, split_volume, surface_cells
 from toolkit.networks.store import GlobalStore
+from toolkit.networks.sweep import Empty
 from toolkit.networks.unproject import EncodedView
 from toolkit.progress import SILENT, Progress
 from toolkit.volume.space import Space
@@ -92,13 +93,16 @@ def fusion_lattice(space: Space, voxel_size: float, levels: int) -> Lattice:
 class Fusion:
     """The global volumes of all levels, and one step of the loop."""
 
-    def __init__(self, model: NerfusionModel, lattice: Lattice, options: FusionOptions | None = None) -> None:
-        """`lattice`: the finest.
+    def __init__(self, model: NerfusionModel, lattice: Lattice, options: FusionOptions | None = None, empty: Empty | None = None) -> None:
+        """
+        Args:
+            lattice: the finest.
+            empty: where there is for sure nothing (not in the paper).
 
         Raises:
             InputError: the lattice cannot be halved so often.
         """
-        self.model, self.options = model, options or FusionOptions()
+        self.model, self.options, self.empty = model, options or FusionOptions(), empty
         if self.options.levels < 1 or lattice.resolution % (BLOCK * 2 ** (self.options.levels - 1)):
             raise InputError(f"a lattice of {lattice.resolution} voxels a side does not have {self.options.levels} levels; choose fewer")
         steps = range(self.options.levels - 1, -1, -1)
@@ -115,7 +119,7 @@ class Fusion:
         keys = self._keys[visible_blocks(*self._balls, cameras[0], options.near, options.far)]
         topology, finer = Topology(keys), None
         bounded = options.near > 0 or math.isfinite(options.far)
-        swept = self.model.sweep(views, cameras, options.near, options.far, depth) if bounded else None
+        swept = self.model.sweep(views, cameras, options.near, options.far, depth, self.empty) if bounded else None
         for level, store in enumerate(self.stores):
             wanted = None if finer is None else finer.known
             local = self.model.local_volume(views, cameras, store.lattice, topology, wanted, options.near, options.far, swept)
@@ -179,8 +183,12 @@ def fuse_views(
     lattice: Lattice,
     options: FusionOptions | None = None,
     progress: Progress = SILENT,
+    empty: Empty | None = None,
 ) -> Iterator[Fused]:
     """Fuse key frames one after the other; yields after each, so that a preview can be rendered meanwhile.
+
+    Args:
+        empty: see `Fusion`.
 
     Raises:
         InputError: no key frames, or a lattice that does not fit the options.
@@ -188,7 +196,7 @@ def fuse_views(
     """
     if len(key_frames.indices) == 0:
         raise InputError("there are no key frames to fuse; give more pictures")
-    fusion = Fusion(model, lattice, options)
+    fusion = Fusion(model, lattice, options, empty)
     encoded = _Pictures(model, views)
     for done, (key, neighbours) in enumerate(zip(key_frames.indices, key_frames.neighbours, strict=True)):
         progress.check()

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from tests.networks.made import cameras
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.matching import LARGE, SIDE, SMALL, describe, difference, distribution, semi_global, together
-from toolkit.networks.sweep import PLANES, Sweep, _table, sweep
+from toolkit.networks.sweep import LOST, PLANES, Sweep, _table, carved, sweep
 
 WALL = 2.0
 
@@ -239,3 +239,40 @@ def test_a_sensor_mends_what_pictures_do_not_tell() -> None:
 
     assert wrong(flat, depth) < 0.05 < 0.3 < wrong(flat, None)
     assert wrong(described, depth) < 0.05
+
+
+def test_a_silhouette_tells_where_no_surface_is() -> None:
+    """Without texture, but with all empty that is not near the wall, it is found; what is ahead of an empty place is left as it was."""
+    described, seen_by = wall(3)
+    flat = [torch.full_like(one, 0.0) for one in described]
+    places, truncation = on_axis(torch.linspace(0.9, 3.5, 53)), torch.full((53,), 0.15)
+    wanted = ((WALL - places[:, 2]) / 0.15).clamp(-1, 1)
+
+    def thin(points: torch.Tensor) -> torch.Tensor:
+        return (points[:, 2] - WALL).abs() > 0.1
+
+    found = sweep(flat, seen_by, 0.8, 4.0, empty=thin).look(places, truncation)
+    assert float((found.signed - wanted).abs().mean()) < 0.1
+    plain = sweep(described, seen_by, 0.8, 4.0)
+    held = sweep(described, seen_by, 0.8, 4.0, empty=lambda points: points[:, 2] < 1.0)  # nothing was likely there
+    torch.testing.assert_close(held.look(places, truncation).signed, plain.look(places, truncation).signed, atol=0.02, rtol=0)
+    nothing = sweep(described, seen_by, 0.8, 4.0, empty=lambda points: torch.ones(len(points), dtype=torch.bool))
+    free = nothing.look(places[:45], truncation[:45])  # up to a truncation before the farthest plane
+    assert float(free.signed.min()) > 0.99 and float(free.open.min()) > 0.99
+
+
+def test_likelihoods_within_silhouettes_against_a_loop() -> None:
+    generator = torch.Generator().manual_seed(0)
+    likely = torch.softmax(6 * torch.randn((9, 4, 5), generator=generator), 0)
+    empty = torch.rand((9, 4, 5), generator=generator) < 0.6
+    empty[:, 0, 0] = True
+    likely[:, 1, 1], empty[:, 1, 1] = torch.tensor([1 - 8e-6] + [1e-6] * 8), torch.tensor([True] + [False] * 8)
+    found = carved(likely, empty)
+    for y in range(4):
+        for x in range(5):
+            left = [0.0 if bool(empty[d, y, x]) else float(likely[d, y, x]) for d in range(9)]
+            if bool(empty[:, y, x].all()):
+                left = [1.0] + [0.0] * 8
+            elif sum(left) <= LOST:
+                left = [float(not empty[d, y, x]) for d in range(9)]
+            np.testing.assert_allclose(found[:, y, x].numpy(), np.array(left) / sum(left), rtol=1e-5)

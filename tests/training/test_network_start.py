@@ -11,10 +11,11 @@ import pytest
 import torch
 
 from tests.networks.made import INTRINSICS, SMALL, small_model, wall_pictures
-from toolkit.camera import Intrinsics, Similarity
+from toolkit.camera import Intrinsics, Similarity, pixel_grid, rays
 from toolkit.capture.types import Views
 from toolkit.config import Settings, load_settings
 from toolkit.errors import InputError
+from toolkit.evaluate.speed_state import around, lens
 from toolkit.keyframes import KeyFrames
 from toolkit.networks.decoder import Deferred
 from toolkit.poses.scene import Scene
@@ -31,9 +32,10 @@ from toolkit.training.from_network import (
     voxels_to_median,
 )
 from toolkit.training.network_start import THICK, THIN, network_start, widened
-from toolkit.training.silhouettes import inside_silhouettes
+from toolkit.training.silhouettes import inside_silhouettes, visual_hull
 from toolkit.training.start import space_of
 from toolkit.volume.lookup import corners, gather
+from toolkit.volume.space import Space
 
 DEPTH = 2.0
 
@@ -176,11 +178,16 @@ def test_what_lies_outside_of_the_silhouettes_is_left_out() -> None:
     height, width = views.images[0].shape[:2]
     alpha = np.full((height, width), 255, np.uint8)
     alpha[:, : width // 2] = 0
-    views = replace(views, alpha=[alpha] * len(views), background=(1.0, 1.0, 1.0))
-    running = Inference(inference().model, views, scene(), KeyFrames(np.array([0, 2]), np.array([[1], [1]])), options=NetworkOptions(32.0))
-    list(running.frames())
-    whole, carved = running.field(finished=False), running.field()
+    cut = replace(views, alpha=[alpha] * len(views), background=(1.0, 1.0, 1.0))
+    made = []
+    for some in (views, cut):
+        keys = KeyFrames(np.array([0, 2]), np.array([[1], [1]]))
+        running = Inference(inference().model, some, scene(), keys, "off", NetworkOptions(32.0))
+        list(running.frames())
+        made.append(running.field())
+    whole, carved = made
     assert 0 < carved.voxels < whole.voxels
+    views = cut
     for index in (0, 2, 3):
         full, rest = (
             np.asarray(render_view(one, views.intrinsics[index], views.world_from_camera[index]).opacity) for one in (whole, carved)
@@ -188,7 +195,8 @@ def test_what_lies_outside_of_the_silhouettes_is_left_out() -> None:
         left = width // 2 - 4  # voxels reach over the edge by some pixels, and over the picture's border, where nothing is judged
         assert float(rest[2:-2, :left].mean()) < 0.01 and float(rest.max()) > 0.99
         assert index == 0 or float(full[:, :left].mean()) > 0.8
-    assert torch.equal(inside_silhouettes(whole, views).occupied.sum(), carved.occupied.sum())
+    again = inside_silhouettes(carved, views)
+    assert torch.equal(again.occupied, carved.occupied) and inside_silhouettes(whole, views).voxels < 0.8 * whole.voxels
 
 
 def test_nothing_to_look_at_is_said() -> None:
@@ -203,3 +211,24 @@ def test_networks_are_found(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nowhere"):
         load_networks(tmp_path / "nowhere.safetensors")
     assert SMALL.features == 8
+
+
+def test_the_hull_holds_what_silhouettes_show_and_little_else() -> None:
+    """A ball seen from eight sides."""
+    poses, camera = around(8), lens(64, 64)
+    space, radius = Space((0.0, 0.0, 0.0), 1.0, 0.0), 0.5
+    alpha = []
+    for pose in poses:
+        origins, directions, _ = rays(camera, pose, pixel_grid(64, 64))
+        closest = (origins - (origins * directions).sum(1, keepdim=True) * directions).norm(dim=1)
+        alpha.append(np.where(closest.numpy().reshape(64, 64) < radius, 255, 0).astype(np.uint8))
+    blank = [np.zeros((64, 64, 3), np.uint8)] * 8
+    views = Views([str(i) for i in range(8)], blank, [camera] * 8, poses, np.zeros(8, bool), alpha=alpha, background=(0.0, 0.0, 0.0))
+    hull = visual_hull(space, views)
+    assert hull is not None
+    directions = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    assert not hull(0.97 * radius * directions).any()
+    assert float(hull(1.6 * radius * directions).float().mean()) > 0.95  # eight silhouettes leave corners
+    assert hull(torch.tensor([[5.0, 0.0, 0.0], [0.0, -9.0, 0.0]])).all()
+    assert visual_hull(space, replace(views, alpha=[None] * 8)) is None
+    assert visual_hull(space, replace(views, alpha=[np.zeros((64, 64), np.uint8)] * 8)) is None  # it would leave nothing

@@ -33,7 +33,7 @@ from toolkit.networks.local import INSIDE, LocalReconstruction, colour_latent, i
 from toolkit.networks.matching import describe
 from toolkit.networks.pyramid import Pyramid
 from toolkit.networks.refine import with_blocks
-from toolkit.networks.sweep import Sighted, Sweep, sweep
+from toolkit.networks.sweep import Empty, Sighted, Sweep, sweep
 from toolkit.networks.unproject import EncodedView, look_up, project
 from toolkit.volume.topology import VOXELS, Topology
 
@@ -108,10 +108,18 @@ class NerfusionModel(nn.Module):
             views.append(EncodedView(features, Pyramid.of(whole[index], 1, COLOUR_LEVELS), described[index]))
         return views
 
-    def sweep(self, views: Sequence[EncodedView], cameras: Cameras, near: float, far: float, depth: Tensor | None = None) -> Sweep:
-        """Where along the pixels of the key frame (first) the surface is likely to be, its measured `depth` (H, W) included; asked once for
-        all lattices. Not differentiable."""
-        return sweep([view.described for view in views], cameras, near, far, depth)
+    def sweep(
+        self,
+        views: Sequence[EncodedView],
+        cameras: Cameras,
+        near: float,
+        far: float,
+        depth: Tensor | None = None,
+        empty: Empty | None = None,
+    ) -> Sweep:
+        """Where along the pixels of the key frame (first) the surface is likely to be, its measured `depth` (H, W) and what is known to be
+        `empty` included; asked once for all lattices. Not differentiable."""
+        return sweep([view.described for view in views], cameras, near, far, depth, empty)
 
     def local_volume(
         self,

@@ -9,7 +9,7 @@ and variance of features; these are known terms beside them, which the networks 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -26,6 +26,9 @@ RANGE = 50.0  # farthest by nearest depth, where the caller does not bound them
 PEAK = 2  # planes on either side of the likeliest one that count as the same depth
 NOISE = 0.01  # of a depth that a sensor measured, as a part of it; at least as wide as planes lie apart
 TRUST = 0.98  # in a measured depth, against what the pictures say
+LOST = 1e-4  # likelihood that is left where a silhouette takes the rest, below which nothing is known of where the surface is inside
+
+Empty = Callable[[Tensor], Tensor]  # (N, 3) points of the working frame → (N,) bool, for sure nothing there
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,14 @@ class Sweep:
 
 
 @torch.no_grad()
-def sweep(described: Sequence[Tensor], cameras: Cameras, near: float, far: float, depth: Tensor | None = None) -> Sweep:
+def sweep(
+    described: Sequence[Tensor],
+    cameras: Cameras,
+    near: float,
+    far: float,
+    depth: Tensor | None = None,
+    empty: Empty | None = None,
+) -> Sweep:
     """Compare the first view with all others at planes between `near` and `far` along its axis; the others may come in any order.
 
     Args:
@@ -100,6 +110,7 @@ def sweep(described: Sequence[Tensor], cameras: Cameras, near: float, far: float
         cameras: K.
         near, far: 0 and ∞ where unknown.
         depth: (H, W) of the first view along z in working units, where a sensor measured it; 0 or not finite where it did not.
+        empty: where there is for sure no surface, as silhouettes tell.
 
     Raises:
         ValueError: neither is known, or the nearest does not lie before the farthest.
@@ -116,9 +127,26 @@ def sweep(described: Sequence[Tensor], cameras: Cameras, near: float, far: float
     cost = together(torch.stack(costs), torch.stack(visible)) if costs else rays.new_zeros((len(inverses), len(rays)))
     likely = distribution(cost.view(len(inverses), *shape))
     step = float(inverses[1] - inverses[0])
+    if empty is not None:
+        points = (rays @ cameras.world_from_camera[0, :3, :3].T)[None] / inverses[:, None, None] + cameras.positions[0]
+        likely = carved(likely, empty(points.view(-1, 3)).view_as(likely))
     if depth is not None:
         likely = measured(likely, inverses, depth)
     return Sweep(cameras[0], _table(likely, step), low, step)
+
+
+def carved(likely: Tensor, empty: Tensor) -> Tensor:
+    """What the pictures say of planes (D, h, w), farthest first, within silhouettes: no surface where it is `empty` (D, h, w).
+
+    Of pixels whose likely planes are all empty any other one is as likely; along those that meet nothing it is free to the farthest.
+    """
+    left = likely * ~empty
+    total = left.sum(0)
+    anywhere = (~empty).to(likely.dtype)
+    left = torch.where(total > LOST, left / total.clamp_min(LOST), anywhere / anywhere.sum(0).clamp_min(1))
+    free = torch.zeros_like(left)
+    free[0] = 1
+    return torch.where(empty.all(0), free, left)
 
 
 def measured(likely: Tensor, inverses: Tensor, depth: Tensor) -> Tensor:

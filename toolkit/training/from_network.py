@@ -30,7 +30,7 @@ from toolkit.render.fused import make_field, without_empty_blocks
 from toolkit.training import start as classical
 from toolkit.training.behind import sky_behind
 from toolkit.training.finer_colours import finer_colours
-from toolkit.training.silhouettes import inside_silhouettes
+from toolkit.training.silhouettes import inside_silhouettes, visual_hull
 from toolkit.training.start import colour_behind, space_of
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK
@@ -126,6 +126,7 @@ class Inference:
         self.near, self.far, self.median_depth = scene.near, scene.far, scene.median_depth
         voxels = self.options.voxels or voxels_to_median(self.train, self.options.measured)
         self.lattice = lattice_of(space_of(views, scene, background), scene, voxels, self.options.levels)
+        self.hull = visual_hull(self.lattice.space, self.train, model.device)
         self.behind, self.sky = colour_behind(views).to(model.device), sky_behind(views)
         self.seconds = self.fusion_seconds = self.encode_seconds = 0.0
         self.done = 0
@@ -138,7 +139,7 @@ class Inference:
             Interrupted: the user asked to stop.
         """
         options = FusionOptions(self.options.levels, self.near, self.far, measured=self.options.measured)
-        for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress):
+        for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress, self.hull):
             self._latest = fused
             self.seconds += fused.seconds
             self.fusion_seconds += fused.seconds
@@ -161,7 +162,7 @@ class Inference:
         start = time.perf_counter()
         gamma, allowed = self.options.gamma, self._latest.allowed
         made = make_field(self.model, self._latest.volume, self.behind, gamma, 0.5 * self.near, allowed=allowed)
-        if finished and self.train.background is not None:
+        if finished and self.hull is not None:
             made = inside_silhouettes(made, self.train)
         made = replace(without_empty_blocks(made), sky=self.sky)
         self.seconds += time.perf_counter() - start

@@ -1,13 +1,62 @@
-"""Captures with alpha: what lies outside of the silhouettes is empty."""
+"""Captures with alpha: what lies outside of the silhouettes is empty, for the plane sweep and for what is made of it."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+
+import torch
 
 from toolkit.capture.types import Views
 from toolkit.networks.lattice import Lattice
 from toolkit.render.field import Field
-from toolkit.training.start import WHOLE, emptied_by_views
+from toolkit.training.levels import all_places
+from toolkit.training.start import COARSEST, WHOLE, emptied_by_views
+from toolkit.volume.space import Space
+
+Tensor = torch.Tensor
+HULL = 128  # voxels along a side: 256 gave no better fields
+
+
+@dataclass(frozen=True)
+class Hull:
+    """The visual hull of the training views on a lattice.
+
+    Attributes:
+        empty: (R, R, R) bool z, y, x; voxel (0, 0, 0) starts at −extent.
+    """
+
+    space: Space
+    empty: Tensor
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """(N, 3) points of the working frame → (N,) bool, outside of the hull (or of the lattice)."""
+        side = len(self.empty)
+        contracted = self.space.contract(self.space.normalise(points))
+        place = ((contracted + self.space.extent) * (side / (2 * self.space.extent))).floor().long()
+        outside = ((place < 0) | (place >= side)).any(1)
+        x, y, z = place.clamp(0, side - 1).unbind(1)
+        return outside | self.empty[z, y, x]
+
+
+def visual_hull(space: Space, views: Views, device: torch.device | str = "cpu") -> Hull | None:
+    """What the alpha of the training views leaves, from coarse to fine: what is empty is not divided. None where there is no alpha, or
+    where it leaves nothing at all."""
+    if all(alpha is None for alpha in views.alpha):
+        return None
+    side = COARSEST
+    places = all_places(space, side)
+    places = places[~emptied_by_views(space, side, places, views)]
+    octants = torch.cartesian_prod(*[torch.arange(2)] * 3)
+    while side < HULL:
+        side *= 2
+        places = (2 * places[:, None] + octants).view(-1, 3)
+        places = places[~emptied_by_views(space, side, places, views)]
+    if len(places) == 0:
+        return None
+    empty = torch.ones((side, side, side), dtype=torch.bool)
+    x, y, z = places.unbind(1)
+    empty[z, y, x] = False
+    return Hull(space, empty.to(device))
 
 
 def inside_silhouettes(field: Field, views: Views, reach: float = WHOLE) -> Field:

@@ -12,7 +12,7 @@ from torch import Tensor
 from toolkit.evaluate.selftest.case import Measure, absolute, case, not_finite
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.matching import LARGE, SMALL, TEMPERATURE, UNKNOWN, describe
-from toolkit.networks.sweep import Sweep, sweep
+from toolkit.networks.sweep import Sweep, carved, sweep
 
 GROUP = "networks"
 WIDTH, HEIGHT, FOCAL = 24, 18, 22.0
@@ -202,4 +202,28 @@ def sweep_exact(folder: Path) -> list[Measure]:
         sure = ~unsure.any()
         out.append(Measure(f"{name}: places on a picture's border", float(~sure), 0.0))
         out.append(Measure(f"{name}: likelihood that the surface is nearer", absolute(made.table[0], nearer), 2e-5))
+    return out
+
+
+@case(GROUP, "plane sweep: silhouettes that leave nothing, one plane, or what pictures say is impossible")
+def sweep_carved(folder: Path) -> list[Measure]:
+    """Likelihoods still sum to one, none is where it is empty, and places at the ends of the earth can be read."""
+    planes = 32
+    one_left = torch.ones(planes, 1, 2, dtype=torch.bool)
+    one_left[7] = False
+    sharp = torch.zeros(planes, 1, 2)
+    sharp[3] = 1
+    never = torch.full((planes, 1, 2), 1e-30)
+    out = []
+    for name, likely in {"sharp": sharp, "denormal": never, "even": torch.full((planes, 1, 2), 1 / planes)}.items():
+        for holes, empty in {"all": torch.ones_like(one_left), "all but one": one_left, "none": torch.zeros_like(one_left)}.items():
+            left = carved(likely, empty)
+            out.append(Measure(f"{name}, empty {holes}: values that are not finite", not_finite(left), 0.0))
+            out.append(Measure(f"{name}, empty {holes}: sum", absolute(left.sum(0), torch.ones(1, 2)), 1e-6))
+            if holes == "all but one":
+                out.append(Measure(f"{name}, empty {holes}: likely where it is empty", float((left * empty).max()), 0.0))
+    for name, (images, cameras) in awkward().items():
+        made = sweep(list(describe(images)), cameras, NEAR, FAR, empty=lambda points: points[:, 2] < 1)
+        seen = made.look(places(), torch.full((len(places()),), TRUNCATION))
+        out.append(Measure(f"{name}: values that are not finite", not_finite(seen.signed, seen.open, seen.sure), 0.0))
     return out
