@@ -126,6 +126,14 @@ def test_any_number_of_threads_gives_the_same_but_for_the_order_of_sums() -> Non
     assert torch.allclose(one.field.feature_rows, three.field.feature_rows, atol=1e-4)
 
 
+def test_in_place_is_the_same() -> None:
+    field, views = grey(painted()), pictures_of(painted(), 4)
+    expected = recoloured(field, views, DEPTH)
+    assert not field.feature_rows.any()
+    found = recoloured(field, views, DEPTH, in_place=True).field
+    assert found.feature_rows is field.feature_rows and torch.equal(found.feature_rows, expected.field.feature_rows)
+
+
 def test_what_is_seen_is_the_side_of_the_sphere_that_a_picture_shows() -> None:
     field = painted()
     seen = recoloured(field, pictures_of(field).subset([0]), DEPTH).seen

@@ -39,7 +39,9 @@ def views() -> Views:
 def test_stripes_of_two_to_five_voxels_become_sharp(coarse: Field, views: Views, engine: str) -> None:
     between, others = views.subset([1, 6, 11]), views.subset([i for i in range(16) if i not in (1, 6, 11)])
     once = recoloured(coarse, others, DEPTH).field
+    before = coarse.feature_rows.clone()
     found = finer_colours(coarse, others, DEPTH, engine=engine)
+    assert torch.equal(coarse.feature_rows, before)
     assert decibel(found, between) > decibel(once, between) + 3
     spans = views.intrinsics[0].fx * found.voxel_size / DEPTH
     assert spans == pytest.approx(PIXELS, rel=0.1) and found.resolution == 2 * coarse.resolution

@@ -61,7 +61,13 @@ class _Engine(Protocol):
 
 @torch.no_grad()
 def recoloured(
-    field: Field, views: Views, depth: float, progress: Progress = SILENT, engine: str = "auto", relaxation: float = 1.0
+    field: Field,
+    views: Views,
+    depth: float,
+    progress: Progress = SILENT,
+    engine: str = "auto",
+    relaxation: float = 1.0,
+    in_place: bool = False,
 ) -> Recoloured:
     """A field like `field` whose colours were looked up again.
 
@@ -79,9 +85,10 @@ def recoloured(
         engine: auto | numba | torch. The compiled one runs on the CPU and knows the deferred decoder alone.
         relaxation: ω. With 1 every corner gets what its rays ask for in the mean, which is too little where neighbours are asked for the
             opposite. Below 2, passes one after the other do not diverge where the way from logits to colours is straight (as in SIRT).
+        in_place: the colours of `field` itself change, once all rays were asked: no second copy of its features is made.
 
     Raises:
-        Interrupted: the user asked to stop.
+        Interrupted: the user asked to stop; then nothing has changed.
     """
     compiled = field.device.type == "cpu" and isinstance(field.decoder, Deferred) and engine != "torch"
     worker: _Engine = _Compiled(field) if compiled else _Torch(field)
@@ -94,8 +101,9 @@ def recoloured(
         progress.check()
         worker.add(*_pixels(views, index, camera))
     sums, seen = worker.sums()
-    features = field.feature_rows.clone()
-    features[:-1, :COLOURS] += relaxation * (sums[:, :COLOURS] / sums[:, COLOURS:].clamp_min(THRESHOLD))[:-1]
+    features = field.feature_rows if in_place else field.feature_rows.clone()
+    sums[:, :COLOURS] *= relaxation / sums[:, COLOURS:].clamp_min(THRESHOLD)
+    features[:-1, :COLOURS] += sums[:-1, :COLOURS]
     return Recoloured(replace(field, feature_rows=features), seen)
 
 

@@ -31,7 +31,7 @@ SEEN = 0.02  # weight T·α below which no ray sees a voxel: it hides behind oth
 RELAXATION = 1.6  # of each back-projection: one is worth as much as two without
 SILHOUETTE = 0.5  # voxels about a voxel's middle in which alpha must show nothing for it to go: what bulges over a silhouette costs most
 STEP = 2.0  # most that a lattice is finer than the one before
-LEAST_STEP = 1.1  # what is gained by less is not worth a lattice
+LEAST_STEP = 1.2  # what is gained by less is not worth a lattice
 
 
 @torch.no_grad()
@@ -53,13 +53,14 @@ def finer_colours(field: Field, views: Views, depth: float, progress: Progress =
     focal = float(np.median([views.intrinsics[index].fx for index in train]))
     host = TorchHost(field.device)
     most = memory.bounded(MOST_VOXELS * VOXEL_BYTES) // VOXEL_BYTES
+    own = False  # whether the field's rows were made here
     while True:
-        field, seen = recoloured(field, views, depth, progress, engine, RELAXATION)
+        field, seen = recoloured(field, views, depth, progress, engine, RELAXATION, in_place=own)
         kept = beside(field.topology, (seen > SEEN) & field.occupied) & field.occupied
         resolution = _next(field, focal / depth, int(kept.sum()), most)
         if resolution is None:
-            return recoloured(field, views, depth, progress, engine, RELAXATION).field
-        field = finer(field, kept, resolution, host)
+            return recoloured(field, views, depth, progress, engine, RELAXATION, in_place=True).field
+        field, own = finer(field, kept, resolution, host), True
         if any(alpha is not None for alpha in views.alpha):
             field = inside_silhouettes(field, views, SILHOUETTE)
 
