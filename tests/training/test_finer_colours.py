@@ -68,13 +68,18 @@ def test_held_out_pictures_are_not_looked_at(coarse: Field, views: Views) -> Non
     assert torch.equal(finer_colours(coarse, spoilt, DEPTH).feature_rows, expected.feature_rows)
 
 
-def test_voxels_are_bounded(coarse: Field, views: Views, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voxels_and_lattices_are_bounded(coarse: Field, views: Views, monkeypatch: pytest.MonkeyPatch) -> None:
     views = views.subset(range(8))
     free = finer_colours(coarse, views, DEPTH)
     for most in (free.voxels // 2, 10):
         monkeypatch.setattr(module, "MOST_VOXELS", most)
         found = finer_colours(coarse, views, DEPTH)
         assert found.voxels <= max(most, coarse.voxels) and found.resolution < free.resolution
+    monkeypatch.undo()
+    monkeypatch.setattr(module, "MOST_RESOLUTION", 64)
+    assert finer_colours(coarse, views, DEPTH).resolution == 64 < free.resolution
+    monkeypatch.setattr(module, "MOST_RESOLUTION", 16)  # a lattice that is finer already stays
+    assert finer_colours(coarse, views, DEPTH).resolution == coarse.resolution
     monkeypatch.undo()
     monkeypatch.setattr("toolkit.memory.available", lambda: 0)  # nothing free: the lattice stays
     found = finer_colours(coarse, views, DEPTH)

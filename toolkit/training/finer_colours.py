@@ -26,6 +26,7 @@ from toolkit.volume.topology import BLOCK
 Tensor = torch.Tensor
 PIXELS = 1.5  # of the training views that a voxel at the median depth spans in the end
 MOST_VOXELS = 3_000_000
+MOST_RESOLUTION = 1024  # voxels along a side: what a ray needs to skip empty space is an array over all of the lattice
 VOXEL_BYTES = 500  # at the worst: rows of half-empty blocks, those that replace them, sums of what rays ask for
 SEEN = 0.02  # weight T·α below which no ray sees a voxel: it hides behind others, and is not divided
 RELAXATION = 1.6  # of each back-projection: one is worth as much as two without
@@ -77,5 +78,5 @@ def _next(field: Field, pixels: float, kept: int, most: int) -> int | None:
         return None
     blocks = field.resolution / BLOCK
     wanted, allowed = round(min(STEP, pixels * field.voxel_size / PIXELS) * blocks), math.floor((most / kept) ** (1 / 3) * blocks)
-    resolution = BLOCK * min(wanted, allowed)
+    resolution = min(BLOCK * min(wanted, allowed), MOST_RESOLUTION)
     return resolution if resolution >= LEAST_STEP * field.resolution else None
