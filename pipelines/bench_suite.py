@@ -166,14 +166,14 @@ def render_directly(job: Job, views: Views, scene: Scene) -> Pictures:
     def make() -> Pictures:
         import numpy as np
 
-        field, key_frames = direct_field(settings, views, scene, job.progress)
+        made = direct_field(settings, views, scene, job.progress)
         pictures = Pictures()
         for index in np.flatnonzero(views.test):
             job.progress.check()
             start = time.monotonic()
-            picture = to_picture(render_view(field, views.intrinsics[index], views.world_from_camera[index]))
+            picture = to_picture(render_view(made.field, views.intrinsics[index], views.world_from_camera[index]))
             pictures.add(views.names[index], picture, time.monotonic() - start)
-        pictures.facts = {"voxels": field.voxels, "key_frames": key_frames}
+        pictures.facts = {"voxels": made.field.voxels, "key_frames": made.key_frames}
         return pictures
 
     def save(pictures: Pictures) -> list[Path]:

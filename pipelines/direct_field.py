@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,20 @@ if TYPE_CHECKING:
     from toolkit.poses.scene import Scene
     from toolkit.progress import Progress
     from toolkit.render.field import Field
+
+
+@dataclass(frozen=True)
+class DirectField:
+    """What direct inference gave.
+
+    Attributes:
+        key_frames: that were fused.
+        voxel_size: of the networks' finest lattice, working units; the field's is finer where colours are.
+    """
+
+    field: Field
+    key_frames: int
+    voxel_size: float
 
 
 def weights_of(settings: Settings) -> Path:
@@ -32,9 +46,9 @@ def weights_state(settings: Settings) -> str:
 
 def direct_field(
     settings: Settings, views: Views, scene: Scene, progress: Progress, share: float = 1.0, voxel_factor: float = 1.0
-) -> tuple[Field, int]:
-    """Fuse the key frames (about `share` of them, evenly spread) of the training views into a field; and how many they were. Key frames
-    are chosen as by a run but for sharpness.
+) -> DirectField:
+    """Fuse the key frames (about `share` of them, evenly spread) of the training views into a field. Key frames are chosen as by a run but
+    for sharpness.
 
     Args:
         voxel_factor: voxels this many times as large as `network.voxels` asks for.
@@ -57,4 +71,4 @@ def direct_field(
     inference = Inference(model, views, scene, keys, settings.field.background, options)
     for _ in inference.frames(progress):
         pass
-    return inference.result(progress, settings.engine), len(keys.indices)
+    return DirectField(inference.result(progress, settings.engine), len(keys.indices), inference.lattice.voxel_size)

@@ -209,13 +209,18 @@ def make_direct(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dic
     settings, share = ground.settings, float(spec["wanted"]["keyframes"])
     path = scratch / "field.safetensors"
     with Cost(ground) as cost:
-        made, count = direct_field(settings, ground.chosen, ground.scene, SILENT, share, float(spec["wanted"]["voxel_size"]))
+        made = direct_field(settings, ground.chosen, ground.scene, SILENT, share, float(spec["wanted"]["voxel_size"]))
         cost.lap("fuse")
-        made.save(path, ground.scene.working_from_input)
+        made.field.save(path, ground.scene.working_from_input)
         cost.lap("save")
     field = Field.load(path).to(settings.device)
-    voxel = field.voxel_size / ground.scene.working_from_input.scale
-    setting = {"keyframes": count, "voxel_size": voxel, "views": len(ground.used), "resolution": field.resolution, "voxels": field.voxels}
+    setting = {
+        "keyframes": made.key_frames,
+        "voxel_size": made.voxel_size / ground.scene.working_from_input.scale,
+        "views": len(ground.used),
+        "resolution": field.resolution,
+        "voxels": field.voxels,
+    }
     return [{"setting": setting, **cost.facts(), "disk_bytes": path.stat().st_size, "show": shown_field(field, settings.engine)}]
 
 

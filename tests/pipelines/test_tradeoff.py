@@ -7,13 +7,17 @@ from pathlib import Path
 
 import pytest
 
+from pipelines.direct_field import direct_field
 from pipelines.tradeoff import unbounded
 from pipelines.tradeoff_plan import base_time, chosen_axes, chosen_times, plan
 from tests.pipelines.made import call
 from tests.pipelines.test_matched import make_corner
+from tests.training.test_network_start import scene, wall_views
+from toolkit.config import Settings
 from toolkit.errors import InputError
 from toolkit.evaluate.tradeoff import checked_row, points_of, series
 from toolkit.files import read_json, write_json
+from toolkit.progress import SILENT
 
 Capsys = pytest.CaptureFixture[str]
 SMALL = ["--holdout", "4", "--threads", "1", "--quiet", "--json", "--set", "field.resolution=64"]
@@ -130,3 +134,12 @@ def test_what_cannot_be_measured_is_refused(tmp_path: Path, capsys: Capsys) -> N
     ):
         answer = call(capsys, "tradeoff", tmp_path / "corner", "--out", tmp_path / "out", "--quiet", *arguments)
         assert answer.code == 2 and words in answer.sentence(), answer.err
+
+
+def test_the_voxels_of_direct_inference_are_those_of_the_networks() -> None:
+    """Its field's are finer, and the same whatever the networks' are."""
+    settings = Settings()
+    settings.network.voxels = 24.0
+    made = [direct_field(settings, wall_views(), scene(), SILENT, voxel_factor=factor) for factor in (1.0, 2.0)]
+    assert made[1].voxel_size == pytest.approx(2 * made[0].voxel_size, rel=0.1)
+    assert made[0].field.voxel_size <= made[0].voxel_size and made[0].key_frames >= 1
