@@ -139,7 +139,7 @@ def test_what_cannot_be_measured_is_refused(tmp_path: Path, capsys: Capsys) -> N
 def test_the_voxels_of_direct_inference_are_those_of_the_networks() -> None:
     """Its field's are finer, and the same whatever the networks' are."""
     settings = Settings()
-    settings.network.voxels = 24.0
+    settings.device, settings.network.voxels = "cpu", 48.0
     made = [direct_field(settings, wall_views(), scene(), SILENT, voxel_factor=factor) for factor in (1.0, 2.0)]
-    assert made[1].voxel_size == pytest.approx(2 * made[0].voxel_size, rel=0.1)
-    assert made[0].field.voxel_size <= made[0].voxel_size and made[0].key_frames >= 1
+    assert made[1].voxel_size > 1.4 * made[0].voxel_size  # a lattice is so many whole blocks
+    assert all(one.field.voxel_size <= one.voxel_size for one in made) and made[0].key_frames >= 1
