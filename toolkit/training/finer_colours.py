@@ -76,7 +76,10 @@ def _next(field: Field, pixels: float, kept: int, most: int) -> int | None:
     """
     if kept == 0:
         return None
-    blocks = field.resolution / BLOCK
-    wanted, allowed = round(min(STEP, pixels * field.voxel_size / PIXELS) * blocks), math.floor((most / kept) ** (1 / 3) * blocks)
+    whole, blocks = pixels * field.voxel_size / PIXELS, field.resolution / BLOCK
+    if whole < LEAST_STEP:
+        return None
+    step = whole ** (1 / math.ceil(math.log(whole, STEP)))  # even ones
+    wanted, allowed = round(step * blocks), math.floor((most / kept) ** (1 / 3) * blocks)
     resolution = min(BLOCK * min(wanted, allowed), MOST_RESOLUTION)
     return resolution if resolution >= LEAST_STEP * field.resolution else None
