@@ -92,7 +92,8 @@ def test_ctrl_c_twice_ends_at_once(tmp_path: Path) -> None:
 def test_ctrl_c_while_code_is_made_from_text(tmp_path: Path) -> None:
     """Many imports do that. CPython then ends `python -m` by the signal, although the interrupt was caught."""
     (tmp_path / "interrupted.py").write_text(
-        "import atexit, pipelines.cli\n"
+        "import atexit, signal, pipelines.cli\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # tests that run in the background inherit that it is ignored
         "atexit.register(print, 'tidied')\n"
         "pipelines.cli.app = lambda: exec('import signal; signal.raise_signal(signal.SIGINT)')\n"
         "pipelines.cli.program()\n"
