@@ -37,8 +37,8 @@ LEAST_STEP = 1.2  # what is gained by less is not worth a lattice
 
 @torch.no_grad()
 def finer_colours(field: Field, views: Views, depth: float, progress: Progress = SILENT, engine: str = "auto") -> Field:
-    """A field of about the same densities whose colours were looked up again on lattices of half the voxel size and half of that, until
-    a voxel spans `PIXELS`; on the last of them twice.
+    """A field of about the same densities whose colours were looked up again on ever finer lattices, each at most twice as fine as the one
+    before, until a voxel spans `PIXELS`; on the last of them twice.
 
     Voxels that no ray of the pictures saw, nor lie beside one that a ray saw, are dropped on the way.
 

@@ -126,9 +126,11 @@ class Inference:
         self.near, self.far, self.median_depth = scene.near, scene.far, scene.median_depth
         voxels = self.options.voxels or voxels_to_median(self.train, self.options.measured)
         self.lattice = lattice_of(space_of(views, scene, background), scene, voxels, self.options.levels)
-        self.hull = visual_hull(self.lattice.space, self.train, model.device)
         self.behind, self.sky = colour_behind(views).to(model.device), sky_behind(views)
-        self.seconds = self.fusion_seconds = self.encode_seconds = 0.0
+        start = time.perf_counter()
+        self.hull = visual_hull(self.lattice.space, self.train, model.device)
+        self.seconds = time.perf_counter() - start
+        self.fusion_seconds = self.encode_seconds = 0.0
         self.done = 0
         self._latest: Fused | None = None
 
