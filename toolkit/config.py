@@ -55,6 +55,7 @@ class NetworkSettings:
     voxels: float | None = None  # finest ones to the median depth; None: 48, or more: a voxel to some pixels there
     levels: int = 2  # lattices, each of half the voxel size of the one before; 1: the paper's single one
     depth_from: str = "sensor"  # sensor (if the capture has one; the paper has none) | off
+    agreement: bool = True  # key frames' plane sweeps are held against each other, but where there is alpha (not in the paper)
     recolour: bool = True  # colours of the result are looked up again in the training pictures, on finer lattices (not in the paper)
 
 

@@ -13,13 +13,12 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from toolkit.camera import Array
 from toolkit.capture.types import Views
 from toolkit.errors import InputError
+from toolkit.key_sweeps import KeySweeps, picture, sensed, together
 from toolkit.keyframes import KeyFrames
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
@@ -27,7 +26,7 @@ from toolkit.networks.lattice import LatentVolume, Lattice
 from toolkit.networks.model import NerfusionModel
 from toolkit.networks.refine import adopt, children, merged, part, solid_cells, split_volume, surface_cells
 from toolkit.networks.store import GlobalStore
-from toolkit.networks.sweep import Empty
+from toolkit.networks.sweep import Empty, Sweep
 from toolkit.networks.unproject import EncodedView
 from toolkit.progress import SILENT, Progress
 from toolkit.volume.space import Space
@@ -113,13 +112,19 @@ class Fusion:
         self._balls = block_balls(self.stores[0].lattice, self._keys)
 
     @torch.no_grad()
-    def add(self, views: Sequence[EncodedView], cameras: Cameras, depth: Tensor | None = None) -> None:
-        """Fuse one key frame (first) and its neighbours; `depth` (H, W) of the key frame where a sensor measured it, working units."""
+    def add(self, views: Sequence[EncodedView], cameras: Cameras, depth: Tensor | None = None, swept: Sweep | None = None) -> None:
+        """Fuse one key frame (first) and its neighbours.
+
+        Args:
+            depth: (H, W) of the key frame where a sensor measured it, working units.
+            swept: of the key frame, where it was made already (`KeySweeps`), depth and all; None: made here.
+        """
         options = self.options
         keys = self._keys[visible_blocks(*self._balls, cameras[0], options.near, options.far)]
         topology, finer = Topology(keys), None
         bounded = options.near > 0 or math.isfinite(options.far)
-        swept = self.model.sweep(views, cameras, options.near, options.far, depth, self.empty) if bounded else None
+        if swept is None and bounded:
+            swept = self.model.sweep(views, cameras, options.near, options.far, depth, self.empty)
         for level, store in enumerate(self.stores):
             wanted = None if finer is None else finer.known
             local = self.model.local_volume(views, cameras, store.lattice, topology, wanted, options.near, options.far, swept)
@@ -168,8 +173,7 @@ class _Pictures:
         if index not in self._kept:
             views, device = self.views, self.model.device
             cameras = Cameras.of([views.intrinsics[index]], views.world_from_camera[index : index + 1], device)
-            image = torch.from_numpy(np.ascontiguousarray(views.images[index])).to(device).permute(2, 0, 1)[None].float() / 255
-            self._kept[index] = (self.model.encode(image, cameras)[0], cameras)
+            self._kept[index] = (self.model.encode(picture(views, index, device), cameras)[0], cameras)
         self._kept.move_to_end(index)
         while len(self._kept) > KEPT_PICTURES:
             self._kept.popitem(last=False)
@@ -184,11 +188,14 @@ def fuse_views(
     options: FusionOptions | None = None,
     progress: Progress = SILENT,
     empty: Empty | None = None,
+    witnesses: Sequence[Sequence[int]] | None = None,
 ) -> Iterator[Fused]:
     """Fuse key frames one after the other; yields after each, so that a preview can be rendered meanwhile.
 
     Args:
         empty: see `Fusion`.
+        witnesses: of each key frame, other ones (places among them, `key_sweeps.beside`) that its sweep is held against (not in the paper);
+            needs a nearest or a farthest depth.
 
     Raises:
         InputError: no key frames, or a lattice that does not fit the options.
@@ -198,21 +205,18 @@ def fuse_views(
         raise InputError("there are no key frames to fuse; give more pictures")
     fusion = Fusion(model, lattice, options, empty)
     encoded = _Pictures(model, views)
+    near, far, measured = fusion.options.near, fusion.options.far, fusion.options.measured
+    sweeps = None if witnesses is None else KeySweeps(views, key_frames, witnesses, near, far, measured, empty, model.device)
     for done, (key, neighbours) in enumerate(zip(key_frames.indices, key_frames.neighbours, strict=True)):
         progress.check()
         begin = time.perf_counter()
-        group = [encoded(index) for index in _together(int(key), neighbours)]
+        group = [encoded(index) for index in together(int(key), neighbours)]
         encode_seconds = time.perf_counter() - begin
-        depth = views.depths[int(key)] if fusion.options.measured and views.depths else None
-        measured = None if depth is None else torch.from_numpy(np.ascontiguousarray(depth, np.float32)).to(model.device)
-        fusion.add([view for view, _ in group], Cameras.together([camera for _, camera in group]), measured)
+        depth = sensed(views, int(key), model.device) if measured else None
+        swept = None if sweeps is None else sweeps(done)
+        fusion.add([view for view, _ in group], Cameras.together([camera for _, camera in group]), depth, swept)
         if (done + 1) % fusion.options.prune_every == 0:
             fusion.prune()
         seconds = time.perf_counter() - begin
         yield Fused(int(key), fusion.volume, fusion.allowed(), seconds, encode_seconds)
         progress.update(done + 1, len(key_frames.indices), f"{fusion.volume.topology.blocks} blocks")
-
-
-def _together(key: int, neighbours: Array) -> list[int]:
-    """The key frame and its neighbours, each once."""
-    return list(dict.fromkeys([key, *(int(n) for n in neighbours)]))

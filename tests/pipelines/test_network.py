@@ -179,7 +179,8 @@ def test_parts_of_the_networks_can_be_switched_off(room: Path, tmp_path: Path, c
     answer = call(capsys, "bench", "ablations", room, "--out", tmp_path / "table", *settings, "--quiet")
     assert answer.code == 0, answer.err
     rows = {row["part"]: row for row in read_json(tmp_path / "table" / "ablations.json")["rows"]}
-    assert list(rows) == ["whole", "no variance", "no direction code", "mean instead of GRU", "no pruning", "colours of the fusion"]
+    parts = ["whole", "no variance", "no direction code", "mean instead of GRU", "no pruning", "sweeps alone", "colours of the fusion"]
+    assert list(rows) == parts
     others = [row["psnr"] for name, row in rows.items() if name != "whole"]
     assert all(value != rows["whole"]["psnr"] for value in others) and len(set(others)) == 5
 

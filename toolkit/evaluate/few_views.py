@@ -30,7 +30,11 @@ if TYPE_CHECKING:
 
 STARTS = ("direct", "network", "classical")
 SHOWN = ("psnr", "ssim", "lpips", "depth_abs_err")
-OF_OPTIONS: dict[str, dict[str, Any]] = {"no pruning": {"gamma": None}, "colours of the fusion": {"recolour": False}}
+OF_OPTIONS: dict[str, dict[str, Any]] = {
+    "no pruning": {"gamma": None},
+    "sweeps alone": {"agreement": False},
+    "colours of the fusion": {"recolour": False},
+}
 ABLATIONS = ("whole", "no variance", "no direction code", "mean instead of GRU", *OF_OPTIONS)
 
 

@@ -94,7 +94,73 @@ class Sweep:
         return torch.stack([found[0], found[1] - beyond, found[2]])
 
 
+@dataclass(frozen=True)
+class Compared:
+    """How badly the pictures of a key view and its neighbours fit at planes, before anything is decided.
+
+    Attributes:
+        camera: one.
+        rays: (h · w, 3) of the working frame, through pixels of the key view, of unit depth along its axis.
+        inverses: (D,) inverse depths of the planes, evenly spaced, ascending.
+        cost: (D, h, w) in [0, 1].
+    """
+
+    camera: Cameras
+    rays: Tensor
+    inverses: Tensor
+    cost: Tensor
+
+    @property
+    def step(self) -> float:
+        """Inverse depth between planes."""
+        return float(self.inverses[1] - self.inverses[0])
+
+    def points(self) -> Tensor:
+        """(D · h · w, 3) of the working frame."""
+        return (self.rays[None] / self.inverses[:, None, None] + self.camera.positions[0]).view(-1, 3)
+
+
 @torch.no_grad()
+def compare(described: Sequence[Tensor], cameras: Cameras, near: float, far: float) -> Compared:
+    """Compare the first view with all others at planes between `near` and `far` along its axis; the others may come in any order.
+
+    Args:
+        described: K times (21, h, w) of `matching.describe`.
+        cameras: K.
+        near, far: 0 and ∞ where unknown.
+
+    Raises:
+        ValueError: neither is known, or the nearest does not lie before the farthest.
+    """
+    near, far = _bounded(near, far)
+    inverses = torch.linspace(1 / far, 1 / near, _planes(described, cameras, near, far), device=cameras.intrinsics.device)
+    rays, own, shape = _pixels(described[0], cameras)
+    costs, visible = [], []
+    for view in range(1, len(cameras)):
+        found, seen = _warped(described[view], cameras[view], cameras, rays, inverses)
+        costs.append(difference(own[None], found))
+        visible.append(seen)
+    cost = together(torch.stack(costs), torch.stack(visible)) if costs else rays.new_zeros((len(inverses), len(rays)))
+    return Compared(cameras[0], rays @ cameras.world_from_camera[0, :3, :3].T, inverses, cost.view(len(inverses), *shape))
+
+
+@torch.no_grad()
+def decide(compared: Compared, depth: Tensor | None = None, empty: Empty | None = None, said: Tensor | None = None) -> Sweep:
+    """Where the surface is likely to be.
+
+    Args:
+        depth: (H, W) of the key view along z in working units, where a sensor measured it; 0 or not finite where it did not.
+        empty: where there is for sure no surface, as silhouettes tell.
+        said: (D, h, w) that makes planes likelier, in units of the cost (`witness.evidence`).
+    """
+    likely = distribution(compared.cost if said is None else compared.cost - said)
+    if empty is not None:
+        likely = carved(likely, empty(compared.points()).view_as(likely))
+    if depth is not None:
+        likely = measured(likely, compared.inverses, depth)
+    return Sweep(compared.camera, _table(likely, compared.step), float(compared.inverses[0]), compared.step)
+
+
 def sweep(
     described: Sequence[Tensor],
     cameras: Cameras,
@@ -103,36 +169,8 @@ def sweep(
     depth: Tensor | None = None,
     empty: Empty | None = None,
 ) -> Sweep:
-    """Compare the first view with all others at planes between `near` and `far` along its axis; the others may come in any order.
-
-    Args:
-        described: K times (21, h, w) of `matching.describe`.
-        cameras: K.
-        near, far: 0 and ∞ where unknown.
-        depth: (H, W) of the first view along z in working units, where a sensor measured it; 0 or not finite where it did not.
-        empty: where there is for sure no surface, as silhouettes tell.
-
-    Raises:
-        ValueError: neither is known, or the nearest does not lie before the farthest.
-    """
-    near, far = _bounded(near, far)
-    low, high = 1 / far, 1 / near
-    inverses = torch.linspace(low, high, _planes(described, cameras, near, far), device=cameras.intrinsics.device)
-    rays, own, shape = _pixels(described[0], cameras)
-    costs, visible = [], []
-    for view in range(1, len(cameras)):
-        found, seen = _warped(described[view], cameras[view], cameras, rays, inverses)
-        costs.append(difference(own[None], found))
-        visible.append(seen)
-    cost = together(torch.stack(costs), torch.stack(visible)) if costs else rays.new_zeros((len(inverses), len(rays)))
-    likely = distribution(cost.view(len(inverses), *shape))
-    step = float(inverses[1] - inverses[0])
-    if empty is not None:
-        points = (rays @ cameras.world_from_camera[0, :3, :3].T)[None] / inverses[:, None, None] + cameras.positions[0]
-        likely = carved(likely, empty(points.view(-1, 3)).view_as(likely))
-    if depth is not None:
-        likely = measured(likely, inverses, depth)
-    return Sweep(cameras[0], _table(likely, step), low, step)
+    """`compare` and `decide` for a key view alone."""
+    return decide(compare(described, cameras, near, far), depth, empty)
 
 
 def carved(likely: Tensor, empty: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ field can be looked at while key frames come in. The space is the one that a fit
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from toolkit.capture.types import Views
 from toolkit.config import NetworkSettings
 from toolkit.errors import InputError
 from toolkit.fusion import Fused, FusionOptions, fuse_views
+from toolkit.key_sweeps import beside
 from toolkit.keyframes import KeyFrames
 from toolkit.networks import weights
 from toolkit.networks.lattice import Lattice
@@ -55,6 +57,7 @@ class NetworkOptions:
         levels: lattices, each of half the voxel size of the one before; 1: the paper's single one.
         gamma: see-through voxels (exp(−optical thickness) above it) are not rendered; None: all are.
         measured: the views' depth goes into the key frames' sweeps.
+        agreement: key frames' sweeps are held against each other, but for captures with alpha, where the visual hull is known.
         recolour: `Inference.result` looks colours up again in the training pictures (`finer_colours`).
     """
 
@@ -62,12 +65,14 @@ class NetworkOptions:
     levels: int = LEVELS
     gamma: float | None = GAMMA
     measured: bool = False
+    agreement: bool = True
     recolour: bool = True
 
     @classmethod
     def of(cls, settings: NetworkSettings) -> NetworkOptions:
         """As the settings say."""
-        return cls(settings.voxels, settings.levels, measured=settings.depth_from == "sensor", recolour=settings.recolour)
+        measured = settings.depth_from == "sensor"
+        return cls(settings.voxels, settings.levels, measured=measured, agreement=settings.agreement, recolour=settings.recolour)
 
 
 def load_networks(path: Path | str | None = None, device: torch.device | str = "cpu") -> NerfusionModel:
@@ -141,7 +146,10 @@ class Inference:
             Interrupted: the user asked to stop.
         """
         options = FusionOptions(self.options.levels, self.near, self.far, measured=self.options.measured)
-        for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress, self.hull):
+        # Things without texture that stand before nothing lead all sweeps astray in the same way; the hull knows better.
+        agree = self.options.agreement and self.hull is None and (self.near > 0 or math.isfinite(self.far))
+        witnesses = beside(self.keys, self.train.world_from_camera, self.train.intrinsics, self.median_depth) if agree else None
+        for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress, self.hull, witnesses):
             self._latest = fused
             self.seconds += fused.seconds
             self.fusion_seconds += fused.seconds

@@ -12,7 +12,8 @@ from torch import Tensor
 from toolkit.evaluate.selftest.case import Measure, absolute, case, not_finite
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.matching import LARGE, SMALL, TEMPERATURE, UNKNOWN, describe
-from toolkit.networks.sweep import Sweep, carved, sweep
+from toolkit.networks.sweep import Sweep, carved, compare, decide, sweep
+from toolkit.networks.witness import AGAINST, FOR, SHARE, evidence, witness
 
 GROUP = "networks"
 WIDTH, HEIGHT, FOCAL = 24, 18, 22.0
@@ -226,4 +227,29 @@ def sweep_carved(folder: Path) -> list[Measure]:
         made = sweep(list(describe(images)), cameras, NEAR, FAR, empty=lambda points: points[:, 2] < 1)
         seen = made.look(places(), torch.full((len(places()),), TRUNCATION))
         out.append(Measure(f"{name}: values that are not finite", not_finite(seen.signed, seen.open, seen.sure), 0.0))
+    return out
+
+
+@case(GROUP, "plane sweep: witnesses that know nothing, look away, stand in the picture or at the ends of the earth")
+def sweep_witnessed(folder: Path) -> list[Measure]:
+    """What is said stays within its bounds, likelihoods are numbers, and who does not look changes none."""
+    out = []
+    images, cameras = awkward()["one neighbour"]
+    compared = compare(list(describe(images)), cameras, NEAR, FAR)
+    alone = decide(compared).table[0]
+    low, high = (SHARE * math.log(value) for value in (AGAINST, FOR + AGAINST))
+    for name, (others, seen_by) in awkward().items():
+        for near, far in ((NEAR, FAR), (1e-6, 1e6)):
+            one = witness(sweep(list(describe(others)), seen_by, near, far))
+            said = evidence(compared, [one, one])
+            assert said is not None
+            made = decide(compared, said=said)
+            ends = f"{name}, {near:g} to {far:g}"
+            out.append(Measure(f"{ends}: values that are not finite", not_finite(said, made.table), 0.0))
+            out.append(Measure(f"{ends}: said beyond its bounds", max(0.0, float(said.max()) - high, low - float(said.min())), 1e-5))
+            rising = float((torch.diff(made.table[0], dim=0) > 1e-6).sum())
+            out.append(Measure(f"{ends}: likelihoods that rise towards the camera", rising, 0.0))
+    silent = evidence(compared, [witness(sweep(list(describe(images)), turned(cameras, 0, math.pi), NEAR, FAR))])
+    assert silent is not None
+    out.append(Measure("one that looks away: change of likelihoods", absolute(decide(compared, said=silent).table[0], alone), 1e-6))
     return out

@@ -1,0 +1,114 @@
+"""The plane sweeps of all key frames, each held against those of the key frames beside it (not in the paper).
+
+A key frame's witnesses are wanted before it is fused, whichever of them come later, so sweeps are made as they are asked for and kept for
+those that ask next. The pictures are compared small, which costs little against encoding them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from toolkit.camera import Array, Intrinsics
+from toolkit.capture.types import Views
+from toolkit.keyframes import KeyFrames
+from toolkit.networks.cameras import Cameras
+from toolkit.networks.matching import describe
+from toolkit.networks.sweep import Compared, Empty, Sweep, compare, decide
+from toolkit.networks.witness import Witness, evidence, witness
+from toolkit.poses.overlap import overlap, parallax
+
+MOST = 8  # witnesses of a key frame
+LEAST_OVERLAP = 0.1  # either way
+WIDEST = 60.0  # degrees of parallax: two that look at a place from either side say little about each other
+KEPT = 32  # sweeps kept for key frames to come, some 9 MB each at most
+KEPT_DESCRIPTORS = 48  # pictures, 3 MB each at most
+
+
+def beside(keys: KeyFrames, world_from_camera: Array, intrinsics: Sequence[Intrinsics], depth: float) -> list[list[int]]:
+    """For each key frame its witnesses, as places in `keys.indices`: those that overlap most.
+
+    Args:
+        world_from_camera: (N, 4, 4) of all views that `keys` counts.
+        depth: median depth, in the frame of the poses.
+    """
+    poses = np.asarray(world_from_camera, dtype=np.float64)[keys.indices]
+    shares = overlap(poses, [intrinsics[int(index)] for index in keys.indices], depth)
+    angles = parallax(poses, depth)
+    common = np.minimum(shares, shares.T)
+    common[np.maximum(angles, angles.T) > WIDEST] = 0
+    np.fill_diagonal(common, 0)
+    order = np.argsort(-common, axis=1, kind="stable")[:, :MOST]
+    return [[int(other) for other in row if common[at, other] > LEAST_OVERLAP] for at, row in enumerate(order)]
+
+
+class KeySweeps:
+    """Call with a place in `keys.indices` for the sweep of that key frame."""
+
+    def __init__(
+        self,
+        views: Views,
+        keys: KeyFrames,
+        witnesses: Sequence[Sequence[int]],
+        near: float,
+        far: float,
+        measured: bool = False,
+        empty: Empty | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """
+        Args:
+            witnesses: for each key frame, as `beside` gives them; none: its sweep alone.
+            near, far: depths along z, working units; one of them known.
+            measured: the depth that a sensor measured goes into a key frame's sweep.
+            empty: where there is for sure nothing.
+
+        Raises:
+            ValueError: neither depth is known.
+        """
+        if not (near > 0 or math.isfinite(far)):
+            raise ValueError("sweeps need a nearest or a farthest depth")
+        self.views, self.keys, self.witnesses, self.empty = views, keys, witnesses, empty
+        self.near, self.far, self.measured, self.device = near, far, measured, device
+        self._described = lru_cache(KEPT_DESCRIPTORS)(self._describe)
+        self._made = lru_cache(KEPT)(self._make)
+
+    def __call__(self, at: int) -> Sweep:
+        compared, _ = self._made(at)
+        said = evidence(compared, [self._made(other)[1] for other in self.witnesses[at]])
+        return decide(compared, self._depth(at), self.empty, said)
+
+    def _make(self, at: int) -> tuple[Compared, Witness]:
+        """What the pictures say alone, and what this key frame says of others' surfaces."""
+        group = together(int(self.keys.indices[at]), self.keys.neighbours[at])
+        poses = self.views.world_from_camera[group]
+        cameras = Cameras.of([self.views.intrinsics[index] for index in group], poses, self.device)
+        compared = compare([self._described(index) for index in group], cameras, self.near, self.far)
+        return compared, witness(decide(compared, self._depth(at), self.empty))
+
+    def _describe(self, index: int) -> Tensor:
+        return describe(picture(self.views, index, self.device))[0]
+
+    def _depth(self, at: int) -> Tensor | None:
+        return sensed(self.views, int(self.keys.indices[at]), self.device) if self.measured else None
+
+
+def together(key: int, neighbours: Array) -> list[int]:
+    """The key frame and its neighbours, each once."""
+    return list(dict.fromkeys([key, *(int(n) for n in neighbours)]))
+
+
+def picture(views: Views, index: int, device: torch.device | str) -> Tensor:
+    """(1, 3, H, W) RGB in [0, 1]."""
+    return torch.from_numpy(np.ascontiguousarray(views.images[index])).to(device).permute(2, 0, 1)[None].float() / 255
+
+
+def sensed(views: Views, index: int, device: torch.device | str) -> Tensor | None:
+    """(H, W) of a view's depth along z in working units, None where it has none."""
+    depth = views.depths[index] if views.depths else None
+    return None if depth is None else torch.from_numpy(np.ascontiguousarray(depth, np.float32)).to(device)

@@ -1,0 +1,74 @@
+"""Key frames as each other's witnesses: where one says that there is surface, those beside it must not see through (not in the paper).
+
+A sweep of three views is led astray where they show no texture or repeat, but not all key frames are in the same way. A point along a pixel
+of one key frame is seen by another one as surface, as free space in front of it, or not at all since something hides it, each with a
+likelihood that the other's sweep tells. Surface there speaks for the plane, free space against it, and what is hidden for neither. What the
+witnesses say on average goes into the cost before it is smoothed, so that it spreads over a surface as what the pictures say does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from toolkit.networks.cameras import Cameras
+from toolkit.networks.sweep import Compared, Sweep
+
+FOR = 4.0  # times as likely as where it is hidden, where the witness is sure of surface
+AGAINST = 0.1  # times as likely where it is sure of free space: it may err
+SHARE = 0.3  # of the mean logarithm that is taken from the cost
+
+
+@dataclass(frozen=True)
+class Witness:
+    """What a sweep says for and against surface.
+
+    Attributes:
+        camera: one.
+        says: (D, h, w) over inverse depths, farthest first: logarithm of how much likelier surface is than without this witness.
+        lowest, step: inverse depth of the first entry, and between entries.
+    """
+
+    camera: Cameras
+    says: Tensor
+    lowest: float
+    step: float
+
+    def ask(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 3) points of the working frame → (N,) what is said, 0 where the witness does not look, and (N,) bool where it does."""
+        local = self.camera.local(points)[0]
+        seen = local[:, 2] > 1e-4
+        inverse = 1 / torch.where(seen, local[:, 2], torch.ones_like(local[:, 2]))
+        focal, middle = self.camera.intrinsics[0, :2], self.camera.intrinsics[0, 2:]
+        pixel = (local[:, :2] * inverse[:, None] * focal + middle) / self.camera.size[0] * 2 - 1
+        seen &= (pixel.abs() <= 1).all(1)
+        plane = ((inverse - self.lowest) / self.step + 0.5) / len(self.says) * 2 - 1
+        grid = torch.cat([pixel, plane[:, None]], 1).clamp(-2, 2)[None, None, None]
+        found = F.grid_sample(self.says[None, None], grid, padding_mode="border", align_corners=False)[0, 0, 0, 0]
+        return torch.where(seen, found, torch.zeros_like(found)), seen
+
+
+def witness(swept: Sweep) -> Witness:
+    """Surface counts within about a plane: the next one on either side with half its weight."""
+    nearer = swept.table[0]
+    hidden = torch.cat([nearer[1:], torch.zeros_like(nearer[:1])])
+    not_free = torch.cat([torch.ones_like(nearer[:1]), nearer[:-1]])
+    says = torch.log(FOR * (not_free - hidden).clamp_min(0) + hidden + AGAINST)
+    return Witness(swept.camera, says, swept.lowest, swept.step)
+
+
+@torch.no_grad()
+def evidence(compared: Compared, witnesses: Sequence[Witness]) -> Tensor | None:
+    """(D, h, w) that `decide` takes from the cost, in any order of the witnesses; None without any."""
+    if not witnesses:
+        return None
+    points = compared.points()
+    total, count = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
+    for one in witnesses:
+        said, seen = one.ask(points)
+        total, count = total + said, count + seen
+    return (SHARE * total / count.clamp_min(1)).view_as(compared.cost)
