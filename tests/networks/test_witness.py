@@ -45,8 +45,8 @@ def test_a_witness_says_what_a_slow_loop_says() -> None:
             for x in range(width):
                 nearer[d][y][x] = float(swept.table[0, d, y, x])
     for d, y, x in [(0, 3, 5), (1, 0, 0), (planes // 2, 20, 30), (planes - 2, 7, 1), (planes - 1, height - 1, width - 1)]:
-        hidden = nearer[d + 1][y][x] if d + 1 < planes else 0.0
-        free = 1 - nearer[d - 1][y][x] if d > 0 else 0.0
+        hidden = nearer[d + 2][y][x] if d + 2 < planes else 0.0
+        free = 1 - nearer[d - 2][y][x] if d > 1 else 0.0
         expected = torch.tensor(FOR * max(0.0, 1 - hidden - free) + hidden + AGAINST).log()
         assert float(one.says[d, y, x]) == pytest.approx(float(expected), abs=1e-5)
     # A place in the middle of a cell reads that cell alone.

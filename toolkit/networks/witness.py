@@ -21,6 +21,8 @@ from toolkit.networks.sweep import Compared, Sweep
 FOR = 4.0  # times as likely as where it is hidden, where the witness is sure of surface
 AGAINST = 0.1  # times as likely where it is sure of free space: it may err
 SHARE = 0.3  # of the mean logarithm that is taken from the cost
+ABOUT = 2  # planes on either side within which surface counts, the last of them by half
+SPACING = 2  # of the pixels that ask
 
 
 @dataclass(frozen=True)
@@ -53,22 +55,29 @@ class Witness:
 
 
 def witness(swept: Sweep) -> Witness:
-    """Surface counts within about a plane: the next one on either side with half its weight."""
+    """What others may ask a key frame, from its sweep."""
     nearer = swept.table[0]
-    hidden = torch.cat([nearer[1:], torch.zeros_like(nearer[:1])])
-    not_free = torch.cat([torch.ones_like(nearer[:1]), nearer[:-1]])
+    hidden = torch.cat([nearer[ABOUT:], torch.zeros_like(nearer[:ABOUT])])
+    not_free = torch.cat([torch.ones_like(nearer[:ABOUT]), nearer[:-ABOUT]])
     says = torch.log(FOR * (not_free - hidden).clamp_min(0) + hidden + AGAINST)
     return Witness(swept.camera, says, swept.lowest, swept.step)
 
 
 @torch.no_grad()
 def evidence(compared: Compared, witnesses: Sequence[Witness]) -> Tensor | None:
-    """(D, h, w) that `decide` takes from the cost, in any order of the witnesses; None without any."""
+    """(D, h, w) that `decide` takes from the cost, in any order of the witnesses; None without any.
+
+    Witnesses are asked at every `SPACING`-th pixel either way; between planes nothing can be left out, surfaces are thinner.
+    """
     if not witnesses:
         return None
-    points = compared.points()
+    planes, height, width = compared.cost.shape
+    coarse = [-(-side // SPACING) for side in (height, width)]
+    rays = F.interpolate(compared.rays.T.view(1, 3, height, width), coarse, mode="bilinear").view(3, -1).T
+    points = (rays / compared.inverses[:, None, None] + compared.camera.positions[0]).reshape(-1, 3)
     total, count = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
     for one in witnesses:
         said, seen = one.ask(points)
         total, count = total + said, count + seen
-    return (SHARE * total / count.clamp_min(1)).view_as(compared.cost)
+    mean = (SHARE * total / count.clamp_min(1)).view(1, planes, *coarse)
+    return F.interpolate(mean, (height, width), mode="bilinear")[0]
