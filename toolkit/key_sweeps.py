@@ -20,7 +20,7 @@ from toolkit.keyframes import KeyFrames
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.matching import describe
 from toolkit.networks.sweep import Compared, Empty, Sweep, compare, decide
-from toolkit.networks.witness import Witness, evidence, witness
+from toolkit.networks.witness import Witness, certain, evidence, witness
 from toolkit.poses.overlap import overlap, parallax
 
 MOST = 8  # witnesses of a key frame
@@ -79,17 +79,19 @@ class KeySweeps:
         self._made = lru_cache(KEPT)(self._make)
 
     def __call__(self, at: int) -> Sweep:
-        compared, _ = self._made(at)
-        said = evidence(compared, [self._made(other)[1] for other in self.witnesses[at]])
+        compared, _, surface = self._made(at)
+        said = evidence(compared, [self._made(other)[1] for other in self.witnesses[at]], surface)
         return decide(compared, self._depth(at), self.empty, said)
 
-    def _make(self, at: int) -> tuple[Compared, Witness]:
-        """What the pictures say alone, and what this key frame says of others' surfaces."""
+    def _make(self, at: int) -> tuple[Compared, Witness, Tensor]:
+        """What the pictures say alone, what this key frame says of others' surfaces, and the places it is sure of."""
         group = together(int(self.keys.indices[at]), self.keys.neighbours[at])
         poses = self.views.world_from_camera[group]
         cameras = Cameras.of([self.views.intrinsics[index] for index in group], poses, self.device)
         compared = compare([self._described(index) for index in group], cameras, self.near, self.far)
-        return compared, witness(decide(compared, self._depth(at), self.empty))
+        alone = decide(compared, empty=self.empty)
+        depth = self._depth(at)
+        return compared, witness(alone if depth is None else decide(compared, depth, self.empty)), certain(compared, alone)
 
     def _describe(self, index: int) -> Tensor:
         return describe(picture(self.views, index, self.device))[0]

@@ -10,7 +10,7 @@ import torch
 from tests.networks.test_sweep import WALL, on_axis, wall
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.sweep import Compared, Sweep, compare, decide, sweep
-from toolkit.networks.witness import AGAINST, FOR, SHARE, evidence, witness
+from toolkit.networks.witness import AGAINST, FOR, SHARE, certain, credit, evidence, witness
 
 NEAR, FAR = 0.8, 6.0
 
@@ -93,3 +93,25 @@ def test_what_is_said_is_bounded() -> None:
     assert said is not None
     low, high = (SHARE * float(torch.tensor(value).log()) for value in (AGAINST, FOR + AGAINST))
     assert low - 1e-5 <= float(said.min()) < 0 < float(said.max()) <= high + 1e-5
+
+
+def test_a_witness_is_believed_as_far_as_it_confirms_what_is_sure() -> None:
+    described, seen_by = wall(3)
+    compared = compare(described, seen_by, NEAR, FAR)
+    surface = certain(compared, decide(compared))
+    assert len(surface) > 1000 and float((surface[:, 2] - WALL).abs().median()) < 0.05
+    honest, liar, beyond = witness(others()), witness(others(told=1.4)), witness(others(told=4.0))
+    assert credit(honest, surface) > 0.8 and credit(liar, surface) < 0.2 and credit(beyond, surface) == 0
+    assert credit(liar, surface[:0]) == 1.0, "nothing speaks against it"
+    silent = evidence(compared, [beyond], surface)
+    assert silent is not None and float(silent.abs().max()) == 0
+    full, weighed = evidence(compared, [honest, beyond]), evidence(compared, [honest, beyond], surface)
+    half = evidence(compared, [honest])
+    assert full is not None and weighed is not None and half is not None
+    torch.testing.assert_close(weighed, 0.5 * credit(honest, surface) * half)
+
+
+def test_what_tells_nothing_is_sure_of_no_place() -> None:
+    described, seen_by = wall(1)
+    alone = compare(described, seen_by, NEAR, FAR)
+    assert certain(alone, decide(alone)).shape == (0, 3)

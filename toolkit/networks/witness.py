@@ -22,6 +22,8 @@ FOR = 4.0  # times as likely as where it is hidden, where the witness is sure of
 AGAINST = 0.1  # times as likely where it is sure of free space: it may err
 SHARE = 0.3  # of the mean logarithm that is taken from the cost
 ABOUT = 2  # planes on either side within which surface counts, the last of them by half
+SURE = 0.7  # of the likelihood within some planes about one depth
+BELIEVED = 1.0  # mean logarithm from which on a witness is believed in full; its most is 1.4
 SPACING = 2  # of the pixels that ask
 
 
@@ -64,8 +66,29 @@ def witness(swept: Sweep) -> Witness:
 
 
 @torch.no_grad()
-def evidence(compared: Compared, witnesses: Sequence[Witness]) -> Tensor | None:
+def certain(compared: Compared, swept: Sweep) -> Tensor:
+    """(N, 3) of the working frame: the likeliest places of pixels along which `swept`, made of `compared`, is sure of one depth."""
+    likely = torch.diff(swept.table[0], dim=0).neg().flatten(1)  # between planes
+    best = likely.argmax(0)
+    middle = 0.5 * (compared.inverses[best] + compared.inverses[best + 1])
+    places = compared.rays / middle[:, None] + compared.camera.positions[0]
+    return places[swept.table[2, 0].flatten() > SURE]
+
+
+def credit(one: Witness, surface: Tensor) -> float:
+    """In [0, 1]: how far a witness is to be believed, by what it says of places that another one is sure of; 1 if it sees none of them."""
+    said, seen = one.ask(surface)
+    count = int(seen.sum())
+    return 1.0 if count == 0 else min(1.0, max(0.0, float(said.sum()) / count / BELIEVED))
+
+
+@torch.no_grad()
+def evidence(compared: Compared, witnesses: Sequence[Witness], surface: Tensor | None = None) -> Tensor | None:
     """(D, h, w) that `decide` takes from the cost, in any order of the witnesses; None without any.
+
+    Args:
+        surface: (N, 3) points that `compared` alone is sure of (`certain`). A witness is believed as far as it confirms them on average:
+            where poses are off, key frames look through each other's surfaces. None: every witness is believed.
 
     Witnesses are asked at every `SPACING`-th pixel either way; between planes nothing can be left out, surfaces are thinner.
     """
@@ -78,6 +101,6 @@ def evidence(compared: Compared, witnesses: Sequence[Witness]) -> Tensor | None:
     total, count = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
     for one in witnesses:
         said, seen = one.ask(points)
-        total, count = total + said, count + seen
+        total, count = total + (1.0 if surface is None else credit(one, surface)) * said, count + seen
     mean = (SHARE * total / count.clamp_min(1)).view(1, planes, *coarse)
     return F.interpolate(mean, (height, width), mode="bilinear")[0]
