@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -72,6 +74,19 @@ def test_each_sweep_is_made_once_and_again_only_when_it_was_forgotten(monkeypatc
     monkeypatch.setattr(key_sweeps, "KEPT", 2)
     forgetful = KeySweeps(views, keys, witnesses, NEAR, FAR)
     assert all(torch.equal(forgetful(at).table, table) for at, table in enumerate(tables)) and len(made) > 10
+
+
+def test_what_it_keeps_goes_with_it() -> None:
+    views, keys = captured(3)
+    kept = KeySweeps(views, keys, [[1], [0], [1]], NEAR, FAR)
+    kept(0)
+    gone = weakref.ref(kept)
+    gc.disable()
+    try:
+        del kept
+        assert gone() is None, "without waiting for the garbage collector"
+    finally:
+        gc.enable()
 
 
 def test_witnesses_mend_a_key_frame_that_sees_no_texture() -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -18,7 +17,7 @@ from torch import Tensor
 
 from toolkit.capture.types import Views
 from toolkit.errors import InputError
-from toolkit.key_sweeps import KeySweeps, picture, sensed, together
+from toolkit.key_sweeps import KeySweeps, Recent, picture, sensed, together
 from toolkit.keyframes import KeyFrames
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
@@ -166,18 +165,16 @@ class _Pictures:
 
     def __init__(self, model: NerfusionModel, views: Views) -> None:
         self.model, self.views = model, views
-        self._kept: OrderedDict[int, tuple[EncodedView, Cameras]] = OrderedDict()
+        self._kept: Recent[tuple[EncodedView, Cameras]] = Recent(KEPT_PICTURES)
+
+    def __call__(self, index: int) -> tuple[EncodedView, Cameras]:
+        return self._kept.get(index, self._encode)
 
     @torch.no_grad()
-    def __call__(self, index: int) -> tuple[EncodedView, Cameras]:
-        if index not in self._kept:
-            views, device = self.views, self.model.device
-            cameras = Cameras.of([views.intrinsics[index]], views.world_from_camera[index : index + 1], device)
-            self._kept[index] = (self.model.encode(picture(views, index, device), cameras)[0], cameras)
-        self._kept.move_to_end(index)
-        while len(self._kept) > KEPT_PICTURES:
-            self._kept.popitem(last=False)
-        return self._kept[index]
+    def _encode(self, index: int) -> tuple[EncodedView, Cameras]:
+        views, device = self.views, self.model.device
+        cameras = Cameras.of([views.intrinsics[index]], views.world_from_camera[index : index + 1], device)
+        return self.model.encode(picture(views, index, device), cameras)[0], cameras
 
 
 def fuse_views(

@@ -7,8 +7,9 @@ those that ask next. The pictures are compared small, which costs little against
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import lru_cache
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
@@ -28,6 +29,7 @@ LEAST_OVERLAP = 0.1  # either way
 WIDEST = 60.0  # degrees of parallax: two that look at a place from either side say little about each other
 KEPT = 32  # sweeps kept for key frames to come, some 9 MB each at most
 KEPT_DESCRIPTORS = 48  # pictures, 3 MB each at most
+T = TypeVar("T")
 
 
 def beside(keys: KeyFrames, world_from_camera: Array, intrinsics: Sequence[Intrinsics], depth: float) -> list[list[int]]:
@@ -75,12 +77,12 @@ class KeySweeps:
             raise ValueError("sweeps need a nearest or a farthest depth")
         self.views, self.keys, self.witnesses, self.empty = views, keys, witnesses, empty
         self.near, self.far, self.measured, self.device = near, far, measured, device
-        self._described = lru_cache(KEPT_DESCRIPTORS)(self._describe)
-        self._made = lru_cache(KEPT)(self._make)
+        self._described: Recent[Tensor] = Recent(KEPT_DESCRIPTORS)
+        self._made: Recent[tuple[Compared, Witness, Tensor]] = Recent(KEPT)
 
     def __call__(self, at: int) -> Sweep:
-        compared, _, surface = self._made(at)
-        said = evidence(compared, [self._made(other)[1] for other in self.witnesses[at]], surface)
+        compared, _, surface = self._made.get(at, self._make)
+        said = evidence(compared, [self._made.get(other, self._make)[1] for other in self.witnesses[at]], surface)
         return decide(compared, self._depth(at), self.empty, said)
 
     def _make(self, at: int) -> tuple[Compared, Witness, Tensor]:
@@ -88,7 +90,7 @@ class KeySweeps:
         group = together(int(self.keys.indices[at]), self.keys.neighbours[at])
         poses = self.views.world_from_camera[group]
         cameras = Cameras.of([self.views.intrinsics[index] for index in group], poses, self.device)
-        compared = compare([self._described(index) for index in group], cameras, self.near, self.far)
+        compared = compare([self._described.get(index, self._describe) for index in group], cameras, self.near, self.far)
         alone = decide(compared, empty=self.empty)
         depth = self._depth(at)
         return compared, witness(alone if depth is None else decide(compared, depth, self.empty)), certain(compared, alone)
@@ -98,6 +100,25 @@ class KeySweeps:
 
     def _depth(self, at: int) -> Tensor | None:
         return sensed(self.views, int(self.keys.indices[at]), self.device) if self.measured else None
+
+
+class Recent(Generic[T]):
+    """The most recently asked of what is made for an index.
+
+    `functools.lru_cache` of a method would refer to its owner, which then stays in memory until the garbage collector comes by.
+    """
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self._kept: OrderedDict[int, T] = OrderedDict()
+
+    def get(self, index: int, make: Callable[[int], T]) -> T:
+        if index not in self._kept:
+            self._kept[index] = make(index)
+        self._kept.move_to_end(index)
+        while len(self._kept) > self.most:
+            self._kept.popitem(last=False)
+        return self._kept[index]
 
 
 def together(key: int, neighbours: Array) -> list[int]:
