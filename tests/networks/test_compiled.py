@@ -1,0 +1,126 @@
+"""The compiled plane sweep: against the tensors it stands for, on any number of threads, and on places where nothing can be read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.networks.test_sweep import slow_paths, wall
+from toolkit.networks import compiled
+from toolkit.networks.cameras import Cameras
+from toolkit.networks.matching import LARGE, SMALL, semi_global
+from toolkit.networks.sweep import Sweep, compare, decide, sweep
+from toolkit.networks.witness import Witness, certain, evidence, witness
+
+NEAR, FAR = 0.8, 6.0
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def places(count: int = 20_000, seed: int = 0) -> torch.Tensor:
+    """(N, 3) before, behind and beside cameras that look along z from about the origin."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand((count, 3), generator=generator) * torch.tensor([8.0, 8.0, 9.0]) - torch.tensor([4.0, 4.0, 1.0])
+
+
+def everything(views: int = 4) -> dict[str, torch.Tensor]:
+    """What a key frame and its witness come to."""
+    described, seen_by = wall(views)
+    compared = compare(described, seen_by, NEAR, FAR)
+    alone = decide(compared)
+    order = [1, 0, *range(2, views)] if views > 1 else [0]
+    other = witness(sweep([described[k] for k in order], seen_by[order], NEAR, FAR))
+    said = evidence(compared, [other, witness(alone)], certain(compared, alone))
+    made = decide(compared, said=said)
+    assert said is not None
+    read = made.look(places(), torch.full((len(places()),), 0.1))
+    spoken, seen = other.ask(places())
+    return {
+        "cost": compared.cost,
+        "alone": alone.table,
+        "said": said,
+        "table": made.table,
+        "signed": read.signed,
+        "open": read.open,
+        "sure": read.sure,
+        "spoken": spoken,
+        "seen": seen.float(),
+    }
+
+
+@pytest.mark.parametrize("views", [1, 2, 4])
+def test_it_gives_what_the_tensors_give(views: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick = everything(views)
+    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    for name, expected in everything(views).items():
+        torch.testing.assert_close(quick[name], expected, atol=1e-4, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
+
+
+def test_threads_do_not_matter() -> None:
+    with threads(1):
+        one = everything()
+    for count in (2, 3):
+        with threads(count):
+            several = everything()
+        for name in ("cost", "spoken", "seen", "signed"):
+            torch.testing.assert_close(several[name], one[name], atol=1e-6, rtol=1e-6)
+        assert torch.equal(several["cost"], one["cost"])
+
+
+@pytest.mark.parametrize("shape", [(7, 5, 6), (1, 4, 3), (2, 1, 1), (33, 2, 9)])
+def test_semi_global_matching_against_its_recurrence(shape: tuple[int, int, int]) -> None:
+    cost = np.random.default_rng(0).random(shape).astype(np.float32)
+    given = torch.from_numpy(cost)
+    assert compiled.fits(given)
+    np.testing.assert_allclose(semi_global(given).numpy(), slow_paths(cost.astype(np.float64)), atol=1e-5)
+    np.testing.assert_allclose(compiled.semi_global(given, SMALL, LARGE).numpy(), semi_global(given.double()).numpy(), atol=1e-5)
+
+
+def test_volumes_keep_their_shape_and_change_their_order_in_memory() -> None:
+    volume = torch.rand((3, 4, 5, 6))
+    laid = compiled.pixel_major(volume)
+    assert torch.equal(laid, volume) and laid.permute(2, 3, 1, 0).is_contiguous()
+    assert compiled.pixel_major(volume[0]).permute(1, 2, 0).is_contiguous()
+    assert not compiled.fits(volume.double()) and compiled.fits(volume)
+
+
+def no_number(camera: Cameras) -> Cameras:
+    return replace(camera, world_from_camera=torch.full_like(camera.world_from_camera, torch.nan))
+
+
+def test_cameras_out_of_this_world_are_read_as_seeing_nothing() -> None:
+    described, seen_by = wall(3)
+    lost = Cameras.together([seen_by[0], no_number(seen_by[1]), seen_by[2]])
+    honest = compare([described[0], described[2]], seen_by[[0, 2]], NEAR, FAR)
+    comparison = compiled.Comparison(described[0].flatten(1).T, honest.rays, honest.inverses, 8.0)
+    comparison.add(described[1], lost.world_from_camera[1, :3, :3], lost.world_from_camera[1, :3, 3], lost.lens(1))
+    assert float(comparison.seen.max()) == 0 and float((comparison.result(0.6) - 0.6).abs().max()) < 1e-6
+    one = witness(decide(honest))
+    spoken, seen = replace(one, camera=no_number(one.camera)).ask(places())
+    assert not bool(seen.any()) and float(spoken.abs().max()) == 0
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_extreme_places_and_tiny_tables_are_not_read_beyond(scale: float) -> None:
+    camera = Cameras.same_size(torch.tensor([[10.0, 10.0, 0.5, 0.5]]), torch.eye(4)[None], 1, 1)
+    table = torch.tensor([[0.9, 0.1], [0.0, 0.1], [1.0, 1.0]]).view(3, 2, 1, 1)
+    made, told = Sweep(camera, table, 0.2 / scale, 0.5 / scale), Witness(camera, table[0], 0.2 / scale, 0.5 / scale)
+    far = torch.tensor([[0.0, 0, -1], [0, 0, 0], [1e9, -1e9, 1], [0, 0, 1e9], [1e-9, 0, 1e-9], [torch.nan, 0, 1]]) * scale
+    read = made.look(far, torch.full((6,), 0.1 * scale))
+    for values in (read.signed, read.open, read.sure):
+        assert bool(torch.isfinite(values[:5]).all()) and float(values[:5].abs().max()) <= 1
+    spoken, seen = told.ask(far)
+    assert bool(torch.isfinite(spoken).all()) and not bool(seen[[0, 2, 5]].any()) and bool(seen[3])

@@ -1,0 +1,277 @@
+"""The plane sweep on the CPU, compiled: what `sweep.py`, `matching.py` and `witness.py` do with whole tensors, pixel by pixel.
+
+In tensors a sweep writes what another view shows of every pixel at every plane, 21 numbers each, and reads it back; here they are compared
+where they are looked up. Volumes lie in memory pixel by pixel, planes next to each other, since all that follows goes along planes.
+Results equal those of the tensors to rounding (tests compare them), whatever the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+
+OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "nsz", "arcp"}}
+LOOSE: dict[str, Any] = {**OPTIONS, "fastmath": True}  # for numbers that are finite for sure: least ones are found by whole vectors
+F = np.float32
+NEVER = F(1e9)
+COLOURS, PATCH = 3, 18  # of a descriptor
+WIDE, WHOLE = 24, 28  # as kept here: patches and zeros up to whole vectors, then colours
+FEW = 4096  # below which threads do not pay
+
+
+def fits(*values: Tensor) -> bool:
+    """Whether the kernels can take these."""
+    return all(value.device.type == "cpu" and value.dtype == torch.float32 for value in values)
+
+
+def pixel_major(volume: Tensor) -> Tensor:
+    """(…, D, h, w) → the same values and shape, planes of a pixel next to each other in memory, and what comes before them inside."""
+    lead = list(range(volume.ndim - 3))
+    order = [volume.ndim - 2, volume.ndim - 1, volume.ndim - 3, *lead]
+    back = [order.index(axis) for axis in range(volume.ndim)]
+    return volume.permute(order).contiguous().permute(back)
+
+
+def _array(values: Tensor) -> Any:
+    """What a kernel takes; no copy where it lies in memory as it should."""
+    return values.detach().contiguous().numpy()
+
+
+def _spread(work: Callable[[slice], Any], count: int) -> None:
+    """Do `work` on `count` things, on as many threads as torch has."""
+    threads = torch.get_num_threads() if count >= FEW else 1
+    edges = np.linspace(0, count, threads + 1).astype(int)
+    parts = [slice(int(low), int(high)) for low, high in pairwise(edges)]
+    if threads == 1:
+        work(parts[0])
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(work, parts))
+
+
+@njit(**OPTIONS)
+def _compare(
+    own: Any, other: Any, rays: Any, turn: Any, shift: Any, lens: Any, inverses: Any, gain: Any, cost: Any, least: Any, seen: Any
+) -> None:
+    """Add to `cost`, lower `least` and count in `seen` (P, D) how the other view differs where it sees a pixel at a plane."""
+    height, width = other.shape[0], other.shape[1]
+    fx, fy, cx, cy, across, down = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
+    for p in range(len(own)):
+        rx, ry, rz = rays[p, 0], rays[p, 1], rays[p, 2]
+        ax = rx * turn[0, 0] + ry * turn[1, 0] + rz * turn[2, 0]
+        ay = rx * turn[0, 1] + ry * turn[1, 1] + rz * turn[2, 1]
+        az = rx * turn[0, 2] + ry * turn[1, 2] + rz * turn[2, 2]
+        mine = own[p]
+        for d in range(len(inverses)):
+            z = az + inverses[d] * shift[2]
+            if not z > F(1e-4):
+                continue
+            u = ((ax + inverses[d] * shift[0]) / z * fx + cx) / across
+            v = ((ay + inverses[d] * shift[1]) / z * fy + cy) / down
+            if not (u >= F(0) and u <= F(1) and v >= F(0) and v <= F(1)):
+                continue
+            x = min(max(u * F(width) - F(0.5), F(0)), F(width - 1))
+            y = min(max(v * F(height) - F(0.5), F(0)), F(height - 1))
+            left, upper = int(x), int(y)
+            right, lower = min(left + 1, width - 1), min(upper + 1, height - 1)
+            sx, sy = x - F(left), y - F(upper)
+            w00, w01, w10, w11 = (F(1) - sx) * (F(1) - sy), sx * (F(1) - sy), (F(1) - sx) * sy, sx * sy
+            a, b, c, e = other[upper, left], other[upper, right], other[lower, left], other[lower, right]
+            patch = F(0)
+            for k in range(WIDE):
+                apart = w00 * a[k] + w01 * b[k] + w10 * c[k] + w11 * e[k] - mine[k]
+                patch += apart * apart
+            colour = F(0)
+            for k in range(WIDE, WIDE + COLOURS):
+                colour += abs(w00 * a[k] + w01 * b[k] + w10 * c[k] + w11 * e[k] - mine[k])
+            value = F(0.5) * (min(colour * (gain / F(COLOURS)), F(1)) + min(patch * F(0.5 / PATCH), F(1)))
+            cost[p, d] += value
+            least[p, d] = min(least[p, d], value)
+            seen[p, d] += F(1)
+
+
+@njit(**OPTIONS)
+def _combine(cost: Any, least: Any, seen: Any, unknown: Any) -> None:
+    """`matching.together`, into `cost`."""
+    for p in range(len(cost)):
+        for d in range(cost.shape[1]):
+            cost[p, d] = F(0.5) * (cost[p, d] / seen[p, d] + least[p, d]) if seen[p, d] > F(0) else unknown
+
+
+def widened(described: Tensor) -> Tensor:
+    """(N, 21) descriptors as they are kept here, (N, 28)."""
+    out = described.new_zeros((len(described), WHOLE))
+    out[:, :PATCH], out[:, WIDE : WIDE + COLOURS] = described[:, COLOURS:], described[:, :COLOURS]
+    return out
+
+
+class Comparison:
+    """Compares the pixels of one view with what other views show at planes.
+
+    Args:
+        own: (P, 21) descriptors.
+        rays: (P, 3) of unit depth, camera axes.
+        inverses: (D,).
+        gain: of a mean difference in colour (`matching.COLOUR_GAIN`).
+    """
+
+    def __init__(self, own: Tensor, rays: Tensor, inverses: Tensor, gain: float) -> None:
+        self.own, self.rays, self.inverses, self.gain = _array(widened(own)), _array(rays), _array(inverses), F(gain)
+        shape = (len(own), len(inverses))
+        self.cost, self.least, self.seen = np.zeros(shape, np.float32), np.ones(shape, np.float32), np.zeros(shape, np.float32)
+
+    def add(self, described: Tensor, turn: Tensor, shift: Tensor, lens: Tensor) -> None:
+        """One more view.
+
+        Args:
+            described: (21, h, w).
+            turn, shift: (3, 3), (3,): camera axes → the other's, row vectors, the shift for points at unit depth.
+            lens: (6,) fx, fy, cx, cy, width, height of its pictures.
+        """
+        other = _array(widened(described.flatten(1).T).view(*described.shape[1:], WHOLE))
+        given = [other, *(_array(values) for values in (turn, shift, lens))]
+
+        def part(p: slice) -> None:
+            view, *rest = given
+            _compare(self.own[p], view, self.rays[p], *rest, self.inverses, self.gain, self.cost[p], self.least[p], self.seen[p])
+
+        _spread(part, len(self.own))
+
+    def result(self, unknown: float) -> Tensor:
+        """(P, D) costs, `unknown` where no view sees the place."""
+        _combine(self.cost, self.least, self.seen, F(unknown))
+        return torch.from_numpy(self.cost)
+
+
+@njit(**LOOSE)
+def _path(line: Any, before: Any, after: Any, lowest: Any, small: Any, large: Any, total: Any) -> Any:
+    """One step of semi-global matching: the cheapest paths (D,) up to this pixel, into `after` and added to `total`, from those `before` it
+    whose least is `lowest`; answers their least."""
+    last = len(line) - 1
+    most, least = lowest + large, NEVER
+    for end in range(min(2, len(line))):
+        d, inner = (0, min(1, last)) if end == 0 else (last, last - 1)
+        value = line[d] + min(min(before[d], most), before[inner] + small) - lowest
+        after[d], least = value, min(least, value)
+        total[d] += value
+    for d in range(1, last):
+        value = line[d] + min(min(before[d], most), min(before[d - 1], before[d + 1]) + small) - lowest
+        after[d] = value
+        total[d] += value
+        least = min(least, value)
+    return least
+
+
+@njit(**LOOSE)
+def _along(cost: Any, small: Any, large: Any, backwards: bool, total: Any) -> None:
+    """Paths along the first axis of (n, m, D), added to `total`."""
+    count, across, planes = cost.shape
+    paths, lowest = np.zeros((2, across, planes), np.float32), np.zeros(across, np.float32)
+    for step in range(count):
+        at = count - 1 - step if backwards else step
+        before, after = paths[step % 2], paths[1 - step % 2]
+        for other in range(across):
+            lowest[other] = _path(cost[at, other], before[other], after[other], lowest[other], small, large, total[at, other])
+
+
+def semi_global(cost: Tensor, small: float, large: float) -> Tensor:
+    """`matching.semi_global` of float32 costs (D, h, w) on the CPU; pixel-major."""
+    volume = _array(cost.permute(1, 2, 0))
+    turned = volume.transpose(1, 0, 2)
+    totals = [np.zeros_like(volume), np.zeros_like(volume)]
+    halves = [(volume, totals[0]), (turned, totals[1].transpose(1, 0, 2))]
+
+    def paths(which: int) -> None:
+        for backwards in (False, True):
+            _along(halves[which][0], F(small), F(large), backwards, halves[which][1])
+
+    if torch.get_num_threads() == 1:
+        paths(0)
+        paths(1)
+    else:
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(paths, range(2)))
+    return torch.from_numpy((totals[0] + totals[1]) / F(4)).permute(2, 0, 1)
+
+
+@njit(**OPTIONS)
+def _between(table: Any, x: Any, y: Any, d: Any, channel: int) -> Any:
+    """Trilinear value of (h, w, D, C) at pixels and planes with whole numbers at their centres; beyond the border the border's."""
+    height, width, planes = table.shape[0], table.shape[1], table.shape[2]
+    x, y, d = min(max(x, F(0)), F(width - 1)), min(max(y, F(0)), F(height - 1)), min(max(d, F(0)), F(planes - 1))
+    # Whole numbers are bounded once more: what is no number must not be read at.
+    left, upper, first = min(max(int(x), 0), width - 1), min(max(int(y), 0), height - 1), min(max(int(d), 0), planes - 1)
+    right, lower, second = min(left + 1, width - 1), min(upper + 1, height - 1), min(first + 1, planes - 1)
+    sx, sy, sd = x - F(left), y - F(upper), d - F(first)
+    value = F(0)
+    for corner in range(4):
+        row, column = upper if corner < 2 else lower, left if corner % 2 == 0 else right
+        weight = (F(1) - sy if corner < 2 else sy) * (F(1) - sx if corner % 2 == 0 else sx)
+        value += weight * ((F(1) - sd) * table[row, column, first, channel] + sd * table[row, column, second, channel])
+    return value
+
+
+@njit(**OPTIONS)
+def _look(points: Any, truncation: Any, table: Any, pose: Any, lens: Any, lowest: Any, step: Any, out: Any) -> None:
+    """`Sweep.look`: signed, open, sure into `out` (N, 3)."""
+    height, width = F(table.shape[0]), F(table.shape[1])
+    for n in range(len(points)):
+        px, py, pz = points[n, 0] - pose[0, 3], points[n, 1] - pose[1, 3], points[n, 2] - pose[2, 3]
+        depth = max(px * pose[0, 2] + py * pose[1, 2] + pz * pose[2, 2], F(1e-6))
+        inverse = F(1) / depth
+        x = ((px * pose[0, 0] + py * pose[1, 0] + pz * pose[2, 0]) * inverse * lens[0] + lens[2]) / lens[4] * width - F(0.5)
+        y = ((px * pose[0, 1] + py * pose[1, 1] + pz * pose[2, 1]) * inverse * lens[1] + lens[3]) / lens[5] * height - F(0.5)
+        half = inverse * min(truncation[n] / depth, F(0.9))
+        near, far = (inverse + half - lowest) / step, (inverse - half - lowest) / step
+        nearer = _between(table, x, y, near, 0)
+        first = _between(table, x, y, near, 1) - max(-near, F(0)) * step
+        last = _between(table, x, y, far, 1) - max(-far, F(0)) * step
+        out[n, 0] = min(max(F(1) - (first - last) / half, F(-1)), F(1))
+        out[n, 1] = min(max(F(1) - nearer, F(0)), F(1))
+        out[n, 2] = min(max(_between(table, x, y, near, 2), F(0)), F(1))
+
+
+def look(points: Tensor, truncation: Tensor, table: Tensor, pose: Tensor, lens: Tensor, lowest: float, step: float) -> Tensor:
+    """(N, 3) of what voxels read from the table (3, D, h, w) of a sweep.
+
+    Args:
+        pose: (4, 4) of the camera.
+        lens: (6,) fx, fy, cx, cy, width, height of its pictures.
+    """
+    given = [_array(values) for values in (points, truncation.expand(len(points)), table.permute(2, 3, 1, 0), pose, lens)]
+    out = np.empty((len(points), 3), np.float32)
+    _spread(lambda n: _look(given[0][n], given[1][n], *given[2:], F(lowest), F(step), out[n]), len(points))
+    return torch.from_numpy(out)
+
+
+@njit(**OPTIONS)
+def _ask(points: Any, says: Any, pose: Any, lens: Any, lowest: Any, step: Any, said: Any, seen: Any) -> None:
+    """`Witness.ask`."""
+    height, width = F(says.shape[0]), F(says.shape[1])
+    for n in range(len(points)):
+        said[n], seen[n] = F(0), False
+        px, py, pz = points[n, 0] - pose[0, 3], points[n, 1] - pose[1, 3], points[n, 2] - pose[2, 3]
+        depth = px * pose[0, 2] + py * pose[1, 2] + pz * pose[2, 2]
+        if not depth > F(1e-4):
+            continue
+        inverse = F(1) / depth
+        u = ((px * pose[0, 0] + py * pose[1, 0] + pz * pose[2, 0]) * inverse * lens[0] + lens[2]) / lens[4]
+        v = ((px * pose[0, 1] + py * pose[1, 1] + pz * pose[2, 1]) * inverse * lens[1] + lens[3]) / lens[5]
+        if u >= F(0) and u <= F(1) and v >= F(0) and v <= F(1):
+            seen[n] = True
+            said[n] = _between(says, u * width - F(0.5), v * height - F(0.5), (inverse - lowest) / step, 0)
+
+
+def ask(points: Tensor, says: Tensor, pose: Tensor, lens: Tensor, lowest: float, step: float) -> tuple[Tensor, Tensor]:
+    """(N,) what a witness says (D, h, w) of the points, and (N,) bool whether it sees them; pose and lens as in `look`."""
+    given = [_array(values) for values in (points, says.permute(1, 2, 0)[..., None], pose, lens)]
+    said, seen = np.empty(len(points), np.float32), np.empty(len(points), np.bool_)
+    _spread(lambda n: _ask(given[0][n], *given[1:], F(lowest), F(step), said[n], seen[n]), len(points))
+    return torch.from_numpy(said), torch.from_numpy(seen)
