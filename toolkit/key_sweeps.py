@@ -27,8 +27,8 @@ from toolkit.poses.overlap import overlap, parallax
 MOST = 8  # witnesses of a key frame
 LEAST_OVERLAP = 0.1  # either way
 WIDEST = 60.0  # degrees of parallax: two that look at a place from either side say little about each other
-KEPT = 32  # sweeps kept for key frames to come, some 9 MB each at most
-KEPT_DESCRIPTORS = 48  # pictures, 3 MB each at most
+KEPT = 32  # sweeps kept for key frames to come, 16 MB each at most, and as much again until they are asked for
+KEPT_DESCRIPTORS = 16  # pictures, 7 MB each at most
 T = TypeVar("T")
 
 
@@ -78,11 +78,14 @@ class KeySweeps:
         self.views, self.keys, self.witnesses, self.empty = views, keys, witnesses, empty
         self.near, self.far, self.measured, self.device = near, far, measured, device
         self._described: Recent[Tensor] = Recent(KEPT_DESCRIPTORS)
-        self._made: Recent[tuple[Compared, Witness, Tensor]] = Recent(KEPT)
+        self._made: Recent[tuple[Compared | None, Witness, Tensor]] = Recent(KEPT)
 
     def __call__(self, at: int) -> Sweep:
-        compared, _, surface = self._made.get(at, self._make)
+        compared, says, surface = self._made.get(at, self._make)
+        if compared is None:
+            compared, says, surface = self._make(at)
         said = evidence(compared, [self._made.get(other, self._make)[1] for other in self.witnesses[at]], surface)
+        self._made.put(at, (None, says, surface))  # a key frame is fused once, and goes on as a witness
         return decide(compared, self._depth(at), self.empty, said)
 
     def _make(self, at: int) -> tuple[Compared, Witness, Tensor]:
@@ -113,12 +116,16 @@ class Recent(Generic[T]):
         self._kept: OrderedDict[int, T] = OrderedDict()
 
     def get(self, index: int, make: Callable[[int], T]) -> T:
-        if index not in self._kept:
-            self._kept[index] = make(index)
+        """What is kept for `index`, or what `make` gives for it."""
+        return self.put(index, self._kept[index] if index in self._kept else make(index))
+
+    def put(self, index: int, value: T) -> T:
+        """Keep `value` as the most recently asked of."""
+        self._kept[index] = value
         self._kept.move_to_end(index)
         while len(self._kept) > self.most:
             self._kept.popitem(last=False)
-        return self._kept[index]
+        return value
 
 
 def together(key: int, neighbours: Array) -> list[int]:

@@ -66,6 +66,10 @@ class Cameras:
         """(K, 3)."""
         return self.world_from_camera[:, :3, 3]
 
+    def lens(self, view: int) -> Tensor:
+        """(6,) fx, fy, cx, cy, width and height of one view."""
+        return torch.cat([self.intrinsics[view], self.size[view]])
+
     def local(self, points: Tensor) -> Tensor:
         """(N, 3) working frame → (K, N, 3) camera axes."""
         rotation = self.world_from_camera[:, :3, :3]

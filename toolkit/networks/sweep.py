@@ -16,12 +16,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from toolkit.networks import compiled
 from toolkit.networks.cameras import Cameras
-from toolkit.networks.matching import difference, distribution, together
+from toolkit.networks.matching import COLOUR_GAIN, UNKNOWN, difference, distribution, together
 
 SPACING = 2  # pixels of the compared pictures between those whose depth is asked for
 STEP = 0.75  # pixels that the view which moves most moves by from plane to plane
-PLANES = (32, 128)  # fewest and most
+PLANES = (32, 192)  # fewest and most
 RANGE = 50.0  # farthest by nearest depth, where the caller does not bound them
 PEAK = 2  # planes on either side of the likeliest one that count as the same depth
 NOISE = 0.01  # of a depth that a sensor measured, as a part of it; at least as wide as planes lie apart
@@ -72,6 +73,9 @@ class Sweep:
 
         Voxels outside the picture read its border.
         """
+        if compiled.fits(points, truncation, self.table):
+            pose, lens = self.camera.world_from_camera[0], self.camera.lens(0)
+            return Sighted(*compiled.look(points, truncation, self.table, pose, lens, self.lowest, self.step).T)
         local = self.camera.local(points)[0]
         depth = local[:, 2].clamp_min(1e-6)
         focal, middle = self.camera.intrinsics[0, :2], self.camera.intrinsics[0, 2:]
@@ -135,13 +139,19 @@ def compare(described: Sequence[Tensor], cameras: Cameras, near: float, far: flo
     near, far = _bounded(near, far)
     inverses = torch.linspace(1 / far, 1 / near, _planes(described, cameras, near, far), device=cameras.intrinsics.device)
     rays, own, shape = _pixels(described[0], cameras)
-    costs, visible = [], []
-    for view in range(1, len(cameras)):
-        found, seen = _warped(described[view], cameras[view], cameras, rays, inverses)
-        costs.append(difference(own[None], found))
-        visible.append(seen)
-    cost = together(torch.stack(costs), torch.stack(visible)) if costs else rays.new_zeros((len(inverses), len(rays)))
-    return Compared(cameras[0], rays @ cameras.world_from_camera[0, :3, :3].T, inverses, cost.view(len(inverses), *shape))
+    if len(cameras) == 1:
+        cost = rays.new_zeros((len(rays), len(inverses)))
+    elif compiled.fits(rays, *described):
+        comparison = compiled.Comparison(own, rays, inverses, COLOUR_GAIN)
+        for view in range(1, len(cameras)):
+            comparison.add(described[view], *_way(cameras, view), cameras.lens(view))
+        cost = comparison.result(UNKNOWN)
+    else:
+        found = [_warped(described[view], cameras, view, rays, inverses) for view in range(1, len(cameras))]
+        costs = torch.stack([difference(own[None], shown) for shown, _ in found])
+        cost = together(costs, torch.stack([seen for _, seen in found])).T
+    cost = cost.reshape(*shape, len(inverses)).permute(2, 0, 1)
+    return Compared(cameras[0], rays @ cameras.world_from_camera[0, :3, :3].T, inverses, cost)
 
 
 @torch.no_grad()
@@ -218,7 +228,8 @@ def _table(likely: Tensor, step: float) -> Tensor:
     width = min(2 * PEAK + 1, len(likely))
     peaks = F.avg_pool1d(likely.permute(1, 2, 0).flatten(0, 1)[:, None], width, 1) * width
     sure = peaks.amax((1, 2)).view(1, *likely.shape[1:]).expand_as(likely)
-    return torch.stack([nearer, integral, sure])
+    # A voxel's three numbers lie next to each other in memory.
+    return torch.stack([part.permute(1, 2, 0) for part in (nearer, integral, sure)], -1).permute(3, 2, 0, 1)
 
 
 def _bounded(near: float, far: float) -> tuple[float, float]:
@@ -245,15 +256,20 @@ def _pixels(described: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor, tuple[
     return torch.cat([flat, torch.ones_like(flat[:, :1])], 1), own, shape
 
 
-def _warped(described: Tensor, other: Cameras, cameras: Cameras, rays: Tensor, inverses: Tensor) -> tuple[Tensor, Tensor]:
-    """(D, P, 21) what the other view shows of each pixel of the first at each plane, and (D, P) bool whether it sees it."""
-    turn = cameras.world_from_camera[0, :3, :3].T @ other.world_from_camera[0, :3, :3]  # rows: axes of the first camera in the other
-    shift = (cameras.positions[0] - other.positions[0]) @ other.world_from_camera[0, :3, :3]
+def _way(cameras: Cameras, view: int) -> tuple[Tensor, Tensor]:
+    """(3, 3) whose rows are the axes of the first camera in those of `view`, and (3,) where the first camera is there."""
+    axes = cameras.world_from_camera[view, :3, :3]
+    return cameras.world_from_camera[0, :3, :3].T @ axes, (cameras.positions[0] - cameras.positions[view]) @ axes
+
+
+def _warped(described: Tensor, cameras: Cameras, view: int, rays: Tensor, inverses: Tensor) -> tuple[Tensor, Tensor]:
+    """(D, P, 21) what a view shows of each pixel of the first at each plane, and (D, P) bool whether it sees it."""
+    turn, shift = _way(cameras, view)
     local = (rays @ turn)[None] + inverses[:, None, None] * shift  # of the point divided by its depth: no far plane is too far
     deep = local[..., 2] > 1e-4
     depth = torch.where(deep, local[..., 2], torch.ones_like(local[..., 2]))
-    pixel = local[..., :2] / depth[..., None] * other.intrinsics[0, :2] + other.intrinsics[0, 2:]
-    grid = pixel / other.size[0] * 2 - 1
+    pixel = local[..., :2] / depth[..., None] * cameras.intrinsics[view, :2] + cameras.intrinsics[view, 2:]
+    grid = pixel / cameras.size[view] * 2 - 1
     visible = deep & (grid.abs() <= 1).all(-1)
     found = F.grid_sample(described[None], grid.clamp(-2, 2)[None], padding_mode="border", align_corners=False)[0]
     return found.permute(1, 2, 0), visible
@@ -267,8 +283,7 @@ def _planes(described: Sequence[Tensor], cameras: Cameras, near: float, far: flo
     rays = torch.cat([flat, torch.ones_like(flat[:, :1])], 1)
     most = 0.0
     for view in range(1, len(cameras)):
-        turn = cameras.world_from_camera[0, :3, :3].T @ cameras.world_from_camera[view, :3, :3]
-        shift = (cameras.positions[0] - cameras.positions[view]) @ cameras.world_from_camera[view, :3, :3]
+        turn, shift = _way(cameras, view)
         ends = [rays @ turn + shift / depth for depth in (near, far)]
         front = (ends[0][:, 2] > 0.05) & (ends[1][:, 2] > 0.05)
         if not bool(front.any()):

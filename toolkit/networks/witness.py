@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from toolkit.networks import compiled
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.sweep import Compared, Sweep
 
@@ -44,6 +45,9 @@ class Witness:
 
     def ask(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 3) points of the working frame → (N,) what is said, 0 where the witness does not look, and (N,) bool where it does."""
+        if compiled.fits(points, self.says):
+            pose, lens = self.camera.world_from_camera[0], self.camera.lens(0)
+            return compiled.ask(points, self.says, pose, lens, self.lowest, self.step)
         local = self.camera.local(points)[0]
         seen = local[:, 2] > 1e-4
         inverse = 1 / torch.where(seen, local[:, 2], torch.ones_like(local[:, 2]))
@@ -62,7 +66,7 @@ def witness(swept: Sweep) -> Witness:
     hidden = torch.cat([nearer[ABOUT:], torch.zeros_like(nearer[:ABOUT])])
     not_free = torch.cat([torch.ones_like(nearer[:ABOUT]), nearer[:-ABOUT]])
     says = torch.log(FOR * (not_free - hidden).clamp_min(0) + hidden + AGAINST)
-    return Witness(swept.camera, says, swept.lowest, swept.step)
+    return Witness(swept.camera, compiled.pixel_major(says), swept.lowest, swept.step)
 
 
 @torch.no_grad()
@@ -96,11 +100,11 @@ def evidence(compared: Compared, witnesses: Sequence[Witness], surface: Tensor |
         return None
     planes, height, width = compared.cost.shape
     coarse = [-(-side // SPACING) for side in (height, width)]
-    rays = F.interpolate(compared.rays.T.view(1, 3, height, width), coarse, mode="bilinear").view(3, -1).T
-    points = (rays / compared.inverses[:, None, None] + compared.camera.positions[0]).reshape(-1, 3)
+    rays = F.interpolate(compared.rays.T.view(1, 3, height, width), coarse, mode="bilinear").view(3, -1).T.contiguous()
+    points = (rays[:, None] / compared.inverses[:, None] + compared.camera.positions[0]).reshape(-1, 3)
     total, count = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
     for one in witnesses:
         said, seen = one.ask(points)
         total, count = total + (1.0 if surface is None else credit(one, surface)) * said, count + seen
-    mean = (SHARE * total / count.clamp_min(1)).view(1, planes, *coarse)
+    mean = (SHARE * total / count.clamp_min(1)).view(1, *coarse, planes).permute(0, 3, 1, 2)
     return F.interpolate(mean, (height, width), mode="bilinear")[0]

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from toolkit.camera import pixel_grid, rays
+from toolkit.camera import rays
 from toolkit.capture.types import Views
 from toolkit.networks.encoding import SH, spherical_harmonics
 from toolkit.render.sky import SHAPE
@@ -84,7 +84,7 @@ def _sums_of(views: Views, index: int) -> Sums:
     mask = views.valid[index] if views.valid else None
     if mask is not None:
         chosen &= np.asarray(mask, bool)
-    _, directions, _ = rays(camera, views.world_from_camera[index], pixel_grid(camera.width, camera.height)[chosen.ravel()])
+    _, directions, _ = rays(camera, views.world_from_camera[index], np.argwhere(chosen)[:, ::-1] + 0.5)
     harmonics = spherical_harmonics(directions).double()
     colours = torch.from_numpy(picture[chosen].astype(np.float64) / 255)
     return Sums(harmonics.T @ harmonics, harmonics.T @ colours, harmonics.sum(0), colours.sum(0), len(directions))

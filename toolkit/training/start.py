@@ -56,7 +56,7 @@ def colour_behind(views: Views) -> Tensor:
     if views.background is not None:
         return torch.tensor(views.background, dtype=torch.float32)
     train = np.flatnonzero(~np.asarray(views.test))
-    return torch.from_numpy(np.mean([views.images[i].reshape(-1, 3).mean(0) for i in train], axis=0) / 255).float()
+    return torch.from_numpy(np.mean([cv2.mean(np.ascontiguousarray(views.images[i]))[:3] for i in train], axis=0) / 255).float()
 
 
 def finest_resolution(space: Space, views: Views, scene: Scene) -> int:
