@@ -14,7 +14,7 @@ from tests.networks.test_sweep import slow_paths, wall
 from toolkit.networks import compiled
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.matching import LARGE, SMALL, semi_global
-from toolkit.networks.sweep import Sweep, compare, decide, sweep
+from toolkit.networks.sweep import Sweep, _table, compare, decide, sweep
 from toolkit.networks.witness import Witness, certain, evidence, witness
 
 NEAR, FAR = 0.8, 6.0
@@ -89,12 +89,14 @@ def test_semi_global_matching_against_its_recurrence(shape: tuple[int, int, int]
     np.testing.assert_allclose(compiled.semi_global(given, SMALL, LARGE).numpy(), semi_global(given.double()).numpy(), atol=1e-5)
 
 
-def test_volumes_keep_their_shape_and_change_their_order_in_memory() -> None:
-    volume = torch.rand((3, 4, 5, 6))
-    laid = compiled.pixel_major(volume)
-    assert torch.equal(laid, volume) and laid.permute(2, 3, 1, 0).is_contiguous()
-    assert compiled.pixel_major(volume[0]).permute(1, 2, 0).is_contiguous()
-    assert not compiled.fits(volume.double()) and compiled.fits(volume)
+@pytest.mark.parametrize("shape", [(32, 5, 7), (3, 2, 2), (1, 1, 1)])
+def test_tables_lie_pixel_by_pixel_in_memory(shape: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    likely = torch.softmax(3 * torch.randn(shape, generator=torch.Generator().manual_seed(0)), 0)
+    quick = _table(likely, 0.02)
+    assert quick.shape == (3, *shape) and quick.permute(2, 3, 1, 0).is_contiguous()
+    assert not compiled.fits(likely.double()) and compiled.fits(likely)
+    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    torch.testing.assert_close(quick, _table(likely, 0.02), atol=1e-6, rtol=1e-5)
 
 
 def no_number(camera: Cameras) -> Cameras:

@@ -31,14 +31,6 @@ def fits(*values: Tensor) -> bool:
     return all(value.device.type == "cpu" and value.dtype == torch.float32 for value in values)
 
 
-def pixel_major(volume: Tensor) -> Tensor:
-    """(…, D, h, w) → the same values and shape, planes of a pixel next to each other in memory, and what comes before them inside."""
-    lead = list(range(volume.ndim - 3))
-    order = [volume.ndim - 2, volume.ndim - 1, volume.ndim - 3, *lead]
-    back = [order.index(axis) for axis in range(volume.ndim)]
-    return volume.permute(order).contiguous().permute(back)
-
-
 def _array(values: Tensor) -> Any:
     """What a kernel takes; no copy where it lies in memory as it should."""
     return values.detach().contiguous().numpy()
@@ -199,6 +191,38 @@ def semi_global(cost: Tensor, small: float, large: float) -> Tensor:
         with ThreadPoolExecutor(2) as pool:
             list(pool.map(paths, range(2)))
     return torch.from_numpy((totals[0] + totals[1]) / F(4)).permute(2, 0, 1)
+
+
+@njit(**OPTIONS)
+def _fill(likely: Any, step: Any, width: int, table: Any) -> None:
+    """Likelihoods (P, D) → `table` (P, D, 3)."""
+    planes = likely.shape[1]
+    for p in range(len(likely)):
+        own, out = likely[p], table[p]
+        before, after, sure = F(0), F(0), F(0)
+        for d in range(planes - 1, -1, -1):
+            out[d, 0] = before + F(0.5) * own[d]  # the surface lies anywhere about its plane
+            before += own[d]
+        out[0, 1] = F(0)
+        for d in range(1, planes):
+            after += F(0.5) * (out[d - 1, 0] + out[d, 0]) * step
+            out[d, 1] = after
+        for first in range(planes - width + 1):
+            about = F(0)
+            for d in range(first, first + width):
+                about += own[d]
+            sure = max(sure, about)
+        for d in range(planes):
+            out[d, 2] = sure
+
+
+def table(likely: Tensor, step: float, peak: int) -> Tensor:
+    """`sweep._table` of float32 likelihoods (D, h, w) on the CPU: (3, D, h, w), in memory (h, w, D, 3)."""
+    planes, height, width = likely.shape
+    given = _array(likely.permute(1, 2, 0).reshape(-1, planes))
+    out = np.empty((height * width, planes, 3), np.float32)
+    _spread(lambda p: _fill(given[p], F(step), min(2 * peak + 1, planes), out[p]), height * width)
+    return torch.from_numpy(out).view(height, width, planes, 3).permute(3, 2, 0, 1)
 
 
 @njit(**OPTIONS)

@@ -222,6 +222,8 @@ def measured(likely: Tensor, inverses: Tensor, depth: Tensor) -> Tensor:
 
 def _table(likely: Tensor, step: float) -> Tensor:
     """(D, h, w) likelihoods, farthest first → what `Sweep` keeps."""
+    if compiled.fits(likely):
+        return compiled.table(likely, step, PEAK)
     nearer = likely.flip(0).cumsum(0).flip(0) - 0.5 * likely  # the surface lies anywhere about its plane
     middle = 0.5 * (nearer[1:] + nearer[:-1]) * step
     integral = torch.cat([torch.zeros_like(nearer[:1]), middle.cumsum(0)])

@@ -62,11 +62,11 @@ class Witness:
 
 def witness(swept: Sweep) -> Witness:
     """What others may ask a key frame, from its sweep."""
-    nearer = swept.table[0]
-    hidden = torch.cat([nearer[ABOUT:], torch.zeros_like(nearer[:ABOUT])])
-    not_free = torch.cat([torch.ones_like(nearer[:ABOUT]), nearer[:-ABOUT]])
+    nearer = swept.table[0].permute(1, 2, 0).contiguous()  # (h, w, D): planes of a pixel next to each other in memory
+    hidden = F.pad(nearer[..., ABOUT:], (0, ABOUT))
+    not_free = F.pad(nearer[..., :-ABOUT], (ABOUT, 0), value=1.0)
     says = torch.log(FOR * (not_free - hidden).clamp_min(0) + hidden + AGAINST)
-    return Witness(swept.camera, compiled.pixel_major(says), swept.lowest, swept.step)
+    return Witness(swept.camera, says.permute(2, 0, 1), swept.lowest, swept.step)
 
 
 @torch.no_grad()
