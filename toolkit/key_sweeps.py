@@ -27,8 +27,8 @@ from toolkit.poses.overlap import overlap, parallax
 MOST = 8  # witnesses of a key frame
 LEAST_OVERLAP = 0.1  # either way
 WIDEST = 60.0  # degrees of parallax: two that look at a place from either side say little about each other
-KEPT = 32  # sweeps kept for key frames to come, 16 MB each at most, and as much again until they are asked for
-KEPT_DESCRIPTORS = 16  # pictures, 7 MB each at most
+KEPT = 32  # sweeps kept for key frames to come, 13 MB each at most, and as much again until they are asked for
+KEPT_DESCRIPTORS = 16  # pictures, 6 MB each at most
 T = TypeVar("T")
 
 

@@ -156,7 +156,7 @@ def test_extreme_places_read_finite_numbers() -> None:
 def test_descriptors_forgive_exposure_and_are_small() -> None:
     images = torch.stack([textured(300)[:, :200], textured(300)[:, :200] * 0.6 + 0.1])
     described = describe(images)
-    assert described.shape == (2, 21, SIDE * 2 // 3, SIDE) and not described.requires_grad
+    assert described.shape == (2, 21, round(SIDE * 2 / 3), SIDE) and not described.requires_grad
     flat = described.flatten(2).transpose(1, 2)
     patches = flat[..., 3:]
     apart = (patches[0] - patches[1]).square().mean()

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from toolkit.networks import compiled
 
-SIDE = 288  # pixels of the long side at which pictures are compared: 192 lost 0.2 dB in the mean of eight captures (docs/few_views.md)
+SIDE = 256  # pixels of the long side at which pictures are compared (docs/few_views.md)
 CONTRAST = 0.03  # of a patch, added to its own: what is flatter is noise
 GREY = (0.3, 0.59, 0.11)
 COLOUR_GAIN = 8.0  # a mean difference of 1/8 in colour counts as different
