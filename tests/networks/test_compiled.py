@@ -126,3 +126,11 @@ def test_extreme_places_and_tiny_tables_are_not_read_beyond(scale: float) -> Non
         assert bool(torch.isfinite(values[:5]).all()) and float(values[:5].abs().max()) <= 1
     spoken, seen = told.ask(far)
     assert bool(torch.isfinite(spoken).all()) and not bool(seen[[0, 2, 5]].any()) and bool(seen[3])
+
+
+def test_where_planes_lie_is_told_in_full_precision() -> None:
+    described, seen_by = wall(3)
+    full = compare(described, seen_by, NEAR, FAR)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        reduced = compare(described, seen_by, NEAR, FAR)
+    assert torch.equal(reduced.cost, full.cost) and torch.equal(reduced.rays, full.rays)

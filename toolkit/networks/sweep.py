@@ -136,7 +136,12 @@ def compare(described: Sequence[Tensor], cameras: Cameras, near: float, far: flo
     Raises:
         ValueError: neither is known, or the nearest does not lie before the farthest.
     """
-    near, far = _bounded(near, far)
+    with torch.autocast(cameras.intrinsics.device.type, enabled=False):  # planes lie less than a pixel apart
+        return _compared(described, cameras, *_bounded(near, far))
+
+
+def _compared(described: Sequence[Tensor], cameras: Cameras, near: float, far: float) -> Compared:
+    """`compare`, with both ends known."""
     inverses = torch.linspace(1 / far, 1 / near, _planes(described, cameras, near, far), device=cameras.intrinsics.device)
     rays, own, shape = _pixels(described[0], cameras)
     if len(cameras) == 1:
