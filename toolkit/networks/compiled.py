@@ -17,10 +17,10 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from toolkit.stereo.smooth import PATHS, summed_paths
+
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "nsz", "arcp"}}
-LOOSE: dict[str, Any] = {**OPTIONS, "fastmath": True}  # for numbers that are finite for sure: least ones are found by whole vectors
 F = np.float32
-NEVER = F(1e9)
 COLOURS, PATCH = 3, 18  # of a descriptor
 WIDE, WHOLE = 24, 28  # as kept here: patches and zeros up to whole vectors, then colours
 FEW = 4096  # below which threads do not pay
@@ -142,55 +142,13 @@ class Comparison:
         return torch.from_numpy(self.cost)
 
 
-@njit(**LOOSE)
-def _path(line: Any, before: Any, after: Any, lowest: Any, small: Any, large: Any, total: Any) -> Any:
-    """One step of semi-global matching: the cheapest paths (D,) up to this pixel, into `after` and added to `total`, from those `before` it
-    whose least is `lowest`; answers their least."""
-    last = len(line) - 1
-    most, least = lowest + large, NEVER
-    for end in range(min(2, len(line))):
-        d, inner = (0, min(1, last)) if end == 0 else (last, last - 1)
-        value = line[d] + min(min(before[d], most), before[inner] + small) - lowest
-        after[d], least = value, min(least, value)
-        total[d] += value
-    for d in range(1, last):
-        value = line[d] + min(min(before[d], most), min(before[d - 1], before[d + 1]) + small) - lowest
-        after[d] = value
-        total[d] += value
-        least = min(least, value)
-    return least
-
-
-@njit(**LOOSE)
-def _along(cost: Any, small: Any, large: Any, backwards: bool, total: Any) -> None:
-    """Paths along the first axis of (n, m, D), added to `total`."""
-    count, across, planes = cost.shape
-    paths, lowest = np.zeros((2, across, planes), np.float32), np.zeros(across, np.float32)
-    for step in range(count):
-        at = count - 1 - step if backwards else step
-        before, after = paths[step % 2], paths[1 - step % 2]
-        for other in range(across):
-            lowest[other] = _path(cost[at, other], before[other], after[other], lowest[other], small, large, total[at, other])
-
-
 def semi_global(cost: Tensor, small: float, large: float) -> Tensor:
-    """`matching.semi_global` of float32 costs (D, h, w) on the CPU; pixel-major."""
+    """`matching.semi_global` of float32 costs (D, h, w) of at least three planes on the CPU, by the kernel of matching; pixel-major."""
     volume = _array(cost.permute(1, 2, 0))
-    turned = volume.transpose(1, 0, 2)
-    totals = [np.zeros_like(volume), np.zeros_like(volume)]
-    halves = [(volume, totals[0]), (turned, totals[1].transpose(1, 0, 2))]
-
-    def paths(which: int) -> None:
-        for backwards in (False, True):
-            _along(halves[which][0], F(small), F(large), backwards, halves[which][1])
-
-    if torch.get_num_threads() == 1:
-        paths(0)
-        paths(1)
-    else:
-        with ThreadPoolExecutor(2) as pool:
-            list(pool.map(paths, range(2)))
-    return torch.from_numpy((totals[0] + totals[1]) / F(4)).permute(2, 0, 1)
+    even = np.zeros(volume.shape[:2], np.float32)  # depth may step anywhere
+    with ThreadPoolExecutor(min(2, torch.get_num_threads())) as pool:
+        one, other = pool.map(lambda paths: summed_paths(volume, even, small, large, paths), (PATHS[:2], PATHS[2:4]))
+    return torch.from_numpy((one + other) / F(4)).permute(2, 0, 1)
 
 
 @njit(**OPTIONS)

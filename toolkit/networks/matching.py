@@ -63,7 +63,7 @@ def together(costs: Tensor, visible: Tensor) -> Tensor:
 
 def semi_global(cost: Tensor) -> Tensor:
     """(D, h, w) costs → the same smoothed along four directions, each the cheapest path up to the pixel (semi-global matching)."""
-    if compiled.fits(cost):
+    if compiled.fits(cost) and len(cost) > 2:
         return compiled.semi_global(cost, SMALL, LARGE)
     volume = cost.permute(1, 2, 0)  # (h, w, D)
     down, right = volume, volume.transpose(0, 1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numba
 import numpy as np
 
@@ -77,6 +79,14 @@ def _lowest(total: Array, plane: Array, margin: Array) -> None:
             margin[y, x] = (second - values[best]) / max(second, np.float32(1e-6))
 
 
+def summed_paths(cost: Array, grey: Array, small: float, large: float, paths: Sequence[tuple[int, int]]) -> Array:
+    """(H, W, D) float32: costs aggregated along each of these directions (a part of `PATHS`), summed; arguments as in `smoothed_planes`."""
+    total = np.zeros_like(cost)
+    for down, right in paths:
+        _add_path(cost, grey, down, right, small, large, SOFT_EDGE, total)
+    return total
+
+
 def smoothed_planes(
     cost: Array, grey: Array, small: float = SMALL_STEP, large: float = LARGE_STEP, paths: int = len(PATHS)
 ) -> tuple[Array, Array]:
@@ -92,9 +102,7 @@ def smoothed_planes(
     """
     cost = np.ascontiguousarray(cost, dtype=np.float32)
     grey = np.ascontiguousarray(grey, dtype=np.float32)
-    total = np.zeros_like(cost)
-    for down, right in PATHS[:paths]:
-        _add_path(cost, grey, down, right, small, large, SOFT_EDGE, total)
+    total = summed_paths(cost, grey, small, large, PATHS[:paths])
     plane, margin = np.empty(grey.shape, np.float32), np.empty(grey.shape, np.float32)
     _lowest(total, plane, margin)
     return plane, margin
