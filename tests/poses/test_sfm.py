@@ -99,7 +99,7 @@ def test_a_second_run_reuses_features_and_gives_the_same(found, pictures, tmp_pa
     listener = Listener()
     capture = write_capture(tmp_path / "fresh", pictures[0])
     fresh = find_poses(capture, tmp_path, SMALL, seed=3, threads=2)
-    np.testing.assert_allclose(fresh.world_from_camera, result.world_from_camera, atol=1e-6)
+    np.testing.assert_array_equal(fresh.world_from_camera, result.world_from_camera)  # one thread and two
     from toolkit.capture.types import Capture, Frame
 
     frames = tuple(Frame(path.stem, path) for path in sorted((out / "photos").iterdir()))

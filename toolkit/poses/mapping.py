@@ -20,6 +20,7 @@ Report = Callable[[float, float, str], None]
 ENOUGH = 0.6  # share of registered pictures below which a looser attempt is worth its time
 FEW_POINTS = 12  # a picture that sees fewer of the model's points hangs in the air: not registered
 SMALLEST = 3  # registered pictures that make a model
+REPEATABLE = 300  # pictures up to which mapping takes one thread, so that it repeats
 MAX_ERROR = 3.0  # pixels; the mean reprojection error of a model that can be trusted
 ANGLE_SAMPLE = 2000  # points looked at for the triangulation angle
 
@@ -71,12 +72,13 @@ def _model(reconstruction: pycolmap.Reconstruction, attempt: str) -> Model:
 
 def _incremental(job: Job, report: Report, loose: bool) -> list[pycolmap.Reconstruction]:
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = job.threads
+    # Threads race for the first pair and sum in any order, and gain a tenth of the time (docs/performance.md).
+    options.num_threads = 1 if len(job.pictures) <= REPEATABLE else job.threads
     options.random_seed = job.seed
     options.extract_colors = False  # pictures may be frames of a video or turned: the points are coloured later where needed
     options.min_model_size = SMALLEST
     options.max_num_models = 10
-    options.mapper.num_threads = job.threads
+    options.mapper.num_threads = options.num_threads
     options.mapper.random_seed = job.seed
     options.triangulation.random_seed = job.seed
     if loose:
