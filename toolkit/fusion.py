@@ -22,6 +22,7 @@ from toolkit.keyframes import KeyFrames
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
 from toolkit.networks.lattice import LatentVolume, Lattice
+from toolkit.networks.matching import SIDE, SIDE_WITHIN
 from toolkit.networks.model import NerfusionModel
 from toolkit.networks.refine import adopt, children, merged, part, solid_cells, split_volume, surface_cells
 from toolkit.networks.store import GlobalStore
@@ -163,8 +164,8 @@ class Fusion:
 class _Pictures:
     """Encoded pictures, the most recently used ones kept."""
 
-    def __init__(self, model: NerfusionModel, views: Views) -> None:
-        self.model, self.views = model, views
+    def __init__(self, model: NerfusionModel, views: Views, side: int) -> None:
+        self.model, self.views, self.side = model, views, side
         self._kept: Recent[tuple[EncodedView, Cameras]] = Recent(KEPT_PICTURES)
 
     def __call__(self, index: int) -> tuple[EncodedView, Cameras]:
@@ -174,7 +175,7 @@ class _Pictures:
     def _encode(self, index: int) -> tuple[EncodedView, Cameras]:
         views, device = self.views, self.model.device
         cameras = Cameras.of([views.intrinsics[index]], views.world_from_camera[index : index + 1], device)
-        return self.model.encode(picture(views, index, device), cameras)[0], cameras
+        return self.model.encode(picture(views, index, device), cameras, self.side)[0], cameras
 
 
 def fuse_views(
@@ -201,7 +202,7 @@ def fuse_views(
     if len(key_frames.indices) == 0:
         raise InputError("there are no key frames to fuse; give more pictures")
     fusion = Fusion(model, lattice, options, empty)
-    encoded = _Pictures(model, views)
+    encoded = _Pictures(model, views, SIDE if empty is None else SIDE_WITHIN)
     near, far, measured = fusion.options.near, fusion.options.far, fusion.options.measured
     sweeps = None if witnesses is None else KeySweeps(views, key_frames, witnesses, near, far, measured, empty, model.device)
     for done, (key, neighbours) in enumerate(zip(key_frames.indices, key_frames.neighbours, strict=True)):

@@ -19,7 +19,7 @@ from toolkit.camera import Array, Intrinsics
 from toolkit.capture.types import Views
 from toolkit.keyframes import KeyFrames
 from toolkit.networks.cameras import Cameras
-from toolkit.networks.matching import describe
+from toolkit.networks.matching import SIDE, SIDE_WITHIN, describe
 from toolkit.networks.sweep import Compared, Empty, Sweep, compare, decide
 from toolkit.networks.witness import Witness, certain, evidence, witness
 from toolkit.poses.overlap import overlap, parallax
@@ -86,20 +86,20 @@ class KeySweeps:
             compared, says, surface = self._make(at)
         said = evidence(compared, [self._made.get(other, self._make)[1] for other in self.witnesses[at]], surface)
         self._made.put(at, (None, says, surface))  # a key frame is fused once, and goes on as a witness
-        return decide(compared, self._depth(at), self.empty, said)
+        return decide(compared, self._depth(at), said)
 
     def _make(self, at: int) -> tuple[Compared, Witness, Tensor]:
         """What the pictures say alone, what this key frame says of others' surfaces, and the places it is sure of."""
         group = together(int(self.keys.indices[at]), self.keys.neighbours[at])
         poses = self.views.world_from_camera[group]
         cameras = Cameras.of([self.views.intrinsics[index] for index in group], poses, self.device)
-        compared = compare([self._described.get(index, self._describe) for index in group], cameras, self.near, self.far)
-        alone = decide(compared, empty=self.empty)
+        compared = compare([self._described.get(index, self._describe) for index in group], cameras, self.near, self.far, self.empty)
+        alone = decide(compared)
         depth = self._depth(at)
-        return compared, witness(alone if depth is None else decide(compared, depth, self.empty)), certain(compared, alone)
+        return compared, witness(alone if depth is None else decide(compared, depth)), certain(compared, alone)
 
     def _describe(self, index: int) -> Tensor:
-        return describe(picture(self.views, index, self.device))[0]
+        return describe(picture(self.views, index, self.device), SIDE if self.empty is None else SIDE_WITHIN)[0]
 
     def _depth(self, at: int) -> Tensor | None:
         return sensed(self.views, int(self.keys.indices[at]), self.device) if self.measured else None

@@ -12,8 +12,8 @@ from tests.networks.test_sweep import slow_paths, wall
 from toolkit.evaluate.speed import pinned
 from toolkit.networks import compiled
 from toolkit.networks.cameras import Cameras
-from toolkit.networks.matching import LARGE, SMALL, semi_global
-from toolkit.networks.sweep import Sweep, _table, compare, decide, sweep
+from toolkit.networks.matching import LARGE, SMALL, distribution, semi_global
+from toolkit.networks.sweep import Sweep, _table, carved, compare, decide, sweep
 from toolkit.networks.witness import Witness, certain, evidence, witness
 
 NEAR, FAR = 0.8, 6.0
@@ -50,11 +50,31 @@ def everything(views: int = 4) -> dict[str, torch.Tensor]:
     }
 
 
+def boxed(points: torch.Tensor) -> torch.Tensor:
+    """Empty but in a box about the wall."""
+    return ((points - points.new_tensor([0.1, 0.0, 2.0])).abs() > points.new_tensor([0.5, 0.4, 0.5])).any(1)
+
+
+def within() -> dict[str, torch.Tensor]:
+    """The same with silhouettes."""
+    described, seen_by = wall(3)
+    compared = compare(described, seen_by, NEAR, FAR, boxed)
+    assert compared.empty is not None and 0 < float(compared.empty.float().mean()) < 1
+    return {"cost": compared.cost, "likely": carved(distribution(compared.cost), compared.empty), "table": decide(compared).table}
+
+
 @pytest.mark.parametrize("views", [1, 2, 4])
 def test_it_gives_what_the_tensors_give(views: int, monkeypatch: pytest.MonkeyPatch) -> None:
     quick = everything(views)
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
     for name, expected in everything(views).items():
+        torch.testing.assert_close(quick[name], expected, atol=1e-4, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
+
+
+def test_it_gives_what_the_tensors_give_within_silhouettes(monkeypatch: pytest.MonkeyPatch) -> None:
+    quick = within()
+    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    for name, expected in within().items():
         torch.testing.assert_close(quick[name], expected, atol=1e-4, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
 
 

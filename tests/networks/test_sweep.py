@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ import torch.nn.functional as F
 from tests.networks.made import cameras
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.matching import LARGE, SIDE, SMALL, describe, difference, distribution, semi_global, together
-from toolkit.networks.sweep import LOST, PLANES, Sweep, _table, carved, sweep
+from toolkit.networks.sweep import LOST, PLANES, Sweep, _table, carved, compare, decide, measured, sweep
 
 WALL = 2.0
 
@@ -259,6 +260,54 @@ def test_a_silhouette_tells_where_no_surface_is() -> None:
     nothing = sweep(described, seen_by, 0.8, 4.0, empty=lambda points: torch.ones(len(points), dtype=torch.bool))
     free = nothing.look(places[:45], truncation[:45])  # up to a truncation before the farthest plane
     assert float(free.signed.min()) > 0.99 and float(free.open.min()) > 0.99
+
+
+def slab(left: float, right: float) -> Callable[[torch.Tensor], torch.Tensor]:
+    """All is empty but a part of the wall, between two places across."""
+
+    def empty(points: torch.Tensor) -> torch.Tensor:
+        return ((points[:, 2] - WALL).abs() > 0.3) | (points[:, 0] < left) | (points[:, 0] > right)
+
+    return empty
+
+
+def test_only_what_silhouettes_leave_is_compared() -> None:
+    """The table covers the part of the picture about it, and says of all places what a table of the whole picture says."""
+    described, seen_by = wall(3)
+    part, all_of_it = (compare(described, seen_by, 0.8, 4.0, slab(*edges)) for edges in ((0.1, 0.4), (-9.0, 9.0)))
+    assert all_of_it.window == (0.0, 0.0, 1.0, 1.0) and all_of_it.cost.shape[1:] == (72, 96)
+    left, upper, right, lower = part.window
+    assert (upper, lower) == (0.0, 1.0) and part.cost.shape[1:] == (72, round((right - left) * 96))
+    nearest, farthest = 0.5 + 0.4 * 90 / 96 / (WALL - 0.3), 0.5 + 0.1 * 90 / 96 / (WALL + 0.3)
+    assert abs(right - nearest) < 2.5 / 96 and abs(left - farthest) < 2.5 / 96  # a cell of margin on each side
+    assert part.empty is not None and bool(part.empty[:, :, [0, -1]].all())
+    points = torch.rand((4000, 3), generator=torch.Generator().manual_seed(0))
+    points, truncation = points * torch.tensor([2.4, 1.8, 3.0]) - torch.tensor([1.2, 0.9, -0.9]), torch.full((4000,), 0.1)
+    nothing = slab(0.1, 0.4)((all_of_it.rays[:, None] / all_of_it.inverses[:, None]).view(-1, 3))
+    whole = replace(all_of_it, empty=nothing.view(72, 96, -1).permute(2, 0, 1))
+    one, other = decide(part).look(points, truncation), decide(whole).look(points, truncation)
+    apart = (one.signed - other.signed).abs()
+    assert float((apart < 0.02).float().mean()) > 0.98  # pixels beside the window are matched in one, and left out in the other
+    assert float((one.open - other.open).abs().mean()) < 0.01
+
+
+@pytest.mark.parametrize("window", [(0.25, 0.5, 0.75, 1.0), (0.0, 0.0, 1.0, 1.0)])
+def test_a_measured_depth_is_cut_as_the_window_is(window: tuple[float, float, float, float]) -> None:
+    depth = 1 + torch.arange(96.0)[None] / 96 + torch.arange(72.0)[:, None] / 36
+    inverses, (left, upper, right, lower) = torch.linspace(0.2, 1, 200), window
+    shape = round(72 * (lower - upper)), round(96 * (right - left))
+    found = measured(torch.full((200, *shape), 1 / 200), inverses, depth, 1, window)
+    told = 1 / inverses[found.argmax(0)]
+    wanted = depth[round(72 * upper) : round(72 * lower), round(96 * left) : round(96 * right)]
+    assert found.shape[1:] == shape and float((told / wanted - 1).abs().max()) < 0.02
+
+
+def test_where_silhouettes_leave_nothing_all_is_free() -> None:
+    described, seen_by = wall(3)
+    made = sweep(described, seen_by, 0.8, 4.0, empty=slab(2.0, 1.0))
+    assert made.table.shape[2:] == (1, 1)
+    seen = made.look(on_axis(torch.linspace(0.9, 3.0, 9)), torch.full((9,), 0.1))
+    assert float(seen.open.min()) > 0.99 and float(seen.signed.min()) > 0.99
 
 
 def test_likelihoods_within_silhouettes_against_a_loop() -> None:

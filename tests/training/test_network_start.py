@@ -24,6 +24,7 @@ from toolkit.render.image import render_view
 from toolkit.training.fit import fit_field
 from toolkit.training.from_network import (
     MEASURED_PIXELS,
+    OBJECT_PIXELS,
     PIXELS,
     Inference,
     NetworkOptions,
@@ -169,7 +170,7 @@ def test_a_voxel_spans_no_more_than_some_pixels_at_the_median_depth() -> None:
         [600 / PIXELS] * 3 + [600 / MEASURED_PIXELS]
     )
     cut_out = replace(long, alpha=[np.full((64, 64), 255, np.uint8)] * len(long))
-    assert voxels_to_median(cut_out) == pytest.approx(600 / PIXELS * 2 / 1.3)
+    assert voxels_to_median(cut_out) == pytest.approx(600 / OBJECT_PIXELS)
 
 
 def test_what_lies_outside_of_the_silhouettes_is_left_out() -> None:
@@ -230,5 +231,11 @@ def test_the_hull_holds_what_silhouettes_show_and_little_else() -> None:
     assert not hull(0.97 * radius * directions).any()
     assert float(hull(1.6 * radius * directions).float().mean()) > 0.95  # eight silhouettes leave corners
     assert hull(torch.tensor([[5.0, 0.0, 0.0], [0.0, -9.0, 0.0]])).all()
+    for within in (space, Space((0.1, 0.0, -0.1), 0.3, 1.5)):  # compiled and as tensors; the second is contracted about the ball
+        found, points = visual_hull(within, views), 0.7 * torch.randn(4000, 3, generator=torch.Generator().manual_seed(1))
+        points[:3] = torch.tensor([[torch.nan, 0.0, 0.0], [torch.inf, 0.0, 0.0], [1e30, -1e30, 0.0]])
+        assert found is not None and 0 < float(found(points).float().mean()) < 1 and found(points)[:3].all()
+        differ = found(points)[3:] != found(points.double())[3:]
+        assert float(differ.float().mean()) < 1e-3  # on the edges of voxels
     assert visual_hull(space, replace(views, alpha=[None] * 8)) is None
     assert visual_hull(space, replace(views, alpha=[np.zeros((64, 64), np.uint8)] * 8)) is None  # it would leave nothing

@@ -36,7 +36,7 @@ def _array(values: Tensor) -> Any:
     return values.detach().contiguous().numpy()
 
 
-def _spread(work: Callable[[slice], Any], count: int) -> None:
+def spread(work: Callable[[slice], Any], count: int) -> None:
     """Do `work` on `count` things, on as many threads as torch has."""
     threads = torch.get_num_threads() if count >= FEW else 1
     edges = np.linspace(0, count, threads + 1).astype(int)
@@ -134,7 +134,7 @@ class Comparison:
             view, *rest = given
             _compare(self.own[p], view, self.rays[p], *rest, self.inverses, self.gain, self.cost[p], self.least[p], self.seen[p])
 
-        _spread(part, len(self.own))
+        spread(part, len(self.own))
 
     def result(self, unknown: float) -> Tensor:
         """(P, D) costs, `unknown` where no view sees the place."""
@@ -152,26 +152,54 @@ def semi_global(cost: Tensor, small: float, large: float) -> Tensor:
 
 
 @njit(**OPTIONS)
+def _carve(likely: Any, empty: Any, lost: Any, out: Any) -> None:
+    """`sweep.carved` of pixels (P, D) into `out`."""
+    planes = likely.shape[1]
+    for p in range(len(likely)):
+        own, left = likely[p], out[p]
+        total, places = F(0), 0
+        for d in range(planes):
+            free = empty[p, d] == 0
+            left[d] = own[d] if free else F(0)
+            total += left[d]
+            places += free
+        if places == 0:
+            left[0] = F(1)
+        elif total > lost:
+            for d in range(planes):
+                left[d] /= total
+        else:
+            for d in range(planes):
+                left[d] = F(0) if empty[p, d] else F(1) / F(places)
+
+
+def carved(likely: Tensor, empty: Tensor, lost: float) -> Tensor:
+    """`sweep.carved` of float32 likelihoods (D, h, w) on the CPU; `lost` is what is left of a pixel where nothing is known any more."""
+    planes, height, width = likely.shape
+    given = _array(likely.permute(1, 2, 0).reshape(-1, planes)), _array(empty.permute(1, 2, 0).reshape(-1, planes).view(torch.uint8))
+    out = np.empty((height * width, planes), np.float32)
+    spread(lambda p: _carve(given[0][p], given[1][p], F(lost), out[p]), height * width)
+    return torch.from_numpy(out).view(height, width, planes).permute(2, 0, 1)
+
+
+@njit(**OPTIONS)
 def _fill(likely: Any, step: Any, width: int, table: Any) -> None:
     """Likelihoods (P, D) → `table` (P, D, 3)."""
     planes = likely.shape[1]
+    behind = np.zeros(planes + 1, np.float32)  # likelihood of this plane and all nearer ones
     for p in range(len(likely)):
         own, out = likely[p], table[p]
-        before, after, sure = F(0), F(0), F(0)
         for d in range(planes - 1, -1, -1):
-            out[d, 0] = before + F(0.5) * own[d]  # the surface lies anywhere about its plane
-            before += own[d]
-        out[0, 1] = F(0)
-        for d in range(1, planes):
-            after += F(0.5) * (out[d - 1, 0] + out[d, 0]) * step
-            out[d, 1] = after
-        for first in range(planes - width + 1):
-            about = F(0)
-            for d in range(first, first + width):
-                about += own[d]
-            sure = max(sure, about)
+            behind[d] = behind[d + 1] + own[d]
+        sure = F(0)
+        for d in range(planes - width + 1):
+            sure = max(sure, behind[d] - behind[d + width])
+        after, last = F(0), F(0)
         for d in range(planes):
-            out[d, 2] = sure
+            nearer = F(0.5) * (behind[d] + behind[d + 1])  # the surface lies anywhere about its plane
+            after += F(0.5) * (last + nearer) * step if d > 0 else F(0)
+            out[d, 0], out[d, 1], out[d, 2] = nearer, after, sure
+            last = nearer
 
 
 def table(likely: Tensor, step: float, peak: int) -> Tensor:
@@ -179,7 +207,7 @@ def table(likely: Tensor, step: float, peak: int) -> Tensor:
     planes, height, width = likely.shape
     given = _array(likely.permute(1, 2, 0).reshape(-1, planes))
     out = np.empty((height * width, planes, 3), np.float32)
-    _spread(lambda p: _fill(given[p], F(step), min(2 * peak + 1, planes), out[p]), height * width)
+    spread(lambda p: _fill(given[p], F(step), min(2 * peak + 1, planes), out[p]), height * width)
     return torch.from_numpy(out).view(height, width, planes, 3).permute(3, 2, 0, 1)
 
 
@@ -229,7 +257,7 @@ def look(points: Tensor, truncation: Tensor, table: Tensor, pose: Tensor, lens: 
     """
     given = [_array(values) for values in (points, truncation.expand(len(points)), table.permute(2, 3, 1, 0), pose, lens)]
     out = np.empty((len(points), 3), np.float32)
-    _spread(lambda n: _look(given[0][n], given[1][n], *given[2:], F(lowest), F(step), out[n]), len(points))
+    spread(lambda n: _look(given[0][n], given[1][n], *given[2:], F(lowest), F(step), out[n]), len(points))
     return torch.from_numpy(out)
 
 
@@ -255,5 +283,5 @@ def ask(points: Tensor, says: Tensor, pose: Tensor, lens: Tensor, lowest: float,
     """(N,) what a witness says (D, h, w) of the points, and (N,) bool whether it sees them; pose and lens as in `look`."""
     given = [_array(values) for values in (points, says.permute(1, 2, 0)[..., None], pose, lens)]
     said, seen = np.empty(len(points), np.float32), np.empty(len(points), np.bool_)
-    _spread(lambda n: _ask(given[0][n], *given[1:], F(lowest), F(step), said[n], seen[n]), len(points))
+    spread(lambda n: _ask(given[0][n], *given[1:], F(lowest), F(step), said[n], seen[n]), len(points))
     return torch.from_numpy(said), torch.from_numpy(seen)

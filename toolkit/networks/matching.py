@@ -12,7 +12,8 @@ from torch import Tensor
 
 from toolkit.networks import compiled
 
-SIDE = 256  # pixels of the long side at which pictures are compared (docs/few_views.md)
+SIDE = 256  # pixels of the long side at which pictures are compared (docs/few_views.md) …
+SIDE_WITHIN = 448  # … and where silhouettes leave a part of them
 CONTRAST = 0.03  # of a patch, added to its own: what is flatter is noise
 GREY = (0.3, 0.59, 0.11)
 COLOUR_GAIN = 8.0  # a mean difference of 1/8 in colour counts as different
@@ -21,12 +22,12 @@ SMALL, LARGE = 0.1, 0.8  # penalties for a step of one plane between neighbourin
 TEMPERATURE = 0.05  # of the distribution; together with the penalties the best of those tried on simulated scenes (docs/few_views.md)
 
 
-def describe(images: Tensor) -> Tensor:
-    """(V, 3, H, W) RGB in [0, 1] → (V, 21, h, w), long side at most `SIDE`: colour, and patches of 3×3 at two spacings."""
+def describe(images: Tensor, side: int = SIDE) -> Tensor:
+    """(V, 3, H, W) RGB in [0, 1] → (V, 21, h, w), long side at most `side`: colour, and patches of 3×3 at two spacings."""
     images = images.detach().float()
     long = max(images.shape[-2:])
-    if long > SIDE:
-        size = [max(1, round(side * SIDE / long)) for side in images.shape[-2:]]
+    if long > side:
+        size = [max(1, round(length * side / long)) for length in images.shape[-2:]]
         images = F.interpolate(images, size, mode="bilinear", antialias=True)
     grey = (images * images.new_tensor(GREY).view(3, 1, 1)).sum(1, keepdim=True)
     return torch.cat([images, _patches(grey, 1), _patches(grey, 2)], 1)

@@ -30,7 +30,7 @@ from toolkit.networks.gru import FusionGRU, RunningMean, mean_gate
 from toolkit.networks.head import FieldHead
 from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume, empty_volume
 from toolkit.networks.local import INSIDE, LocalReconstruction, colour_latent, inside_latent
-from toolkit.networks.matching import describe
+from toolkit.networks.matching import SIDE, describe
 from toolkit.networks.pyramid import Pyramid
 from toolkit.networks.refine import with_blocks
 from toolkit.networks.sweep import Empty, Sighted, Sweep, sweep
@@ -87,7 +87,7 @@ class NerfusionModel(nn.Module):
     def device(self) -> torch.device:
         return next(self.parameters()).device
 
-    def encode(self, images: Tensor, cameras: Cameras) -> list[EncodedView]:
+    def encode(self, images: Tensor, cameras: Cameras, side: int = SIDE) -> list[EncodedView]:
         """Everything that voxels look up in pictures.
 
         A viewing direction is the same for a pixel and for every voxel behind it, so G is evaluated for the cells of the maps and not
@@ -96,9 +96,10 @@ class NerfusionModel(nn.Module):
         Args:
             images: (V, 3, H, W) RGB in [0, 1], undistorted; of one size.
             cameras: V cameras for exactly these pictures.
+            side: pixels of the long side at which they are compared.
         """
         maps = self.sample(*self.encoder.maps(images))
-        whole, described = padded((images - 0.5) * COLOUR_GAIN), describe(images)
+        whole, described = padded((images - 0.5) * COLOUR_GAIN), describe(images, side)
         views = []
         for index in range(len(images)):
             features = Pyramid.of(maps[index], STRIDE, LEVELS)

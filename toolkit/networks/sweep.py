@@ -20,13 +20,16 @@ from toolkit.networks import compiled
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.matching import COLOUR_GAIN, UNKNOWN, difference, distribution, together
 
-SPACING = 2  # pixels of the compared pictures between those whose depth is asked for
+SPACING = 2  # pixels of the compared pictures between those whose depth is asked for …
+WITHIN = 1  # … and where silhouettes bound it: fine things then stand alone, and most pixels meet nothing
 STEP = 0.75  # pixels that the view which moves most moves by from plane to plane
 PLANES = (32, 192)  # fewest and most
 RANGE = 50.0  # farthest by nearest depth, where the caller does not bound them
 PEAK = 2  # planes on either side of the likeliest one that count as the same depth
 NOISE = 0.01  # of a depth that a sensor measured, as a part of it; at least as wide as planes lie apart
 TRUST = 0.98  # in a measured depth, against what the pictures say
+WHOLE = (0.0, 0.0, 1.0, 1.0)
+PART = 1024  # pixels at a time, whose places then stay in the cache
 LOST = 1e-4  # likelihood that is left where a silhouette takes the rest, below which nothing is known of where the surface is inside
 
 Empty = Callable[[Tensor], Tensor]  # (N, 3) points of the working frame → (N,) bool, for sure nothing there
@@ -107,72 +110,114 @@ class Compared:
         rays: (h · w, 3) of the working frame, through pixels of the key view, of unit depth along its axis.
         inverses: (D,) inverse depths of the planes, evenly spaced, ascending.
         cost: (D, h, w) in [0, 1].
+        empty: (D, h, w) bool, where silhouettes say that there is nothing; None without any.
+        window: left, upper, right and lower edge in the key view's whole picture, 0 to 1. Beyond it nothing is but what is `empty`.
     """
 
     camera: Cameras
     rays: Tensor
     inverses: Tensor
     cost: Tensor
+    empty: Tensor | None = None
+    window: tuple[float, float, float, float] = WHOLE
 
     @property
     def step(self) -> float:
         """Inverse depth between planes."""
         return float(self.inverses[1] - self.inverses[0])
 
-    def points(self) -> Tensor:
-        """(D · h · w, 3) of the working frame."""
-        return (self.rays[None] / self.inverses[:, None, None] + self.camera.positions[0]).view(-1, 3)
+    @property
+    def spacing(self) -> int:
+        """Pixels of the compared pictures from one to the next here."""
+        return SPACING if self.empty is None else WITHIN
 
 
 @torch.no_grad()
-def compare(described: Sequence[Tensor], cameras: Cameras, near: float, far: float) -> Compared:
+def compare(described: Sequence[Tensor], cameras: Cameras, near: float, far: float, empty: Empty | None = None) -> Compared:
     """Compare the first view with all others at planes between `near` and `far` along its axis; the others may come in any order.
 
     Args:
         described: K times (21, h, w) of `matching.describe`.
         cameras: K.
         near, far: 0 and ∞ where unknown.
+        empty: where there is for sure no surface, as silhouettes tell; pixels that meet nothing else are not compared.
 
     Raises:
         ValueError: neither is known, or the nearest does not lie before the farthest.
     """
     with torch.autocast(cameras.intrinsics.device.type, enabled=False):  # planes lie less than a pixel apart
-        return _compared(described, cameras, *_bounded(near, far))
+        return _compared(described, cameras, *_bounded(near, far), empty)
 
 
-def _compared(described: Sequence[Tensor], cameras: Cameras, near: float, far: float) -> Compared:
+def _compared(described: Sequence[Tensor], cameras: Cameras, near: float, far: float, empty: Empty | None) -> Compared:
     """`compare`, with both ends known."""
     inverses = torch.linspace(1 / far, 1 / near, _planes(described, cameras, near, far), device=cameras.intrinsics.device)
-    rays, own, shape = _pixels(described[0], cameras)
+    rays, own, shape = _pixels(described[0], cameras, SPACING if empty is None else WITHIN)
+    world = rays @ cameras.world_from_camera[0, :3, :3].T
+    if empty is None:
+        return Compared(cameras[0], world, inverses, _volume(_costs(described, cameras, inverses, rays, own), shape))
+    parts = [empty((part[:, None] / inverses[:, None] + cameras.positions[0]).view(-1, 3)) for part in world.split(PART)]
+    nothing = torch.cat(parts).view(*shape, -1)
+    camera, window, rows, columns = _cropped(cameras[0], ~nothing.all(2))
+    nothing, rays, own, world = (
+        values.view(*shape, -1)[rows, columns].reshape(-1, values.shape[-1]) for values in (nothing, rays, own, world)
+    )
+    shape = (rows.stop - rows.start, columns.stop - columns.start)
+    some = (~nothing).any(1).nonzero().view(-1)
+    cost = rays.new_full(nothing.shape, UNKNOWN).index_copy(0, some, _costs(described, cameras, inverses, rays[some], own[some]))
+    return Compared(camera, world, inverses, _volume(cost, shape), _volume(nothing, shape), window)
+
+
+def _cropped(camera: Cameras, wanted: Tensor) -> tuple[Cameras, tuple[float, float, float, float], slice, slice]:
+    """The part of the picture about the `wanted` (h, w) cells with one more on each side, which says that there is nothing beyond: its
+    camera, its window, and its rows and columns of cells."""
+    (upper, lower), (left, right) = (_span(wanted.any(1)), _span(wanted.any(0)))
+    height, width = wanted.shape
+    cell = camera.size[0] / camera.size.new_tensor([width, height])
+    first, count = (camera.size.new_tensor(pair) for pair in ([left, upper], [right - left, lower - upper]))
+    intrinsics = torch.cat([camera.intrinsics[:, :2], camera.intrinsics[:, 2:] - first * cell], 1)
+    window = (left / width, upper / height, right / width, lower / height)
+    return Cameras(intrinsics, (count * cell)[None], camera.world_from_camera), window, slice(upper, lower), slice(left, right)
+
+
+def _span(wanted: Tensor) -> tuple[int, int]:
+    """From the first to behind the last that is `wanted` (N,), and one more on each side where there is one; never nothing."""
+    found = wanted.nonzero().view(-1)
+    return (0, 1) if len(found) == 0 else (max(0, int(found[0]) - 1), min(len(wanted), int(found[-1]) + 2))
+
+
+def _costs(described: Sequence[Tensor], cameras: Cameras, inverses: Tensor, rays: Tensor, own: Tensor) -> Tensor:
+    """(P, D) of pixels of the first view, with rays (P, 3) in its axes and descriptors (P, 21)."""
     if len(cameras) == 1:
-        cost = rays.new_zeros((len(rays), len(inverses)))
-    elif compiled.fits(rays, *described):
+        return rays.new_zeros((len(rays), len(inverses)))
+    if compiled.fits(rays, *described):
         comparison = compiled.Comparison(own, rays, inverses, COLOUR_GAIN)
         for view in range(1, len(cameras)):
             comparison.add(described[view], *_way(cameras, view), cameras.lens(view))
-        cost = comparison.result(UNKNOWN)
-    else:
-        found = [_warped(described[view], cameras, view, rays, inverses) for view in range(1, len(cameras))]
-        costs = torch.stack([difference(own[None], shown) for shown, _ in found])
-        cost = together(costs, torch.stack([seen for _, seen in found])).T
-    cost = cost.reshape(*shape, len(inverses)).permute(2, 0, 1)
-    return Compared(cameras[0], rays @ cameras.world_from_camera[0, :3, :3].T, inverses, cost)
+        return comparison.result(UNKNOWN)
+    found = [_warped(described[view], cameras, view, rays, inverses) for view in range(1, len(cameras))]
+    costs = torch.stack([difference(own[None], shown) for shown, _ in found])
+    return together(costs, torch.stack([seen for _, seen in found])).T
+
+
+def _volume(values: Tensor, shape: tuple[int, int]) -> Tensor:
+    """(h · w, D) → (D, h, w)."""
+    return values.reshape(*shape, -1).permute(2, 0, 1)
 
 
 @torch.no_grad()
-def decide(compared: Compared, depth: Tensor | None = None, empty: Empty | None = None, said: Tensor | None = None) -> Sweep:
+def decide(compared: Compared, depth: Tensor | None = None, said: Tensor | None = None) -> Sweep:
     """Where the surface is likely to be.
 
     Args:
         depth: (H, W) of the key view along z in working units, where a sensor measured it; 0 or not finite where it did not.
-        empty: where there is for sure no surface, as silhouettes tell.
         said: (D, h, w) that makes planes likelier, in units of the cost (`witness.evidence`).
     """
     likely = distribution(compared.cost if said is None else compared.cost - said)
-    if empty is not None:
-        likely = carved(likely, empty(compared.points()).view_as(likely))
+    if compared.empty is not None:
+        likely = carved(likely, compared.empty)
     if depth is not None:
-        likely = measured(likely, compared.inverses, depth)
+        likely = measured(likely, compared.inverses, depth, compared.spacing, compared.window)
     return Sweep(compared.camera, _table(likely, compared.step), float(compared.inverses[0]), compared.step)
 
 
@@ -185,7 +230,7 @@ def sweep(
     empty: Empty | None = None,
 ) -> Sweep:
     """`compare` and `decide` for a key view alone."""
-    return decide(compare(described, cameras, near, far), depth, empty)
+    return decide(compare(described, cameras, near, far, empty), depth)
 
 
 def carved(likely: Tensor, empty: Tensor) -> Tensor:
@@ -193,6 +238,8 @@ def carved(likely: Tensor, empty: Tensor) -> Tensor:
 
     Of pixels whose likely planes are all empty any other one is as likely; along those that meet nothing it is free to the farthest.
     """
+    if compiled.fits(likely):
+        return compiled.carved(likely, empty, LOST)
     left = likely * ~empty
     total = left.sum(0)
     anywhere = (~empty).to(likely.dtype)
@@ -202,20 +249,28 @@ def carved(likely: Tensor, empty: Tensor) -> Tensor:
     return torch.where(empty.all(0), free, left)
 
 
-def measured(likely: Tensor, inverses: Tensor, depth: Tensor) -> Tensor:
+def measured(
+    likely: Tensor, inverses: Tensor, depth: Tensor, spacing: int = SPACING, window: tuple[float, float, float, float] = WHOLE
+) -> Tensor:
     """What the pictures say, and where a sensor measured the depth, that.
 
     Args:
         likely: (D, h, w) likelihoods of the planes.
         inverses: (D,) of the planes, evenly spaced, ascending.
         depth: (H, W), 0 or not finite where nothing was measured; beyond the planes it counts as the last of them.
+        spacing, window: of `Compared`; the depth is of the whole picture.
 
     Returns:
-        (D, h', w') on a grid finer by `SPACING` (pixels of the compared pictures): a depth sensor tells edges better than patches do.
+        (D, h', w') at all pixels of the compared pictures: a depth sensor tells edges better than patches do.
     """
-    shape = [min(SPACING * side, most) for side, most in zip(likely.shape[1:], depth.shape, strict=True)]
+    left, upper, right, lower = window
+    spans = [(low * most, (high - low) * most) for low, high, most in ((upper, lower, depth.shape[0]), (left, right, depth.shape[1]))]
+    shape = [max(1, min(spacing * side, round(length))) for side, (_, length) in zip(likely.shape[1:], spans, strict=True)]
     # Depth is picked and not averaged: between two surfaces there is nothing.
-    rows, columns = (((torch.arange(n, device=depth.device) + 0.5) * (most / n)).long() for n, most in zip(shape, depth.shape, strict=True))
+    rows, columns = (
+        (first + (torch.arange(n, device=depth.device) + 0.5) * (length / n)).long()
+        for n, (first, length) in zip(shape, spans, strict=True)
+    )
     here = depth[rows[:, None], columns]
     known = torch.isfinite(here) & (here > 0)
     inverse = (1 / torch.where(known, here, torch.ones_like(here))).clamp(float(inverses[0]), float(inverses[-1]))
@@ -249,10 +304,10 @@ def _bounded(near: float, far: float) -> tuple[float, float]:
     return near, far
 
 
-def _pixels(described: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor, tuple[int, int]]:
-    """Rays (P, 3) of unit depth through every `SPACING`-th pixel of the first view, their descriptors (P, 21), and the grid's shape."""
+def _pixels(described: Tensor, cameras: Cameras, spacing: int) -> tuple[Tensor, Tensor, tuple[int, int]]:
+    """Rays (P, 3) of unit depth through every `spacing`-th pixel of the first view, their descriptors (P, 21), and the grid's shape."""
     height, width = described.shape[1:]
-    shape = (max(1, height // SPACING), max(1, width // SPACING))
+    shape = (max(1, height // spacing), max(1, width // spacing))
     # Cells of equal size cover the picture, so that reading the table needs its borders alone.
     v = (torch.arange(shape[0], device=described.device) + 0.5) / shape[0] * 2 - 1
     u = (torch.arange(shape[1], device=described.device) + 0.5) / shape[1] * 2 - 1
@@ -284,8 +339,7 @@ def _warped(described: Tensor, cameras: Cameras, view: int, rays: Tensor, invers
 
 def _planes(described: Sequence[Tensor], cameras: Cameras, near: float, far: float) -> int:
     """How many planes: pictures of the view that moves most move by `STEP` from one to the next at nine places of the first."""
-    rays, _, _ = _pixels(described[0][:, :3, :3], cameras)
-    spots = torch.cartesian_prod(torch.tensor([0.1, 0.5, 0.9]), torch.tensor([0.1, 0.5, 0.9])).to(rays)
+    spots = torch.cartesian_prod(torch.tensor([0.1, 0.5, 0.9]), torch.tensor([0.1, 0.5, 0.9])).to(cameras.intrinsics)
     flat = (spots * cameras.size[0] - cameras.intrinsics[0, 2:]) / cameras.intrinsics[0, :2]
     rays = torch.cat([flat, torch.ones_like(flat[:, :1])], 1)
     most = 0.0

@@ -29,7 +29,6 @@ from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
 from toolkit.render.fused import make_field, without_empty_blocks
-from toolkit.training import start as classical
 from toolkit.training.behind import sky_behind
 from toolkit.training.finer_colours import finer_colours
 from toolkit.training.silhouettes import inside_silhouettes, visual_hull
@@ -43,7 +42,7 @@ SHIPPED = Path(weights.__file__).parent / "weights" / "nerfusion.safetensors"
 VOXELS_TO_MEDIAN, LEVELS = 48.0, 2
 PIXELS = 5.0  # that a voxel spans at most: colours become finer afterwards (`finer_colours.py`) …
 MEASURED_PIXELS = 3.5  # … where a sensor's depth says more exactly where surfaces are …
-OBJECT = classical.OBJECT_PIXELS / classical.PIXELS  # … and times this where alpha cuts the object out: as in a fit
+OBJECT_PIXELS = 2.6  # … and where alpha cuts the object out: fewer voxels are in play
 GAMMA = 0.95  # the paper's 0.6 cuts holes where the networks are in doubt
 LEAST, MOST = 32, 384  # resolution of the lattice
 
@@ -91,7 +90,7 @@ def voxels_to_median(views: Views, measured: bool = False) -> float:
     if measured and any(depth is not None for depth in views.depths):
         pixels = MEASURED_PIXELS
     elif any(alpha is not None for alpha in views.alpha):
-        pixels *= OBJECT
+        pixels = OBJECT_PIXELS
     return max(VOXELS_TO_MEDIAN, float(np.median([lens.fx for lens in views.intrinsics])) / pixels)
 
 
