@@ -111,7 +111,9 @@ def test_what_bulges_over_a_silhouette_goes(coarse: Field, views: Views) -> None
     cut = replace(views, images=images, alpha=[left] * 16, background=(1.0, 1.0, 1.0)).subset([0, 1, 2])
     field = replace(coarse, background=torch.ones(3))
     found = finer_colours(field, cut, DEPTH)
-    assert 0 < found.voxels < 0.8 * finer_colours(field, replace(cut, alpha=[None] * 3), DEPTH).voxels
+    without = finer_colours(field, replace(cut, alpha=[None] * 3), DEPTH)
+    assert found.voxel_size < 0.8 * without.voxel_size  # alpha tells edges to a pixel
+    assert 0 < found.voxels * found.voxel_size**3 < 0.8 * without.voxels * without.voxel_size**3
     for camera, pose in zip(cut.intrinsics, cut.world_from_camera, strict=True):
         shown = render_view(found, camera, pose).opacity
         assert float(shown[:, 68:].mean()) < 0.01 < 0.2 < float(shown[:, :60].mean())

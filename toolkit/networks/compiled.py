@@ -86,7 +86,7 @@ def _compare(
             value = F(0.5) * (min(colour * (gain / F(COLOURS)), F(1)) + min(patch * F(0.5 / PATCH), F(1)))
             cost[p, d] += value
             least[p, d] = min(least[p, d], value)
-            seen[p, d] += F(1)
+            seen[p, d] += 1
 
 
 @njit(**OPTIONS)
@@ -94,7 +94,7 @@ def _combine(cost: Any, least: Any, seen: Any, unknown: Any) -> None:
     """`matching.together`, into `cost`."""
     for p in range(len(cost)):
         for d in range(cost.shape[1]):
-            cost[p, d] = F(0.5) * (cost[p, d] / seen[p, d] + least[p, d]) if seen[p, d] > F(0) else unknown
+            cost[p, d] = F(0.5) * (cost[p, d] / F(seen[p, d]) + least[p, d]) if seen[p, d] else unknown
 
 
 def widened(described: Tensor) -> Tensor:
@@ -117,7 +117,7 @@ class Comparison:
     def __init__(self, own: Tensor, rays: Tensor, inverses: Tensor, gain: float) -> None:
         self.own, self.rays, self.inverses, self.gain = _array(widened(own)), _array(rays), _array(inverses), F(gain)
         shape = (len(own), len(inverses))
-        self.cost, self.least, self.seen = np.zeros(shape, np.float32), np.ones(shape, np.float32), np.zeros(shape, np.float32)
+        self.cost, self.least, self.seen = np.zeros(shape, np.float32), np.ones(shape, np.float32), np.zeros(shape, np.uint16)
 
     def add(self, described: Tensor, turn: Tensor, shift: Tensor, lens: Tensor) -> None:
         """One more view.
@@ -148,7 +148,9 @@ def semi_global(cost: Tensor, small: float, large: float) -> Tensor:
     even = np.zeros(volume.shape[:2], np.float32)  # depth may step anywhere
     with ThreadPoolExecutor(min(2, torch.get_num_threads())) as pool:
         one, other = pool.map(lambda paths: summed_paths(volume, even, small, large, paths), (PATHS[:2], PATHS[2:4]))
-    return torch.from_numpy((one + other) / F(4)).permute(2, 0, 1)
+    one += other
+    one /= F(4)
+    return torch.from_numpy(one).permute(2, 0, 1)
 
 
 @njit(**OPTIONS)

@@ -88,4 +88,4 @@ def _paths(volume: Tensor) -> Tensor:
 def distribution(cost: Tensor) -> Tensor:
     """(D, h, w) costs → how likely the surface lies at each plane; sums to one over D."""
     along = semi_global(cost).permute(1, 2, 0)  # (h, w, D), where the planes of a pixel lie next to each other in memory on the CPU
-    return torch.softmax(along / -TEMPERATURE, 2).permute(2, 0, 1)
+    return torch.softmax(along.div_(-TEMPERATURE), 2).permute(2, 0, 1)

@@ -29,7 +29,7 @@ PEAK = 2  # planes on either side of the likeliest one that count as the same de
 NOISE = 0.01  # of a depth that a sensor measured, as a part of it; at least as wide as planes lie apart
 TRUST = 0.98  # in a measured depth, against what the pictures say
 WHOLE = (0.0, 0.0, 1.0, 1.0)
-PART = 1024  # pixels at a time, whose places then stay in the cache
+PART = 256  # pixels at a time, whose places then stay in the cache
 LOST = 1e-4  # likelihood that is left where a silhouette takes the rest, below which nothing is known of where the surface is inside
 
 Empty = Callable[[Tensor], Tensor]  # (N, 3) points of the working frame → (N,) bool, for sure nothing there
@@ -156,8 +156,8 @@ def _compared(described: Sequence[Tensor], cameras: Cameras, near: float, far: f
     world = rays @ cameras.world_from_camera[0, :3, :3].T
     if empty is None:
         return Compared(cameras[0], world, inverses, _volume(_costs(described, cameras, inverses, rays, own), shape))
-    parts = [empty((part[:, None] / inverses[:, None] + cameras.positions[0]).view(-1, 3)) for part in world.split(PART)]
-    nothing = torch.cat(parts).view(*shape, -1)
+    depths, origin = (1 / inverses)[:, None], cameras.positions[0]
+    nothing = torch.cat([empty(torch.addcmul(origin, part[:, None], depths).view(-1, 3)) for part in world.split(PART)]).view(*shape, -1)
     camera, window, rows, columns = _cropped(cameras[0], ~nothing.all(2))
     nothing, rays, own, world = (
         values.view(*shape, -1)[rows, columns].reshape(-1, values.shape[-1]) for values in (nothing, rays, own, world)

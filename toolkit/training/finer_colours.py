@@ -24,7 +24,8 @@ from toolkit.volume.host import TorchHost
 from toolkit.volume.topology import BLOCK
 
 Tensor = torch.Tensor
-PIXELS = 1.5  # of the training views that a voxel at the median depth spans in the end
+PIXELS = 1.5  # of the training views that a voxel at the median depth spans in the end …
+PIXELS_WITHIN = 1.0  # … and where they have alpha, which tells edges of shape as finely
 MOST_VOXELS = 3_000_000
 MOST_RESOLUTION = 1024  # voxels along a side: what a ray needs to skip empty space is an array over all of the lattice
 VOXEL_BYTES = 500  # at the worst: rows of half-empty blocks, those that replace them, sums of what rays ask for
@@ -38,7 +39,7 @@ LEAST_STEP = 1.2  # what is gained by less is not worth a lattice
 @torch.no_grad()
 def finer_colours(field: Field, views: Views, depth: float, progress: Progress = SILENT, engine: str = "auto") -> Field:
     """A field of about the same densities whose colours were looked up again on ever finer lattices, each at most twice as fine as the one
-    before, until a voxel spans `PIXELS`; on the last of them twice.
+    before, until a voxel spans `PIXELS`, or with alpha `PIXELS_WITHIN`; on the last of them twice.
 
     Voxels that no ray of the pictures saw, nor lie beside one that a ray saw, are dropped on the way.
 
@@ -54,29 +55,31 @@ def finer_colours(field: Field, views: Views, depth: float, progress: Progress =
     focal = float(np.median([views.intrinsics[index].fx for index in train]))
     host = TorchHost(field.device)
     most = memory.bounded(MOST_VOXELS * VOXEL_BYTES) // VOXEL_BYTES
+    cut_out = any(alpha is not None for alpha in views.alpha)
+    wanted = focal / depth / (PIXELS_WITHIN if cut_out else PIXELS)
     own = False  # whether the field's rows were made here
     while True:
         field, seen = recoloured(field, views, depth, progress, engine, RELAXATION, in_place=own)
         kept = beside(field.topology, (seen > SEEN) & field.occupied) & field.occupied
-        resolution = _next(field, focal / depth, int(kept.sum()), most)
+        resolution = _next(field, wanted, int(kept.sum()), most)
         if resolution is None:
             return recoloured(field, views, depth, progress, engine, RELAXATION, in_place=True).field
         field, own = finer(field, kept, resolution, host), True
-        if any(alpha is not None for alpha in views.alpha):
+        if cut_out:
             field = inside_silhouettes(field, views, SILHOUETTE)
 
 
-def _next(field: Field, pixels: float, kept: int, most: int) -> int | None:
+def _next(field: Field, voxels: float, kept: int, most: int) -> int | None:
     """Resolution of the next lattice, None when this one is the last.
 
     Args:
-        pixels: that a working unit spans at the median depth.
+        voxels: wanted to a working unit.
         kept: voxels that would be divided.
         most: voxels that there may be afterwards.
     """
     if kept == 0:
         return None
-    whole, blocks = pixels * field.voxel_size / PIXELS, field.resolution / BLOCK
+    whole, blocks = voxels * field.voxel_size, field.resolution / BLOCK
     if whole < LEAST_STEP:
         return None
     step = whole ** (1 / math.ceil(math.log(whole, STEP)))  # even ones
