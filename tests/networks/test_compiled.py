@@ -74,6 +74,7 @@ def test_it_gives_what_the_tensors_give(views: int, monkeypatch: pytest.MonkeyPa
 def test_it_gives_what_the_tensors_give_within_silhouettes(monkeypatch: pytest.MonkeyPatch) -> None:
     quick = within()
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    monkeypatch.setattr("toolkit.networks.sweep.AT_ONCE", 100)
     for name, expected in within().items():
         torch.testing.assert_close(quick[name], expected, atol=1e-4, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
 

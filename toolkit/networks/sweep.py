@@ -29,7 +29,8 @@ PEAK = 2  # planes on either side of the likeliest one that count as the same de
 NOISE = 0.01  # of a depth that a sensor measured, as a part of it; at least as wide as planes lie apart
 TRUST = 0.98  # in a measured depth, against what the pictures say
 WHOLE = (0.0, 0.0, 1.0, 1.0)
-PART = 256  # pixels at a time, whose places then stay in the cache
+PART = 256  # pixels at a time, whose places then stay in a processor's cache
+AT_ONCE = 16384  # pixels whose descriptors are looked up at once as tensors: 0.3 GB a view
 LOST = 1e-4  # likelihood that is left where a silhouette takes the rest, below which nothing is known of where the surface is inside
 
 Empty = Callable[[Tensor], Tensor]  # (N, 3) points of the working frame → (N,) bool, for sure nothing there
@@ -157,7 +158,8 @@ def _compared(described: Sequence[Tensor], cameras: Cameras, near: float, far: f
     if empty is None:
         return Compared(cameras[0], world, inverses, _volume(_costs(described, cameras, inverses, rays, own), shape))
     depths, origin = (1 / inverses)[:, None], cameras.positions[0]
-    nothing = torch.cat([empty(torch.addcmul(origin, part[:, None], depths).view(-1, 3)) for part in world.split(PART)]).view(*shape, -1)
+    few = PART if world.device.type == "cpu" else AT_ONCE
+    nothing = torch.cat([empty(torch.addcmul(origin, part[:, None], depths).view(-1, 3)) for part in world.split(few)]).view(*shape, -1)
     camera, window, rows, columns = _cropped(cameras[0], ~nothing.all(2))
     nothing, rays, own, world = (
         values.view(*shape, -1)[rows, columns].reshape(-1, values.shape[-1]) for values in (nothing, rays, own, world)
@@ -195,9 +197,12 @@ def _costs(described: Sequence[Tensor], cameras: Cameras, inverses: Tensor, rays
         for view in range(1, len(cameras)):
             comparison.add(described[view], *_way(cameras, view), cameras.lens(view))
         return comparison.result(UNKNOWN)
-    found = [_warped(described[view], cameras, view, rays, inverses) for view in range(1, len(cameras))]
-    costs = torch.stack([difference(own[None], shown) for shown, _ in found])
-    return together(costs, torch.stack([seen for _, seen in found])).T
+    parts = []
+    for ray, mine in zip(rays.split(AT_ONCE), own.split(AT_ONCE), strict=True):
+        found = [_warped(described[view], cameras, view, ray, inverses) for view in range(1, len(cameras))]
+        costs = torch.stack([difference(mine[None], shown) for shown, _ in found])
+        parts.append(together(costs, torch.stack([seen for _, seen in found])).T)
+    return torch.cat(parts) if parts else rays.new_zeros((0, len(inverses)))
 
 
 def _volume(values: Tensor, shape: tuple[int, int]) -> Tensor:
