@@ -120,9 +120,9 @@ def test_encoded_pictures_are_kept_only_for_a_while(monkeypatch: pytest.MonkeyPa
     encoded: list[int] = []
     encode = model.encode
 
-    def counted(images: torch.Tensor, cameras: Cameras) -> object:
+    def counted(images: torch.Tensor, cameras: Cameras, side: int) -> object:
         encoded.append(len(images))
-        return encode(images, cameras)
+        return encode(images, cameras, side)
 
     monkeypatch.setattr(model, "encode", counted)
     views, keys = captured(KEPT_PICTURES + 4)
