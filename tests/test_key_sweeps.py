@@ -145,3 +145,18 @@ def test_no_depth_at_all_is_refused() -> None:
     views, keys = captured(3)
     with pytest.raises(ValueError, match="nearest or a farthest"):
         KeySweeps(views, keys, [[]] * 3, 0.0, float("inf"))
+
+
+def test_witnesses_and_silhouettes_together_are_refused() -> None:
+    views, keys = captured(3)
+    steps = fuse_views(
+        small_model().eval(),
+        views,
+        keys,
+        lattice(),
+        FusionOptions(1, NEAR, FAR),
+        empty=lambda points: points[:, 2] < 0,
+        witnesses=[[1], [0], [1]],
+    )
+    with pytest.raises(ValueError, match="one of the two"):
+        next(steps)

@@ -193,18 +193,21 @@ def fuse_views(
     Args:
         empty: see `Fusion`.
         witnesses: of each key frame, other ones (places among them, `key_sweeps.beside`) that its sweep is held against (not in the paper);
-            needs a nearest or a farthest depth.
+            needs a nearest or a farthest depth, and goes without `empty` (docs/few_views.md, "Within silhouettes").
 
     Raises:
         InputError: no key frames, or a lattice that does not fit the options.
         Interrupted: the user asked to stop.
+        ValueError: witnesses and what is empty were both given.
     """
+    if empty is not None and witnesses is not None:
+        raise ValueError("key frames are witnesses of each other where nothing is known to be empty; give one of the two")
     if len(key_frames.indices) == 0:
         raise InputError("there are no key frames to fuse; give more pictures")
     fusion = Fusion(model, lattice, options, empty)
     encoded = _Pictures(model, views, SIDE if empty is None else SIDE_WITHIN)
     near, far, measured = fusion.options.near, fusion.options.far, fusion.options.measured
-    sweeps = None if witnesses is None else KeySweeps(views, key_frames, witnesses, near, far, measured, empty, model.device)
+    sweeps = None if witnesses is None else KeySweeps(views, key_frames, witnesses, near, far, measured, model.device)
     for done, (key, neighbours) in enumerate(zip(key_frames.indices, key_frames.neighbours, strict=True)):
         progress.check()
         begin = time.perf_counter()

@@ -19,8 +19,8 @@ from toolkit.camera import Array, Intrinsics
 from toolkit.capture.types import Views
 from toolkit.keyframes import KeyFrames
 from toolkit.networks.cameras import Cameras
-from toolkit.networks.matching import SIDE, SIDE_WITHIN, describe
-from toolkit.networks.sweep import Compared, Empty, Sweep, compare, decide
+from toolkit.networks.matching import describe
+from toolkit.networks.sweep import Compared, Sweep, compare, decide
 from toolkit.networks.witness import Witness, certain, evidence, witness
 from toolkit.poses.overlap import overlap, parallax
 
@@ -60,7 +60,6 @@ class KeySweeps:
         near: float,
         far: float,
         measured: bool = False,
-        empty: Empty | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         """
@@ -68,14 +67,13 @@ class KeySweeps:
             witnesses: for each key frame, as `beside` gives them; none: its sweep alone.
             near, far: depths along z, working units; one of them known.
             measured: the depth that a sensor measured goes into a key frame's sweep.
-            empty: where there is for sure nothing.
 
         Raises:
             ValueError: neither depth is known.
         """
         if not (near > 0 or math.isfinite(far)):
             raise ValueError("sweeps need a nearest or a farthest depth")
-        self.views, self.keys, self.witnesses, self.empty = views, keys, witnesses, empty
+        self.views, self.keys, self.witnesses = views, keys, witnesses
         self.near, self.far, self.measured, self.device = near, far, measured, device
         self._described: Recent[Tensor] = Recent(KEPT_DESCRIPTORS)
         self._made: Recent[tuple[Compared | None, Witness, Tensor]] = Recent(KEPT)
@@ -93,13 +91,13 @@ class KeySweeps:
         group = together(int(self.keys.indices[at]), self.keys.neighbours[at])
         poses = self.views.world_from_camera[group]
         cameras = Cameras.of([self.views.intrinsics[index] for index in group], poses, self.device)
-        compared = compare([self._described.get(index, self._describe) for index in group], cameras, self.near, self.far, self.empty)
+        compared = compare([self._described.get(index, self._describe) for index in group], cameras, self.near, self.far)
         alone = decide(compared)
         depth = self._depth(at)
         return compared, witness(alone if depth is None else decide(compared, depth)), certain(compared, alone)
 
     def _describe(self, index: int) -> Tensor:
-        return describe(picture(self.views, index, self.device), SIDE if self.empty is None else SIDE_WITHIN)[0]
+        return describe(picture(self.views, index, self.device))[0]
 
     def _depth(self, at: int) -> Tensor | None:
         return sensed(self.views, int(self.keys.indices[at]), self.device) if self.measured else None

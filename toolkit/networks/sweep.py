@@ -107,12 +107,13 @@ class Compared:
     """How badly the pictures of a key view and its neighbours fit at planes, before anything is decided.
 
     Attributes:
-        camera: one.
+        camera: one, of the window alone.
         rays: (h · w, 3) of the working frame, through pixels of the key view, of unit depth along its axis.
         inverses: (D,) inverse depths of the planes, evenly spaced, ascending.
         cost: (D, h, w) in [0, 1].
         empty: (D, h, w) bool, where silhouettes say that there is nothing; None without any.
         window: left, upper, right and lower edge in the key view's whole picture, 0 to 1. Beyond it nothing is but what is `empty`.
+        spacing: pixels of the compared pictures from one to the next here.
     """
 
     camera: Cameras
@@ -121,16 +122,12 @@ class Compared:
     cost: Tensor
     empty: Tensor | None = None
     window: tuple[float, float, float, float] = WHOLE
+    spacing: int = SPACING
 
     @property
     def step(self) -> float:
         """Inverse depth between planes."""
         return float(self.inverses[1] - self.inverses[0])
-
-    @property
-    def spacing(self) -> int:
-        """Pixels of the compared pictures from one to the next here."""
-        return SPACING if self.empty is None else WITHIN
 
 
 @torch.no_grad()
@@ -153,7 +150,8 @@ def compare(described: Sequence[Tensor], cameras: Cameras, near: float, far: flo
 def _compared(described: Sequence[Tensor], cameras: Cameras, near: float, far: float, empty: Empty | None) -> Compared:
     """`compare`, with both ends known."""
     inverses = torch.linspace(1 / far, 1 / near, _planes(described, cameras, near, far), device=cameras.intrinsics.device)
-    rays, own, shape = _pixels(described[0], cameras, SPACING if empty is None else WITHIN)
+    spacing = SPACING if empty is None else WITHIN
+    rays, own, shape = _pixels(described[0], cameras, spacing)
     world = rays @ cameras.world_from_camera[0, :3, :3].T
     if empty is None:
         return Compared(cameras[0], world, inverses, _volume(_costs(described, cameras, inverses, rays, own), shape))
@@ -167,7 +165,7 @@ def _compared(described: Sequence[Tensor], cameras: Cameras, near: float, far: f
     shape = (rows.stop - rows.start, columns.stop - columns.start)
     some = (~nothing).any(1).nonzero().view(-1)
     cost = rays.new_full(nothing.shape, UNKNOWN).index_copy(0, some, _costs(described, cameras, inverses, rays[some], own[some]))
-    return Compared(camera, world, inverses, _volume(cost, shape), _volume(nothing, shape), window)
+    return Compared(camera, world, inverses, _volume(cost, shape), _volume(nothing, shape), window, spacing)
 
 
 def _cropped(camera: Cameras, wanted: Tensor) -> tuple[Cameras, tuple[float, float, float, float], slice, slice]:
