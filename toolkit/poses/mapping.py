@@ -72,7 +72,7 @@ def _model(reconstruction: pycolmap.Reconstruction, attempt: str) -> Model:
 
 def _incremental(job: Job, report: Report, loose: bool) -> list[pycolmap.Reconstruction]:
     options = pycolmap.IncrementalPipelineOptions()
-    # Threads race for the first pair and sum in any order, and gain a tenth of the time (docs/performance.md).
+    # With several the result depends on which is first now and then; they gain a tenth of the time (docs/performance.md).
     options.num_threads = 1 if len(job.pictures) <= REPEATABLE else job.threads
     options.random_seed = job.seed
     options.extract_colors = False  # pictures may be frames of a video or turned: the points are coloured later where needed
