@@ -57,6 +57,7 @@ class NetworkSettings:
     depth_from: str = "sensor"  # sensor (if the capture has one; the paper has none) | off
     agreement: bool = True  # key frames' plane sweeps are held against each other, but where there is alpha (not in the paper)
     recolour: bool = True  # colours of the result are looked up again in the training pictures, on finer lattices (not in the paper)
+    precision: str = "auto"  # of the networks' arithmetic: auto (bfloat16 where the processor multiplies it) | float32 | bfloat16
 
 
 @dataclass
@@ -153,6 +154,7 @@ CHOICES = {
     "poses.matching": ("auto", "exhaustive", "sequential"),
     "field.decoder": ("deferred", "per_sample"),
     "network.depth_from": ("sensor", "off"),
+    "network.precision": ("auto", "float32", "bfloat16"),
     "fit.depth_from": ("auto", "any", "sensor", "off"),
     "field.background": ("auto", "on", "off"),
     "field.view": ("auto", "full", "low", "none"),

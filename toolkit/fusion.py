@@ -24,6 +24,7 @@ from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
 from toolkit.networks.lattice import LatentVolume, Lattice
 from toolkit.networks.matching import SIDE, SIDE_WITHIN
 from toolkit.networks.model import NerfusionModel
+from toolkit.networks.precision import FLOAT32, computing
 from toolkit.networks.refine import adopt, children, merged, part, solid_cells, split_volume, surface_cells
 from toolkit.networks.store import GlobalStore
 from toolkit.networks.sweep import Empty, Sweep
@@ -45,6 +46,7 @@ class FusionOptions:
         gamma: coarse cells in which exp(−optical thickness) exceeds this are not looked at finer.
         prune_every: key frames after which blocks without such cells are forgotten.
         measured: the depth that a sensor measured for key frames goes into their sweep, where there is one (not in the paper).
+        precision: of the networks' arithmetic (`networks.precision`).
     """
 
     levels: int = 2
@@ -53,6 +55,7 @@ class FusionOptions:
     gamma: float = 0.95
     prune_every: int = 8
     measured: bool = False
+    precision: str = FLOAT32
 
 
 @dataclass(frozen=True)
@@ -164,8 +167,8 @@ class Fusion:
 class _Pictures:
     """Encoded pictures, the most recently used ones kept."""
 
-    def __init__(self, model: NerfusionModel, views: Views, side: int) -> None:
-        self.model, self.views, self.side = model, views, side
+    def __init__(self, model: NerfusionModel, views: Views, side: int, precision: str) -> None:
+        self.model, self.views, self.side, self.precision = model, views, side, precision
         self._kept: Recent[tuple[EncodedView, Cameras]] = Recent(KEPT_PICTURES)
 
     def __call__(self, index: int) -> tuple[EncodedView, Cameras]:
@@ -175,7 +178,8 @@ class _Pictures:
     def _encode(self, index: int) -> tuple[EncodedView, Cameras]:
         views, device = self.views, self.model.device
         cameras = Cameras.of([views.intrinsics[index]], views.world_from_camera[index : index + 1], device)
-        return self.model.encode(picture(views, index, device), cameras, self.side)[0], cameras
+        with computing(self.precision, device):
+            return self.model.encode(picture(views, index, device), cameras, self.side)[0], cameras
 
 
 def fuse_views(
@@ -205,7 +209,7 @@ def fuse_views(
     if len(key_frames.indices) == 0:
         raise InputError("there are no key frames to fuse; give more pictures")
     fusion = Fusion(model, lattice, options, empty)
-    encoded = _Pictures(model, views, SIDE if empty is None else SIDE_WITHIN)
+    encoded = _Pictures(model, views, SIDE if empty is None else SIDE_WITHIN, fusion.options.precision)
     near, far, measured = fusion.options.near, fusion.options.far, fusion.options.measured
     sweeps = None if witnesses is None else KeySweeps(views, key_frames, witnesses, near, far, measured, model.device)
     for done, (key, neighbours) in enumerate(zip(key_frames.indices, key_frames.neighbours, strict=True)):
@@ -215,7 +219,8 @@ def fuse_views(
         encode_seconds = time.perf_counter() - begin
         depth = sensed(views, int(key), model.device) if measured else None
         swept = None if sweeps is None else sweeps(done)
-        fusion.add([view for view, _ in group], Cameras.together([camera for _, camera in group]), depth, swept)
+        with computing(fusion.options.precision, model.device):
+            fusion.add([view for view, _ in group], Cameras.together([camera for _, camera in group]), depth, swept)
         if (done + 1) % fusion.options.prune_every == 0:
             fusion.prune()
         seconds = time.perf_counter() - begin

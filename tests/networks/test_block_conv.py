@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.networks.block_conv import BlockConv3d, block_conv3d
+from toolkit.networks.block_conv import BlockConv3d, _clear, block_conv3d
 from toolkit.volume.topology import VOXELS, Topology
 
 
@@ -184,3 +184,16 @@ import toolkit.networks.block_conv, toolkit.volume.topology, toolkit.volume.edit
     root = Path(__file__).resolve().parents[2]
     done = subprocess.run([sys.executable, "-c", code], check=False, cwd=root, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("kind", [torch.float64, torch.float32, torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("channels", [1, 3, 8])
+def test_rows_that_are_not_kept_are_zero_whatever_they_were(kind: torch.dtype, channels: int) -> None:
+    rows = torch.randn(64, channels).to(kind)
+    rows[::5] = torch.nan
+    rows[1::7] = -torch.inf
+    kept = torch.rand(64) < 0.5
+    expected = rows.clone()
+    expected[~kept] = 0
+    _clear(rows, kept)
+    assert torch.equal(rows.nan_to_num(17.0), expected.nan_to_num(17.0))

@@ -6,6 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from toolkit.networks import compiled_lookup
 from toolkit.networks.pyramid import Pyramid
 
 
@@ -53,3 +54,36 @@ def test_gradient() -> None:
     pixels = torch.rand(7, 2, dtype=torch.float64) * 4
     footprint = torch.tensor([1.0, 1.0, 2.0, 2.0, 8.0, 0.1, 1.0], dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda x: Pyramid.of(x, 1, 2).lookup(pixels, footprint), (image,))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([1, 2, 4]), st.integers(1, 4), st.integers(1, 9))
+def test_the_kernel_gives_the_same(seed: int, stride: int, levels: int, channels: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    pyramid = Pyramid.of(torch.randn((channels, 16, 24), generator=generator), stride, levels)
+    pixels = (torch.rand((5000, 2), generator=generator) * 1.4 - 0.2) * stride * torch.tensor([24.0, 16.0])
+    footprint = torch.exp(2 * torch.randn(5000, generator=generator))
+    out = torch.full((5000, channels + 3), 7.0)
+    assert compiled_lookup.fits([pyramid.rows], pixels, footprint)
+    pyramid.lookup_into(pixels, footprint, out, 2)
+    torch.testing.assert_close(out[:, 2 : channels + 2], pyramid.lookup(pixels, footprint), atol=1e-5, rtol=1e-5)
+    assert bool((out[:, :2] == 7).all()) and bool((out[:, channels + 2 :] == 7).all()), "the other columns are not its own"
+
+
+def test_the_kernel_is_for_numbers_that_it_knows_and_for_nobody_who_wants_gradients() -> None:
+    rows, pixels = torch.rand(4, 3, requires_grad=True), torch.rand(2, 2)
+    assert not compiled_lookup.fits([rows], pixels)
+    with torch.no_grad():
+        assert compiled_lookup.fits([rows], pixels)
+    assert not compiled_lookup.fits([rows.detach().bfloat16()], pixels)
+    assert not compiled_lookup.fits([rows.detach()], pixels.double())
+
+
+def test_the_kernel_reads_nothing_beyond_for_places_out_of_this_world() -> None:
+    pyramid = Pyramid.of(torch.rand(2, 4, 6), 2, 2)
+    nan, inf = torch.nan, torch.inf
+    pixels = torch.tensor([[nan, 1.0], [inf, -inf], [1e30, -1e30], [3.0, nan], [3.0, 3.0], [3.0, 3.0]])
+    footprint = torch.tensor([1.0, inf, 1e30, nan, nan, -1.0])
+    out = torch.zeros(6, 2)
+    pyramid.lookup_into(pixels, footprint, out)
+    assert bool(((out[1:3] >= 0) & (out[1:3] <= 1)).all()) and bool(((out[4:] >= 0) & (out[4:] <= 1)).all())

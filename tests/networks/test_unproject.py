@@ -17,7 +17,7 @@ from toolkit.camera import project as project_one
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
 from toolkit.networks.lattice import Lattice
-from toolkit.networks.unproject import project
+from toolkit.networks.unproject import look_up, project
 from toolkit.volume.space import Space
 from toolkit.volume.topology import Topology
 
@@ -110,3 +110,29 @@ def test_depth_limits_and_what_is_behind() -> None:
     assert bool(torch.isfinite(seen.footprint).all())
     world = invert(np.eye(4))
     assert world.shape == (4, 4)
+
+
+def test_what_views_show_is_the_same_with_gradients_and_without() -> None:
+    world = np.stack([random_pose(np.random.default_rng(seed)) for seed in range(3)])
+    seen_by = Cameras.of([INTRINSICS] * 3, world)
+    with torch.no_grad():
+        views = small_model().eval().encode(pictures(3), seen_by)
+    points = torch.randn((300, 3), generator=torch.Generator().manual_seed(0)) * 2
+    projection, step = project(points, torch.full((300,), 0.1), seen_by, 0.3, 2.5), torch.linspace(0.1, 9.0, 300)
+    assert 0 < float(projection.visible.float().mean()) < 1
+    quick = look_up(views, projection, step)
+    asked = [replace(view, features=replace(view.features, rows=view.features.rows.requires_grad_())) for view in views]
+    slow = look_up(asked, projection, step)
+    assert slow.requires_grad and not quick.requires_grad
+    torch.testing.assert_close(quick, slow.detach(), atol=1e-5, rtol=1e-5)
+
+
+def test_fewer_digits_move_no_pixel() -> None:
+    seen_by = cameras(3)
+    points = torch.randn((500, 3), generator=torch.Generator().manual_seed(1))
+    pixels = torch.rand((50, 2)) * torch.tensor([WIDTH, HEIGHT])
+    exact = project(points, torch.full((500,), 0.1), seen_by, 0.3, 2.5), seen_by.directions(1, pixels)
+    with torch.autocast("cpu", torch.bfloat16):
+        low = project(points, torch.full((500,), 0.1), seen_by, 0.3, 2.5), seen_by.directions(1, pixels)
+    assert torch.equal(low[0].pixels, exact[0].pixels) and torch.equal(low[0].visible, exact[0].visible)
+    assert torch.equal(low[1], exact[1])

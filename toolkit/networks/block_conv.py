@@ -19,6 +19,7 @@ from toolkit.volume.topology import BLOCK, HALO, VOXELS, Topology
 DEFAULT_CHUNK = 64  # blocks at a time: 4 MB of halo at 16 channels in float32
 FEW = 4096  # blocks up to which the halo's rows (4 kB a block) are kept for the next convolution on the same topology
 _ONES, _ZEROS = [1, 1, 1], [0, 0, 0]
+_WHOLE = {2: torch.int16, 4: torch.int32, 8: torch.int64}  # numbers of so many bytes
 
 
 class BlockConv3d(nn.Module):
@@ -99,6 +100,12 @@ def _cubes(rows: Tensor) -> Tensor:
     return rows.view(-1, BLOCK, BLOCK, BLOCK, rows.shape[1]).permute(0, 4, 1, 2, 3)
 
 
+def _clear(rows: Tensor, kept: Tensor) -> None:
+    """Set rows that are not kept to zero, in place: by their bits, since a product with a mask takes five times as long in bfloat16."""
+    kind = _WHOLE[rows.element_size()]
+    rows.view(kind).bitwise_and_(kept.to(kind).neg_()[:, None])
+
+
 def _convolve(rows: Tensor, weight: Tensor, bias: Tensor | None, topology: Topology, occupied: Tensor | None, chunk: int) -> Tensor:
     """(M · 512 + 1, C) → (M · 512 + 1, C')."""
     out = rows.new_empty((topology.zero_row + 1, len(weight)))
@@ -111,7 +118,7 @@ def _convolve(rows: Tensor, weight: Tensor, bias: Tensor | None, topology: Topol
         part = F.conv3d(_haloed(rows, topology, start, stop, buffer), weight, bias)
         _cubes(out[start * VOXELS : stop * VOXELS]).copy_(part)
     if occupied is not None:
-        out[:-1].mul_(occupied[:, None])
+        _clear(out[:-1], occupied)
     return out
 
 
@@ -144,7 +151,7 @@ class _BlockConv(torch.autograd.Function):
             padded = gradient.new_zeros((topology.zero_row + 1, gradient.shape[1]), dtype=kind)
             padded[:-1] = gradient[: topology.zero_row]
             if occupied is not None:
-                padded[:-1].mul_(occupied[:, None])
+                _clear(padded[:-1], occupied)
             to_rows = to_weight = to_bias = None
             if ctx.needs_input_grad[0]:
                 flipped = weight.to(kind).flip(2, 3, 4).transpose(0, 1)

@@ -73,11 +73,13 @@ class Cameras:
     def local(self, points: Tensor) -> Tensor:
         """(N, 3) working frame → (K, N, 3) camera axes."""
         rotation = self.world_from_camera[:, :3, :3]
-        # Subtract first: differences are small numbers, products with a far origin are not.
-        return (points[None] - self.positions[:, None]) @ rotation
+        # Subtract first: differences are small numbers, products with a far origin are not. In bfloat16 a pixel would be lost.
+        with torch.autocast(points.device.type, enabled=False):
+            return (points[None] - self.positions[:, None]) @ rotation
 
     def directions(self, view: int, pixels: Tensor) -> Tensor:
         """(N, 2) pixels of one view → (N, 3) unit directions in the working frame."""
         fx, fy, cx, cy = self.intrinsics[view].unbind()
         ray = torch.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, torch.ones_like(pixels[:, 0])], 1)
-        return torch.nn.functional.normalize(ray @ self.world_from_camera[view, :3, :3].T, dim=1)
+        with torch.autocast(pixels.device.type, enabled=False):
+            return torch.nn.functional.normalize(ray @ self.world_from_camera[view, :3, :3].T, dim=1)

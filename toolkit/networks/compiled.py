@@ -8,8 +8,6 @@ Results equal those of the tensors to rounding (tests compare them), whatever th
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -18,12 +16,14 @@ from numba import njit
 from torch import Tensor
 
 from toolkit.stereo.smooth import PATHS, summed_paths
+from toolkit.threads import share, slices
 
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "nsz", "arcp"}}
 F = np.float32
 COLOURS, PATCH = 3, 18  # of a descriptor
 WIDE, WHOLE = 24, 28  # as kept here: patches and zeros up to whole vectors, then colours
 FEW = 4096  # below which threads do not pay
+PIECES = 8  # a thread
 
 
 def fits(*values: Tensor) -> bool:
@@ -31,7 +31,7 @@ def fits(*values: Tensor) -> bool:
     return all(value.device.type == "cpu" and value.dtype == torch.float32 for value in values)
 
 
-def _array(values: Tensor) -> Any:
+def array(values: Tensor) -> Any:
     """What a kernel takes; no copy where it lies in memory as it should."""
     return values.detach().contiguous().numpy()
 
@@ -39,13 +39,7 @@ def _array(values: Tensor) -> Any:
 def spread(work: Callable[[slice], Any], count: int) -> None:
     """Do `work` on `count` things, on as many threads as torch has."""
     threads = torch.get_num_threads() if count >= FEW else 1
-    edges = np.linspace(0, count, threads + 1).astype(int)
-    parts = [slice(int(low), int(high)) for low, high in pairwise(edges)]
-    if threads == 1:
-        work(parts[0])
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(work, parts))
+    share(work, slices(count, PIECES * threads if threads > 1 else 1), threads)
 
 
 @njit(**OPTIONS)
@@ -115,7 +109,7 @@ class Comparison:
     """
 
     def __init__(self, own: Tensor, rays: Tensor, inverses: Tensor, gain: float) -> None:
-        self.own, self.rays, self.inverses, self.gain = _array(widened(own)), _array(rays), _array(inverses), F(gain)
+        self.own, self.rays, self.inverses, self.gain = array(widened(own)), array(rays), array(inverses), F(gain)
         shape = (len(own), len(inverses))
         self.cost, self.least, self.seen = np.zeros(shape, np.float32), np.ones(shape, np.float32), np.zeros(shape, np.uint16)
 
@@ -127,8 +121,8 @@ class Comparison:
             turn, shift: (3, 3), (3,): camera axes → the other's, row vectors, the shift for points at unit depth.
             lens: (6,) fx, fy, cx, cy, width, height of its pictures.
         """
-        other = _array(widened(described.flatten(1).T).view(*described.shape[1:], WHOLE))
-        given = [other, *(_array(values) for values in (turn, shift, lens))]
+        other = array(widened(described.flatten(1).T).view(*described.shape[1:], WHOLE))
+        given = [other, *(array(values) for values in (turn, shift, lens))]
 
         def part(p: slice) -> None:
             view, *rest = given
@@ -144,10 +138,10 @@ class Comparison:
 
 def semi_global(cost: Tensor, small: float, large: float) -> Tensor:
     """`matching.semi_global` of float32 costs (D, h, w) of at least three planes on the CPU, by the kernel of matching; pixel-major."""
-    volume = _array(cost.permute(1, 2, 0))
+    volume = array(cost.permute(1, 2, 0))
     even = np.zeros(volume.shape[:2], np.float32)  # depth may step anywhere
-    with ThreadPoolExecutor(min(2, torch.get_num_threads())) as pool:
-        one, other = pool.map(lambda paths: summed_paths(volume, even, small, large, paths), (PATHS[:2], PATHS[2:4]))
+    pairs, threads = (PATHS[:2], PATHS[2:4]), min(2, torch.get_num_threads())
+    one, other = share(lambda paths: summed_paths(volume, even, small, large, paths), pairs, threads)
     one += other
     one /= F(4)
     return torch.from_numpy(one).permute(2, 0, 1)
@@ -178,7 +172,7 @@ def _carve(likely: Any, empty: Any, lost: Any, out: Any) -> None:
 def carved(likely: Tensor, empty: Tensor, lost: float) -> Tensor:
     """`sweep.carved` of float32 likelihoods (D, h, w) on the CPU; `lost` is what is left of a pixel where nothing is known any more."""
     planes, height, width = likely.shape
-    given = _array(likely.permute(1, 2, 0).reshape(-1, planes)), _array(empty.permute(1, 2, 0).reshape(-1, planes).view(torch.uint8))
+    given = array(likely.permute(1, 2, 0).reshape(-1, planes)), array(empty.permute(1, 2, 0).reshape(-1, planes).view(torch.uint8))
     out = np.empty((height * width, planes), np.float32)
     spread(lambda p: _carve(given[0][p], given[1][p], F(lost), out[p]), height * width)
     return torch.from_numpy(out).view(height, width, planes).permute(2, 0, 1)
@@ -207,14 +201,14 @@ def _fill(likely: Any, step: Any, width: int, table: Any) -> None:
 def table(likely: Tensor, step: float, peak: int) -> Tensor:
     """`sweep._table` of float32 likelihoods (D, h, w) on the CPU: (3, D, h, w), in memory (h, w, D, 3)."""
     planes, height, width = likely.shape
-    given = _array(likely.permute(1, 2, 0).reshape(-1, planes))
+    given = array(likely.permute(1, 2, 0).reshape(-1, planes))
     out = np.empty((height * width, planes, 3), np.float32)
     spread(lambda p: _fill(given[p], F(step), min(2 * peak + 1, planes), out[p]), height * width)
     return torch.from_numpy(out).view(height, width, planes, 3).permute(3, 2, 0, 1)
 
 
 @njit(**OPTIONS)
-def _between(table: Any, x: Any, y: Any, d: Any, channel: int) -> Any:
+def between(table: Any, x: Any, y: Any, d: Any, channel: int) -> Any:
     """Trilinear value of (h, w, D, C) at pixels and planes with whole numbers at their centres; beyond the border the border's."""
     height, width, planes = table.shape[0], table.shape[1], table.shape[2]
     x, y, d = min(max(x, F(0)), F(width - 1)), min(max(y, F(0)), F(height - 1)), min(max(d, F(0)), F(planes - 1))
@@ -242,12 +236,12 @@ def _look(points: Any, truncation: Any, table: Any, pose: Any, lens: Any, lowest
         y = ((px * pose[0, 1] + py * pose[1, 1] + pz * pose[2, 1]) * inverse * lens[1] + lens[3]) / lens[5] * height - F(0.5)
         half = inverse * min(truncation[n] / depth, F(0.9))
         near, far = (inverse + half - lowest) / step, (inverse - half - lowest) / step
-        nearer = _between(table, x, y, near, 0)
-        first = _between(table, x, y, near, 1) - max(-near, F(0)) * step
-        last = _between(table, x, y, far, 1) - max(-far, F(0)) * step
+        nearer = between(table, x, y, near, 0)
+        first = between(table, x, y, near, 1) - max(-near, F(0)) * step
+        last = between(table, x, y, far, 1) - max(-far, F(0)) * step
         out[n, 0] = min(max(F(1) - (first - last) / half, F(-1)), F(1))
         out[n, 1] = min(max(F(1) - nearer, F(0)), F(1))
-        out[n, 2] = min(max(_between(table, x, y, near, 2), F(0)), F(1))
+        out[n, 2] = min(max(between(table, x, y, near, 2), F(0)), F(1))
 
 
 def look(points: Tensor, truncation: Tensor, table: Tensor, pose: Tensor, lens: Tensor, lowest: float, step: float) -> Tensor:
@@ -257,33 +251,7 @@ def look(points: Tensor, truncation: Tensor, table: Tensor, pose: Tensor, lens: 
         pose: (4, 4) of the camera.
         lens: (6,) fx, fy, cx, cy, width, height of its pictures.
     """
-    given = [_array(values) for values in (points, truncation.expand(len(points)), table.permute(2, 3, 1, 0), pose, lens)]
+    given = [array(values) for values in (points, truncation.expand(len(points)), table.permute(2, 3, 1, 0), pose, lens)]
     out = np.empty((len(points), 3), np.float32)
     spread(lambda n: _look(given[0][n], given[1][n], *given[2:], F(lowest), F(step), out[n]), len(points))
     return torch.from_numpy(out)
-
-
-@njit(**OPTIONS)
-def _ask(points: Any, says: Any, pose: Any, lens: Any, lowest: Any, step: Any, said: Any, seen: Any) -> None:
-    """`Witness.ask`."""
-    height, width = F(says.shape[0]), F(says.shape[1])
-    for n in range(len(points)):
-        said[n], seen[n] = F(0), False
-        px, py, pz = points[n, 0] - pose[0, 3], points[n, 1] - pose[1, 3], points[n, 2] - pose[2, 3]
-        depth = px * pose[0, 2] + py * pose[1, 2] + pz * pose[2, 2]
-        if not depth > F(1e-4):
-            continue
-        inverse = F(1) / depth
-        u = ((px * pose[0, 0] + py * pose[1, 0] + pz * pose[2, 0]) * inverse * lens[0] + lens[2]) / lens[4]
-        v = ((px * pose[0, 1] + py * pose[1, 1] + pz * pose[2, 1]) * inverse * lens[1] + lens[3]) / lens[5]
-        if u >= F(0) and u <= F(1) and v >= F(0) and v <= F(1):
-            seen[n] = True
-            said[n] = _between(says, u * width - F(0.5), v * height - F(0.5), (inverse - lowest) / step, 0)
-
-
-def ask(points: Tensor, says: Tensor, pose: Tensor, lens: Tensor, lowest: float, step: float) -> tuple[Tensor, Tensor]:
-    """(N,) what a witness says (D, h, w) of the points, and (N,) bool whether it sees them; pose and lens as in `look`."""
-    given = [_array(values) for values in (points, says.permute(1, 2, 0)[..., None], pose, lens)]
-    said, seen = np.empty(len(points), np.float32), np.empty(len(points), np.bool_)
-    spread(lambda n: _ask(given[0][n], *given[1:], F(lowest), F(step), said[n], seen[n]), len(points))
-    return torch.from_numpy(said), torch.from_numpy(seen)

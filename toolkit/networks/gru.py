@@ -84,7 +84,7 @@ class FusionGRU(nn.Module):
         update, reset = self._gates(both, topology, inside)
         z, r = torch.sigmoid(update - known), torch.sigmoid(reset)
         candidate = torch.tanh(raw + held(self.candidate(torch.cat([r * state, local], 1), topology, inside)))
-        return (1 - z) * state + z * candidate
+        return torch.lerp(state, candidate, z)
 
     def _gates(self, both: Tensor, topology: Topology, inside: Tensor) -> list[Tensor]:
         """M_z and M_r of [H, V]; their first convolutions are one, which costs as much as either alone."""
@@ -114,4 +114,4 @@ class RunningMean(nn.Module):
     ) -> Tensor:
         """See `FusionGRU.forward`."""
         z = mean_gate(count, weight, self.most)
-        return (1 - z) * state + z * local
+        return torch.lerp(state, local, z)

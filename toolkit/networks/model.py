@@ -98,7 +98,7 @@ class NerfusionModel(nn.Module):
             cameras: V cameras for exactly these pictures.
             side: pixels of the long side at which they are compared.
         """
-        maps = self.sample(*self.encoder.maps(images))
+        maps = self.sample(*self.encoder.maps(images)).float()  # variances are looked for in them
         whole, described = padded((images - 0.5) * COLOUR_GAIN), describe(images, side)
         views = []
         for index in range(len(images)):
@@ -225,7 +225,7 @@ class NerfusionModel(nn.Module):
         mask = torch.cat([count > 0, inside.new_zeros(1)])[:, None]
         before = part.rows * mask
         z = mean_gate(count, local.weight)
-        rows = (1 - z) * before + z * local.rows
+        rows = torch.lerp(before, local.rows, z)
         busy, place, inner = local.busy, local.place, local.place[:-1]
         after = self.fusion(before[place], count[inner], local.rows[place], local.raw[place], local.weight[inner], busy, inside[inner])
         return replace(part, rows=rows.index_copy(0, place, after), count=count + local.weight)

@@ -14,6 +14,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from toolkit.networks import compiled_lookup
+
 
 @dataclass(frozen=True)
 class Pyramid:
@@ -75,6 +77,10 @@ class Pyramid:
         weights = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], 1)
         found: Tensor = _Lookup.apply(self.rows, rows, weights)
         return found
+
+    def lookup_into(self, pixels: Tensor, footprint: Tensor, out: Tensor, first: int = 0) -> None:
+        """`lookup` into columns `first` … of `out` (N, C'), where `compiled_lookup.fits`; nothing of it is differentiable."""
+        compiled_lookup.look_up(self.rows, self.sizes, self.stride, pixels, footprint, out, first)
 
 
 class _Lookup(torch.autograd.Function):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from toolkit.networks import compiled_lookup
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.pyramid import Pyramid
 
@@ -80,8 +81,22 @@ def look_up(views: Sequence[EncodedView], projection: Projection, step: Tensor) 
     Returns:
         (K, N, C): features and direction code (F), colour at the size of the step (3), colour for the voxel (3).
     """
+    tables = [pyramid.rows for view in views for pyramid in (view.features, view.colours)]
+    if compiled_lookup.fits(tables, projection.pixels, step, projection.footprint):
+        return _filled(views, projection, step)
     parts = []
     for view, pixels, footprint in zip(views, projection.pixels, projection.footprint, strict=True):
         fine = [view.features.lookup(pixels, step), view.colours.lookup(pixels, step)]
         parts.append(torch.cat([*fine, view.colours.lookup(pixels, COLOURED * footprint)], 1))
     return torch.stack(parts)
+
+
+def _filled(views: Sequence[EncodedView], projection: Projection, step: Tensor) -> Tensor:
+    """The same without gradients: one tensor, into which kernels write."""
+    features, colours = views[0].features.rows.shape[1], views[0].colours.rows.shape[1]
+    out = step.new_empty((len(views), len(step), features + 2 * colours))
+    for view, pixels, footprint, into in zip(views, projection.pixels, projection.footprint, out, strict=True):
+        view.features.lookup_into(pixels, step, into)
+        view.colours.lookup_into(pixels, step, into, features)
+        view.colours.lookup_into(pixels, COLOURED * footprint, into, features + colours)
+    return out

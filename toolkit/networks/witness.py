@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from toolkit.networks import compiled
+from toolkit.networks import compiled, compiled_witness
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.sweep import Compared, Sweep
 
@@ -47,7 +47,7 @@ class Witness:
         """(N, 3) points of the working frame → (N,) what is said, 0 where the witness does not look, and (N,) bool where it does."""
         if compiled.fits(points, self.says):
             pose, lens = self.camera.world_from_camera[0], self.camera.lens(0)
-            return compiled.ask(points, self.says, pose, lens, self.lowest, self.step)
+            return compiled_witness.ask(points, self.says, pose, lens, self.lowest, self.step)
         local = self.camera.local(points)[0]
         seen = local[:, 2] > 1e-4
         inverse = 1 / torch.where(seen, local[:, 2], torch.ones_like(local[:, 2]))
@@ -101,10 +101,21 @@ def evidence(compared: Compared, witnesses: Sequence[Witness], surface: Tensor |
     planes, height, width = compared.cost.shape
     coarse = [-(-side // SPACING) for side in (height, width)]
     rays = F.interpolate(compared.rays.T.view(1, 3, height, width), coarse, mode="bilinear").view(3, -1).T.contiguous()
-    points = (rays[:, None] / compared.inverses[:, None] + compared.camera.positions[0]).reshape(-1, 3)
+    beliefs = [1.0 if surface is None else credit(one, surface) for one in witnesses]
+    mean = SHARE * _mean(rays, compared.inverses, compared.camera.positions[0], witnesses, beliefs)
+    return F.interpolate(mean.view(1, *coarse, planes).permute(0, 3, 1, 2), (height, width), mode="bilinear")[0]
+
+
+def _mean(rays: Tensor, inverses: Tensor, origin: Tensor, witnesses: Sequence[Witness], beliefs: Sequence[float]) -> Tensor:
+    """(P, D) what witnesses that look there say in the mean, each by how far it is believed, along rays (P, 3) at inverse depths (D,)."""
+    if compiled.fits(rays, inverses, *(one.says for one in witnesses)):
+        asked = compiled_witness.Question(rays, inverses, origin)
+        for one, belief in zip(witnesses, beliefs, strict=True):
+            asked.put(one.says, one.camera.world_from_camera[0], one.camera.lens(0), one.lowest, one.step, belief)
+        return asked.mean()
+    points = (rays[:, None] / inverses[:, None] + origin).reshape(-1, 3)
     total, count = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
-    for one in witnesses:
+    for one, belief in zip(witnesses, beliefs, strict=True):
         said, seen = one.ask(points)
-        total, count = total + (1.0 if surface is None else credit(one, surface)) * said, count + seen
-    mean = (SHARE * total / count.clamp_min(1)).view(1, *coarse, planes).permute(0, 3, 1, 2)
-    return F.interpolate(mean, (height, width), mode="bilinear")[0]
+        total, count = total + belief * said, count + seen
+    return (total / count.clamp_min(1)).view(len(rays), -1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +14,7 @@ from toolkit.render.bake import BakedField
 from toolkit.render.bake_tiles import TILE, render_tiles
 from toolkit.render.image import SOLID, Rendered
 from toolkit.render.sky import on_sky
+from toolkit.threads import share
 
 STOP = 1e-2  # a ray ends where less than this part of the light is left, and what it saw stands for all of it
 THRESHOLD = 5e-3  # samples of smaller weight lend no colour
@@ -63,11 +63,7 @@ class BakedRenderer:
         def part(piece: int) -> Any:
             return render_tiles(*fixed, (cuts[piece], cuts[piece + 1]), self.limits, out)
 
-        if self.threads == 1:
-            counts = [part(0)]
-        else:
-            with ThreadPoolExecutor(self.threads) as pool:
-                counts = list(pool.map(part, range(pieces)))
+        counts = share(part, range(pieces), self.threads)
         looked, coloured, walked = (sum(count[i] for count in counts) for i in range(3))
         if self.field.sky is not None:
             _, directions, _ = rays(intrinsics, world_from_camera, pixel_grid(width, height))

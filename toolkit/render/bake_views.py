@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from toolkit.render.compiled import make_space, make_volume
 from toolkit.render.composite import STOP
 from toolkit.render.field import Field
 from toolkit.render.kernels_march import march_ray
+from toolkit.threads import share
 
 SEEN = 0.01  # largest weight below which a voxel is left out
 MOST_RAYS = 3_000_000  # of all views together; of more pixels a regular part is looked at
@@ -75,7 +75,6 @@ def seen_voxels(
                 progress.update(view, len(cameras), "looking where training views look")
             mark_pass(space, volume, cameras, poses, view, view + 1, stride, np.float32(STOP), marks[thread])
 
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(part, range(threads)))
+    share(part, range(threads), threads)
     progress.check()
     return torch.from_numpy((marks.max(0) >> 4) > least * 4095)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from toolkit.render.field import Field
 from toolkit.render.kernels_decode import decode, encode_direction
 from toolkit.render.kernels_lookup import gather_row
 from toolkit.render.kernels_march import march_ray
+from toolkit.threads import share
 from toolkit.volume.topology import VOXELS
 
 Tensor = torch.Tensor
@@ -152,10 +152,5 @@ class CompiledRenderer:
 
         size = max(min(PIECE, len(out) // self.threads), 1)
         pieces = [slice(start, start + size) for start in range(0, len(out), size)]
-        if self.threads == 1 or len(pieces) == 1:
-            for piece in pieces:
-                part(piece)
-        else:
-            with ThreadPoolExecutor(self.threads) as pool:
-                list(pool.map(part, pieces))
+        share(part, pieces, self.threads)
         return torch.from_numpy(out)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from toolkit.render.field import Field
 from toolkit.render.kernels_matrix import LANES
 from toolkit.render.kernels_net import BATCH, Net, Tape, decode_colours, make_tape
 from toolkit.render.kernels_per_sample import NEGLIGIBLE, march_ray
+from toolkit.threads import share
 
 Tensor = torch.Tensor
 Array = np.ndarray[Any, Any]
@@ -151,10 +151,5 @@ class PerSampleRenderer:
 
         size = max(min(PIECE, len(out) // self.threads), 1)
         pieces = [slice(start, start + size) for start in range(0, len(out), size)]
-        if self.threads == 1 or len(pieces) == 1:
-            for piece in pieces:
-                part(piece)
-        else:
-            with ThreadPoolExecutor(self.threads) as pool:
-                list(pool.map(part, pieces))
+        share(part, pieces, self.threads)
         return torch.from_numpy(out)

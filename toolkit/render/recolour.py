@@ -8,7 +8,6 @@ every pixel's light is known to come from the samples of its ray, each by its we
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import NamedTuple, Protocol
 
@@ -23,6 +22,7 @@ from toolkit.progress import SILENT, Progress
 from toolkit.render.composite import SOLID, STOP, THRESHOLD, ray_sum
 from toolkit.render.differentiable import render_with_gradients
 from toolkit.render.field import Field
+from toolkit.threads import share
 from toolkit.volume.lookup import corners, scatter
 
 Tensor = torch.Tensor
@@ -168,11 +168,7 @@ class _Compiled:
             own = [values[edges[thread] : edges[thread + 1]] for values in given]
             project_back_pass(self.space, self.volume, self.decoder, *own, *limits, self.marks[thread], self.total[thread])
 
-        if self.threads == 1:
-            part(0)
-        else:
-            with ThreadPoolExecutor(self.threads) as pool:
-                list(pool.map(part, range(self.threads)))
+        share(part, range(self.threads), self.threads)
 
     def sums(self) -> tuple[Tensor, Tensor]:
         seen = (self.marks.max(0) >> 4).astype(np.float32) / 4095

@@ -24,6 +24,7 @@ from toolkit.keyframes import KeyFrames
 from toolkit.networks import weights
 from toolkit.networks.lattice import Lattice
 from toolkit.networks.model import NerfusionModel
+from toolkit.networks.precision import AUTO
 from toolkit.networks.weights import load_model
 from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
@@ -58,6 +59,7 @@ class NetworkOptions:
         measured: the views' depth goes into the key frames' sweeps.
         agreement: key frames' sweeps are held against each other, but for captures with alpha, where the visual hull is known.
         recolour: `Inference.result` looks colours up again in the training pictures (`finer_colours`).
+        precision: of the networks' arithmetic (`networks.precision`).
     """
 
     voxels: float | None = None
@@ -66,12 +68,14 @@ class NetworkOptions:
     measured: bool = False
     agreement: bool = True
     recolour: bool = True
+    precision: str = AUTO
 
     @classmethod
     def of(cls, settings: NetworkSettings) -> NetworkOptions:
         """As the settings say."""
         measured = settings.depth_from == "sensor"
-        return cls(settings.voxels, settings.levels, measured=measured, agreement=settings.agreement, recolour=settings.recolour)
+        switches = {"measured": measured, "agreement": settings.agreement, "recolour": settings.recolour}
+        return cls(settings.voxels, settings.levels, **switches, precision=settings.precision)
 
 
 def load_networks(path: Path | str | None = None, device: torch.device | str = "cpu") -> NerfusionModel:
@@ -144,7 +148,8 @@ class Inference:
         Raises:
             Interrupted: the user asked to stop.
         """
-        options = FusionOptions(self.options.levels, self.near, self.far, measured=self.options.measured)
+        measured, precision = self.options.measured, self.options.precision
+        options = FusionOptions(self.options.levels, self.near, self.far, measured=measured, precision=precision)
         # Things without texture that stand before nothing lead all sweeps astray in the same way; the hull knows better.
         agree = self.options.agreement and self.hull is None and (self.near > 0 or math.isfinite(self.far))
         witnesses = beside(self.keys, self.train.world_from_camera, self.train.intrinsics, self.median_depth) if agree else None

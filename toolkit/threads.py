@@ -1,0 +1,58 @@
+"""Work shared between threads by those who come for it.
+
+A thread that was just made, or woken, may start milliseconds late, or on a core where another one is at work (torch's own threads spin for
+a while after each operation); fixed shares would wait for it. So the calling thread works too, and each takes the next piece when it is
+done with one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import count, pairwise
+from typing import TypeVar
+
+T = TypeVar("T")
+R = TypeVar("R")
+MOST = 64  # threads beside the calling one
+_helpers = ThreadPoolExecutor(MOST, "helper")  # threads are made when they are first wanted
+
+
+def share(work: Callable[[T], R], pieces: Sequence[T], threads: int) -> list[R]:
+    """`[work(piece) for piece in pieces]` on so many threads, the calling one included.
+
+    Only what lets go of the interpreter (compiled code, NumPy, OpenCV) gains by it. `work` may call it again.
+
+    Raises:
+        whatever `work` raises; pieces that nobody has begun are left alone then.
+    """
+    if threads <= 1 or len(pieces) <= 1:
+        return [work(piece) for piece in pieces]
+    results: dict[int, R] = {}
+    turns = count()
+    failed = False
+
+    def help_out() -> None:
+        nonlocal failed
+        try:
+            while (turn := next(turns)) < len(pieces) and not failed:
+                results[turn] = work(pieces[turn])
+        except BaseException:
+            failed = True
+            raise
+
+    helpers = [_helpers.submit(help_out) for _ in range(min(threads, len(pieces)) - 1)]
+    try:
+        help_out()
+    finally:
+        begun = [helper for helper in helpers if not helper.cancel()]
+        errors = [error for helper in begun if (error := helper.exception()) is not None]
+    if errors:
+        raise errors[0]
+    return [results[turn] for turn in range(len(pieces))]
+
+
+def slices(length: int, pieces: int) -> list[slice]:
+    """`range(length)` in so many parts, as equal as can be; empty ones are left out."""
+    cuts = [length * i // pieces for i in range(pieces + 1)]
+    return [slice(low, high) for low, high in pairwise(cuts) if high > low]
