@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -18,7 +19,7 @@ from toolkit.render.composite import SOLID, THRESHOLD
 from toolkit.render.differentiable import render_with_gradients
 from toolkit.render.field import Field
 from toolkit.render.image import render_view
-from toolkit.render.recolour import COLOURS, MOST, STEEPEST, project_back, recoloured
+from toolkit.render.recolour import BESIDE, COLOURS, MOST, STEEPEST, project_back, recoloured
 from toolkit.volume.lookup import corners
 
 DEPTH = 2.4  # of the cameras around the sphere
@@ -200,6 +201,42 @@ def test_rays_are_bounded_by_leaving_pictures_out(monkeypatch: pytest.MonkeyPatc
     third = recoloured(grey(field), views, 100.0).field.feature_rows
     monkeypatch.undo()
     assert torch.equal(third, recoloured(grey(field), views.subset([0, 3, 6]), 100.0).field.feature_rows)
+
+
+def with_alpha(field: Field) -> Views:
+    """The same pictures with the field's own opacity as alpha, which leaves the corners of each see-through."""
+    views = pictures_of(field)
+    cameras = zip(views.intrinsics, views.world_from_camera, strict=True)
+    opacities = [render_view(field, camera, pose).opacity for camera, pose in cameras]
+    return replace(views, alpha=[(opacity > 0.5).astype(np.uint8) * 255 for opacity in opacities])
+
+
+def test_with_alpha_the_rays_that_count_are_those_that_show_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    field = painted()
+    views = with_alpha(field)
+    shown = sum(int(np.count_nonzero(alpha)) for alpha in views.alpha if alpha is not None)
+    assert 0.1 < shown / (8 * 64 * 64) < 0.9
+    everything = recoloured(grey(field), views, 100.0).field.feature_rows
+    monkeypatch.setattr("toolkit.render.recolour.MOST_RAYS", 1)  # that of captures without alpha
+    monkeypatch.setattr("toolkit.render.recolour.MOST_WITHIN", shown)
+    assert torch.equal(recoloured(grey(field), views, 100.0).field.feature_rows, everything)
+    monkeypatch.setattr("toolkit.render.recolour.MOST_WITHIN", shown - 1)
+    half = recoloured(grey(field), views.subset([0, 2, 4, 6]), 100.0).field.feature_rows
+    assert torch.equal(recoloured(grey(field), views, 100.0).field.feature_rows, half)
+
+
+def test_pixels_far_from_what_a_picture_shows_are_not_asked() -> None:
+    """And those just beside it are, so that what bulges over a silhouette gets the background's colour."""
+    field = painted()
+    views = with_alpha(field)
+    views = replace(views, alpha=[cv2.erode(alpha, np.ones((17, 17), np.uint8)) for alpha in views.alpha if alpha is not None])
+    expected = recoloured(grey(field), views, 100.0).field.feature_rows
+    for beside, same in ((BESIDE + 1, True), (1, False)):
+        spoilt = replace(views, images=[picture.copy() for picture in views.images])
+        for picture, alpha in zip(spoilt.images, views.alpha, strict=True):
+            assert alpha is not None
+            picture[cv2.dilate(alpha, np.ones((2 * beside - 1, 2 * beside - 1), np.uint8)) == 0] = 255
+        assert torch.equal(recoloured(grey(field), spoilt, 100.0).field.feature_rows, expected) == same
 
 
 def test_it_can_be_stopped() -> None:

@@ -29,10 +29,12 @@ Tensor = torch.Tensor
 COLOURS = 3  # the first features are logits of the colour
 CHUNK = 2048  # rays at a time, in torch
 PER_VOXEL = 1.2  # rays along a voxel's side: 1.7 give 0.1 dB more for twice the time
-MOST_RAYS = 2_000_000  # pictures are left out evenly until there are no more
+MOST_RAYS = 2_000_000  # pictures are left out evenly until there are no more …
+MOST_WITHIN = 4_000_000  # … with alpha of those that show something: every side of an object is seen by few of them
 STEEPEST = 0.05  # least slope of colour over logit that is divided by
 MOST = 2.0  # logits that a ray may ask for
 VALID = 0.99
+BESIDE = 4  # pixels beside what a picture shows within which it asks for its background's colour, about three voxels
 
 
 class Recoloured(NamedTuple):
@@ -94,7 +96,8 @@ def recoloured(
     worker: _Engine = _Compiled(field) if compiled else _Torch(field)
     train = [int(index) for index in np.flatnonzero(~np.asarray(views.test))]
     cameras = [_smaller(views.intrinsics[index], PER_VOXEL * depth / field.voxel_size) for index in train]
-    every = max(1, math.ceil(sum(camera.width * camera.height for camera in cameras) / MOST_RAYS))
+    wanted = sum(_shown(views, index, camera) for index, camera in zip(train, cameras, strict=True))
+    every = max(1, math.ceil(wanted / (MOST_WITHIN if any(alpha is not None for alpha in views.alpha) else MOST_RAYS)))
     chosen = list(zip(train, cameras, strict=True))[::every]
     for count, (index, camera) in enumerate(chosen):
         progress.update(count, len(chosen), "colours")
@@ -181,6 +184,12 @@ def _smaller(full: Intrinsics, focal: float) -> Intrinsics:
     return full.scaled(max(1, round(shrink * full.width)), max(1, round(shrink * full.height)))
 
 
+def _shown(views: Views, index: int, camera: Intrinsics) -> float:
+    """Pixels of a picture made as small as `camera` that are not see-through."""
+    alpha = views.alpha[index] if views.alpha else None
+    return camera.width * camera.height * (1.0 if alpha is None else float(np.count_nonzero(alpha)) / alpha.size)
+
+
 def _pixels(views: Views, index: int, camera: Intrinsics) -> tuple[Tensor, Tensor, Tensor]:
     """Origins, directions and colours (B, 3) of a picture made as small as `camera`, without what is masked."""
     shape = (camera.width, camera.height)
@@ -189,5 +198,9 @@ def _pixels(views: Views, index: int, camera: Intrinsics) -> tuple[Tensor, Tenso
     mask = views.valid[index] if views.valid else None
     if mask is not None:
         kept &= cv2.resize(np.asarray(mask, np.float32), shape, interpolation=cv2.INTER_AREA).ravel() > VALID
+    alpha = views.alpha[index] if views.alpha else None
+    if alpha is not None:
+        near = cv2.dilate(cv2.resize(alpha, shape, interpolation=cv2.INTER_AREA), np.ones((2 * BESIDE + 1, 2 * BESIDE + 1), np.uint8))
+        kept &= near.ravel() > 0
     origins, directions, _ = rays(camera, views.world_from_camera[index], pixel_grid(*shape)[kept])
     return origins, directions, torch.from_numpy(picture[kept].astype(np.float32) / 255)
