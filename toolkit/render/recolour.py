@@ -82,7 +82,7 @@ def recoloured(
 
     Args:
         views: held-out ones are not looked at, nor masked pixels. Pictures with alpha ask for their background's colour where they are
-            see-through: what bulges over a silhouette shows best what is behind it.
+            see-through, up to `BESIDE` pixels from what they show: what bulges over a silhouette shows best what is behind it.
         depth: at which a voxel's size in pixels tells how densely rays are taken, working units.
         engine: auto | numba | torch. The compiled one runs on the CPU and knows the deferred decoder alone.
         relaxation: ω. With 1 every corner gets what its rays ask for in the mean, which is too little where neighbours are asked for the
@@ -191,7 +191,8 @@ def _shown(views: Views, index: int, camera: Intrinsics) -> float:
 
 
 def _pixels(views: Views, index: int, camera: Intrinsics) -> tuple[Tensor, Tensor, Tensor]:
-    """Origins, directions and colours (B, 3) of a picture made as small as `camera`, without what is masked."""
+    """Origins, directions and colours (B, 3) of a picture made as small as `camera`, without what is masked, or see-through and more than
+    `BESIDE` pixels from what is not."""
     shape = (camera.width, camera.height)
     picture = cv2.resize(views.images[index], shape, interpolation=cv2.INTER_AREA).reshape(-1, COLOURS)
     kept = np.ones(len(picture), bool)
