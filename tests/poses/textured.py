@@ -1,8 +1,10 @@
-"""Small pictures with known cameras: a corner of textured walls, and a panorama seen by a camera that only turns."""
+"""Small pictures with known cameras: a corner of textured walls, a post whose sides look alike, and a panorama seen by a camera that only
+turns."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -49,24 +51,43 @@ def arc(count: int, degrees: float = 50.0) -> Array:
     return np.array([look_at(eye, np.array([-0.1, -0.7, 2.0])) for eye in eyes])
 
 
-def render(pose: Array, camera: Intrinsics = CAMERA) -> tuple[Array, Array]:
-    """(H, W, 3) uint8 picture and (H, W) float32 z-depth of the planes; twofold supersampled."""
+def orbit(count: int, turns: float) -> Array:
+    """(count, 4, 4) cameras on a way around the post, at changing heights and distances."""
+    angles = np.radians(np.linspace(0, 360 * turns, count, endpoint=False))
+    far = 3 + 0.2 * np.sin(3 * angles)
+    eyes = np.stack([far * np.sin(angles), -1.2 + 0.3 * np.sin(2.3 * angles), -far * np.cos(angles)], axis=1)
+    return np.array([look_at(eye, np.array([0, -0.6, 0])) for eye in eyes])
+
+
+def post(sides: tuple[int, int, int, int]) -> list[tuple[Any, Any, Any, Array]]:
+    """Planes of a post with these textures on its sides, on a dull floor."""
+    w, h = 0.5, 1.4
+    floor = cv2.GaussianBlur((120 + 0.1 * texture(101).astype(np.float64)).astype(np.uint8), (0, 0), 1.0)
+    corners = [(-w, 0, -w), (w, 0, -w), (w, 0, w), (-w, 0, w)]
+    along = [(2 * w, 0, 0), (0, 0, 2 * w), (-2 * w, 0, 0), (0, 0, -2 * w)]
+    walls = [(corner, edge, (0, -h, 0), texture(side, 256)) for corner, edge, side in zip(corners, along, sides, strict=True)]
+    return [*walls, ((-w, -h, -w), (2 * w, 0, 0), (0, 0, 2 * w), texture(5, 256)), ((-4, 0, -4), (8, 0, 0), (0, 0, 8), floor)]
+
+
+def render(pose: Array, camera: Intrinsics = CAMERA, planes: list[tuple[Any, Any, Any, Array]] | None = None) -> tuple[Array, Array]:
+    """(H, W, 3) uint8 picture and (H, W) float32 z-depth of the planes (the corner's without any); twofold supersampled."""
+    planes = planes or [(*plane, texture(index)) for index, plane in enumerate(PLANES)]
     fine = camera.scaled(2 * camera.width, 2 * camera.height)
     v, u = np.mgrid[0 : fine.height, 0 : fine.width] + 0.5
     local = np.stack([(u - fine.cx) / fine.fx, (v - fine.cy) / fine.fy, np.ones_like(u)], axis=-1)
     rays = local @ pose[:3, :3].T
     depth = np.full(u.shape, np.inf)
     picture = np.full(u.shape, 90, np.uint8)
-    for index, (corner, first, second) in enumerate(PLANES):
+    for corner, first, second, painted in planes:
         corner, first, second = (np.array(values, float) for values in (corner, first, second))
         normal = np.cross(first, second)
         t = ((corner - pose[:3, 3]) @ normal) / (rays @ normal)
         hit = pose[:3, 3] + t[..., None] * rays - corner
         a, b = hit @ first / (first @ first), hit @ second / (second @ second)
         nearer = (t > 1e-6) & (t < depth) & (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1)
-        size = 512
+        size = len(painted)
         surface = cv2.remap(
-            texture(index), (a * size).astype(np.float32), (b * size).astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+            painted, (a * size).astype(np.float32), (b * size).astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
         )
         picture[nearer], depth[nearer] = surface[nearer], t[nearer]
     small = cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)

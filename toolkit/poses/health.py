@@ -206,6 +206,28 @@ def shortfalls(facts: dict[str, Any]) -> list[str]:
     return warnings
 
 
+def fold(facts: dict[str, Any], ordered: bool) -> list[str]:
+    """A warning when places that look alike were taken for one (`loops.without_folds`): what was done about it, or that nothing helped.
+
+    Args:
+        ordered: pictures that stand next to each other were taken one after the other. Else what did not help may well be no fold.
+    """
+    folded = facts.get("folded")
+    if folded is None:
+        return []
+    if folded["left"] < folded["contradicting"]:
+        return [
+            f"what is filmed looks alike from several sides: {folded['dropped']} of {folded['far']} matches between frames far apart "
+            f"contradict the way of the camera and were taken back"
+        ]
+    if not ordered:
+        return []
+    return [
+        f"{folded['contradicting']} pairs of neighbouring frames contradict the poses found: places that look alike may have been taken "
+        f"for one; film with more of what differs in view, such as the floor and things around"
+    ]
+
+
 def runs(names: Sequence[str], positions: Sequence[int]) -> list[str]:
     """Names of neighbouring positions gathered as `first to last`."""
     out: list[str] = []

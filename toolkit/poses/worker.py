@@ -61,7 +61,7 @@ def work(job_file: Path, mouth: Mouth) -> None:
     """
     from toolkit.files import write_json
     from toolkit.poses import database as store
-    from toolkit.poses import mapping
+    from toolkit.poses import loops, mapping
     from toolkit.poses.health import hopeless
     from toolkit.poses.job import Job
     from toolkit.poses.selection import choose_pairs
@@ -76,7 +76,7 @@ def work(job_file: Path, mouth: Mouth) -> None:
 
     database = store.open_database(job)
     records = store.extract(job, database, lambda done, total, note: mouth.progress("features", done, total, note))
-    facts: dict[str, Any] = {"pictures": records, "pairs": [], "attempts": [], "model": None}
+    facts: dict[str, Any] = {"pictures": records, "pairs": [], "attempts": [], "folded": None, "model": None}
     step("features")
     if hopeless(records) is None:
         pairs = choose_pairs(job, database, lambda done, total, note: mouth.progress("matching", 0, total, note))
@@ -85,8 +85,13 @@ def work(job_file: Path, mouth: Mouth) -> None:
         step("matching")
         database.close()
         if facts["pairs"]:
-            model, facts["attempts"] = mapping.map_pictures(job, lambda done, total, note: mouth.progress("mapping", done, total, note))
+
+            def report(done: float, total: float, note: str) -> None:
+                mouth.progress("mapping", done, total, note)
+
+            model, facts["attempts"] = mapping.map_pictures(job, report)
             if model is not None:
+                model, facts["attempts"], facts["folded"] = loops.without_folds(job, model, facts["attempts"], report)
                 facts["model"] = mapping.plain(model)
                 mapping.save_model(model, [picture.name for picture in job.pictures], Path(job.folder) / "model")
         step("mapping")

@@ -1,0 +1,157 @@
+"""Sides that look alike fold the way of the camera: noticed by neighbouring frames, and unfolded, with the real mapper."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from tests.poses.textured import aligned_error, orbit, post, render, write_capture
+from toolkit.config import PosesSettings
+from toolkit.poses import loops
+from toolkit.poses.health import fold
+from toolkit.poses.job import Job
+from toolkit.poses.mapping import Model, map_pictures, plain
+from toolkit.poses.result import PoseResult
+from toolkit.poses.sfm import find_poses
+
+FRAMES, TURNS = 40, 1.2
+POSES = orbit(FRAMES, TURNS)
+
+
+def silent(done: float, total: float, note: str) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def walked(tmp_path_factory) -> tuple[PoseResult, Path]:
+    """A post that looks the same from the front and the back, and from the left and the right."""
+    out = tmp_path_factory.mktemp("post")
+    pictures = [render(pose, planes=post((3, 4, 3, 4)))[0] for pose in POSES]
+    capture = write_capture(out / "photos", pictures, ordered=True)
+    return find_poses(capture, out, PosesSettings(max_features=800), seed=3, threads=1), out
+
+
+def test_a_post_with_two_sides_alike_is_walked_around(walked):
+    result, out = walked
+    assert result.registered == FRAMES and result.models[0] == FRAMES
+    assert aligned_error(result.world_from_camera[:, :3, 3], POSES[:, :3, 3]) < 0.005
+    assert any("looks alike from several sides" in warning for warning in result.warnings)
+    assert not (out / "sparse" / "again").exists()
+
+
+@dataclass
+class Again:
+    """The steps of the child process once more, on what it left: the mapper's model, what pairs tell before and after, and the answer."""
+
+    job: Job
+    folded: Model
+    before: loops.Turns
+    after: loops.Turns
+    better: Model
+    facts: dict[str, int] | None
+
+
+@pytest.fixture(scope="module")
+def again(walked) -> Again:
+    job = Job.load(walked[1] / "sparse" / "job.json")
+    model, attempts = map_pictures(job, silent)
+    assert model is not None
+    before = loops.turns(job, model)
+    better, _, facts = loops.without_folds(job, model, attempts, silent)
+    return Again(job, model, before, loops.turns(job, model), better, facts)
+
+
+def centres(model: Model) -> np.ndarray:
+    return np.array(plain(model)["world_from_camera"])[:, :3, 3]
+
+
+def test_without_it_the_way_is_folded_and_all_frames_seem_well(again):
+    """What the mapper makes of the same matches: the reason for `without_folds`."""
+    assert len(again.folded.registered) == FRAMES and again.folded.reconstruction.compute_mean_reprojection_error() < 1
+    assert aligned_error(centres(again.folded), POSES[:, :3, 3]) > 0.05
+    assert loops.contradictions(again.before, loops.axes(again.folded)) >= loops.LEAST
+    assert again.facts is not None and again.facts["dropped"] > 10 and again.facts["left"] == 0
+    assert aligned_error(centres(again.better), POSES[:, :3, 3]) < 0.005
+
+
+def test_true_cameras_agree_with_their_neighbours_and_not_with_matches_across_the_post(again):
+    true = {i: pose[:3, :3].T for i, pose in enumerate(POSES)}
+    assert loops.contradictions(again.before, true) == 0
+    assert np.count_nonzero(loops.disagreement(again.before, true)[again.before.apart > 10] > loops.AGREES) > 10
+
+
+def test_what_was_matched_is_as_it_was(again):
+    """Only copies of the database lose pairs, so that a second run begins with the same."""
+    np.testing.assert_array_equal(again.before.images, again.after.images)
+    np.testing.assert_array_equal(again.before.turn, again.after.turn)
+
+
+def test_cameras_that_meet_on_the_second_turn_are_found(again):
+    pairs = loops.meetings(again.better)
+    around = FRAMES / TURNS
+    assert len(pairs) >= FRAMES - around
+    assert all(abs((j - i) - around) < 4 for i, j in pairs)
+
+
+def made_up(seed: int, count: int, noise: float) -> tuple[loops.Turns, dict[int, np.ndarray]]:
+    """Cameras that turn a little from frame to frame, and what their neighbours tell."""
+    random = np.random.default_rng(seed)
+    rotations = [np.eye(3)]
+    for _ in range(count - 1):
+        rotations.append(Rotation.from_rotvec(random.normal(0, 0.1, 3)).as_matrix() @ rotations[-1])
+    pairs = [(i, j) for i in range(count) for j in range(i + 1, min(i + 4, count))]
+    turn = [Rotation.from_rotvec(random.normal(0, noise, 3)).as_matrix() @ rotations[j] @ rotations[i].T for i, j in pairs]
+    first, second = np.array(pairs).T
+    return loops.Turns(first, second, np.array(turn), np.array(pairs)), dict(enumerate(rotations))
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 1000), count=st.integers(4, 30), noise=st.floats(0, 0.1))
+def test_a_way_agrees_with_its_own_neighbours_however_the_world_lies(seed, count, noise):
+    seen, rotations = made_up(seed, count, noise)
+    world = Rotation.random(random_state=seed).as_matrix()
+    off = loops.disagreement(seen, {i: rotation @ world for i, rotation in rotations.items()})
+    assert off.max() < 8 * noise + 1e-6
+    assert loops.contradictions(seen, rotations) == 0
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 1000), count=st.integers(8, 30), at=st.floats(0.3, 0.7), angle=st.floats(70, 180))
+def test_one_fold_parts_at_least_three_pairs_of_neighbours(seed, count, at, angle):
+    seen, rotations = made_up(seed, count, 0.02)
+    turned = Rotation.from_rotvec([0, np.radians(angle), 0]).as_matrix()
+    folded = {i: rotation @ turned if i >= at * count else rotation for i, rotation in rotations.items()}
+    assert loops.contradictions(seen, folded) >= loops.LEAST
+
+
+def test_frames_that_are_not_in_the_model_say_nothing():
+    seen, rotations = made_up(0, 10, 0.0)
+    off = loops.disagreement(seen, {i: rotation for i, rotation in rotations.items() if i != 4})
+    assert np.isnan(off).sum() == np.count_nonzero((seen.first == 4) | (seen.second == 4))
+    assert loops.contradictions(seen, {}) == 0
+
+
+def test_each_outcome_has_its_sentence(walked):
+    _, out = walked
+    facts = json.loads((out / "sparse" / "result.json").read_text())
+    assert facts["folded"]["dropped"] > 0 and "were taken back" in fold(facts, True)[0]
+    unresolved = {"folded": {"contradicting": 7, "left": 7, "far": 40, "dropped": 0}}
+    assert "7 pairs of neighbouring frames contradict" in fold(unresolved, True)[0]
+    assert fold(unresolved, False) == []  # photos in any order have no neighbours
+    assert fold({"folded": None}, True) == [] == fold({}, True)
+
+
+def test_photos_in_any_order_are_left_alone(tmp_path):
+    """All sides differ, names are shuffled: neighbours by name need not see the same, and nothing is taken back."""
+    poses = orbit(20, 0.8)[np.random.default_rng(1).permutation(20)]
+    capture = write_capture(tmp_path / "photos", [render(pose, planes=post((3, 4, 13, 14)))[0] for pose in poses])
+    result = find_poses(replace(capture, ordered=False), tmp_path, PosesSettings(max_features=800), seed=3, threads=1)
+    assert result.registered >= 18 and not result.warnings[1 if result.registered < 20 else 0 :]
+    assert json.loads((tmp_path / "sparse" / "result.json").read_text())["folded"] is None

@@ -1,0 +1,185 @@
+"""Frames far apart that look alike and are not the same place: what they seem to share is taken back, and the mapper asked again.
+
+A can with the same print on both sides, a table with four legs, a corridor of equal doors: matched across, they fold the way of the
+camera together, and all frames are registered with a small error. The way itself tells. Neighbouring frames see the same side, so how far
+the camera turned between two of them does not hang on what was matched far off, and a model that has them turned otherwise is folded. Then
+frames are mapped by their near neighbours alone, and of the matches between frames far apart those stay that agree with that.
+
+Runs in the child process only.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from toolkit.camera import Array, Intrinsics
+from toolkit.files import remove
+from toolkit.poses.database import MIN_INLIERS, match
+from toolkit.poses.job import Job
+from toolkit.poses.mapping import Model, Report, map_pictures, plain
+from toolkit.poses.overlap import guessed_depth, overlap, parallax
+
+NEIGHBOURS = 2  # frames apart that show the same side of things
+CONTRADICTS = np.radians(60.0)  # between the turn that a pair of pictures tells and the model's: a few blurred points are off by less
+LEAST = 3  # such pairs of neighbours that make a fold: one fold between two frames parts so many
+NEAR = (10, 5, 3)  # frames apart whose matches are believed when a model is folded; fewer when the model of these is folded, too
+AGREES = np.radians(30.0)  # matches farther apart stay within this: what a long way adds up to without loops
+MEETINGS = 4  # pairs far apart that are matched for each picture, where the near model says that cameras meet
+WIDEST = 25.0  # degrees of parallax between two such cameras
+COMMON = 0.4  # of both pictures, that they have to share
+KEPT = 0.5  # share of the folded model's frames that another one has to hold
+
+
+@dataclass(frozen=True)
+class Turns:
+    """How far the camera turned between two pictures, by what they share: of every verified pair."""
+
+    first: Array  # (P,) int64 index into the job's pictures
+    second: Array  # (P,) int64
+    turn: Array  # (P, 3, 3) the second camera's axes from the first's
+    images: Array  # (P, 2) int64 the pictures' ids in the database
+
+    @property
+    def apart(self) -> Array:
+        """(P,) frames between the two."""
+        return np.abs(self.second - self.first)
+
+
+def without_folds(
+    job: Job, model: Model, attempts: list[dict[str, Any]], report: Report
+) -> tuple[Model, list[dict[str, Any]], dict[str, int] | None]:
+    """The model and its attempts as they came from `map_pictures`, or, where the way of the camera is folded, better ones.
+
+    Returns:
+        with them, None where nothing was folded, else counts: `contradicting` pairs of neighbours in the folded model, `left` of these
+        in the one that is answered, and of the `far` pairs how many were `dropped` (0: the folded model is answered, nothing better
+        was found).
+    """
+    seen = turns(job, model)
+    before = contradictions(seen, axes(model))
+    if before < LEAST:
+        return model, attempts, None
+
+    def again(done: float, total: float, note: str) -> None:
+        report(total, total, f"{note} (again, the way was folded)")
+
+    facts = {"contradicting": before, "left": before, "far": int((seen.apart > NEAR[0]).sum()), "dropped": 0}
+    for reach in NEAR:
+        near = _by_neighbours(job, seen, reach, again)
+        if near is None or contradictions(seen, axes(near)) >= LEAST:
+            continue  # what looks alike is so near that it is among the neighbours
+        with _copy(job) as copy:
+            match(copy, meetings(near), again)
+            every = turns(copy, near)
+            far = every.apart > reach
+            false = far & ~(disagreement(every, axes(near)) < AGREES)  # where the near model has no answer a pair is not believed
+            _drop(copy, every, false)
+            found, tried = map_pictures(copy, again)
+        if found is None or len(found.registered) < KEPT * len(model.registered):
+            break
+        left = contradictions(every, axes(found))
+        if left < LEAST:
+            return found, tried, {"contradicting": before, "left": left, "far": int(far.sum()), "dropped": int(false.sum())}
+    return model, attempts, facts
+
+
+def _by_neighbours(job: Job, seen: Turns, reach: int, report: Report) -> Model | None:
+    """The model of what pictures at most `reach` apart share."""
+    with _copy(job) as copy:
+        _drop(copy, seen, seen.apart > reach)
+        return map_pictures(copy, report)[0]
+
+
+def turns(job: Job, model: Model) -> Turns:
+    """Of all verified pairs of the job's database, with the lenses that `model` found."""
+    database = pycolmap.Database.open(job.database)
+    try:
+        images = {image.image_id: image for image in database.read_all_images()}
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()} | dict(model.reconstruction.cameras)
+        points = {image_id: np.asarray(database.read_keypoints(image_id), dtype=np.float64).reshape(-1, 4)[:, :2] for image_id in images}
+        rows = []
+        for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
+            if len(geometry.inlier_matches) < MIN_INLIERS:
+                continue
+            a, b = pycolmap.pair_id_to_image_pair(pair_id)
+            lenses = cameras[images[a].camera_id], cameras[images[b].camera_id]
+            if pycolmap.estimate_two_view_geometry_pose(lenses[0], points[a], lenses[1], points[b], geometry):
+                rows.append((int(images[a].name), int(images[b].name), geometry.cam2_from_cam1.rotation.matrix(), (a, b)))
+    finally:
+        database.close()
+    return Turns(
+        np.array([row[0] for row in rows], dtype=np.int64),
+        np.array([row[1] for row in rows], dtype=np.int64),
+        np.array([row[2] for row in rows], dtype=np.float64).reshape(-1, 3, 3),
+        np.array([row[3] for row in rows], dtype=np.int64).reshape(-1, 2),
+    )
+
+
+def axes(model: Model) -> dict[int, Array]:
+    """(3, 3) camera_from_world rotations of the registered pictures, by their index."""
+    images = (model.reconstruction.image(image_id) for image_id in model.registered)
+    return {int(image.name): np.asarray(image.cam_from_world().rotation.matrix()) for image in images}
+
+
+def disagreement(seen: Turns, rotations: dict[int, Array]) -> Array:
+    """(P,) radians between the turn that each pair tells and that of the cameras at `rotations`; nan where one of the two is missing."""
+    off = np.full(len(seen.first), np.nan)
+    known = np.array([i in rotations and j in rotations for i, j in zip(seen.first, seen.second, strict=True)], dtype=bool)
+    if known.any():
+        first, second = (np.array([rotations[int(i)] for i in side[known]]) for side in (seen.first, seen.second))
+        rest = seen.turn[known] @ first @ np.swapaxes(second, 1, 2)
+        off[known] = np.arccos(np.clip((np.trace(rest, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    return off
+
+
+def contradictions(seen: Turns, rotations: dict[int, Array]) -> int:
+    """How many pairs of neighbours tell of another turn than `rotations`."""
+    return int(np.count_nonzero((seen.apart <= NEIGHBOURS) & (disagreement(seen, rotations) > CONTRADICTS)))
+
+
+def meetings(model: Model) -> list[tuple[int, int]]:
+    """Pairs of pictures far apart whose cameras see much in common from nearly the same side, by the model's own poses: each picture's
+    best few. On a way that was not known before these are the loops."""
+    data = plain(model)
+    names, poses = np.array(data["pictures"]), np.array(data["world_from_camera"])
+    shares = overlap(poses, [Intrinsics.from_dict(camera) for camera in data["intrinsics"]], depth := guessed_depth(poses))
+    score = np.sqrt(shares * shares.T) * (parallax(poses, depth) < WIDEST) * (np.abs(names[:, None] - names[None]) > NEAR[0])
+    pairs = set()
+    for i, row in enumerate(score):
+        for j in np.argsort(-row, kind="stable")[:MEETINGS]:
+            if row[j] > COMMON:
+                pairs.add((int(min(names[i], names[j])), int(max(names[i], names[j]))))
+    return sorted(pairs)
+
+
+def _drop(job: Job, seen: Turns, which: Array) -> None:
+    """Take the pairs `which` (P,) out of the job's database."""
+    database = pycolmap.Database.open(job.database)
+    try:
+        with pycolmap.DatabaseTransaction(database):
+            for a, b in seen.images[which]:
+                database.delete_two_view_geometry(int(a), int(b))
+    finally:
+        database.close()
+
+
+@contextmanager
+def _copy(job: Job) -> Iterator[Job]:
+    """The job in a folder of its own, which goes again: what was matched stays as it is for later runs."""
+    folder = Path(job.folder) / "again"
+    remove(folder)
+    folder.mkdir()
+    copy = replace(job, folder=str(folder))
+    try:
+        shutil.copyfile(job.database, copy.database)
+        yield copy
+    finally:
+        remove(folder)
