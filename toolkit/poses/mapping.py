@@ -14,9 +14,10 @@ import pycolmap
 from toolkit.camera import OPENCV, Intrinsics
 from toolkit.errors import PoseError
 from toolkit.files import remove
-from toolkit.poses.job import Job
+from toolkit.poses.job import GONE_ON, Job
 
 Report = Callable[[float, float, str], None]
+WORSE = 1.25  # times the error of the strict model that a model which went on from it may have
 ENOUGH = 0.6  # share of registered pictures below which a looser attempt is worth its time
 FEW_POINTS = 12  # a picture that sees fewer of the model's points hangs in the air: not registered
 SMALLEST = 3  # registered pictures that make a model
@@ -34,6 +35,11 @@ class Model:
     registered: list[int]  # image ids that see enough points
 
     @property
+    def error(self) -> float:
+        """Mean reprojection error in pixels."""
+        return float(self.reconstruction.compute_mean_reprojection_error())
+
+    @property
     def size(self) -> tuple[int, int]:
         return len(self.registered), self.reconstruction.num_points3D()
 
@@ -43,26 +49,32 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
     first."""
     attempts: list[tuple[str, Callable[[], list[pycolmap.Reconstruction]]]] = [
         ("incremental", lambda: _incremental(job, report, loose=False)),
+        (GONE_ON, lambda: [] if best is None else _incremental(job, report, loose=True, start=best.reconstruction)),
         ("incremental, small angles", lambda: _incremental(job, report, loose=True)),
         ("global", lambda: _global(job, report)),
     ]
     best: Model | None = None
     history = []
     for name, attempt in attempts:
+        if best is not None and best.size[0] >= (1.0 if name == GONE_ON else ENOUGH) * len(job.pictures):
+            break
         models = sorted((_model(found, name) for found in attempt()), key=lambda model: model.size, reverse=True)
         models = [model for model in models if len(model.registered) >= SMALLEST]
         history.append({"attempt": name, "models": [len(model.registered) for model in models]})
         for model in models:
-            if model.reconstruction.compute_mean_reprojection_error() > MAX_ERROR:
-                continue
-            # A looser attempt has to find clearly more: a few frames on top come at the price of accuracy.
-            if best is None or model.size[0] > 1.1 * best.size[0]:
+            if model.error <= MAX_ERROR and (best is None or _better(model, best)):
                 best = model
-        if best is not None and best.size[0] >= ENOUGH * len(job.pictures):
-            break
     if best is not None:
         settle(best)
     return best, history
+
+
+def _better(model: Model, best: Model) -> bool:
+    """Whether a looser attempt is worth it. One from scratch has to find clearly more: a few frames on top come at the price of accuracy.
+    One that went on left the others where they were."""
+    if model.attempt == GONE_ON:
+        return model.size[0] > best.size[0] and model.error <= WORSE * best.error
+    return model.size[0] > 1.1 * best.size[0]
 
 
 def _model(reconstruction: pycolmap.Reconstruction, attempt: str) -> Model:
@@ -70,7 +82,8 @@ def _model(reconstruction: pycolmap.Reconstruction, attempt: str) -> Model:
     return Model(reconstruction, attempt, registered)
 
 
-def _incremental(job: Job, report: Report, loose: bool) -> list[pycolmap.Reconstruction]:
+def _incremental(job: Job, report: Report, loose: bool, start: pycolmap.Reconstruction | None = None) -> list[pycolmap.Reconstruction]:
+    """The models that COLMAP's incremental mapper makes; with `start` that one, gone on from."""
     options = pycolmap.IncrementalPipelineOptions()
     # With several the result depends on which is first now and then; they gain a tenth of the time (docs/performance.md).
     options.num_threads = 1 if len(job.pictures) <= REPEATABLE else job.threads
@@ -89,8 +102,8 @@ def _incremental(job: Job, report: Report, loose: bool) -> list[pycolmap.Reconst
         options.mapper.filter_min_tri_angle = 1.0
         options.triangulation.min_angle = 1.0
     total = len(job.pictures)
-    what = "mapping again with small angles" if loose else "mapping"
-    count = 0
+    what = "mapping" if not loose else "mapping again with small angles" if start is None else "going on with small angles"
+    count = 0 if start is None else start.num_reg_images()
 
     def started() -> None:
         nonlocal count
@@ -102,12 +115,20 @@ def _incremental(job: Job, report: Report, loose: bool) -> list[pycolmap.Reconst
         count += 1
         report(min(count, total), total, f"{what}, {min(count, total)} of {total} registered")
 
-    report(0, total, what)
+    report(count, total, what)
     pycolmap.set_random_seed(job.seed)
     folder = _empty(Path(job.folder) / "attempt")
-    found = pycolmap.incremental_mapping(
-        job.database, folder, folder, options, initial_image_pair_callback=started, next_image_callback=registered
-    )
+    given: Path | str = ""  # nothing
+    if start is not None:
+        options.multiple_models = False
+        given = _empty(Path(job.folder) / "start")
+        start.write_binary(given)
+    try:
+        found = pycolmap.incremental_mapping(
+            job.database, folder, folder, options, given, initial_image_pair_callback=started, next_image_callback=registered
+        )
+    finally:
+        remove(Path(job.folder) / "start")
     return list(found.values())
 
 
@@ -175,7 +196,7 @@ def plain(model: Model) -> dict[str, Any]:
         "world_from_camera": [_homogeneous(image.cam_from_world().inverse().matrix()) for image in images],
         "points": [[float(value) for value in point.xyz] for point in points],
         "point_errors": [float(point.error) for point in points],
-        "error": float(reconstruction.compute_mean_reprojection_error()),
+        "error": model.error,
         "angle": _median_angle(reconstruction),
     }
 
