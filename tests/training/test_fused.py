@@ -22,6 +22,7 @@ from toolkit.training.rays import PixelPool
 from toolkit.training.step import Optimiser, Rates
 
 RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03, depth=0.05)
+SLOW = replace(RATES, reach=3.0)  # the made views look from 3 away: half of what they see moves slowly
 
 
 def looking(eye: np.ndarray) -> np.ndarray:
@@ -63,7 +64,7 @@ def test_pictures_agree(shell: float, keep: float) -> None:
     assert float(close.float().mean()) > 0.99
 
 
-def gradients(engine: FusedOptimiser, picks: torch.Tensor) -> list[torch.Tensor]:
+def gradients(engine: FusedOptimiser, picks: torch.Tensor, rates: Rates = RATES) -> list[torch.Tensor]:
     """Dense gradients of densities and features, and the decoder's in the order of its parameters."""
     field, counts = engine.field, {}
 
@@ -73,7 +74,7 @@ def gradients(engine: FusedOptimiser, picks: torch.Tensor) -> list[torch.Tensor]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("toolkit.training.fused.moves.adam_pass", keep_sums)
-        engine.step_on(picks.numpy(), np.zeros(len(picks), np.float32), RATES, some_weights(len(picks)).numpy())
+        engine.step_on(picks.numpy(), np.zeros(len(picks), np.float32), rates, some_weights(len(picks)).numpy())
     assert len(counts) == engine.threads
     dense = [torch.zeros_like(field.density_rows), torch.zeros_like(field.feature_rows)]
     for thread, used in counts.items():
@@ -85,16 +86,16 @@ def gradients(engine: FusedOptimiser, picks: torch.Tensor) -> list[torch.Tensor]
     return [*dense, *(torch.from_numpy(weight) for weight in weights)]
 
 
-@pytest.mark.parametrize(("seed", "threads"), [(0, 1), (1, 3), (2, 1)])
+@pytest.mark.parametrize(("seed", "threads", "rates"), [(0, 1, RATES), (1, 3, RATES), (2, 1, SLOW)])
 @pytest.mark.parametrize("shell", [0.0, 1.0])
-def test_gradients_agree(shell: float, seed: int, threads: int) -> None:
+def test_gradients_agree(shell: float, seed: int, threads: int, rates: Rates) -> None:
     """Compiled, torch, and torch in float64: within 1e-4 of the largest, every value of every tensor."""
     field = random_field(shell, 32, keep=0.5, raw=-2.5, seed=seed)
     pool = PixelPool(made_views(), depth=True)
     picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(seed))[:300]
-    exact = exact_gradients(field, weighed(pool, picks), RATES)
-    reference = torch_gradients(field, weighed(pool, picks), RATES)
-    compiled = gradients(FusedOptimiser(field, pool, threads=threads), picks)
+    exact = exact_gradients(field, weighed(pool, picks), rates)
+    reference = torch_gradients(field, weighed(pool, picks), rates)
+    compiled = gradients(FusedOptimiser(field, pool, threads=threads), picks, rates)
     for wanted, of_torch, of_ours in zip(exact, reference, compiled, strict=True):
         scale = float(wanted.abs().max())
         assert scale > 0

@@ -23,6 +23,7 @@ from toolkit.training.rays import PixelPool
 from toolkit.training.step import Optimiser, Rates
 
 RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03, depth=0.05)
+SLOW = replace(RATES, reach=3.0)  # the made views look from 3 away: half of what they see moves slowly
 
 
 @pytest.fixture
@@ -92,7 +93,9 @@ def test_pictures_agree(shell: float, keep: float) -> None:
     assert torch.equal(got, PerSampleRenderer(field, 2).render(origins, directions))
 
 
-def gradients(engine: FusedPerSampleOptimiser, picks: torch.Tensor, monkeypatch: pytest.MonkeyPatch) -> list[torch.Tensor]:
+def gradients(
+    engine: FusedPerSampleOptimiser, picks: torch.Tensor, monkeypatch: pytest.MonkeyPatch, rates: Rates = RATES
+) -> list[torch.Tensor]:
     """Dense gradients of densities and features, and the decoder's in the order of its parameters."""
     field, counts = engine.field, {}
 
@@ -102,7 +105,7 @@ def gradients(engine: FusedPerSampleOptimiser, picks: torch.Tensor, monkeypatch:
 
     with monkeypatch.context() as patch:
         patch.setattr("toolkit.training.fused.moves.adam_pass", keep_sums)
-        engine.step_on(picks.numpy(), np.zeros(len(picks), np.float32), RATES, some_weights(len(picks)).numpy())
+        engine.step_on(picks.numpy(), np.zeros(len(picks), np.float32), rates, some_weights(len(picks)).numpy())
     assert len(counts) == engine.threads
     dense = [torch.zeros_like(field.density_rows), torch.zeros_like(field.feature_rows)]
     for thread, used in counts.items():
@@ -125,21 +128,21 @@ BOUNDS = {"density_rows": (1e-3, 0.999), "feature_rows": (1.5e-3, 0.999), "body.
 CLEAR = 2e-3  # the same steepness puts a hidden unit whose input is nearer to zero on the other side of its ReLU
 
 
-@pytest.mark.parametrize(("seed", "threads"), [(0, 1), (1, 3), (2, 1)])
+@pytest.mark.parametrize(("seed", "threads", "rates"), [(0, 1, RATES), (1, 3, RATES), (2, 1, SLOW)])
 @pytest.mark.parametrize("shell", [0.0, 1.0])
-def test_gradients_agree(shell: float, seed: int, threads: int, every_sample: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gradients_agree(shell: float, seed: int, threads: int, rates: Rates, every_sample: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiled, torch, and torch in float64, on rays of which rounding cannot put a hidden unit on the other side of its ReLU."""
     field = random_field(shell, 32, "per_sample", keep=0.5, raw=-3.5, seed=seed)
     pool = PixelPool(made_views(), depth=True)
     picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(seed))[:600]
     picks = picks[clear_of_zero(field, pool.take(picks), CLEAR)]
     assert len(picks) > 60
-    exact = exact_gradients(field, weighed(pool, picks), RATES)
+    exact = exact_gradients(field, weighed(pool, picks), rates)
     with monkeypatch.context() as patch:
         # In float32 the reference's own angles are off by 1e-5.
         patch.setattr("toolkit.networks.decoder.positional", lambda values, count: positional(values.double(), count).float())
-        reference = torch_gradients(field, weighed(pool, picks), RATES)
-    compiled = gradients(FusedPerSampleOptimiser(field, pool, threads=threads), picks, monkeypatch)
+        reference = torch_gradients(field, weighed(pool, picks), rates)
+    compiled = gradients(FusedPerSampleOptimiser(field, pool, threads=threads), picks, monkeypatch, rates)
     names = ["density_rows", "feature_rows", *(name for name, _ in field.decoder.named_parameters())]
     for name, wanted, of_torch, of_ours in zip(names, exact, reference, compiled, strict=True):
         scale = float(wanted.abs().max())

@@ -25,12 +25,16 @@ def reference_loss(field: Field, samples: Samples, batch: Batch, rates: Rates, r
     raw = (raw_rows[rows.long()] * corner_weights).sum(1)
     features = (feature_rows[rows.long()] * corner_weights[..., None]).sum(1)
     count, total = len(batch.origins), torch.zeros(())
+    slow = (samples.distance / rates.reach).clamp_max(1) ** 2 if rates.reach else torch.ones(len(samples))
     if isinstance(field.decoder, Deferred):
         colours = None
+        features.register_hook(lambda gradient: gradient * slow[:, None])
     else:
         extra, colours = field.decoder(features, batch.directions[samples.ray])
         raw = raw + extra
+        colours.register_hook(lambda gradient: gradient * slow[:, None])
     tau = density(raw) * samples.length
+    tau.register_hook(lambda gradient: gradient * slow)
     for ray in range(count):
         mine = (samples.ray == ray).nonzero().squeeze(1)
         light, weights = torch.ones(()), []
@@ -58,8 +62,8 @@ def reference_loss(field: Field, samples: Samples, batch: Batch, rates: Rates, r
 
 
 @pytest.mark.parametrize("decoder", ["deferred", "per_sample"])
-@pytest.mark.parametrize("shell", [0.0, 1.0])
-def test_gradients_match_autograd(decoder: str, shell: float, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("shell", "slow"), [(0.0, False), (1.0, False), (1.0, True)])
+def test_gradients_match_autograd(decoder: str, shell: float, slow: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     field = random_field(background=shell, resolution=16, decoder=decoder, raw=-2.0)
     monkeypatch.setattr(step_module, "STOP", -1.0)
     origins, directions = random_rays(24)
@@ -71,7 +75,7 @@ def test_gradients_match_autograd(decoder: str, shell: float, monkeypatch: pytes
     assert bool((distance > 0).any()) and bool((distance == 0).any())
     weight = torch.rand(24, generator=generator) + 0.5
     batch = Batch(origins, directions, torch.rand(24, 3, generator=generator), torch.zeros(24, dtype=torch.int64), distance, weight)
-    rates = Rates(0.0, 0.0, 0.0, 0.01, 0.03, colour_threshold=-1.0, depth=0.05)
+    rates = Rates(0.0, 0.0, 0.0, 0.01, 0.03, colour_threshold=-1.0, depth=0.05, reach=float(samples.distance.median()) if slow else 0.0)
     monkeypatch.setattr(step_module, "march", lambda *arguments: samples)  # the same samples for both, without jitter
     raw_rows = field.density_rows.clone().requires_grad_(True)
     feature_rows = field.feature_rows.clone().requires_grad_(True)

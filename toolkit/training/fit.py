@@ -31,7 +31,7 @@ from toolkit.training.guard import Guard, refuse_broken
 from toolkit.training.levels import all_places, finer, first_field, pruned, visible
 from toolkit.training.rays import PixelPool
 from toolkit.training.schedule import Schedule, most_rays
-from toolkit.training.start import colour_behind, finest_resolution, levels, possible, space_of
+from toolkit.training.start import NEAR, colour_behind, finest_resolution, levels, possible, space_of
 from toolkit.training.view import limit
 from toolkit.volume.host import Host, TorchHost
 from toolkit.volume.space import Space
@@ -152,7 +152,8 @@ def fit_field(
             ladder += [resolution for resolution in _ladder(views, train, scene, settings)[1] if resolution > start.resolution]
     engine = make_engine(settings, current, pool)
     limit_rays = most_rays(len(pool), bool(aside.any()), settings.fit.passes)
-    plan = Schedule(ladder, budget, settings.fit, views.background is None, settings.fit.patience, limit_rays)
+    reach = settings.fit.reach * scene.median_depth
+    plan = Schedule(ladder, budget, settings.fit, views.background is None, settings.fit.patience, limit_rays, reach)
     guard = Guard()
     result = FitResult(current, notes=guard.notes)
     marks = [budget * 0.02 * 50 ** (i / (TIMELINE_POINTS - 1)) for i in range(TIMELINE_POINTS - 1)]
@@ -215,7 +216,7 @@ def _first(
     decoder = make_decoder(settings.field.decoder, settings.field.channels, settings.field.hidden).to(device)
     limit(decoder, settings.field.view)
     behind = colour_behind(views).to(device)
-    near = 0.5 * scene.near
+    near = NEAR * scene.near
     fine = 4
     return first_field(space, ladder[0], places, settings.field.channels, START_RAW, decoder, behind, near, fine, host, generator), ladder
 

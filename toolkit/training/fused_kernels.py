@@ -55,6 +55,7 @@ class Losses(NamedTuple):
     depth: Any
     threshold: Any
     stop: Any
+    reach: Any  # working units; samples nearer than this move slowly (`near`), 0: none
 
 
 @njit(**K.OPTIONS)
@@ -80,6 +81,13 @@ def depth_pull(along: Any, distance: Any) -> Any:
     if distance <= ZERO:
         return ZERO
     return min(max(abs(along - distance) / distance - NOISE, ZERO) / REACH, ONE) - ONE
+
+
+@njit(**K.OPTIONS)
+def slow_near(along: Any, reach: Any) -> Any:
+    """`near.slowness` of one sample."""
+    share = max(along, ZERO) / reach if along < reach and reach > ZERO else ONE  # a sample may lie behind its camera
+    return share * share
 
 
 @njit(**K.OPTIONS)
@@ -237,6 +245,9 @@ def gradient_pass(
             if raw >= K.RAW_MAX:
                 g_raw = ZERO
             behind += weight * g_weight[i]
+            slow = slow_near(values[i, K.ALONG], losses.reach)
+            g_raw *= slow
+            weight *= slow
             for corner in range(8):
                 row = rows[i, corner]
                 if row == zero_row:

@@ -16,7 +16,7 @@ from toolkit.render import kernels as K
 from toolkit.render.kernels_matrix import add_outer, product
 from toolkit.render.kernels_net import BATCH, SAMPLES, Net, Tape, decode_colours, make_tape
 from toolkit.render.kernels_per_sample import march_ray
-from toolkit.training.fused_kernels import depth_pull, pixel_ray
+from toolkit.training.fused_kernels import depth_pull, pixel_ray, slow_near
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
 RAYS = 64  # rays at a time, when they have few samples
@@ -171,6 +171,10 @@ def ray_backward(
         g = g_raw[i]
         g_raw[i] = (values[K.AFTER] * g - behind) * values[K.TAU] if values[K.RAW] < K.RAW_MAX else ZERO
         behind += values[K.WEIGHT] * g
+        slow = slow_near(values[K.ALONG], losses.reach)
+        g_raw[i] *= slow
+        for k in range(3):
+            g_logit[i, k] *= slow
     return (red * red + green * green + blue * blue) * K.THIRD
 
 

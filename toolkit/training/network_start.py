@@ -17,7 +17,7 @@ from toolkit.networks.decoder import Deferred, PerSample, make_decoder
 from toolkit.poses.scene import Scene
 from toolkit.render.field import Field
 from toolkit.training.levels import FEATURE_NOISE, all_places, occupancy
-from toolkit.training.start import finest_resolution, levels, possible
+from toolkit.training.start import NEAR, finest_resolution, levels, possible
 from toolkit.volume.edit import resample
 
 Tensor = torch.Tensor
@@ -84,7 +84,7 @@ def network_start(made: Field, views: Views, scene: Scene, settings: Settings) -
         density_rows=density,
         feature_rows=rows.contiguous(),
         decoder=decoder.to(device),
-        near=0.5 * scene.near,
+        near=NEAR * scene.near,
     )
 
 

@@ -48,6 +48,7 @@ class Schedule:
         budget: seconds.
         patient: end when the validation views stop improving, before the budget does.
         most_rays: rays after which the fit ends, if the budget has not ended it before.
+        reach: of what moves slowly before a camera, working units (`near`).
     """
 
     ladder: list[int]
@@ -56,6 +57,7 @@ class Schedule:
     opaque: bool
     patient: bool = False
     most_rays: float = math.inf
+    reach: float = 0.0
     level: int = 0
     steps_here: int = 0
     slower: float = 1.0
@@ -145,4 +147,4 @@ class Schedule:
         fit = self.settings
         opacity = fit.opacity if self.opaque else 0.0
         steps = (fit.rate_density * fall, fit.rate_feature * fall, fit.rate_decoder * fall)
-        return Rates(*steps, fit.distortion, opacity, depth=fit.depth * LAST_DEPTH**done)
+        return Rates(*steps, fit.distortion, opacity, depth=fit.depth * LAST_DEPTH**done, reach=self.reach)

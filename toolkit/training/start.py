@@ -22,6 +22,7 @@ ROOM_MARGIN = 1.4  # the same where nothing exists outside and no alpha says whe
 # Of the median depth: the undistorted region is at least as large. A small object on a desk fills few pixels; with the region drawn
 # tightly around it, the desk lies where voxels are stretched, which cost 5 dB on the validation views of such a capture.
 LEAST_REACH = 0.9
+NEAR = 0.8  # of the scene's nearest depth: where a fit's rays begin
 COARSEST = 32
 FINEST = 512
 PIXELS = 2.0  # of the training views, a voxel in the middle of the scene

@@ -14,6 +14,7 @@ from toolkit.render.rays import OPACITY_FLOOR
 from toolkit.training.adam import LazyAdam
 from toolkit.training.depth import depth_gradient
 from toolkit.training.finite import NotFiniteError, check
+from toolkit.training.near import slowness
 from toolkit.training.rays import Batch
 from toolkit.training.view import blind, of_direction
 from toolkit.volume.lookup import corners, gather, scatter
@@ -33,6 +34,7 @@ class Rates:
     random_background: bool = False  # what is behind everything is another colour for every ray, so that it cannot stand in for a surface
     colour_threshold: float = 3e-3  # samples of smaller weight are neither decoded nor given a gradient
     depth: float = 0.0  # weight of the mean of the depth term (see `depth`), for rays whose surface is known
+    reach: float = 0.0  # working units; samples nearer than this move slowly (see `near`), 0: none
 
 
 class Optimiser:
@@ -166,8 +168,9 @@ class Optimiser:
             g_weight = g_weight + g_distortion * (rates.distortion * shares[kept.ray])
         g_weight = g_weight + self._depth(batch, kept, rates)
         g_thickness = thickness_gradient(weight, transmittance, thickness, g_weight, kept.first, kept.ray, count)
-        g_raw = torch.where(raw < RAW_MAX, g_thickness * thickness, torch.zeros_like(raw))  # ∂τ/∂raw = τ
-        self._move(rows, corner_weights, g_raw, per_ray[:, :-1] * weight[:, None], rates, residual)
+        slow = slowness(kept.distance, rates.reach)
+        g_raw = torch.where(raw < RAW_MAX, g_thickness * thickness * slow, torch.zeros_like(raw))  # ∂τ/∂raw = τ
+        self._move(rows, corner_weights, g_raw, per_ray[:, :-1] * (weight * slow)[:, None], rates, residual)
         return self._mean_error(residual, shares)
 
     def _per_sample(self, batch: Batch, samples: Samples, rates: Rates, behind: Tensor) -> float:
@@ -195,7 +198,8 @@ class Optimiser:
             g_weight = g_weight + g_distortion * (rates.distortion * shares[samples.ray])
         g_weight = g_weight + self._depth(batch, samples, rates)
         g_thickness = thickness_gradient(weight, transmittance, tau, g_weight, samples.first, samples.ray, count)
-        torch.autograd.backward([thickness, colour], [g_thickness, weight[:, None] * g_mixed])
+        slow = slowness(samples.distance, rates.reach)
+        torch.autograd.backward([thickness, colour], [g_thickness * slow, (weight * slow)[:, None] * g_mixed])
         assert features.grad is not None and base.grad is not None
         self._move(rows, corner_weights, base.grad, features.grad, rates, residual)
         return self._mean_error(residual, shares)
