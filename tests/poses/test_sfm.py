@@ -25,7 +25,9 @@ from tests.poses.textured import (
 )
 from toolkit.config import PosesSettings
 from toolkit.errors import InputError, Interrupted, PoseError
+from toolkit.files import read_json
 from toolkit.poses.child import run_child
+from toolkit.poses.job import GONE_ON
 from toolkit.poses.result import PoseResult
 from toolkit.poses.sfm import find_poses
 from toolkit.progress import Progress
@@ -254,3 +256,22 @@ def test_a_full_disk_is_said_to_be_one(pictures, tmp_path):
     )
     assert done.stdout.startswith("OUTPUT cannot write"), done.stdout + done.stderr
     assert done.stdout.count("\n") == 1
+
+
+def test_what_the_strict_mapper_has_no_place_for_is_added_and_said(tmp_path):
+    """A camera that turns away at the end of its way and hardly moves on: its last pictures share little with the others."""
+    poses = list(arc(8))
+    for k in (1, 2, 3):
+        turned = poses[7].copy()
+        turned[:3, :3] = poses[7][:3, :3] @ cv2.Rodrigues(np.array([0, -np.radians(45 + 3 * k), 0]))[0]
+        turned[:3, 3] += 0.02 * k * poses[7][:3, 0]
+        poses.append(turned)
+    result = find_poses(write_capture(tmp_path / "photos", [render(pose)[0] for pose in poses]), tmp_path, SMALL, seed=3, threads=1)
+    attempts = read_json(tmp_path / "sparse" / "result.json")["attempts"]
+    assert [attempt["attempt"] for attempt in attempts] == ["incremental", GONE_ON]
+    strict, gone_on = (attempt["models"][0] for attempt in attempts)
+    assert 8 <= strict < gone_on == result.registered
+    assert any(f"{gone_on - strict} of {gone_on} frames were placed by fewer matches" in warning for warning in result.warnings)
+    true = np.array([poses[int(name)] for name in result.names])
+    assert aligned_error(result.world_from_camera[:, :3, 3], true[:, :3, 3]) < 0.01
+    assert not (tmp_path / "sparse" / "start").exists()
