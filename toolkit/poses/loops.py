@@ -35,7 +35,8 @@ AGREES = np.radians(30.0)  # matches farther apart stay within this: what a long
 MEETINGS = 4  # pairs far apart that are matched for each picture, where the near model says that cameras meet
 WIDEST = 25.0  # degrees of parallax between two such cameras
 COMMON = 0.4  # of both pictures, that they have to share
-KEPT = 0.5  # share of the folded model's frames that another one has to hold
+KEPT = 0.5  # share of the folded model's frames that another one has to hold …
+KEPT_PHOTOS = 0.9  # … and of photos', whose neighbours by name may be of other things
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ def without_folds(
             false = far & ~(disagreement(every, axes(near)) < AGREES)  # where the near model has no answer a pair is not believed
             _drop(copy, every, false)
             found, tried = map_pictures(copy, again)
-        if found is None or len(found.registered) < KEPT * len(model.registered):
+        if found is None or len(found.registered) < (KEPT if job.sequential else KEPT_PHOTOS) * len(model.registered):
             break
         left = contradictions(every, axes(found))
         if left < LEAST:
