@@ -14,7 +14,7 @@ from toolkit.config import Settings, load_settings
 from toolkit.poses.scene import Scene
 from toolkit.render.image import render_view
 from toolkit.training.fit import fit_field
-from toolkit.training.levels import all_places, finer, visible
+from toolkit.training.levels import all_places, finer, looked_at, visible
 from toolkit.training.start import levels, make_space, possible
 from toolkit.volume.grid_host import GridHost
 
@@ -165,3 +165,15 @@ def test_pruning_keeps_neighbours_of_what_was_seen() -> None:
     assert 8 <= int(visible(field, seen, often, 0.05).sum()) <= 27
     assert visible(field, never, often, 0.05).equal(field.occupied)  # nothing seen strongly yet: nothing removed
     assert visible(field, seen, never, 0.05).equal(field.occupied)  # too few samples to tell
+
+
+def test_when_memory_is_short_surfaces_keep_the_neighbours_that_no_ray_came_to() -> None:
+    from tests.render.made import random_field
+
+    field = random_field(resolution=32)
+    surface, passed = field.occupied.nonzero().squeeze(1)[[5000, 9000]]
+    seen, visits = torch.zeros(len(field.occupied)), torch.zeros(len(field.occupied))
+    seen[surface], visits[surface], visits[passed] = 0.5, 20.0, 3.0
+    kept = looked_at(field, seen, visits, 0.05)
+    assert bool(kept[surface]) and bool(kept[passed])
+    assert 8 <= int(kept.sum()) <= 28  # the surface with up to 26 neighbours, and what light only passed, which has none

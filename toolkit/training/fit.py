@@ -28,7 +28,7 @@ from toolkit.training.behind import sky_behind
 from toolkit.training.engine import Engine, make_engine, warm_up
 from toolkit.training.finite import NotFiniteError
 from toolkit.training.guard import Guard, refuse_broken
-from toolkit.training.levels import all_places, finer, first_field, pruned, visible
+from toolkit.training.levels import all_places, finer, first_field, looked_at, pruned, visible
 from toolkit.training.rays import PixelPool
 from toolkit.training.schedule import Schedule, most_rays
 from toolkit.training.start import NEAR, colour_behind, finest_resolution, levels, possible, space_of
@@ -162,9 +162,13 @@ def fit_field(
         if plan.wants_finer(done):
             keep = visible(current, engine.seen, engine.visits, settings.fit.prune_weight)
             growth = (ladder[plan.level + 1] / current.resolution) ** 3
-            if int(keep.sum()) * growth > MANY_VOXELS:
-                keep &= engine.visits > 0  # memory is bounded: what no ray came to is the first to go
-            if plan.worth(int(keep.sum()) * growth, plan.rays_left(now, result.rays)) and room.fits(
+            voxels = int(keep.sum()) * growth
+            if voxels > MANY_VOXELS:  # memory is bounded
+                came = keep & (engine.visits > 0)
+                voxels = int(came.sum()) * growth  # what stays for the sake of holes gets no rays, so it does not decide
+                last = plan.level + 2 == len(ladder)
+                keep = keep & looked_at(current, engine.seen, engine.visits, settings.fit.prune_weight) if last else came
+            if plan.worth(voxels, plan.rays_left(now, result.rays)) and room.fits(
                 current, keep, plan, settings, guard.notes
             ):
                 plan.climb()

@@ -97,6 +97,12 @@ def visible(field: Field, seen: Tensor, visits: Tensor, threshold: float) -> Ten
     return (beside(field.topology, strong) | (visits < ENOUGH_VISITS)) & field.occupied
 
 
+def looked_at(field: Field, seen: Tensor, visits: Tensor, threshold: float) -> Tensor:
+    """(M · 512,) bool: the voxels that rays came to, and those beside a surface, which would have holes where a lattice has more voxels
+    than rays came. The others are the first to go when memory is short. Arguments as in `visible`."""
+    return (visits > 0) | beside(field.topology, seen > threshold)
+
+
 def beside(topology: Topology, strong: Tensor) -> Tensor:
     """(M · 512,) bool grown by one voxel."""
     if strong.device.type == "cpu":
