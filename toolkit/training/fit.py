@@ -168,9 +168,7 @@ def fit_field(
                 voxels = int(came.sum()) * growth  # what stays for the sake of holes gets no rays, so it does not decide
                 last = plan.level + 2 == len(ladder)
                 keep = keep & looked_at(current, engine.seen, engine.visits, settings.fit.prune_weight) if last else came
-            if plan.worth(voxels, plan.rays_left(now, result.rays)) and room.fits(
-                current, keep, plan, settings, guard.notes
-            ):
+            if plan.worth(voxels, plan.rays_left(now, result.rays)) and room.fits(current, keep, plan, settings, guard.notes):
                 plan.climb()
                 engine.let_go()
                 current = finer(current, keep, plan.resolution, host)
