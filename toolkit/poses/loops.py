@@ -60,9 +60,9 @@ def without_folds(
     """The model and its attempts as they came from `map_pictures`, or, where the way of the camera is folded, better ones.
 
     Returns:
-        with them, None where nothing was folded, else counts: pairs of neighbours that are `contradicting` the folded model, and how many of
-        them are `left` in the one that is answered (as many as before: nothing better was found, it is the same); matches between frames
-        `far` apart, and how many of these were `dropped`.
+        with them, None where nothing was folded, else counts: pairs of neighbours that are `contradicting` the folded model, and how many
+        of them are `left` in the one that is answered (as many as before: nothing better was found, it is the same); matches between
+        frames `far` apart, and how many of these were `dropped`.
     """
     seen = turns(job, model)
     before = contradictions(seen, axes(model))
