@@ -22,7 +22,7 @@ from toolkit.training.rays import PixelPool
 from toolkit.training.step import Optimiser, Rates
 
 RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03, depth=0.05)
-SLOW = replace(RATES, reach=3.0)  # the made views look from 3 away: half of what they see moves slowly
+SLOW = replace(RATES, slow_within=3.0)  # the made views look from 3 away: half of what they see moves slowly
 
 
 def looking(eye: np.ndarray) -> np.ndarray:

@@ -19,37 +19,37 @@ from toolkit.training.near import slowness
 from toolkit.training.rays import PixelPool
 from toolkit.training.schedule import Schedule
 
-REACHES = st.floats(0.0625, 100, width=32)
+BOUNDS = st.floats(0.0625, 100, width=32)
 DISTANCES = st.floats(-1, 1000, width=32)
 
 
 @settings(deadline=None)
-@given(distance=DISTANCES, reach=REACHES)
-def test_both_engines_slow_a_sample_by_its_distance(distance, reach):
-    factor = float(slowness(torch.tensor([distance]), reach)[0])
-    assert factor == pytest.approx(min(max(distance, 0) / reach, 1) ** 2, abs=1e-6)
-    assert float(slow_near(np.float32(distance), np.float32(reach))) == pytest.approx(factor, abs=1e-6)
+@given(distance=DISTANCES, within=BOUNDS)
+def test_both_engines_slow_a_sample_by_its_distance(distance, within):
+    factor = float(slowness(torch.tensor([distance]), within)[0])
+    assert factor == pytest.approx(min(max(distance, 0) / within, 1) ** 2, abs=1e-6)
+    assert float(slow_near(np.float32(distance), np.float32(within))) == pytest.approx(factor, abs=1e-6)
 
 
 @settings(deadline=None)
 @given(distance=DISTANCES)
-def test_without_a_reach_nothing_is_slowed(distance):
+def test_without_a_bound_nothing_is_slowed(distance):
     assert float(slowness(torch.tensor([distance]), 0.0)[0]) == 1.0 == float(slow_near(np.float32(distance), np.float32(0)))
 
 
 @pytest.mark.parametrize("decoder", ["deferred", "per_sample"])
 def test_far_away_gradients_are_what_they_were(decoder):
-    """Cameras stand 3 before a box of half a side 1: a reach below the nearest corner changes nothing, one far beyond makes all gradients
+    """Cameras stand 3 before a box of half a side 1: a bound below the nearest corner changes nothing, one far beyond makes all gradients
     of rows smaller."""
     field = random_field(0.0, 32, decoder, keep=0.5, raw=-2.5)
     batch = PixelPool(made_views(), depth=True).take(torch.arange(0, 2000, 7))
-    plain, below, beyond = (torch_gradients(field, batch, replace(RATES, reach=reach)) for reach in (0.0, 0.5, 20.0))
+    plain, below, beyond = (torch_gradients(field, batch, replace(RATES, slow_within=bound)) for bound in (0.0, 0.5, 20.0))
     for one, other in zip(plain, below, strict=True):
         assert torch.equal(one, other)
     for one, other in zip(plain[:2], beyond[:2], strict=True):
         assert 0 < float(other.norm()) < 0.1 * float(one.norm())
 
 
-def test_the_schedule_hands_the_reach_on():
-    assert Schedule([32], 1.0, FitSettings(), True, reach=0.7).rates(0.0, 0).reach == 0.7
-    assert FitSettings().reach == 0.5
+def test_the_schedule_hands_the_bound_on():
+    assert Schedule([32], 1.0, FitSettings(), True, slow_within=0.7).rates(0.0, 0).slow_within == 0.7
+    assert FitSettings().slow_within == 0.5

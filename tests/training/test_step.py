@@ -25,7 +25,7 @@ def reference_loss(field: Field, samples: Samples, batch: Batch, rates: Rates, r
     raw = (raw_rows[rows.long()] * corner_weights).sum(1)
     features = (feature_rows[rows.long()] * corner_weights[..., None]).sum(1)
     count, total = len(batch.origins), torch.zeros(())
-    slow = (samples.distance / rates.reach).clamp_max(1) ** 2 if rates.reach else torch.ones(len(samples))
+    slow = (samples.distance / rates.slow_within).clamp_max(1) ** 2 if rates.slow_within else torch.ones(len(samples))
     if isinstance(field.decoder, Deferred):
         colours = None
         features.register_hook(lambda gradient: gradient * slow[:, None])
@@ -75,7 +75,8 @@ def test_gradients_match_autograd(decoder: str, shell: float, slow: bool, monkey
     assert bool((distance > 0).any()) and bool((distance == 0).any())
     weight = torch.rand(24, generator=generator) + 0.5
     batch = Batch(origins, directions, torch.rand(24, 3, generator=generator), torch.zeros(24, dtype=torch.int64), distance, weight)
-    rates = Rates(0.0, 0.0, 0.0, 0.01, 0.03, colour_threshold=-1.0, depth=0.05, reach=float(samples.distance.median()) if slow else 0.0)
+    within = float(samples.distance.median()) if slow else 0.0
+    rates = Rates(0.0, 0.0, 0.0, 0.01, 0.03, colour_threshold=-1.0, depth=0.05, slow_within=within)
     monkeypatch.setattr(step_module, "march", lambda *arguments: samples)  # the same samples for both, without jitter
     raw_rows = field.density_rows.clone().requires_grad_(True)
     feature_rows = field.feature_rows.clone().requires_grad_(True)

@@ -152,8 +152,8 @@ def fit_field(
             ladder += [resolution for resolution in _ladder(views, train, scene, settings)[1] if resolution > start.resolution]
     engine = make_engine(settings, current, pool)
     limit_rays = most_rays(len(pool), bool(aside.any()), settings.fit.passes)
-    reach = settings.fit.reach * scene.median_depth
-    plan = Schedule(ladder, budget, settings.fit, views.background is None, settings.fit.patience, limit_rays, reach)
+    slow_within = settings.fit.slow_within * scene.median_depth
+    plan = Schedule(ladder, budget, settings.fit, views.background is None, settings.fit.patience, limit_rays, slow_within)
     guard = Guard()
     result = FitResult(current, notes=guard.notes)
     marks = [budget * 0.02 * 50 ** (i / (TIMELINE_POINTS - 1)) for i in range(TIMELINE_POINTS - 1)]
@@ -166,8 +166,7 @@ def fit_field(
             if voxels > MANY_VOXELS:  # memory is bounded
                 came = keep & (engine.visits > 0)
                 voxels = int(came.sum()) * growth  # what stays for the sake of holes gets no rays, so it does not decide
-                last = plan.level + 2 == len(ladder)
-                keep = keep & looked_at(current, engine.seen, engine.visits, settings.fit.prune_weight) if last else came
+                keep = keep & looked_at(current, engine.seen, engine.visits, settings.fit.prune_weight) if plan.next_is_finest else came
             if plan.worth(voxels, plan.rays_left(now, result.rays)) and room.fits(current, keep, plan, settings, guard.notes):
                 plan.climb()
                 engine.let_go()

@@ -55,7 +55,7 @@ class Losses(NamedTuple):
     depth: Any
     threshold: Any
     stop: Any
-    reach: Any  # working units; samples nearer than this move slowly (`near`), 0: none
+    slow_within: Any  # working units; samples nearer than this move slowly (`near`), 0: none
 
 
 @njit(**K.OPTIONS)
@@ -84,9 +84,9 @@ def depth_pull(along: Any, distance: Any) -> Any:
 
 
 @njit(**K.OPTIONS)
-def slow_near(along: Any, reach: Any) -> Any:
+def slow_near(along: Any, within: Any) -> Any:
     """`near.slowness` of one sample."""
-    share = max(along, ZERO) / reach if along < reach and reach > ZERO else ONE  # a sample may lie behind its camera
+    share = max(along, ZERO) / within if along < within and within > ZERO else ONE  # a sample may lie behind its camera
     return share * share
 
 
@@ -245,7 +245,7 @@ def gradient_pass(
             if raw >= K.RAW_MAX:
                 g_raw = ZERO
             behind += weight * g_weight[i]
-            slow = slow_near(values[i, K.ALONG], losses.reach)
+            slow = slow_near(values[i, K.ALONG], losses.slow_within)
             g_raw *= slow
             weight *= slow
             for corner in range(8):

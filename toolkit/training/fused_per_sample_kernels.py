@@ -171,7 +171,7 @@ def ray_backward(
         g = g_raw[i]
         g_raw[i] = (values[K.AFTER] * g - behind) * values[K.TAU] if values[K.RAW] < K.RAW_MAX else ZERO
         behind += values[K.WEIGHT] * g
-        slow = slow_near(values[K.ALONG], losses.reach)
+        slow = slow_near(values[K.ALONG], losses.slow_within)
         g_raw[i] *= slow
         for k in range(3):
             g_logit[i, k] *= slow

@@ -48,7 +48,7 @@ class Schedule:
         budget: seconds.
         patient: end when the validation views stop improving, before the budget does.
         most_rays: rays after which the fit ends, if the budget has not ended it before.
-        reach: of what moves slowly before a camera, working units (`near`).
+        slow_within: distance before a camera up to which things move slowly, working units (`near`).
     """
 
     ladder: list[int]
@@ -57,7 +57,7 @@ class Schedule:
     opaque: bool
     patient: bool = False
     most_rays: float = math.inf
-    reach: float = 0.0
+    slow_within: float = 0.0
     level: int = 0
     steps_here: int = 0
     slower: float = 1.0
@@ -72,6 +72,10 @@ class Schedule:
     @property
     def finest(self) -> bool:
         return self.level == len(self.ladder) - 1
+
+    @property
+    def next_is_finest(self) -> bool:
+        return self.level == len(self.ladder) - 2
 
     @property
     def rays(self) -> int:
@@ -147,4 +151,4 @@ class Schedule:
         fit = self.settings
         opacity = fit.opacity if self.opaque else 0.0
         steps = (fit.rate_density * fall, fit.rate_feature * fall, fit.rate_decoder * fall)
-        return Rates(*steps, fit.distortion, opacity, depth=fit.depth * LAST_DEPTH**done, reach=self.reach)
+        return Rates(*steps, fit.distortion, opacity, depth=fit.depth * LAST_DEPTH**done, slow_within=self.slow_within)

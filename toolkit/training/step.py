@@ -34,7 +34,7 @@ class Rates:
     random_background: bool = False  # what is behind everything is another colour for every ray, so that it cannot stand in for a surface
     colour_threshold: float = 3e-3  # samples of smaller weight are neither decoded nor given a gradient
     depth: float = 0.0  # weight of the mean of the depth term (see `depth`), for rays whose surface is known
-    reach: float = 0.0  # working units; samples nearer than this move slowly (see `near`), 0: none
+    slow_within: float = 0.0  # working units; samples nearer than this move slowly (see `near`), 0: none
 
 
 class Optimiser:
@@ -168,7 +168,7 @@ class Optimiser:
             g_weight = g_weight + g_distortion * (rates.distortion * shares[kept.ray])
         g_weight = g_weight + self._depth(batch, kept, rates)
         g_thickness = thickness_gradient(weight, transmittance, thickness, g_weight, kept.first, kept.ray, count)
-        slow = slowness(kept.distance, rates.reach)
+        slow = slowness(kept.distance, rates.slow_within)
         g_raw = torch.where(raw < RAW_MAX, g_thickness * thickness * slow, torch.zeros_like(raw))  # ∂τ/∂raw = τ
         self._move(rows, corner_weights, g_raw, per_ray[:, :-1] * (weight * slow)[:, None], rates, residual)
         return self._mean_error(residual, shares)
@@ -198,7 +198,7 @@ class Optimiser:
             g_weight = g_weight + g_distortion * (rates.distortion * shares[samples.ray])
         g_weight = g_weight + self._depth(batch, samples, rates)
         g_thickness = thickness_gradient(weight, transmittance, tau, g_weight, samples.first, samples.ray, count)
-        slow = slowness(samples.distance, rates.reach)
+        slow = slowness(samples.distance, rates.slow_within)
         torch.autograd.backward([thickness, colour], [g_thickness * slow, (weight * slow)[:, None] * g_mixed])
         assert features.grad is not None and base.grad is not None
         self._move(rows, corner_weights, base.grad, features.grad, rates, residual)
