@@ -57,6 +57,7 @@ def views_for_fit(job: Job, scene: Scene, views: Views) -> tuple[Views, list[str
         InputError: the pictures are to be matched, and cannot be.
         Interrupted: the user asked to stop.
     """
+    from toolkit.stereo.bare import continued
     from toolkit.stereo.quick import with_depths
 
     wanted = job.settings.fit.depth_from if job.settings.fit.depth > 0 else "off"
@@ -66,7 +67,9 @@ def views_for_fit(job: Job, scene: Scene, views: Views) -> tuple[Views, list[str
     full = wanted == "any" or (wanted == "auto" and job.settings.tsdf.enabled == "on")  # then it is there for the surface
     if known or not full:
         return views, []  # by `auto`, the fit matches pictures itself, quickly
-    return with_depths(views, np.flatnonzero(~views.test), match_pictures(job, scene, views)), ["stereo"]
+    training = np.flatnonzero(~views.test)
+    found = continued(match_pictures(job, scene, views), views.subset(training), scene.median_depth)
+    return with_depths(views, training, found), ["stereo"]
 
 
 def reuse_matched(job: Job, scene: Scene, views: Views) -> None:

@@ -30,8 +30,9 @@ SEEN_BY_SFM = (
 )
 MATCHED = (
     "The fit began by matching {views} training pictures of {pixels} pixels with each other ({seconds:.1f} s of its budget), so that it"
-    " knew a depth for {percent:.0f}% of their pixels."
+    " knew a depth for {percent:.0f}% of their pixels{bare}."
 )
+BARE = " ({percent:.0f}% are bare and lie on planes that go on from beside them)"
 OPENED = {".ply", ".obj", ".glb", ".mp4", ".txt", ".json"}
 NO_TEST_VIEWS = "no picture was held out, so there are no scores; give --holdout 8 to keep every 8th picture for testing"
 
@@ -130,6 +131,13 @@ def warnings_of(job: Job, capture: Capture, poses: PoseResult, scene: Scene, vie
     return unique(texts)
 
 
+def describe_matching(matched: dict[str, Any]) -> str:
+    """A sentence about what the fit's quick matching found."""
+    bare = matched.get("bare", 0.0)
+    words = BARE.format(percent=100 * bare) if bare >= 0.005 else ""
+    return MATCHED.format(**{**matched, "percent": 100 * matched["share"], "bare": words})
+
+
 def describe_field(field: Field | None, matched: dict[str, Any] | None = None) -> dict[str, Any] | None:
     """The report's part `field`; the voxel size is in working units. `matched` is what the fit's quick matching found."""
     if field is None:
@@ -190,7 +198,7 @@ def put_report(
             "height": views.intrinsics[0].height,
         },
         "field": describe_field(field, matched),
-        "notes": [] if matched is None else [MATCHED.format(**matched, percent=100 * matched["share"])],
+        "notes": [] if matched is None else [describe_matching(matched)],
         "evaluation": {name: scores.get(name) for name in ("field", "tsdf", *(["network"] if "network" in scores else []))},
         "baseline": scores.get("nearest_image"),
         "timeline": timeline,

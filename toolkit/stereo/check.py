@@ -15,6 +15,18 @@ SPECKLE = 1 / 2000  # share of the picture: smaller patches of kept depth are dr
 
 
 @numba.njit(cache=True, nogil=True)
+def seen_at(x: int, y: int, z: float, camera: Array, there: Array, other_camera: Array) -> tuple[float, float, float]:
+    """Where another camera sees the point of pixel (x, y) at depth z: its pixel coordinates there, and its depth (≤ 0: not before it)."""
+    px, py = (x + 0.5 - camera[2]) / camera[0] * z, (y + 0.5 - camera[3]) / camera[1] * z
+    qz = there[2, 0] * px + there[2, 1] * py + there[2, 2] * z + there[2, 3]
+    if qz <= 0:
+        return 0.0, 0.0, qz
+    qx = there[0, 0] * px + there[0, 1] * py + there[0, 2] * z + there[0, 3]
+    qy = there[1, 0] * px + there[1, 1] * py + there[1, 2] * z + there[1, 3]
+    return qx / qz * other_camera[0] + other_camera[2], qy / qz * other_camera[1] + other_camera[3], qz
+
+
+@numba.njit(cache=True, nogil=True)
 def _compare(
     depth: Array,
     camera: Array,
@@ -29,21 +41,14 @@ def _compare(
     """Count for each pixel whether one other view confirms its depth or sees through it, and sum up the inverse depths that confirm it."""
     height, width = depth.shape
     rows, columns = other.shape
-    fx, fy, cx, cy = camera
     gx, gy, ox, oy = other_camera
     for y in range(height):
         for x in range(width):
             z = depth[y, x]
             if z <= 0:
                 continue
-            px, py = (x + 0.5 - cx) / fx * z, (y + 0.5 - cy) / fy * z
-            qz = there[2, 0] * px + there[2, 1] * py + there[2, 2] * z + there[2, 3]
-            if qz <= 0:
-                continue
-            qx = there[0, 0] * px + there[0, 1] * py + there[0, 2] * z + there[0, 3]
-            qy = there[1, 0] * px + there[1, 1] * py + there[1, 2] * z + there[1, 3]
-            u, v = qx / qz * gx + ox, qy / qz * gy + oy
-            if not (0 <= u < columns and 0 <= v < rows):
+            u, v, qz = seen_at(x, y, z, camera, there, other_camera)
+            if qz <= 0 or not (0 <= u < columns and 0 <= v < rows):
                 continue
             column, row = int(u), int(v)
             seen = other[row, column]
@@ -84,13 +89,8 @@ def confirmed(
         (H, W) float32 depth, 0 where it is not kept, and (H, W) float32 confidence in [0, 1): a / (a + t + 1) for a others that agree and t
         that see through the point.
     """
-    depth = np.ascontiguousarray(depths[index], dtype=np.float32)
-    agree, through = np.zeros(depth.shape, np.int32), np.zeros(depth.shape, np.int32)
-    total = np.where(depth > 0, 1 / np.maximum(depth, 1e-12), 0)
-    for other in others:
-        there = invert(world_from_camera[other]) @ world_from_camera[index]
-        theirs = np.ascontiguousarray(depths[other], dtype=np.float32)
-        _compare(depth, _numbers(cameras[index]), theirs, _numbers(cameras[other]), there, tolerance, agree, through, total)
+    depth = depths[index]
+    agree, through, total = agreement(index, others, depths, cameras, world_from_camera, tolerance)
     kept = (depth > 0) & (agree >= needed) & (agree > through)
     mean = np.where(kept, (agree + 1) / np.maximum(total, 1e-12), 0)
     kept &= ~_speckles(mean, tolerance)
@@ -98,7 +98,28 @@ def confirmed(
     return np.where(kept, mean, 0).astype(np.float32), confidence.astype(np.float32)
 
 
-def _numbers(camera: Intrinsics) -> Array:
+def agreement(
+    index: int,
+    others: Sequence[int],
+    depths: Sequence[Array],
+    cameras: Sequence[Intrinsics],
+    world_from_camera: Array,
+    tolerance: float = TOLERANCE,
+) -> tuple[Array, Array, Array]:
+    """How many of `others` have the same point as each pixel of the depth map `index`, how many see through it, and the sum of the inverse
+    depths (H, W) of the pixel itself and of those that agree; arguments as `confirmed`."""
+    depth = np.ascontiguousarray(depths[index], dtype=np.float32)
+    agree, through = np.zeros(depth.shape, np.int32), np.zeros(depth.shape, np.int32)
+    total = np.where(depth > 0, 1 / np.maximum(depth, 1e-12), 0)
+    for other in others:
+        there = invert(world_from_camera[other]) @ world_from_camera[index]
+        theirs = np.ascontiguousarray(depths[other], dtype=np.float32)
+        _compare(depth, numbers(cameras[index]), theirs, numbers(cameras[other]), there, tolerance, agree, through, total)
+    return agree, through, total
+
+
+def numbers(camera: Intrinsics) -> Array:
+    """(4,) fx, fy, cx, cy for kernels."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
 

@@ -144,14 +144,19 @@ def _prepared(views: Views, index: int, long_side: int) -> _View:
     camera = views.intrinsics[index].pinhole()
     factor = min(1.0, long_side / max(camera.width, camera.height))
     camera = camera.scaled(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+    return _View(grey_view(views.images[index], camera, views.world_from_camera[index]), usable_pixels(views, index, camera))
+
+
+def usable_pixels(views: Views, index: int, camera: Intrinsics) -> Array | None:
+    """(H, W) bool pixels of a depth map where a view has something to see, None: all."""
     valid = views.valid[index] if views.valid else None
     alpha = views.alpha[index] if views.alpha else None
     usable = valid
     if alpha is not None:
         usable = alpha >= 128 if usable is None else usable & (alpha >= 128)
-    if usable is not None:
-        usable = cv2.resize(usable.astype(np.uint8), (camera.width, camera.height), interpolation=cv2.INTER_NEAREST) > 0
-    return _View(grey_view(views.images[index], camera, views.world_from_camera[index]), usable)
+    if usable is None:
+        return None
+    return np.asarray(cv2.resize(usable.astype(np.uint8), (camera.width, camera.height), interpolation=cv2.INTER_NEAREST) > 0)
 
 
 def _matched(ready: Sequence[_View], index: int, neighbours: Sequence[int], near: float, far: float) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture.types import Views
 from toolkit.progress import SILENT, Progress
+from toolkit.stereo.bare import continued
 from toolkit.stereo.maps import depth_at
 from toolkit.stereo.match import LONG_SIDE, StereoDepth, stereo_depths
 
@@ -32,9 +33,10 @@ class Matched:
     views: int  # pictures that were matched
     pixels: int  # long side of their depth maps
     share: float  # of their pixels that have depth
+    bare: float  # share of their pixels whose depth is that of a plane that goes on, not matched itself; part of `share`
 
     def to_dict(self) -> dict[str, float]:
-        return {"views": self.views, "pixels": self.pixels, "share": round(self.share, 4)}
+        return {"views": self.views, "pixels": self.pixels, "share": round(self.share, 4), "bare": round(self.bare, 4)}
 
 
 def view_seconds(side: float, aspect: float) -> float:
@@ -76,10 +78,13 @@ def guided(
         return views, None
     side, every = chosen
     matched = training[::every]
-    found = stereo_depths(views.subset(matched), near, far, median_depth, long_side=side, progress=progress)
-    out = with_depths(views, matched, found)
+    some = views.subset(matched)
+    found = stereo_depths(some, near, far, median_depth, long_side=side, progress=progress)
+    whole = continued(found, some, median_depth)
+    out = with_depths(views, matched, whole)
     share = float(np.mean([np.mean(out.depths[index] > 0) for index in matched]))
-    return out, Matched(len(matched), max(max(one.depth.shape) for one in found), share)
+    bare = float(np.mean([np.mean((one.depth <= 0) & (more.depth > 0)) for one, more in zip(found, whole, strict=True)]))
+    return out, Matched(len(matched), max(max(one.depth.shape) for one in found), share, bare)
 
 
 def with_depths(views: Views, indices: Array, found: list[StereoDepth]) -> Views:

@@ -1,0 +1,95 @@
+"""The planes of a scene (floor, walls, doors), found in points that matching gave: of planes through three neighbouring points the one that
+most of what is left lies on, again and again (sequential RANSAC, Fischler and Bolles 1981)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from toolkit.camera import Array
+
+ON = 0.015  # share of its depth by which a point may miss a plane that it is counted to
+LEAST = 0.006  # share of all points that a plane must have
+MOST = 24  # planes
+TRIPLES = 400  # planes that are tried in each round …
+SCORED = 6000  # … on so many of the points
+APART = (0.02, 0.3)  # of the picture's long side: a triple's points lie in one picture, no nearer and no farther from each other
+BEST = 3  # of the planes that were tried are fitted to their points
+REFITS = 4
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points of several pictures, those of one picture beside each other."""
+
+    place: Array  # (N, 3) float64, world
+    depth: Array  # (N,) float64 along z of the picture's camera
+    view: Array  # (N,) int64, rising
+    pixel: Array  # (N, 2) float64 x, y in shares of the picture's long side
+
+
+def find_planes(points: Points, seed: int = 0) -> Array:
+    """(K, 4) float64 planes, those with most points first: n · p = d with a unit normal n in the first three columns, d in the last.
+
+    What lies on a plane, within twice `ON`, is no longer asked for the next one.
+    """
+    generator = np.random.default_rng(seed)
+    left = np.arange(len(points.depth))
+    least = max(3.0, LEAST * len(left))
+    found: list[Array] = []
+    while len(found) < MOST and len(left) >= least:
+        tried = _planes_through(points, _triples(points, left, generator))
+        some = generator.permutation(left)[:SCORED]
+        counts = (_misses(points, some, tried) < ON).sum(axis=0)
+        fitted = [_fitted(points, left, tried[best]) for best in np.argsort(-counts, kind="stable")[:BEST]]
+        if not fitted:
+            break
+        number, plane = max(fitted, key=lambda one: one[0])
+        if number < least:
+            break
+        found.append(plane)
+        left = left[_misses(points, left, plane[None])[:, 0] >= 2 * ON]
+    return np.array(found).reshape(-1, 4)
+
+
+def _triples(points: Points, left: Array, generator: np.random.Generator) -> Array:
+    """(T, 3) points of `left`, each three in one picture and `APART`."""
+    first = generator.choice(left, TRIPLES)
+    views = points.view[left]
+    start, stop = np.searchsorted(views, points.view[first]), np.searchsorted(views, points.view[first], side="right")
+    others = left[start[:, None] + (generator.random((TRIPLES, 16)) * (stop - start)[:, None]).astype(np.int64)]  # (T, 16) of the same view
+    gap = np.linalg.norm(points.pixel[others] - points.pixel[first][:, None], axis=2)
+    fits = (gap > APART[0]) & (gap < APART[1])
+    chosen = np.argsort(~fits, axis=1, kind="stable")[:, :2]
+    whole = fits.sum(axis=1) >= 2
+    return np.column_stack([first, np.take_along_axis(others, chosen, axis=1)])[whole]
+
+
+def _planes_through(points: Points, triples: Array) -> Array:
+    """(T', 4) the planes through points, without those on a line."""
+    a, b, c = (points.place[triples[:, corner]] for corner in range(3))
+    normal = np.cross(b - a, c - a)
+    size = np.linalg.norm(normal, axis=1)
+    whole = size > 1e-6 * np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1)
+    normal = normal[whole] / size[whole, None]
+    return np.column_stack([normal, (normal * a[whole]).sum(axis=1)])
+
+
+def _misses(points: Points, which: Array, planes: Array) -> Array:
+    """(len(which), K) distances from planes, in shares of the points' depths."""
+    return np.asarray(np.abs(points.place[which] @ planes[:, :3].T - planes[:, 3]) / points.depth[which, None])
+
+
+def _fitted(points: Points, left: Array, plane: Array) -> tuple[int, Array]:
+    """A plane by least squares over what lies on it, nearer points counting more since they are known better; and how many they are."""
+    for number in range(REFITS):
+        on = left[_misses(points, left, plane[None])[:, 0] < (2 * ON if number == 0 else ON)]
+        if len(on) < 3:
+            return 0, plane
+        weight = 1 / points.depth[on]
+        middle = (points.place[on] * weight[:, None]).sum(axis=0) / weight.sum()
+        spread = (points.place[on] - middle) * weight[:, None]
+        normal = np.linalg.eigh(spread.T @ spread)[1][:, 0]
+        plane = np.append(normal, normal @ middle)
+    return int((_misses(points, left, plane[None])[:, 0] < ON).sum()), plane
