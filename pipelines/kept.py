@@ -44,7 +44,7 @@ MEASURED_POINT = {"key": TEXT, "crashed": FLAG, "wall_seconds": NUMBER, "rows": 
 EXPORT_FACTS = {"mesh": (None, MESH), "?note": TEXT}
 TIMELINE = [{"seconds": NUMBER, "psnr": (None, NUMBER), "*": (None, NUMBER, TEXT)}]
 NOTES = [TEXT]
-MATCHED = {"views": NUMBER, "pixels": NUMBER, "share": NUMBER, "seconds": NUMBER}
+MATCHED = {"views": NUMBER, "pixels": NUMBER, "share": NUMBER, "?bare": NUMBER, "seconds": NUMBER}
 NETWORK = {
     "key_frames": NUMBER, "seconds": NUMBER, "?fusion_seconds": NUMBER, "encode_seconds": NUMBER, "first_preview_seconds": NUMBER,
     "resolution": NUMBER,

@@ -18,17 +18,22 @@ if TYPE_CHECKING:
 
 
 def match_pictures(job: Job, scene: Scene, views: Views) -> list[StereoDepth]:
-    """Depth of every training view; held-out pictures are not looked at.
+    """Depth of every training view, matched, and where bare planes go on; held-out pictures are not looked at.
 
     Raises:
         InputError: the pictures cannot be matched.
         Interrupted: the user asked to stop.
     """
+    from toolkit.stereo.bare import continued
     from toolkit.stereo.maps import load_stereo, save_stereo
     from toolkit.stereo.match import stereo_depths
 
     path = job.folder / "stereo" / "depths.safetensors"
     training = views.subset(np.flatnonzero(~views.test))
+
+    def make() -> list[StereoDepth]:
+        found = stereo_depths(training, scene.near, scene.far, scene.median_depth, progress=job.progress)
+        return continued(found, training, scene.median_depth, job.progress)
 
     def load() -> list[StereoDepth]:
         names, depths = load_stereo(path)
@@ -42,11 +47,12 @@ def match_pictures(job: Job, scene: Scene, views: Views) -> list[StereoDepth]:
 
     return job.stages.run(
         "stereo",
-        make=lambda: stereo_depths(training, scene.near, scene.far, scene.median_depth, progress=job.progress),
+        make=make,
         save=save,
         load=load,
         after=["scene", "views"],
         rounded=True,
+        version=2,
     )
 
 
@@ -57,7 +63,6 @@ def views_for_fit(job: Job, scene: Scene, views: Views) -> tuple[Views, list[str
         InputError: the pictures are to be matched, and cannot be.
         Interrupted: the user asked to stop.
     """
-    from toolkit.stereo.bare import continued
     from toolkit.stereo.quick import with_depths
 
     wanted = job.settings.fit.depth_from if job.settings.fit.depth > 0 else "off"
@@ -67,9 +72,7 @@ def views_for_fit(job: Job, scene: Scene, views: Views) -> tuple[Views, list[str
     full = wanted == "any" or (wanted == "auto" and job.settings.tsdf.enabled == "on")  # then it is there for the surface
     if known or not full:
         return views, []  # by `auto`, the fit matches pictures itself, quickly
-    training = np.flatnonzero(~views.test)
-    found = continued(match_pictures(job, scene, views), views.subset(training), scene.median_depth)
-    return with_depths(views, training, found), ["stereo"]
+    return with_depths(views, np.flatnonzero(~views.test), match_pictures(job, scene, views)), ["stereo"]
 
 
 def reuse_matched(job: Job, scene: Scene, views: Views) -> None:

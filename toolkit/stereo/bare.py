@@ -9,6 +9,7 @@ what was matched.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -17,8 +18,9 @@ import numpy as np
 
 from toolkit.camera import Array, Intrinsics, invert
 from toolkit.capture.types import Views
+from toolkit.progress import SILENT, Progress
 from toolkit.stereo.check import agreement, numbers, seen_at
-from toolkit.stereo.match import CHECKED, StereoDepth, usable_neighbours, usable_pixels
+from toolkit.stereo.match import CHECKED, MOST_WORKERS, StereoDepth, usable_neighbours, usable_pixels
 from toolkit.stereo.planes import Points, find_planes
 
 POINTS = 60_000  # that planes are looked for in, of all pictures together
@@ -40,7 +42,7 @@ class _Proposed:
     new: Array  # (H, W) bool where a plane goes on
 
 
-def continued(found: Sequence[StereoDepth], views: Views, median_depth: float) -> list[StereoDepth]:
+def continued(found: Sequence[StereoDepth], views: Views, median_depth: float, progress: Progress = SILENT) -> list[StereoDepth]:
     """What matching `found` of `views`, and depth beside it where a plane goes on.
 
     Args:
@@ -49,6 +51,9 @@ def continued(found: Sequence[StereoDepth], views: Views, median_depth: float) -
 
     Returns:
         depths as matched where there were any; others confident as what `check.confirmed` keeps.
+
+    Raises:
+        Interrupted: the user asked to stop.
     """
     poses = np.asarray(views.world_from_camera, dtype=np.float64)
     cameras = [one.intrinsics for one in found]
@@ -56,22 +61,37 @@ def continued(found: Sequence[StereoDepth], views: Views, median_depth: float) -
     neighbours = usable_neighbours(poses, cameras, median_depth, CHECKED) if len(found) > 1 else [[]]
     if not len(planes) or not any(neighbours):
         return list(found)
-    small = [_shrunk(picture, camera) for picture, camera in zip(views.images, cameras, strict=True)]
-    usable = [usable_pixels(views, index, camera) for index, camera in enumerate(cameras)]
-    proposed = [_proposal(one, small[i], poses[i], planes, usable[i]) for i, one in enumerate(found)]
-    depths = [one.depth for one in proposed]
-    soft = [cv2.GaussianBlur(picture, (0, 0), BLUR[1]) for picture in small]
     others = [[other for other in row if neighbours[other]] for row in neighbours]
-    differences = [_differences(i, others[i], depths, soft, cameras, poses) for i in range(len(found))]
-    matched = [difference[one.depth > 0] for difference, one in zip(differences, found, strict=True)]
-    limit = _quantile(np.concatenate(matched), ALIKE)
-    out = []
-    for i, (one, plan) in enumerate(zip(found, proposed, strict=True)):
-        agree, through, _ = agreement(i, others[i], depths, cameras, poses)
-        kept = plan.new & (agree >= min(CONFIRMED, len(others[i]))) & (agree > through) & (differences[i] <= limit)
+    small = [_shrunk(picture, camera) for picture, camera in zip(views.images, cameras, strict=True)]
+    soft = [cv2.GaussianBlur(picture, (0, 0), BLUR[1]) for picture in small]
+
+    def proposal(index: int) -> _Proposed:
+        progress.check()
+        return _proposal(found[index], small[index], poses[index], planes, usable_pixels(views, index, cameras[index]))
+
+    def difference(index: int) -> Array:
+        progress.check()
+        return _differences(index, others[index], depths, soft, cameras, poses)
+
+    def checked(index: int) -> StereoDepth:
+        progress.check()
+        one, plan = found[index], proposed[index]
+        agree, through, _ = agreement(index, others[index], depths, cameras, poses)
+        kept = plan.new & (agree >= min(CONFIRMED, len(others[index]))) & (agree > through) & (differences[index] <= limit)
         confidence = np.where(kept, agree / (agree + through + 1), one.confidence).astype(np.float32)
-        out.append(replace(one, depth=np.where(kept, plan.depth, one.depth), confidence=confidence))
-    return out
+        return replace(one, depth=np.where(kept, plan.depth, one.depth), confidence=confidence)
+
+    every = range(len(found))
+    with ThreadPoolExecutor(max(1, min(MOST_WORKERS, cv2.getNumThreads()))) as pool:
+        try:
+            proposed = list(pool.map(proposal, every))
+            depths = [one.depth for one in proposed]
+            differences = list(pool.map(difference, every))
+            matched = [values[one.depth > 0] for values, one in zip(differences, found, strict=True)]
+            limit = _quantile(np.concatenate(matched), ALIKE)
+            return list(pool.map(checked, every))
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def _points(found: Sequence[StereoDepth], poses: Array) -> Points:
@@ -195,7 +215,7 @@ def _go_on(camera: Array, planes: Array, slant: float, winner: Array, depth: Arr
 def _differences(
     index: int, others: Sequence[int], depths: Sequence[Array], pictures: Sequence[Array], cameras: Sequence[Intrinsics], poses: Array
 ) -> Array:
-    """(H, W) float32 median over `others` of how much their colours differ from this picture's, in levels; NaN: none sees the point."""
+    """(H, W) float16 median over `others` of how much their colours differ from this picture's, in levels; NaN: none sees the point."""
     each = np.full((len(others), *depths[index].shape), np.nan, np.float32)
     for place, other in enumerate(others):
         there = invert(poses[other]) @ poses[index]
@@ -205,7 +225,7 @@ def _differences(
     each.sort(axis=0)
     count = np.isfinite(each).sum(axis=0)
     low, high = (np.take_along_axis(each, np.clip(at, 0, len(others) - 1)[None], axis=0)[0] for at in ((count - 1) // 2, count // 2))
-    return np.asarray((low + high) / 2)
+    return np.asarray((low + high) / 2, dtype=np.float16)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -234,4 +254,4 @@ def _differ(
 
 def _quantile(values: Array, share: float) -> float:
     values = values[np.isfinite(values)]
-    return float(np.quantile(values, share)) if len(values) else 0.0
+    return float(np.quantile(values.astype(np.float32), share)) if len(values) else 0.0

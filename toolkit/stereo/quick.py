@@ -80,7 +80,7 @@ def guided(
     matched = training[::every]
     some = views.subset(matched)
     found = stereo_depths(some, near, far, median_depth, long_side=side, progress=progress)
-    whole = continued(found, some, median_depth)
+    whole = continued(found, some, median_depth, progress)
     out = with_depths(views, matched, whole)
     share = float(np.mean([np.mean(out.depths[index] > 0) for index in matched]))
     bare = float(np.mean([np.mean((one.depth <= 0) & (more.depth > 0)) for one, more in zip(found, whole, strict=True)]))
