@@ -13,11 +13,14 @@ from tests.training.test_fit import ticking, wanted
 from tests.training.test_fused import made_views
 from toolkit.camera import Intrinsics, Similarity
 from toolkit.capture.types import Views
+from toolkit.config import FitSettings
 from toolkit.poses.scene import Scene
 from toolkit.render.image import render_view
-from toolkit.training.depth import NOISE, REACH, depth_gradient, ray_distances
+from toolkit.training.depth import MATCHED, MEASURED, REACH, Trust, depth_gradient, ray_distances
 from toolkit.training.fit import fit_field
 from toolkit.training.rays import PixelPool
+from toolkit.training.schedule import Schedule
+from toolkit.training.step import Rates
 
 
 def test_distances_along_rays_are_those_of_the_pools_directions() -> None:
@@ -46,19 +49,47 @@ def test_what_is_no_depth_stays_unknown() -> None:
     assert (found[0, :4] == 0).all() and found[0, 4] > 2
 
 
+@pytest.mark.parametrize("noise", [MEASURED.noise, MATCHED.noise])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-def test_weight_is_drawn_to_the_surface_alike_at_any_scale(scale: float) -> None:
+def test_weight_is_drawn_to_the_surface_alike_at_any_scale(scale: float, noise: float) -> None:
     away = torch.tensor([0.0, 0.5, 1.0, 5.0, -0.5, -0.9])
     target = torch.full((6,), 2.0 * scale)
-    got = depth_gradient(target * (1 + NOISE * away.sign() + REACH * away), target)
+    got = depth_gradient(target * (1 + noise * away.sign() + REACH * away), target, noise)
     torch.testing.assert_close(got, torch.tensor([-1.0, -0.5, 0.0, 0.0, -0.5, -0.1]), atol=1e-3, rtol=0)
-    assert not bool(depth_gradient(target, torch.zeros(6)).any())
+    assert not bool(depth_gradient(target, torch.zeros(6), noise).any())
 
 
-def test_within_its_noise_a_depth_says_nothing() -> None:
+@pytest.mark.parametrize("noise", [MEASURED.noise, MATCHED.noise])
+def test_within_its_noise_a_depth_says_nothing(noise: float) -> None:
     target = torch.full((3,), 2.0)
-    got = depth_gradient(target * (1 + NOISE * torch.tensor([-0.99, 0.3, 0.99])), target)
+    got = depth_gradient(target * (1 + noise * torch.tensor([-0.99, 0.3, 0.99])), target, noise)
     assert bool((got == -1).all())  # the same for all: no sample is drawn away from another
+
+
+@pytest.mark.parametrize("trust", [MEASURED, MATCHED])
+def test_the_schedule_believes_depth_as_far_as_it_is_told(trust: Trust) -> None:
+    plan = Schedule([32], 1.0, FitSettings(depth=0.06), True, trust=trust)
+    first, last = plan.rates(0.0, 0), plan.rates(1.0, 0)
+    assert first.depth_noise == last.depth_noise == trust.noise
+    assert first.depth == pytest.approx(0.06 * trust.weight) and last.depth == pytest.approx(first.depth * trust.last)
+
+
+@pytest.mark.parametrize("matched", [True, False])
+def test_a_fit_knows_where_depth_comes_from(matched: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[float] = []
+
+    class Told(Schedule):
+        def rates(self, done: float, rays: int) -> Rates:
+            rates = super().rates(done, rays)
+            asked.append(rates.depth_noise)
+            return rates
+
+    monkeypatch.setattr("toolkit.training.fit.Schedule", Told)
+    ticking(monkeypatch, 0.05)
+    views = replace(blank_views(), matched=matched)
+    scene = Scene(Similarity.identity(), np.array([0.0, -1.5, 1.0]), np.full(3, 4.5), 3.4, 1.0, 8.0, 0.0, False, False)
+    fit_field(views, scene, wanted("fit.depth=0.05"))
+    assert asked and set(asked) == {(MATCHED if matched else MEASURED).noise}
 
 
 def blank_views() -> Views:

@@ -108,8 +108,9 @@ def describe_scene(capture: Capture, progress: Progress = SILENT) -> Scene:
     cloud = find_cloud(local, progress)
     if len(cloud.points) < FEW_POINTS or len(cloud.point) == 0:
         raise PoseError(
-            f"{capture.root}: only {len(cloud.points)} points could be triangulated with the given poses, so they or their axis "
-            f"convention do not fit the pictures; check them or use --set poses.source=sfm"
+            f"{capture.root}: only {len(cloud.points)} points could be triangulated with the given poses: they or their axis convention "
+            f"do not fit the pictures, or these show too little that is recognised in others; check the poses, use --set poses.source=sfm, "
+            f"or add pictures with more texture"
         )
     depth = cloud.median_depth()
     scale = 1.0 if capture.metric else MEDIAN_DEPTH / depth

@@ -1,7 +1,8 @@
 """Depth for captures that have none: each picture is matched with posed neighbours by a plane sweep, and views confirm each other.
 
 Steps: fronto-parallel planes at even steps of inverse depth (`cost.py`), semi-global matching over them (`smooth.py`), refinement
-between the planes (`refine.py`), agreement between views (`check.py`). Nothing is learned; what has no texture stays empty.
+between the planes (`refine.py`), agreement between views (`check.py`). Nothing is learned; what has no texture stays empty here, and
+planes go on through it afterwards (`bare.py`).
 """
 
 from __future__ import annotations

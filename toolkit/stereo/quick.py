@@ -93,7 +93,7 @@ def with_depths(views: Views, indices: Array, found: list[StereoDepth]) -> Views
     for index, one in zip(indices, found, strict=True):
         camera = views.intrinsics[index]
         depths[index] = depth_at(one, camera.width, camera.height)
-    return replace(views, depths=depths)
+    return replace(views, depths=depths, matched=True)
 
 
 def warm_up() -> None:

@@ -4,12 +4,14 @@ Of a ray whose surface lies at the distance d, each sample with weight w at the 
 
     w · (min(max(|t − d| − e d, 0) / (r d), 1) − 1):
 
-nothing beyond the reach r d, the less the nearer it lies, and the same wherever it is as near as a sensor can tell, e d. So weight is drawn
+nothing beyond the reach r d, the less the nearer it lies, and the same wherever it is as near as can be told, e d. So weight is drawn
 to the surface whatever lies far from it, a depth that is wrong costs no more than one that is missing by far, and where in its noise the
-surface is, colours decide.
+surface is, colours decide. `Trust` tells how strongly, and for how long.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,7 +20,19 @@ from toolkit.camera import Array, Intrinsics
 
 Tensor = torch.Tensor
 REACH = 0.05  # r: share of the distance, beyond the noise, within which a sample counts as near the surface
-NOISE = 0.004  # e: share of the distance by which a measured depth may be off: noise, and pictures that are not quite registered
+
+
+@dataclass(frozen=True)
+class Trust:
+    """How far the depth of pictures is believed."""
+
+    noise: float  # e: share of the distance by which it may be off: noise, and pictures that are not quite registered
+    weight: float  # of the term at the beginning of a fit, in units of `fit.depth` …
+    last: float  # … and the share of it at the end: depth decides early where surfaces are, colours how they look
+
+
+MEASURED = Trust(noise=0.004, weight=1.0, last=0.1)  # by a sensor
+MATCHED = Trust(noise=0.01, weight=10 / 3, last=0.03)  # by matching pictures: less exact, and mostly where colours tell little themselves
 
 
 def ray_distances(depth: Array, camera: Intrinsics) -> Array:
@@ -29,7 +43,7 @@ def ray_distances(depth: Array, camera: Intrinsics) -> Array:
     return np.asarray(np.where(np.isfinite(depth) & (depth > 0), depth * length, 0), dtype=np.float32)
 
 
-def depth_gradient(distance: Tensor, target: Tensor) -> Tensor:
+def depth_gradient(distance: Tensor, target: Tensor, noise: float) -> Tensor:
     """(samples,) gradient of the term for the samples' weights, from their distances and those of their rays' surfaces (0: unknown)."""
-    away = ((distance - target).abs() / target.clamp_min(1e-9) - NOISE) / REACH
+    away = ((distance - target).abs() / target.clamp_min(1e-9) - noise) / REACH
     return torch.where(target > 0, away.clamp(0.0, 1.0) - 1.0, torch.zeros_like(away))

@@ -134,7 +134,7 @@ class FusedOptimiser:
                 batch.look(thread, self.space, self.pixels, self.met)
             batch.sort(self.met)
         picks, jitter = batch.picks, batch.jitter
-        weights = (rates.distortion, rates.opacity, rates.depth, rates.colour_threshold, STOP, rates.slow_within)
+        weights = (rates.distortion, rates.opacity, rates.depth, rates.depth_noise, rates.colour_threshold, STOP, rates.slow_within)
         losses = kernels.Losses(*(np.float32(weight) for weight in weights))
         shares, met = batch.weights / np.float32(rays), np.empty((rays, 3), np.float32)
         self._make_room(rays)

@@ -14,11 +14,10 @@ from toolkit.render import kernels as K
 from toolkit.render.kernels_decode import decode, encode_direction, multiply
 from toolkit.render.kernels_lookup import gather_row
 from toolkit.render.kernels_march import march_ray
-from toolkit.training.depth import NOISE as NOISE_
 from toolkit.training.depth import REACH as REACH_
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
-REACH, NOISE = F(REACH_), F(NOISE_)
+REACH = F(REACH_)
 WALK_WORK = F(0.7)  # what a coarse step costs whose fine ones are tried, in samples that are looked up
 
 
@@ -53,6 +52,7 @@ class Losses(NamedTuple):
     distortion: Any
     opacity: Any
     depth: Any
+    depth_noise: Any
     threshold: Any
     stop: Any
     slow_within: Any  # working units; samples nearer than this move slowly (`near`), 0: none
@@ -76,11 +76,11 @@ def pixel_ray(pixels: Any, pick: Any, ray: Any) -> None:
 
 
 @njit(**K.OPTIONS)
-def depth_pull(along: Any, distance: Any) -> Any:
+def depth_pull(along: Any, distance: Any, noise: Any) -> Any:
     """`depth.depth_gradient` of one sample."""
     if distance <= ZERO:
         return ZERO
-    return min(max(abs(along - distance) / distance - NOISE, ZERO) / REACH, ONE) - ONE
+    return min(max(abs(along - distance) / distance - noise, ZERO) / REACH, ONE) - ONE
 
 
 @njit(**K.OPTIONS)
@@ -227,7 +227,7 @@ def gradient_pass(
         distance = pixels.distance[pick] if pixels.distance.shape[0] > 0 else ZERO
         before, before_place = ZERO, ZERO
         for i in range(kept):
-            g = constant + depth_loss * depth_pull(values[i, K.ALONG], distance)
+            g = constant + depth_loss * depth_pull(values[i, K.ALONG], distance, losses.depth_noise)
             for c in range(channels):
                 g += features[i, c] * g_given[c]
             weight, place = values[i, K.WEIGHT], values[i, K.PLACE]

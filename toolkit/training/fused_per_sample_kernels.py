@@ -160,7 +160,7 @@ def ray_backward(
         after, after_place = total - before - weight, total_place - before_place - weight * place
         pull = place * (before - after) - (before_place - after_place)
         g_raw[i] = g_red * a + g_green * b + g_blue * c + constant + TWO * distortion * (pull + weight * spread * K.THIRD)
-        g_raw[i] += depth_loss * depth_pull(tape.values[i, K.ALONG], surface)
+        g_raw[i] += depth_loss * depth_pull(tape.values[i, K.ALONG], surface, losses.depth_noise)
         before += weight
         before_place += weight * place
     # so far ∂L/∂w; ∂L/∂τ_i = T_i e^{-τ_i} g_i - Σ_{j>i} w_j g_j, far to near

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from dataclasses import field as default
 
 from toolkit.config import FitSettings
+from toolkit.training.depth import MEASURED, Trust
 from toolkit.training.step import Rates
 
 RUNGS = (0.1, 0.3, 0.6, 0.8, 0.9)  # share of the budget at which each level ends at the latest (32 … 512)
@@ -19,7 +20,6 @@ PRUNE_EVERY = 150  # steps
 LAST_PRUNE = 0.8  # of the budget; from here on the field is only polished, on all views
 SLOWING = 1e7  # rays after which step sizes begin to fall
 LAST_RATE = 0.08  # of the step sizes, at the very end
-LAST_DEPTH = 0.1  # of the depth term's weight, at the very end: depth decides early where surfaces are, colours how they look
 FIRST_BATCH = 256  # rays a step at the coarsest level, doubled at each level: early on the number of steps counts
 WORTH = 0.5  # rays that must be left for every voxel of a finer level: with fewer it ends blurred, and worse than the coarser one
 LOOK_STEPS = 60  # from one look at the validation views to the next …
@@ -49,6 +49,7 @@ class Schedule:
         patient: end when the validation views stop improving, before the budget does.
         most_rays: rays after which the fit ends, if the budget has not ended it before.
         slow_within: distance before a camera up to which things move slowly, working units (`near`).
+        trust: how far the pictures' depth is believed.
     """
 
     ladder: list[int]
@@ -58,6 +59,7 @@ class Schedule:
     patient: bool = False
     most_rays: float = math.inf
     slow_within: float = 0.0
+    trust: Trust = MEASURED
     level: int = 0
     steps_here: int = 0
     slower: float = 1.0
@@ -150,5 +152,6 @@ class Schedule:
         fall = (1 + rays / SLOWING) ** -0.85 * self.slower * LAST_RATE ** max(0.0, (done - LAST_PRUNE) / (1 - LAST_PRUNE))
         fit = self.settings
         opacity = fit.opacity if self.opaque else 0.0
+        depth = fit.depth * self.trust.weight * self.trust.last**done
         steps = (fit.rate_density * fall, fit.rate_feature * fall, fit.rate_decoder * fall)
-        return Rates(*steps, fit.distortion, opacity, depth=fit.depth * LAST_DEPTH**done, slow_within=self.slow_within)
+        return Rates(*steps, fit.distortion, opacity, depth=depth, depth_noise=self.trust.noise, slow_within=self.slow_within)
