@@ -84,7 +84,7 @@ class FitSettings:
     distortion: float = 0.015  # weight of the distortion loss
     opacity: float = 0.05  # weight of (1 - opacity)² where every ray must end somewhere (captures without alpha)
     slow_within: float = 0.5  # median depths; what is nearer to a camera moves slowly, so that nothing grows right before it; 0: off
-    depth: float = 0.03  # weight of the depth term where the depth of a picture is known; 0: colours alone
+    depth: float = 0.03  # weight of the depth term where the depth of a picture is known (quickly matched: twice as much); 0: colours alone
     # Where depth comes from. auto: a sensor, or without one quick matching of the pictures in a share of the fit's seconds | any: a sensor,
     # or without one matching in full, which takes time of its own | sensor | off
     depth_from: str = "auto"

@@ -16,7 +16,7 @@ from toolkit.capture.types import Views
 from toolkit.config import FitSettings
 from toolkit.poses.scene import Scene
 from toolkit.render.image import render_view
-from toolkit.training.depth import MATCHED, MEASURED, REACH, Trust, depth_gradient, ray_distances
+from toolkit.training.depth import FINE, REACH, ROUGH, Trust, depth_gradient, ray_distances
 from toolkit.training.fit import fit_field
 from toolkit.training.rays import PixelPool
 from toolkit.training.schedule import Schedule
@@ -49,7 +49,7 @@ def test_what_is_no_depth_stays_unknown() -> None:
     assert (found[0, :4] == 0).all() and found[0, 4] > 2
 
 
-@pytest.mark.parametrize("noise", [MEASURED.noise, MATCHED.noise])
+@pytest.mark.parametrize("noise", [FINE.noise, ROUGH.noise])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_weight_is_drawn_to_the_surface_alike_at_any_scale(scale: float, noise: float) -> None:
     away = torch.tensor([0.0, 0.5, 1.0, 5.0, -0.5, -0.9])
@@ -59,14 +59,14 @@ def test_weight_is_drawn_to_the_surface_alike_at_any_scale(scale: float, noise: 
     assert not bool(depth_gradient(target, torch.zeros(6), noise).any())
 
 
-@pytest.mark.parametrize("noise", [MEASURED.noise, MATCHED.noise])
+@pytest.mark.parametrize("noise", [FINE.noise, ROUGH.noise])
 def test_within_its_noise_a_depth_says_nothing(noise: float) -> None:
     target = torch.full((3,), 2.0)
     got = depth_gradient(target * (1 + noise * torch.tensor([-0.99, 0.3, 0.99])), target, noise)
     assert bool((got == -1).all())  # the same for all: no sample is drawn away from another
 
 
-@pytest.mark.parametrize("trust", [MEASURED, MATCHED])
+@pytest.mark.parametrize("trust", [FINE, ROUGH])
 def test_the_schedule_believes_depth_as_far_as_it_is_told(trust: Trust) -> None:
     plan = Schedule([32], 1.0, FitSettings(depth=0.06), True, trust=trust)
     first, last = plan.rates(0.0, 0), plan.rates(1.0, 0)
@@ -74,8 +74,8 @@ def test_the_schedule_believes_depth_as_far_as_it_is_told(trust: Trust) -> None:
     assert first.depth == pytest.approx(0.06 * trust.weight) and last.depth == pytest.approx(first.depth * trust.last)
 
 
-@pytest.mark.parametrize("matched", [True, False])
-def test_a_fit_knows_where_depth_comes_from(matched: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("rough", [True, False])
+def test_a_fit_knows_where_depth_comes_from(rough: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[float] = []
 
     class Told(Schedule):
@@ -86,10 +86,10 @@ def test_a_fit_knows_where_depth_comes_from(matched: bool, monkeypatch: pytest.M
 
     monkeypatch.setattr("toolkit.training.fit.Schedule", Told)
     ticking(monkeypatch, 0.05)
-    views = replace(blank_views(), matched=matched)
+    views = replace(blank_views(), rough=rough)
     scene = Scene(Similarity.identity(), np.array([0.0, -1.5, 1.0]), np.full(3, 4.5), 3.4, 1.0, 8.0, 0.0, False, False)
     fit_field(views, scene, wanted("fit.depth=0.05"))
-    assert asked and set(asked) == {(MATCHED if matched else MEASURED).noise}
+    assert asked and set(asked) == {(ROUGH if rough else FINE).noise}
 
 
 def blank_views() -> Views:

@@ -17,13 +17,13 @@ from toolkit.capture.types import Views
 from toolkit.render.compiled import CompiledRenderer
 from toolkit.render.rays import render_rays
 from toolkit.training import fused_kernels, fused_order
-from toolkit.training.depth import MATCHED
+from toolkit.training.depth import ROUGH
 from toolkit.training.fused import FusedOptimiser
 from toolkit.training.rays import PixelPool
 from toolkit.training.step import Optimiser, Rates
 
 RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03, depth=0.05)
-SLOW = replace(RATES, slow_within=3.0, depth_noise=MATCHED.noise)  # the made views look from 3 away: half of what they see moves slowly
+SLOW = replace(RATES, slow_within=3.0, depth_noise=ROUGH.noise)  # the made views look from 3 away: half of what they see moves slowly
 
 
 def looking(eye: np.ndarray) -> np.ndarray:

@@ -18,13 +18,13 @@ from toolkit.render.compiled_per_sample import PerSampleRenderer, net_arrays, wr
 from toolkit.render.field import Field
 from toolkit.render.kernels_matrix import add_outer, product
 from toolkit.render.rays import render_rays
-from toolkit.training.depth import MATCHED
+from toolkit.training.depth import ROUGH
 from toolkit.training.fused_per_sample import FusedPerSampleOptimiser
 from toolkit.training.rays import PixelPool
 from toolkit.training.step import Optimiser, Rates
 
 RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03, depth=0.05)
-SLOW = replace(RATES, slow_within=3.0, depth_noise=MATCHED.noise)  # the made views look from 3 away: half of what they see moves slowly
+SLOW = replace(RATES, slow_within=3.0, depth_noise=ROUGH.noise)  # the made views look from 3 away: half of what they see moves slowly
 
 
 @pytest.fixture

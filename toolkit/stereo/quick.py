@@ -81,7 +81,7 @@ def guided(
     some = views.subset(matched)
     found = stereo_depths(some, near, far, median_depth, long_side=side, progress=progress)
     whole = continued(found, some, median_depth, progress)
-    out = with_depths(views, matched, whole)
+    out = replace(with_depths(views, matched, whole), rough=True)
     share = float(np.mean([np.mean(out.depths[index] > 0) for index in matched]))
     bare = float(np.mean([np.mean((one.depth <= 0) & (more.depth > 0)) for one, more in zip(found, whole, strict=True)]))
     return out, Matched(len(matched), max(max(one.depth.shape) for one in found), share, bare)
@@ -93,7 +93,7 @@ def with_depths(views: Views, indices: Array, found: list[StereoDepth]) -> Views
     for index, one in zip(indices, found, strict=True):
         camera = views.intrinsics[index]
         depths[index] = depth_at(one, camera.width, camera.height)
-    return replace(views, depths=depths, matched=True)
+    return replace(views, depths=depths)
 
 
 def warm_up() -> None:

@@ -31,8 +31,8 @@ class Trust:
     last: float  # … and the share of it at the end: depth decides early where surfaces are, colours how they look
 
 
-MEASURED = Trust(noise=0.004, weight=1.0, last=0.1)  # by a sensor
-MATCHED = Trust(noise=0.01, weight=10 / 3, last=0.03)  # by matching pictures: less exact, and mostly where colours tell little themselves
+FINE = Trust(noise=0.004, weight=1.0, last=0.1)  # by a sensor, or by matching pictures in full
+ROUGH = Trust(noise=0.01, weight=2.0, last=0.05)  # by matching small ones
 
 
 def ray_distances(depth: Array, camera: Intrinsics) -> Array:

@@ -25,7 +25,7 @@ from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
 from toolkit.training import room
 from toolkit.training.behind import sky_behind
-from toolkit.training.depth import MATCHED, MEASURED
+from toolkit.training.depth import FINE, ROUGH
 from toolkit.training.engine import Engine, make_engine, warm_up
 from toolkit.training.finite import NotFiniteError
 from toolkit.training.guard import Guard, refuse_broken
@@ -154,7 +154,7 @@ def fit_field(
     engine = make_engine(settings, current, pool)
     limit_rays = most_rays(len(pool), bool(aside.any()), settings.fit.passes)
     slow_within = settings.fit.slow_within * scene.median_depth
-    trust = MATCHED if views.matched else MEASURED
+    trust = ROUGH if views.rough else FINE
     plan = Schedule(ladder, budget, settings.fit, views.background is None, settings.fit.patience, limit_rays, slow_within, trust)
     guard = Guard()
     result = FitResult(current, notes=guard.notes)

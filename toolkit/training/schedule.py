@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from dataclasses import field as default
 
 from toolkit.config import FitSettings
-from toolkit.training.depth import MEASURED, Trust
+from toolkit.training.depth import FINE, Trust
 from toolkit.training.step import Rates
 
 RUNGS = (0.1, 0.3, 0.6, 0.8, 0.9)  # share of the budget at which each level ends at the latest (32 … 512)
@@ -59,7 +59,7 @@ class Schedule:
     patient: bool = False
     most_rays: float = math.inf
     slow_within: float = 0.0
-    trust: Trust = MEASURED
+    trust: Trust = FINE
     level: int = 0
     steps_here: int = 0
     slower: float = 1.0

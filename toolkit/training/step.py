@@ -12,7 +12,7 @@ from toolkit.render.field import Field, density
 from toolkit.render.march import BRICK, Samples, march
 from toolkit.render.rays import OPACITY_FLOOR
 from toolkit.training.adam import LazyAdam
-from toolkit.training.depth import MEASURED, depth_gradient
+from toolkit.training.depth import FINE, depth_gradient
 from toolkit.training.finite import NotFiniteError, check
 from toolkit.training.near import slowness
 from toolkit.training.rays import Batch
@@ -34,7 +34,7 @@ class Rates:
     random_background: bool = False  # what is behind everything is another colour for every ray, so that it cannot stand in for a surface
     colour_threshold: float = 3e-3  # samples of smaller weight are neither decoded nor given a gradient
     depth: float = 0.0  # weight of the mean of the depth term (see `depth`), for rays whose surface is known
-    depth_noise: float = MEASURED.noise  # share of its distance by which such a surface may be off
+    depth_noise: float = FINE.noise  # share of its distance by which such a surface may be off
     slow_within: float = 0.0  # working units; samples nearer than this move slowly (see `near`), 0: none
 
 
