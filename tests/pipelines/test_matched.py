@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pipelines.summary import describe_matching
 from tests.pipelines.made import call, save_picture, write_transforms
 from tests.poses.textured import arc, render
 from toolkit.camera import Intrinsics, opengl_from_world
@@ -72,3 +73,11 @@ def test_without_being_asked_pictures_are_matched_for_the_fit_alone(tmp_path: Pa
     data = read_json(out / "report.json")
     assert "matched" not in data["field"] and not any("matching" in note for note in data["notes"])
     assert not (out / "fit_matched.json").exists()
+
+
+def test_the_report_tells_of_bare_surfaces() -> None:
+    """Folders of earlier versions know nothing of them."""
+    found = {"views": 4, "pixels": 128, "share": 0.6, "seconds": 1.0}
+    words = describe_matching({**found, "bare": 0.25})
+    assert "60% of their pixels" in words and "25% are bare" in words
+    assert "bare" not in describe_matching(found) and describe_matching(found) == describe_matching({**found, "bare": 0.0})

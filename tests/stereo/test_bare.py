@@ -129,6 +129,16 @@ def test_one_picture_or_none_that_sees_the_same_is_left_as_it_was() -> None:
     assert all((one.depth == 0).all() for one in continued(empty, views, MEDIAN))
 
 
+def test_a_picture_that_looks_elsewhere_is_left_as_it_was() -> None:
+    views, _, found = room()
+    away = np.diag([-1.0, 1.0, -1.0, 1.0])  # turned round
+    poses = np.concatenate([views.world_from_camera, (views.world_from_camera[0] @ away)[None]])
+    more = continued([*found, found[0]], views_of(poses, [*views.images, views.images[0]]), MEDIAN)
+    assert np.array_equal(more[-1].depth, found[0].depth) and np.array_equal(more[-1].confidence, found[0].confidence)
+    before, after = ([(one.depth > 0).mean() for one in many] for many in (found, more[:-1]))
+    assert np.mean(after) > np.mean(before) + 0.1
+
+
 def test_a_plane_aslant_tells_no_depth() -> None:
     planes = np.array([[0.0, 1.0, 0.0, 1.0]])  # a floor below the camera
     camera = np.array([150.0, 150.0, 80.0, 60.0])

@@ -216,7 +216,7 @@ def _differences(
     index: int, others: Sequence[int], depths: Sequence[Array], pictures: Sequence[Array], cameras: Sequence[Intrinsics], poses: Array
 ) -> Array:
     """(H, W) float16 median over `others` of how much their colours differ from this picture's, in levels; NaN: none sees the point."""
-    each = np.full((len(others), *depths[index].shape), np.nan, np.float32)
+    each = np.full((max(1, len(others)), *depths[index].shape), np.nan, np.float32)
     for place, other in enumerate(others):
         there = invert(poses[other]) @ poses[index]
         here, away = (depths[index], pictures[index], numbers(cameras[index])), (depths[other], pictures[other], numbers(cameras[other]))
@@ -224,7 +224,7 @@ def _differences(
     # np.nanmedian, which warns of pixels that none sees and takes ten times as long
     each.sort(axis=0)
     count = np.isfinite(each).sum(axis=0)
-    low, high = (np.take_along_axis(each, np.clip(at, 0, len(others) - 1)[None], axis=0)[0] for at in ((count - 1) // 2, count // 2))
+    low, high = (np.take_along_axis(each, np.clip(at, 0, len(each) - 1)[None], axis=0)[0] for at in ((count - 1) // 2, count // 2))
     return np.asarray((low + high) / 2, dtype=np.float16)
 
 

@@ -97,10 +97,12 @@ def with_depths(views: Views, indices: Array, found: list[StereoDepth]) -> Views
 
 
 def warm_up() -> None:
-    """Have the kernels compiled, or loaded, by matching three small pictures."""
+    """Have the kernels compiled, or loaded, by matching three small pictures, and letting a plane go on in them."""
     noise = np.random.default_rng(0).integers(0, 256, (24, 48, 3)).astype(np.uint8)
     camera = Intrinsics(32, 24, 32.0, 32.0, 16.0, 12.0)
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = np.arange(3) / 8  # 4 pixels at a depth of 1
     pictures = [np.ascontiguousarray(noise[:, 4 * i : 4 * i + 32]) for i in range(3)]
-    stereo_depths(Views(["a", "b", "c"], pictures, [camera] * 3, poses, np.zeros(3, bool)), 0.5, 4.0, 1.0)
+    views = Views(["a", "b", "c"], pictures, [camera] * 3, poses, np.zeros(3, bool))
+    wall = np.ones((24, 32), np.float32)
+    continued([replace(one, depth=wall, confidence=0.5 * wall) for one in stereo_depths(views, 0.5, 4.0, 1.0)], views, 1.0)

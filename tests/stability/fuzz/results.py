@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.summary import MATCHED
+from pipelines.summary import describe_matching
 from toolkit.files import write_json
 
 FILES = (
@@ -62,7 +62,7 @@ def make_results(root: Path) -> None:
     write_json(root / "timeline.json", [{"seconds": 1.0 + i, "psnr": 20.0 + i} for i in range(4)])
     write_json(root / "exports" / "facts.json", {"mesh": mesh, "note": "points and meshes were left out"})
     write_json(root / "fit_notes.json", ["step 3 of the fit was not finite", "the field stayed at 64³"])
-    write_json(root / "fit_matched.json", {"views": 7, "pixels": 128, "share": 0.31, "seconds": 0.4})
+    write_json(root / "fit_matched.json", {"views": 7, "pixels": 128, "share": 0.31, "bare": 0.12, "seconds": 0.4})
     network = {
         "key_frames": 4,
         "seconds": 0.3,
@@ -99,7 +99,7 @@ def _report(root: Path) -> dict[str, Any]:
             "capture": {"kind": "transforms", "frames": 8, "width": 48, "height": 36},
             "poses": {"source": "given", "registered": 8, "total": 8, "models": [8], "missing": []},
             "warnings": kept.read_kept(root / "fit_notes.json", kept.NOTES),
-            "notes": [MATCHED.format(percent=3, **kept.read_kept(root / "fit_matched.json", kept.MATCHED))],
+            "notes": [describe_matching(kept.read_kept(root / "fit_matched.json", kept.MATCHED))],
             "evaluation": {name: scores.get(name) for name in ("field", "tsdf")} | {"network": {**(scores.get("field") or {}), **network}},
             "effects": {name: effects[name] for name in ("effects", "seconds", "looked_at")},
             "baseline": scores.get("nearest_image"),
