@@ -150,6 +150,15 @@ def test_a_plane_aslant_tells_no_depth() -> None:
     assert np.array_equal(depth[:, 80] > 0, expected) and np.allclose(depth[expected, 80], 1 / rows[expected], rtol=1e-5)
 
 
+def test_who_votes_for_which_plane() -> None:
+    """The first plane that is near enough; none is an answer, too, and what has no depth does not vote."""
+    planes = np.array([[0.0, 0.0, 1.0, 2.0], [0.0, 0.0, -1.0, -2.1], [0.0, 1.0, 0.0, 1.0]])  # the last is seen from above its edge, aslant
+    depth = np.array([[2.0, 2.05, 2.1, 2.3, 0.0]], np.float32)
+    voter = np.empty(depth.shape, np.int32)
+    bare._voters(depth, np.array([100.0, 100.0, 2.5, 0.5]), planes, bare.ON, 0.17, voter)
+    assert voter.tolist() == [[0, 0, 1, len(planes), -1]]
+
+
 def test_votes_spread_as_by_opencv() -> None:
     """Its extra modules have the same filter, which a plain OpenCV has not."""
     if not hasattr(cv2, "ximgproc"):
