@@ -48,6 +48,7 @@ def test_depth_is_found_and_held_out_pictures_are_not_looked_at() -> None:
     views, truth = with_held_out(), corner()[1]
     known, matched = quick.guided(views, NEAR, FAR, MEDIAN, 2.0)
     assert matched is not None and matched.views == 6 and quick.LEAST_SIDE <= matched.pixels < 160
+    assert known.rough and not views.rough and known.subset([0, 1]).rough
     assert known.depths[3] is None and 0.3 < matched.share < 1
     errors = [
         np.abs(depth - truth[i])[depth > 0] / truth[i][depth > 0]

@@ -16,10 +16,11 @@ import cv2
 import numba
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, invert
+from toolkit.camera import Array
 from toolkit.capture.types import Views
 from toolkit.progress import SILENT, Progress
-from toolkit.stereo.check import agreement, numbers, seen_at
+from toolkit.stereo.check import agreement, numbers
+from toolkit.stereo.cost import shrunk
 from toolkit.stereo.match import CHECKED, MOST_WORKERS, StereoDepth, usable_neighbours, usable_pixels
 from toolkit.stereo.planes import Points, find_planes
 
@@ -62,36 +63,31 @@ def continued(found: Sequence[StereoDepth], views: Views, median_depth: float, p
     if not len(planes) or not any(neighbours):
         return list(found)
     others = [[other for other in row if neighbours[other]] for row in neighbours]
-    small = [_shrunk(picture, camera) for picture, camera in zip(views.images, cameras, strict=True)]
+    small = [shrunk(picture, camera) for picture, camera in zip(views.images, cameras, strict=True)]
     soft = [cv2.GaussianBlur(picture, (0, 0), BLUR[1]) for picture in small]
 
     def proposal(index: int) -> _Proposed:
         progress.check()
         return _proposal(found[index], small[index], poses[index], planes, usable_pixels(views, index, cameras[index]))
 
-    def difference(index: int) -> Array:
-        progress.check()
-        return _differences(index, others[index], depths, soft, cameras, poses)
-
-    def checked(index: int) -> StereoDepth:
+    def compared(index: int) -> tuple[Array, StereoDepth]:
         progress.check()
         one, plan = found[index], proposed[index]
-        agree, through, _ = agreement(index, others[index], depths, cameras, poses)
-        kept = plan.new & (agree >= min(CONFIRMED, len(others[index]))) & (agree > through) & (differences[index] <= limit)
-        confidence = np.where(kept, agree / (agree + through + 1), one.confidence).astype(np.float32)
-        return replace(one, depth=np.where(kept, plan.depth, one.depth), confidence=confidence)
+        said = agreement(index, others[index], depths, cameras, poses, pictures=soft)
+        sure = plan.new & (said.agree >= min(CONFIRMED, len(others[index]))) & (said.agree > said.through)
+        confidence = np.where(sure, said.agree / (said.agree + said.through + 1), one.confidence).astype(np.float32)
+        return _middle(said.colours), replace(one, depth=np.where(sure, plan.depth, one.depth), confidence=confidence)
 
-    every = range(len(found))
     with ThreadPoolExecutor(max(1, min(MOST_WORKERS, cv2.getNumThreads()))) as pool:
         try:
-            proposed = list(pool.map(proposal, every))
+            proposed = list(pool.map(proposal, range(len(found))))
             depths = [one.depth for one in proposed]
-            differences = list(pool.map(difference, every))
-            matched = [values[one.depth > 0] for values, one in zip(differences, found, strict=True)]
-            limit = _quantile(np.concatenate(matched), ALIKE)
-            return list(pool.map(checked, every))
+            differences, sure = zip(*pool.map(compared, range(len(found))), strict=True)
         finally:
             pool.shutdown(cancel_futures=True)
+    limit = _quantile(np.concatenate([values[one.depth > 0] for values, one in zip(differences, found, strict=True)]), ALIKE)
+    alike = [(one.depth > 0) | (values <= limit) for values, one in zip(differences, found, strict=True)]
+    return [replace(one, depth=one.depth * kept, confidence=one.confidence * kept) for one, kept in zip(sure, alike, strict=True)]
 
 
 def _points(found: Sequence[StereoDepth], poses: Array) -> Points:
@@ -112,20 +108,14 @@ def _points(found: Sequence[StereoDepth], poses: Array) -> Points:
     return Points(np.concatenate(places), np.concatenate(depths), np.concatenate(views), np.concatenate(pixels))
 
 
-def _shrunk(picture: Array, camera: Intrinsics) -> Array:
-    if picture.shape[:2] != (camera.height, camera.width):
-        picture = cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(picture)
-
-
 def _proposal(one: StereoDepth, picture: Array, pose: Array, planes: Array, usable: Array | None) -> _Proposed:
     """Where the pixels that have a depth, by their votes, let one of the planes go on."""
-    numbers_ = numbers(one.intrinsics)
+    camera = numbers(one.intrinsics)
     normals = planes[:, :3] @ pose[:3, :3]
     local = np.column_stack([normals, planes[:, 3] - planes[:, :3] @ pose[:3, 3]])  # the planes in the camera's frame
     voter = np.empty(one.depth.shape, np.int32)
     slant = float(np.cos(np.deg2rad(SLANT)))
-    _voters(one.depth, numbers_, local, ON, slant, voter)
+    _voters(one.depth, camera, local, ON, slant, voter)
     guide = cv2.GaussianBlur(picture, (0, 0), BLUR[0])
     present = [plane for plane in np.unique(voter) if plane >= 0]  # len(planes): those that lie on none
     if not present:
@@ -138,7 +128,7 @@ def _proposal(one: StereoDepth, picture: Array, pose: Array, planes: Array, usab
     if usable is not None:
         open_ &= usable
     depth = one.depth.copy()
-    _go_on(numbers_, local, slant, np.where(open_, winner, np.int32(-1)), depth)
+    _go_on(camera, local, slant, np.where(open_, winner, np.int32(-1)), depth)
     return _Proposed(depth, open_ & (depth > 0))
 
 
@@ -212,44 +202,18 @@ def _go_on(camera: Array, planes: Array, slant: float, winner: Array, depth: Arr
                     depth[v, u] = 1 / inverse
 
 
-def _differences(
-    index: int, others: Sequence[int], depths: Sequence[Array], pictures: Sequence[Array], cameras: Sequence[Intrinsics], poses: Array
-) -> Array:
-    """(H, W) float16 median over `others` of how much their colours differ from this picture's, in levels; NaN: none sees the point."""
-    each = np.full((max(1, len(others)), *depths[index].shape), np.nan, np.float32)
-    for place, other in enumerate(others):
-        there = invert(poses[other]) @ poses[index]
-        here, away = (depths[index], pictures[index], numbers(cameras[index])), (depths[other], pictures[other], numbers(cameras[other]))
-        _differ(*here, *away, there, each[place])
-    # np.nanmedian, which warns of pixels that none sees and takes ten times as long
-    each.sort(axis=0)
-    count = np.isfinite(each).sum(axis=0)
-    low, high = (np.take_along_axis(each, np.clip(at, 0, len(each) - 1)[None], axis=0)[0] for at in ((count - 1) // 2, count // 2))
+def _middle(values: Array) -> Array:
+    """(H, W) float16 median of (N, H, W) float32, which it sorts, over N, without those that are NaN; NaN: all are.
+
+    np.nanmedian takes ten times as long.
+    """
+    if not len(values):
+        return np.full(values.shape[1:], np.nan, np.float16)
+    values.sort(axis=0)
+    count = np.isfinite(values).sum(axis=0)
+    middles = np.maximum((count - 1) // 2, 0), np.minimum(count // 2, len(values) - 1)
+    low, high = (np.take_along_axis(values, at[None], axis=0)[0] for at in middles)
     return np.asarray((low + high) / 2, dtype=np.float16)
-
-
-@numba.njit(cache=True, nogil=True)
-def _differ(
-    depth: Array, picture: Array, camera: Array, other: Array, other_picture: Array, other_camera: Array, there: Array, out: Array
-) -> None:
-    """Mean difference of the three colours of what one other view shows where each pixel's point is, unless something stands before it."""
-    rows, columns = other.shape
-    for y in range(depth.shape[0]):
-        for x in range(depth.shape[1]):
-            z = depth[y, x]
-            if z <= 0:
-                continue
-            u, v, qz = seen_at(x, y, z, camera, there, other_camera)
-            if qz <= 0 or not (0 <= u < columns and 0 <= v < rows):
-                continue
-            column, row = int(u), int(v)
-            seen = other[row, column]
-            if seen > 0 and seen < (1 - ON) * qz:
-                continue
-            total = 0.0
-            for channel in range(3):
-                total += abs(float(picture[y, x, channel]) - float(other_picture[row, column, channel]))
-            out[y, x] = total / 3
 
 
 def _quantile(values: Array, share: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numba
@@ -11,19 +12,19 @@ import numpy as np
 from toolkit.camera import Array, Intrinsics, invert
 
 TOLERANCE = 0.02  # share of depth by which two views may differ
+HIDDEN = 0.03  # share of a point's depth by which another view's surface before it hides its colour
 SPECKLE = 1 / 2000  # share of the picture: smaller patches of kept depth are dropped
+NO_PICTURE, NO_COLOURS = np.empty((0, 0, 3), np.uint8), np.empty((0, 0), np.float32)
 
 
-@numba.njit(cache=True, nogil=True)
-def seen_at(x: int, y: int, z: float, camera: Array, there: Array, other_camera: Array) -> tuple[float, float, float]:
-    """Where another camera sees the point of pixel (x, y) at depth z: its pixel coordinates there, and its depth (≤ 0: not before it)."""
-    px, py = (x + 0.5 - camera[2]) / camera[0] * z, (y + 0.5 - camera[3]) / camera[1] * z
-    qz = there[2, 0] * px + there[2, 1] * py + there[2, 2] * z + there[2, 3]
-    if qz <= 0:
-        return 0.0, 0.0, qz
-    qx = there[0, 0] * px + there[0, 1] * py + there[0, 2] * z + there[0, 3]
-    qy = there[1, 0] * px + there[1, 1] * py + there[1, 2] * z + there[1, 3]
-    return qx / qz * other_camera[0] + other_camera[2], qy / qz * other_camera[1] + other_camera[3], qz
+@dataclass(frozen=True)
+class Agreement:
+    """What other views say of each pixel of a depth map."""
+
+    agree: Array  # (H, W) int32 how many have the same point …
+    through: Array  # … and how many see through it
+    total: Array  # (H, W) float64 sum of the inverse depths of the pixel itself and of those that agree
+    colours: Array  # (others or 0, H, W) float32 how much the colours there differ, in levels; NaN: hidden, or out of sight
 
 
 @numba.njit(cache=True, nogil=True)
@@ -34,24 +35,42 @@ def _compare(
     other_camera: Array,
     there: Array,
     tolerance: float,
+    picture: Array,
+    other_picture: Array,
     agree: Array,
     through: Array,
     total: Array,
+    colours: Array,
 ) -> None:
-    """Count for each pixel whether one other view confirms its depth or sees through it, and sum up the inverse depths that confirm it."""
+    """Count for each pixel whether one other view confirms its depth or sees through it, and sum up the inverse depths that confirm it.
+
+    Pictures, (H, W, 3) uint8 or of height 0, are compared where nothing stands before the point, whether the other's depth is known or not.
+    """
     height, width = depth.shape
     rows, columns = other.shape
+    fx, fy, cx, cy = camera
     gx, gy, ox, oy = other_camera
     for y in range(height):
         for x in range(width):
             z = depth[y, x]
             if z <= 0:
                 continue
-            u, v, qz = seen_at(x, y, z, camera, there, other_camera)
-            if qz <= 0 or not (0 <= u < columns and 0 <= v < rows):
+            px, py = (x + 0.5 - cx) / fx * z, (y + 0.5 - cy) / fy * z
+            qz = there[2, 0] * px + there[2, 1] * py + there[2, 2] * z + there[2, 3]
+            if qz <= 0:
+                continue
+            qx = there[0, 0] * px + there[0, 1] * py + there[0, 2] * z + there[0, 3]
+            qy = there[1, 0] * px + there[1, 1] * py + there[1, 2] * z + there[1, 3]
+            u, v = qx / qz * gx + ox, qy / qz * gy + oy
+            if not (0 <= u < columns and 0 <= v < rows):
                 continue
             column, row = int(u), int(v)
             seen = other[row, column]
+            if len(picture) > 0 and not 0 < seen < (1 - HIDDEN) * qz:
+                difference = 0.0
+                for channel in range(3):
+                    difference += abs(float(picture[y, x, channel]) - float(other_picture[row, column, channel]))
+                colours[y, x] = difference / 3
             if seen <= 0:
                 continue
             if abs(seen - qz) <= tolerance * qz:
@@ -89,8 +108,8 @@ def confirmed(
         (H, W) float32 depth, 0 where it is not kept, and (H, W) float32 confidence in [0, 1): a / (a + t + 1) for a others that agree and t
         that see through the point.
     """
-    depth = depths[index]
-    agree, through, total = agreement(index, others, depths, cameras, world_from_camera, tolerance)
+    depth, found = depths[index], agreement(index, others, depths, cameras, world_from_camera, tolerance)
+    agree, through, total = found.agree, found.through, found.total
     kept = (depth > 0) & (agree >= needed) & (agree > through)
     mean = np.where(kept, (agree + 1) / np.maximum(total, 1e-12), 0)
     kept &= ~_speckles(mean, tolerance)
@@ -105,17 +124,28 @@ def agreement(
     cameras: Sequence[Intrinsics],
     world_from_camera: Array,
     tolerance: float = TOLERANCE,
-) -> tuple[Array, Array, Array]:
-    """How many of `others` have the same point as each pixel of the depth map `index`, how many see through it, and the sum of the inverse
-    depths (H, W) of the pixel itself and of those that agree; arguments as `confirmed`."""
+    pictures: Sequence[Array] | None = None,
+) -> Agreement:
+    """What the views `others` say of each pixel of the depth map `index`.
+
+    Args:
+        depths, world_from_camera, tolerance: as in `confirmed`.
+        pictures: (H, W, 3) uint8 of all views, of the size of their depth maps; None: colours are not compared.
+    """
     depth = np.ascontiguousarray(depths[index], dtype=np.float32)
     agree, through = np.zeros(depth.shape, np.int32), np.zeros(depth.shape, np.int32)
     total = np.where(depth > 0, 1 / np.maximum(depth, 1e-12), 0)
-    for other in others:
+    colours = np.full((0 if pictures is None else len(others), *depth.shape), np.nan, np.float32)
+    for number, other in enumerate(others):
         there = invert(world_from_camera[other]) @ world_from_camera[index]
         theirs = np.ascontiguousarray(depths[other], dtype=np.float32)
-        _compare(depth, numbers(cameras[index]), theirs, numbers(cameras[other]), there, tolerance, agree, through, total)
-    return agree, through, total
+        here, away = (depth, numbers(cameras[index])), (theirs, numbers(cameras[other]))
+        if pictures is None:
+            shown, out = (NO_PICTURE, NO_PICTURE), NO_COLOURS
+        else:
+            shown, out = (pictures[index], pictures[other]), colours[number]
+        _compare(*here, *away, there, tolerance, *shown, agree, through, total, out)
+    return Agreement(agree, through, total, colours)
 
 
 def numbers(camera: Intrinsics) -> Array:

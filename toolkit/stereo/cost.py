@@ -28,11 +28,16 @@ class GreyView:
     world_from_camera: Array  # (4, 4) float64
 
 
-def grey_view(picture: Array, camera: Intrinsics, world_from_camera: Array) -> GreyView:
-    """(h, w, 3) uint8 RGB, shrunk to the camera's size where it is larger."""
+def shrunk(picture: Array, camera: Intrinsics) -> Array:
+    """(h, w, 3) uint8 at the size of the camera, each pixel the mean of what it covers."""
     if picture.shape[:2] != (camera.height, camera.width):
         picture = cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    grey = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY).astype(np.float32) - 128
+    return np.ascontiguousarray(picture)
+
+
+def grey_view(picture: Array, camera: Intrinsics, world_from_camera: Array) -> GreyView:
+    """(h, w, 3) uint8 RGB, shrunk to the camera's size where it is larger."""
+    grey = cv2.cvtColor(shrunk(picture, camera), cv2.COLOR_RGB2GRAY).astype(np.float32) - 128
     return GreyView(grey, camera, np.asarray(world_from_camera, dtype=np.float64))
 
 
