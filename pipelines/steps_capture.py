@@ -80,6 +80,7 @@ def last_of(job: Job, *names: str) -> list[str]:
 def find_camera_poses(job: Job, capture: Capture) -> PoseResult:
     """Poses that the capture brings, or structure from motion."""
     from toolkit.poses.given import given_poses
+    from toolkit.poses.job import VERSION
     from toolkit.poses.result import PoseResult
     from toolkit.poses.sfm import find_poses
 
@@ -99,7 +100,7 @@ def find_camera_poses(job: Job, capture: Capture) -> PoseResult:
 
     uses: list[Any] = [given]
     if not given:
-        uses += [asdict(settings.poses), settings.seed, pixel_state(capture)]
+        uses += [VERSION, asdict(settings.poses), settings.seed, pixel_state(capture)]
     return job.stages.run(
         "poses",
         make=make,

@@ -42,7 +42,7 @@ FACTOR_RANGE = (0.05, 20.0)
 COST = {
     "capture": ("decode", 3.0),
     "frames": ("decode", 2.0),
-    "poses": ("features", 1.3),
+    "poses": ("features", 0.8),
     "effects": ("features", 1.0),
     "scene": ("features", 1.0),
     "views": ("decode", 7.0),

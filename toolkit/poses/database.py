@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -16,6 +15,7 @@ from toolkit.camera import Array
 from toolkit.capture.images import load_image, load_mask
 from toolkit.errors import InputError
 from toolkit.files import atomic_path, read_json, remove, write_json
+from toolkit.poses.features import sift
 from toolkit.poses.job import Job, Picture
 from toolkit.poses.pairs import coarse
 
@@ -80,12 +80,9 @@ def extract(job: Job, database: pycolmap.Database, report: Report) -> list[dict[
 
 def _features(job: Job, indices: list[int]) -> Iterator[tuple[int, tuple[dict[str, Any], Array, Array]]]:
     """Features of the pictures at `indices`, a few ahead of what is asked for, in order."""
-    local = threading.local()
 
     def work(index: int) -> tuple[dict[str, Any], Array, Array]:
-        if not hasattr(local, "extractor"):
-            local.extractor = pycolmap.FeatureExtractor.create(_extraction(job), pycolmap.Device.cpu)
-        return _describe(job.pictures[index], job, local.extractor)
+        return _describe(job.pictures[index], job)
 
     with ThreadPoolExecutor(job.threads) as pool:
         ahead: list[tuple[int, Future[tuple[dict[str, Any], Array, Array]]]] = []
@@ -98,15 +95,7 @@ def _features(job: Job, indices: list[int]) -> Iterator[tuple[int, tuple[dict[st
             yield first, future.result()
 
 
-def _extraction(job: Job) -> pycolmap.FeatureExtractionOptions:
-    options = pycolmap.FeatureExtractionOptions()
-    options.num_threads = 1
-    options.use_gpu = False
-    options.sift.max_num_features = job.max_features
-    return options
-
-
-def _describe(picture: Picture, job: Job, extractor: pycolmap.FeatureExtractor) -> tuple[dict[str, Any], Array, Array]:
+def _describe(picture: Picture, job: Job) -> tuple[dict[str, Any], Array, Array]:
     """One picture as every later stage loads it, its keypoints (N, 4) in its own pixels and descriptors (N, 128)."""
     frame = picture.frame()
     pixels = load_image(frame, exif=job.exif)
@@ -118,9 +107,7 @@ def _describe(picture: Picture, job: Job, extractor: pycolmap.FeatureExtractor) 
         usable = solid if usable is None or usable.shape != solid.shape else usable & solid
     factor = min(1.0, job.image_size / max(width, height))
     small = grey if factor == 1.0 else cv2.resize(grey, (round(width * factor), round(height * factor)), interpolation=cv2.INTER_AREA)
-    found, described = extractor.extract_from_uint8_array(np.ascontiguousarray(small))
-    keypoints = np.asarray(pycolmap.keypoints_to_matrix(found), dtype=np.float32).reshape(-1, 4)
-    descriptors = np.asarray(described.data).reshape(-1, 128)
+    keypoints, descriptors = sift(small, job.max_features)
     keypoints = keypoints * np.array([width / small.shape[1], height / small.shape[0], width / small.shape[1], 1.0], dtype=np.float32)
     if usable is not None and usable.shape == (height, width) and len(keypoints):
         column = np.clip(keypoints[:, 0].astype(int), 0, width - 1)

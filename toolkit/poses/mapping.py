@@ -17,12 +17,15 @@ from toolkit.files import remove
 from toolkit.poses.job import GONE_ON, Job
 
 Report = Callable[[float, float, str], None]
+STRICT = "incremental"  # the attempt by COLMAP's own rules
 WORSE = 1.25  # times the error of the strict model that a model which went on from it may have
 ENOUGH = 0.6  # share of registered pictures below which a looser attempt is worth its time
 FEW_POINTS = 12  # a picture that sees fewer of the model's points hangs in the air: not registered
 SMALLEST = 3  # registered pictures that make a model
 REPEATABLE = 300  # pictures up to which mapping takes one thread, so that it repeats
 MAX_ERROR = 3.0  # pixels; the mean reprojection error of a model that can be trusted
+STEP_TOLERANCE = 1e-5  # share of the error by which an adjustment has to get better to go on, while mapping …
+LAST_TOLERANCE, LAST_STEPS = 1e-9, 30  # … and at the end; a point that flees to infinity would go on for ever
 ANGLE_SAMPLE = 2000  # points looked at for the triangulation angle
 
 
@@ -48,7 +51,7 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
     """The largest trustworthy model in a settled frame, and what every attempt gave: `{"attempt", "models": [frames, …]}`, largest
     first."""
     attempts: list[tuple[str, Callable[[], list[pycolmap.Reconstruction]]]] = [
-        ("incremental", lambda: _incremental(job, report, loose=False)),
+        (STRICT, lambda: _incremental(job, report, loose=False)),
         (GONE_ON, lambda: [] if best is None else _incremental(job, report, loose=True, start=best.reconstruction)),
         ("incremental, small angles", lambda: _incremental(job, report, loose=True)),
         ("global", lambda: _global(job, report)),
@@ -58,7 +61,7 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
     for name, attempt in attempts:
         if best is not None and best.size[0] >= (1.0 if name == GONE_ON else ENOUGH) * len(job.pictures):
             break
-        models = sorted((_model(found, name) for found in attempt()), key=lambda model: model.size, reverse=True)
+        models = sorted((Model(found, name, _registered(found)) for found in attempt()), key=lambda model: model.size, reverse=True)
         models = [model for model in models if len(model.registered) >= SMALLEST]
         history.append({"attempt": name, "models": [len(model.registered) for model in models]})
         for model in models:
@@ -77,16 +80,13 @@ def _better(model: Model, best: Model) -> bool:
     return model.size[0] > 1.1 * best.size[0]
 
 
-def _model(reconstruction: pycolmap.Reconstruction, attempt: str) -> Model:
-    registered = sorted(i for i in reconstruction.reg_image_ids() if reconstruction.image(i).num_points3D >= FEW_POINTS)
-    return Model(reconstruction, attempt, registered)
+def _registered(reconstruction: pycolmap.Reconstruction) -> list[int]:
+    return sorted(i for i in reconstruction.reg_image_ids() if reconstruction.image(i).num_points3D >= FEW_POINTS)
 
 
-def _incremental(job: Job, report: Report, loose: bool, start: pycolmap.Reconstruction | None = None) -> list[pycolmap.Reconstruction]:
-    """The models that COLMAP's incremental mapper makes; with `start` that one, gone on from."""
+def _options(job: Job, loose: bool) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
-    # With several the result depends on which is first now and then; they gain a tenth of the time (docs/performance.md).
-    options.num_threads = 1 if len(job.pictures) <= REPEATABLE else job.threads
+    options.num_threads = _threads(job)
     options.random_seed = job.seed
     options.extract_colors = False  # pictures may be frames of a video or turned: the points are coloured later where needed
     options.min_model_size = SMALLEST
@@ -94,6 +94,8 @@ def _incremental(job: Job, report: Report, loose: bool, start: pycolmap.Reconstr
     options.mapper.num_threads = options.num_threads
     options.mapper.random_seed = job.seed
     options.triangulation.random_seed = job.seed
+    # COLMAP would go on to the last bit after every few pictures, and find the same in twice the time (docs/performance.md).
+    options.ba_local_function_tolerance = options.ba_global_function_tolerance = STEP_TOLERANCE
     if loose:
         options.mapper.init_min_tri_angle = 4.0
         options.mapper.init_min_num_inliers = 40
@@ -101,6 +103,12 @@ def _incremental(job: Job, report: Report, loose: bool, start: pycolmap.Reconstr
         options.mapper.abs_pose_min_inlier_ratio = 0.15
         options.mapper.filter_min_tri_angle = 1.0
         options.triangulation.min_angle = 1.0
+    return options
+
+
+def _incremental(job: Job, report: Report, loose: bool, start: pycolmap.Reconstruction | None = None) -> list[pycolmap.Reconstruction]:
+    """The models that COLMAP's incremental mapper makes; with `start` that one, gone on from."""
+    options = _options(job, loose)
     total = len(job.pictures)
     what = "mapping" if not loose else "mapping again with small angles" if start is None else "going on with small angles"
     count = 0 if start is None else start.num_reg_images()
@@ -132,6 +140,11 @@ def _incremental(job: Job, report: Report, loose: bool, start: pycolmap.Reconstr
     return list(found.values())
 
 
+def _threads(job: Job) -> int:
+    """With several the result depends on which is first now and then; they gain a tenth of the time (docs/performance.md)."""
+    return 1 if len(job.pictures) <= REPEATABLE else job.threads
+
+
 def _global(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
     report(0, len(job.pictures), "mapping all at once")
     # Calibrating the view graph rewrites cameras and pairs: on a copy, so that a re-run starts from the same matches.
@@ -159,6 +172,23 @@ def _empty(folder: Path) -> Path:
 
 
 # --------------------------------------------------------------------------------------------------- results
+
+
+def finish(job: Job, model: Model, report: Report) -> None:
+    """Adjust all cameras and points once more, to the end, and settle the frame."""
+    report(len(job.pictures), len(job.pictures), "adjusting all once more")
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.solver_options.function_tolerance = LAST_TOLERANCE
+    options.ceres.solver_options.max_num_iterations = LAST_STEPS
+    options.ceres.solver_options.num_threads = _threads(job)
+    pycolmap.bundle_adjustment(model.reconstruction, options)
+    # As after each of the mapper's own: a point that hardly any parallax held may have gone behind a camera, or to where numbers end.
+    rules = _options(job, loose=model.attempt != STRICT).mapper
+    pycolmap.ObservationManager(model.reconstruction).filter_all_points3D(rules.filter_max_reproj_error, rules.filter_min_tri_angle)
+    model.reconstruction.update_point_3d_errors()
+    model.registered = _registered(model.reconstruction)
+    settle(model)
 
 
 def settle(model: Model) -> None:

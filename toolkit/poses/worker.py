@@ -92,6 +92,7 @@ def work(job_file: Path, mouth: Mouth) -> None:
             model, facts["attempts"] = mapping.map_pictures(job, report)
             if model is not None:
                 model, facts["attempts"], facts["folded"] = loops.without_folds(job, model, facts["attempts"], report)
+                mapping.finish(job, model, report)
                 facts["model"] = mapping.plain(model)
                 mapping.save_model(model, [picture.name for picture in job.pictures], Path(job.folder) / "model")
         step("mapping")
