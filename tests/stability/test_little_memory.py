@@ -72,7 +72,7 @@ def test_fewer_workers_look_for_features(tmp_path: Path, monkeypatch: pytest.Mon
         with pytest.raises(Enough):
             sfm.find_poses(capture, tmp_path / "out", PosesSettings(), threads=4)
     assert asked == [4, 2, 1]
-    assert sfm._pixels(capture, 80) == 80 * 60 and np.isclose(each, 300 * sfm._pixels(capture, 10_000))
+    assert sfm._pixels(capture, 80) == 80 * 60 and np.isclose(each, sfm.SIFT_BYTES * sfm._pixels(capture, 10_000))
 
 
 HUGE = 2**44

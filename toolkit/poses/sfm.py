@@ -26,7 +26,7 @@ from toolkit.poses.sensor import scale_to_depth
 from toolkit.progress import SILENT, Progress
 
 WORKER = "toolkit.poses.worker"
-SIFT_BYTES = 300  # that COLMAP takes for a pixel of a picture in which it looks for features, whatever the picture's size
+SIFT_BYTES = 240  # that OpenCV takes for a pixel of a picture in which it looks for features, whatever the picture's size
 MAX_RESULT_BYTES = 2 * 2**30
 
 
