@@ -11,7 +11,7 @@ CONTRAST = 0.014  # finds as many as COLMAP's own detector does with its thresho
 
 
 def sift(grey: Array, most: int) -> tuple[Array, Array]:
-    """The `most` strongest features of (H, W) uint8, always the same ones.
+    """The `most` largest features of (H, W) uint8, always the same ones: these are found again from other places.
 
     Returns:
         (N, 4) float32 keypoints: x and y in pixels, pixel centres at +0.5, scale in pixels, angle in radians; (N, 128) uint8 descriptors,

@@ -186,7 +186,6 @@ def finish(job: Job, model: Model, report: Report) -> None:
     # As after each of the mapper's own: a point that hardly any parallax held may have gone behind a camera, or to where numbers end.
     rules = _options(job, loose=model.attempt != STRICT).mapper
     pycolmap.ObservationManager(model.reconstruction).filter_all_points3D(rules.filter_max_reproj_error, rules.filter_min_tri_angle)
-    model.reconstruction.update_point_3d_errors()
     model.registered = _registered(model.reconstruction)
     settle(model)
 
