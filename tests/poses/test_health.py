@@ -18,7 +18,9 @@ from toolkit.poses.health import (
     runs,
     shortfalls,
     turned_only,
+    way,
 )
+from toolkit.poses.job import GLOBAL
 
 
 def picture(n: int, keypoints: int = 900, grey: int | None = None) -> dict[str, Any]:
@@ -90,6 +92,26 @@ def test_the_verdict_names_turning_only_when_pairs_agree():
     mixed = turning[:3] + [pair(i, i + 1) for i in range(3, 9)]
     assert not turned_only(facts(10, mixed, None))
     assert failure(facts(10, mixed, model(list(range(10))))) is None
+
+
+@pytest.mark.parametrize(("moved", "believed"), [(0.012, True), (0.15, False)])
+def test_a_model_that_moves_farther_than_its_pairs_tell_has_a_wrong_lens(moved, believed):
+    """Slowly along a far wall, 1.2% of its distance from picture to picture: pairs alone look like turning, the model says how far it went."""
+    shift, normal = np.array([0.012, 0, 0]), np.array([0, 0, 1.0])
+    pairs = [pair(i, i + 1, homography=homography(r, 600, shift, normal).tolist()) for i, r in enumerate(rotations(3, 9, 2.0))]
+    poses = np.tile(np.eye(4), (10, 1, 1))
+    poses[:, 0, 3] = 7 * moved * np.arange(10)
+    across = np.random.default_rng(0).uniform(-3, 3, (200, 2))
+    found = {
+        **model(list(range(10)), angle=7.0),
+        "world_from_camera": poses.tolist(),
+        "points": np.column_stack([across, np.full(200, 7.0)]).tolist(),
+    }
+    assert turned_only(facts(10, pairs, found)) and way(facts(10, pairs, found)) == pytest.approx(moved)
+    reason = failure(facts(10, pairs, found))
+    assert reason is None if believed else "turned on the spot" in str(reason)
+    last_resort = {**found, "attempt": GLOBAL}
+    assert "turned on the spot" in str(failure(facts(10, pairs, last_resort))), "no other mapper found a pair to begin with"
 
 
 def test_each_failure_has_its_own_sentence():

@@ -119,13 +119,14 @@ def test_changed_pictures_are_not_answered_from_the_old_database(pictures, tmp_p
     assert find_poses(capture, tmp_path, SMALL, threads=1).registered == 5
 
 
-@pytest.mark.parametrize("case", ["identical", "black", "blurred", "turning", "one", "unrelated"])
+@pytest.mark.parametrize("case", ["identical", "black", "blurred", "turning", "turning on", "one", "unrelated"])
 def test_bad_input_gives_one_sentence_that_says_why(case, pictures, tmp_path):
     made = {
         "identical": lambda: ([pictures[0][0]] * 10, "identical"),
         "black": lambda: ([np.zeros((240, 320), np.uint8)] * 6, "no features .* flat colour"),
         "blurred": lambda: ([cv2.GaussianBlur(p, (0, 0), 40) for p in pictures[0][:5]], "no features"),
         "turning": lambda: (turning(8), "turned on the spot"),
+        "turning on": lambda: (turning(12), "turned on the spot"),  # of these COLMAP makes a model, with a lens that explains them
         "one": lambda: (pictures[0][:1], "not enough"),
         "unrelated": lambda: ([texture(n)[:240, :320] for n in range(4)], "share enough features"),
     }[case]()

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from toolkit.camera import Array
+from toolkit.poses.job import GLOBAL
 from toolkit.poses.result import listed
 
 FEW_KEYPOINTS = 40  # below which a picture cannot be matched reliably
@@ -19,6 +20,7 @@ FLAT_SHARE = 0.8  # of verified pairs explained by a homography before the scene
 ROTATION_RESIDUAL = 0.06  # distance of K⁻¹HK from a rotation, relative
 STILL = 0.004  # features moved by less than this share of the long side: the camera stood still
 SMALL_ANGLE = 1.5  # degrees; the median triangulation angle below which depth is guesswork
+PRETENDED = 5.0  # times the way that the pairs tell of: a model that moves its cameras so far has a wrong lens (true ones: at most once)
 TOO_FEW = 3  # registered frames that make a model at all
 
 
@@ -120,8 +122,14 @@ def failure(facts: dict[str, Any]) -> str | None:
             f"the camera hardly moved: features shift by {100 * seen.moved:.2g}% of the picture on the median; move sideways "
             f"around the scene while recording"
         )
-    # A turning camera can be fitted by a wrong lens and a tiny shift, so the verdict of the pairs stands whatever the mapper says.
-    if turned_only(facts) and (model is None or model["angle"] < 2 * SMALL_ANGLE or found < TOO_FEW):
+    # A turning camera can be fitted by a wrong lens and a shift, so the verdict of the pairs stands whatever the mapper says.
+    if turned_only(facts) and (
+        model is None
+        or found < TOO_FEW
+        or model["angle"] < 2 * SMALL_ANGLE
+        or model["attempt"] == GLOBAL
+        or way(facts) > PRETENDED * seen.residual
+    ):
         return (
             "the camera only turned on the spot (rotations explain all matches), so depth cannot be told; move sideways around "
             "the scene while recording"
@@ -148,6 +156,24 @@ def failure(facts: dict[str, Any]) -> str | None:
         f"mapping found no consistent geometry from {len(facts['pairs'])} matched pairs of {count} pictures; take sharper "
         f"pictures with more overlap, of a scene that stands still"
     )
+
+
+def way(facts: dict[str, Any]) -> float:
+    """How far the model's cameras moved between two pictures that a homography connects, in shares of the scene's depth: the median.
+
+    A homography is off from a rotation by about as much.
+    """
+    model = facts["model"]
+    poses, points = np.array(model["world_from_camera"], dtype=np.float64), np.array(model["points"], dtype=np.float64).reshape(-1, 3)
+    at = {picture: number for number, picture in enumerate(model["pictures"])}
+    ends = [
+        (at[pair["first"]], at[pair["second"]]) for pair in facts["pairs"] if pair["flat"] and {pair["first"], pair["second"]} <= set(at)
+    ]
+    if not ends or not len(points):
+        return 0.0
+    depth = float(np.median([np.median((points - pose[:3, 3]) @ pose[:3, 2]) for pose in poses]))
+    first, second = (poses[list(side), :3, 3] for side in zip(*ends, strict=True))
+    return float(np.median(np.linalg.norm(first - second, axis=1))) / max(depth, 1e-12)
 
 
 def components(count: int, pairs: Sequence[dict[str, Any]], least: int = 15) -> list[list[int]]:

@@ -13,6 +13,7 @@ from toolkit.files import fingerprint, read_json, write_json
 
 MAX_EXHAUSTIVE = 120  # photos; beyond it pairs are chosen
 GONE_ON = "incremental, gone on with small angles"  # the attempt that adds to the strict one's model what that had no place for
+GLOBAL = "global"  # the last attempt, which takes what no other can begin with
 VERSION = 2  # of what is found and how; a change discards what earlier versions left in out/sparse
 
 

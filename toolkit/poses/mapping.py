@@ -14,7 +14,7 @@ import pycolmap
 from toolkit.camera import OPENCV, Intrinsics
 from toolkit.errors import PoseError
 from toolkit.files import remove
-from toolkit.poses.job import GONE_ON, Job
+from toolkit.poses.job import GLOBAL, GONE_ON, Job
 
 Report = Callable[[float, float, str], None]
 STRICT = "incremental"  # the attempt by COLMAP's own rules
@@ -54,7 +54,7 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
         (STRICT, lambda: _incremental(job, report, loose=False)),
         (GONE_ON, lambda: [] if best is None else _incremental(job, report, loose=True, start=best.reconstruction)),
         ("incremental, small angles", lambda: _incremental(job, report, loose=True)),
-        ("global", lambda: _global(job, report)),
+        (GLOBAL, lambda: _global(job, report)),
     ]
     best: Model | None = None
     history = []
