@@ -96,7 +96,7 @@ def test_the_verdict_names_turning_only_when_pairs_agree():
 
 @pytest.mark.parametrize(("moved", "believed"), [(0.012, True), (0.15, False)])
 def test_a_model_that_moves_farther_than_its_pairs_tell_has_a_wrong_lens(moved, believed):
-    """Slowly along a far wall, 1.2% of its distance from picture to picture: pairs alone look like turning, the model says how far it went."""
+    """Slowly along a far wall, 1.2% of its distance a picture: pairs alone look like turning, the model says how far it went."""
     shift, normal = np.array([0.012, 0, 0]), np.array([0, 0, 1.0])
     pairs = [pair(i, i + 1, homography=homography(r, 600, shift, normal).tolist()) for i, r in enumerate(rotations(3, 9, 2.0))]
     poses = np.tile(np.eye(4), (10, 1, 1))
