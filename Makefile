@@ -7,8 +7,11 @@ SHELL := /bin/bash
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-# Threads that wait for each other sleep instead of spinning: on a machine with other work that is several times faster.
+# Threads that wait for each other soon sleep instead of spinning: on a machine with other work that is several times faster.
 export OMP_WAIT_POLICY ?= PASSIVE
+ifeq ($(OMP_WAIT_POLICY),PASSIVE)
+export GOMP_SPINCOUNT ?= 1000
+endif
 
 # The first interpreter that runs and is new enough; `make PYTHON=/path/to/python3.12 ...` chooses another.
 NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))

@@ -9,7 +9,7 @@ import typer
 
 Files = Annotated[
     list[Path],
-    typer.Argument(help="results.json, tradeoff.json, compare.json; or report.json of runs with a total budget.", show_default=False),
+    typer.Argument(help="results.json, tradeoff.json, compare.json; or report.json of runs.", show_default=False),
 ]
 
 
@@ -36,6 +36,7 @@ def sections(files: list[Path], name: str | None, data: Path | None) -> list[tup
     """
     from pipelines.kept import ANY, read_kept
     from toolkit.errors import InputError
+    from toolkit.evaluate.run_table import is_report, run_table
 
     held = [(path, read_kept(path, ANY)) for path in files]
     planned = [found for _, found in held if isinstance(found, dict) and isinstance(found.get("budget"), dict)]
@@ -43,6 +44,9 @@ def sections(files: list[Path], name: str | None, data: Path | None) -> list[tup
         from toolkit.evaluate.budget_table import budget_table
 
         return [(name or "total-budget", _whole(files[0], lambda: budget_table(planned, _commands(planned, data))))]
+    if all(is_report(found) for _, found in held):
+        runs = [found for _, found in held]
+        return [(name or "runs", _whole(files[0], lambda: run_table(runs, _commands(runs, data))))]
     if name is not None and len(held) > 1:
         raise InputError(f"--name {name} is for one table, and {len(held)} files are given; leave it out")
     out = []

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import cv2
 import pytest
 
+from pipelines.job import THREAD_VARIABLES, bound_threads
 from tests.pipelines.made import call, make_room
 from tests.pipelines.short import FAST, stages
 from toolkit.errors import InputError
@@ -68,6 +70,11 @@ def test_tsdf_alone_then_the_rest_in_the_same_folder(tmp_path: Path, capsys: Cap
         and (out / "exports" / "mesh.ply").is_file()
         and not (out / "exports" / "points.ply").exists()
     )
+    page = tmp_path / "page.md"
+    page.write_text("# Results\n")
+    answer = call(capsys, "bench", "table", out / "report.json", "--into", page, "--data", tmp_path)
+    assert answer.code == 0, answer.err
+    assert "| room | 8 / 2 |" in page.read_text() and "its TSDF" in page.read_text()
 
 
 def test_a_changed_budget_redoes_the_field_and_what_follows(tmp_path: Path, capsys: Capsys) -> None:
@@ -114,3 +121,20 @@ def test_a_tampered_field_is_refused(tmp_path: Path, capsys: Capsys) -> None:
             answer = call(capsys, *arguments, "--quiet")
             assert answer.code == 2, answer
             assert "field.safetensors" in answer.sentence()
+
+
+@pytest.mark.parametrize(
+    ("given", "policy", "spins"),
+    [({}, "PASSIVE", "1000"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE", None), ({"GOMP_SPINCOUNT": "7"}, "PASSIVE", "7")],
+)
+def test_waiting_threads_sleep_soon_unless_told_otherwise(
+    given: dict[str, str], policy: str, spins: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in (*THREAD_VARIABLES, "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"):
+        monkeypatch.setenv(name, "")  # put back as it was when the test ends
+        monkeypatch.delenv(name)
+    for name, value in given.items():
+        monkeypatch.setenv(name, value)
+    bound_threads({"flags": {"threads": 3}})
+    assert os.environ["OMP_WAIT_POLICY"] == policy and os.environ.get("GOMP_SPINCOUNT") == spins
+    assert {os.environ[name] for name in THREAD_VARIABLES} == {"3"}
