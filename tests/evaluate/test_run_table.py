@@ -30,9 +30,10 @@ def rows(text: str) -> list[list[str]]:
 
 def test_seeds_stand_side_by_side() -> None:
     text = run_table([run("/data/fox", 29.5), run("/data/gum", 24.0), run("/data/fox", 29.1, seed=1)], ["one", "two", "three"])
+    same = ["43 / 7", "240×135", "30 s, one thread"]
     assert rows(text) == [
-        ["fox", "43 / 7", "240×135", "30 s, one thread", "29.5, 29.1", "0.900, 0.900", "0.100, 0.100", "11.2", "900 MB", "1 min, 1 min 1 s"],
-        ["gum", "43 / 7", "240×135", "30 s, one thread", "24.0", "0.900", "0.100", "11.2", "900 MB", "1 min"],
+        ["fox", *same, "29.5, 29.1", "0.900, 0.900", "0.100, 0.100", "11.2", "900 MB", "1 min, 1 min 1 s"],
+        ["gum", *same, "24.0", "0.900", "0.100", "11.2", "900 MB", "1 min"],
     ]
     assert text.startswith("Measured 2026-11-23, Python 3.11, device cpu:") and "    three\n" in text
 

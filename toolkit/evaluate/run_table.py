@@ -23,7 +23,7 @@ def run_table(reports: Sequence[dict[str, Any]], commands: Sequence[str]) -> str
     rows: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     surfaces: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for data in reports:
-        key = (short_name(data["source"]), _views(data), _pixels(data), _how(data))
+        key: tuple[str, ...] = (short_name(data["source"]), _views(data), _pixels(data), _how(data))
         rows.setdefault(key, []).append(data)
         if data["evaluation"].get("tsdf"):
             surfaces.setdefault((*key[:3], "its TSDF"), []).append(data)
