@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from toolkit.config import load_settings
 from toolkit.evaluate import budget as model
-from toolkit.evaluate.budget import KINDS, Choice, Speed, Work, amounts, effects_work, most_export_seconds
+from toolkit.evaluate.budget import KINDS, Choice, Speed, Work, amounts, effects_work, most_export_seconds, sfm_work
 from toolkit.evaluate.budget_probe import self_test
 from toolkit.evaluate.budget_table import budget_table
 from toolkit.files import write_json
@@ -121,10 +121,24 @@ def test_the_self_test_measures_every_kind() -> None:
     assert 1e-8 < speed.units["ray"] < 1e-3 and 1e-8 < speed.units["fit"] < 1e-2 and speed.units["features"] > 1e-3
 
 
+def test_poses_take_what_pictures_pairs_and_their_size_ask_for() -> None:
+    unit = 0.132  # of the machine on which these were measured, one thread: width, height, then frames → seconds
+    for width, height, measured in ((848, 364, {36: 8.8, 75: 29.4, 100: 48.2}), (720, 1280, {24: 17.4, 50: 36.9, 75: 64.3})):
+        video = Work(150, width, height, 19, posed=False, depth=False, outlined=False, video=True, total=1000)
+        for frames, seconds in measured.items():
+            predicted = unit * sfm_work(video, frames)
+            assert seconds / 1.6 < predicted < 1.6 * seconds
+            assert amounts(video, Choice(320, frames))["poses"] == sfm_work(video, frames)
+    photos = replace(video, video=False)
+    assert sfm_work(photos, 50) > 2 * sfm_work(video, 50)  # all pairs are matched
+    assert sfm_work(replace(video, width=3 * 720, height=3 * 1280), 50) < 2 * sfm_work(video, 50)  # it works on 1600 pixels
+
+
 def test_looking_for_effects_is_modelled_by_pictures() -> None:
     kitchen = Work(200, 640, 480, 25, posed=True, depth=True, outlined=True, effects=True)
     assert effects_work(kitchen) == 240 and effects_work(kitchen, every=False) == 40
     assert effects_work(Work(20, 640, 480, 3, posed=True, depth=False, outlined=False, effects=True), every=False) == 17
+    assert effects_work(replace(kitchen, posed=False)) == 120  # the points are there already
     assert amounts(kitchen, Choice(320))["effects"] == 240
     assert amounts(replace(kitchen, effects=False), Choice(320))["effects"] == 0
     speed = Speed(dict.fromkeys(KINDS, 0.1))
