@@ -33,6 +33,7 @@ from pipelines import (
     tradeoff,
     train,
     tsdf,
+    view,
 )
 from pipelines.options import Json
 from toolkit import __version__
@@ -142,6 +143,7 @@ for _command in (
     tsdf.tsdf,
     finetune.finetune,
     render.render,
+    view.view,
     export.export,
     bake.bake,
     evaluate.evaluate,

@@ -67,7 +67,7 @@ class Check:
 def collect() -> list[Check]:
     """Look at everything (a few seconds). Never raises: what goes wrong in a check is its finding."""
     checks = [_python(), *_packages()]
-    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _video, _lpips, _cores, _memory, _disk)
+    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _video, _lpips, _viewer, _cores, _memory, _disk)
     for look in looks:
         try:
             checks.append(look())
@@ -186,6 +186,15 @@ def _video() -> Check:
     if len(read) != len(frames) or max(abs(float(a.mean()) - float(b.mean())) for a, b in zip(read, frames, strict=True)) > 12:
         return Check("video", FAIL, "OpenCV does not read back the mp4 that it wrote", "install opencv-contrib-python-headless again")
     return Check("video", OK, "mp4 written and read")
+
+
+def _viewer() -> Check:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return Check("viewer", OK, f"viser {version('viser')}")
+    except PackageNotFoundError:
+        return Check("viewer", WARN, "no viser: `fieldfuse view` is not there", "pip install 'viser>=1'")
 
 
 def _lpips() -> Check:

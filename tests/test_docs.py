@@ -25,7 +25,7 @@ def test_commands_and_options_exist(page: Path) -> None:
 
     commands = typer.main.get_command(app)
     text = page.read_text(encoding="utf-8")
-    for line in re.findall(r"fieldfuse ((?:run|info|poses|tsdf|finetune|render|export|evaluate|doctor)\b[^\n`|#]*)", text):
+    for line in re.findall(r"fieldfuse ((?:run|info|poses|tsdf|finetune|render|view|export|evaluate|doctor)\b[^\n`|#]*)", text):
         name, *words = line.split()
         known = {option for parameter in commands.commands[name].params for option in (*parameter.opts, *parameter.secondary_opts)}  # type: ignore[attr-defined]
         for word in words:

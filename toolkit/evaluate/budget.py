@@ -148,8 +148,8 @@ def amounts(work: Work, choice: Choice) -> dict[str, float]:
 
 
 def effects_work(work: Work, choice: Choice | None = None, every: bool = True) -> float:
-    """Pictures whose features are found and matched; `every`: all of them a second time, as when one is corrected. Half where structure from
-    motion leaves points."""
+    """Pictures whose features are found and matched; `every`: all of them a second time, as when one is corrected. Half where
+    structure from motion leaves points."""
     frames = min(work.frames, (choice.max_frames if choice is not None else None) or work.frames)
     test = work.test * frames / max(work.frames, 1)
     return (min(frames - test, EFFECTS_LOOKED_AT) + (frames if every else 0)) * (1.0 if work.posed else 0.5)

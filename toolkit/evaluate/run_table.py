@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
 
 from toolkit.evaluate import words
@@ -73,7 +74,7 @@ def _how(data: dict[str, Any]) -> str:
     if threads is not None:
         parts.append("one thread" if threads == 1 else f"{threads} threads")
     given = shlex.split(str(data["command"]))
-    pairs = [value for name, value in zip(given, given[1:], strict=False) if name == "--set" and not value.startswith(NOT_TOLD)]
+    pairs = [value for name, value in pairwise(given) if name == "--set" and not value.startswith(NOT_TOLD)]
     return ", ".join([*parts, *(f"`{pair}`" for pair in pairs)])
 
 
