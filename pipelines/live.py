@@ -8,33 +8,30 @@ from __future__ import annotations
 import io
 import socket
 import threading
-import time
 import warnings
 from collections.abc import Callable
 from contextlib import redirect_stdout
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.rendered import to_picture
-from toolkit.camera import Array, Intrinsics
-from toolkit.errors import InputError
+from pipelines.render_path import read_cameras
+from pipelines.visitor import COLOURS, DEPTH, OPACITY, SMALLEST, Visitor, lens_of, pose_of
+from toolkit.camera import Array, Intrinsics, Similarity
+from toolkit.errors import FieldfuseError, InputError
+from toolkit.export.cameras import transforms
+from toolkit.files import write_json
 
 if TYPE_CHECKING:
     import viser
 
     from toolkit.capture.types import Views
 
-MOVING_SECONDS = 0.08  # that a picture may take while the camera moves
-REST = 0.15  # seconds without a movement after which a camera rests
-GOODBYE = 0.5  # seconds after which it is known whether what failed was the connection
-SMALLEST = 64  # pixels of a long side
 MOST_CAMERAS = 150  # that are drawn
 FRUSTUM = 0.06  # of the median depth
 TRAINING, HELD_OUT = (40, 110, 200), (230, 120, 30)
-NOTHING = 160.0  # depth where nothing is; viser's pictures know 167 at most
-COLOURS, DEPTH, OPACITY = "colours", "depth", "opacity"
 
 
 @dataclass(frozen=True)
@@ -44,12 +41,28 @@ class Shown:
     Attributes:
         render: lens and pose (4, 4, working frame) → `Rendered`.
         median_depth: of the scene, working units.
+        kept: the file for cameras that visitors keep, in the input's frame; those that it has stay in it.
     """
 
     name: str
     render: Callable[[Intrinsics, Array], Any]
     views: Views
     median_depth: float
+    kept: Path
+    working_from_input: Similarity
+
+    def keep(self, lens: Intrinsics, pose: Array) -> int:
+        """Add a camera (working frame) to the file; answers how many it has.
+
+        Raises:
+            InputError: the file that is there holds no cameras.
+            OutputError: it cannot be written.
+        """
+        names, lenses, poses = read_cameras(self.kept) if self.kept.is_file() else ([], [], np.zeros((0, 4, 4)))
+        mine = self.working_from_input.inverse().poses(pose[None])
+        names = [*names, f"view_{len(names):04d}"]
+        write_json(self.kept, transforms(names, [*lenses, lens], np.concatenate([poses, mine])))
+        return len(names)
 
 
 def require_server(host: str) -> None:
@@ -69,14 +82,6 @@ def require_server(host: str) -> None:
         raise InputError(f"nothing can be served at --host {host} ({error.strerror or error}); try 127.0.0.1") from error
 
 
-def lens_of(fov: float, aspect: float, long_side: int) -> Intrinsics:
-    """A pinhole camera by its vertical opening angle (radians) and width over height."""
-    height, width = (long_side / aspect, long_side) if aspect >= 1 else (long_side, long_side * aspect)
-    height, width = max(1, round(height)), max(1, round(width))
-    focal = height / 2 / np.tan(fov / 2)
-    return Intrinsics(width, height, focal, focal, width / 2, height / 2)
-
-
 class Live:
     """The server. A context: it stops serving at the end."""
 
@@ -86,6 +91,7 @@ class Live:
 
         self.shown, self.image_size = shown, image_size
         self.rendering = threading.Lock()  # the kernels' threads are shared
+        self._keeping = threading.Lock()
         self.failed: BaseException | None = None
         self._ends = threading.Event()
         self._visitors: dict[int, Visitor] = {}
@@ -141,6 +147,9 @@ class Live:
         )
         for control in (self.what, self.side):
             control.on_update(lambda _: self.renew())
+        keep = gui.add_button("Keep this camera", hint="For `fieldfuse render --cameras`.")
+        keep.on_click(self._keep)
+        self.told = gui.add_markdown("")
         frustums = [self._frustum(index) for index in spread(len(views), MOST_CAMERAS)]
 
         @cameras.on_update
@@ -177,6 +186,15 @@ class Live:
 
         return frustum
 
+    def _keep(self, event: Any) -> None:
+        camera = event.client.camera
+        lens, pose = lens_of(camera.fov, camera.aspect, int(self.side.value)), pose_of(camera.wxyz, camera.position)
+        try:
+            with self._keeping:
+                self.told.content = f"{self.shown.keep(lens, pose)} in `{self.shown.kept}`"
+        except FieldfuseError as error:
+            self.told.content = str(error)
+
     def renew(self) -> None:
         """Everybody's picture is rendered again."""
         for visitor in list(self._visitors.values()):
@@ -192,73 +210,10 @@ class Live:
             visitor.leave()
 
 
-class Visitor:
-    """One browser, and the thread that renders for it."""
-
-    def __init__(self, live: Live, client: viser.ClientHandle) -> None:
-        self.live, self.client = live, client
-        self.moved = threading.Event()
-        self.moved.set()
-        self._left = False
-        self._per_pixel = 1e-6  # seconds, learnt as it goes
-        threading.Thread(target=self._run, name=f"visitor-{client.client_id}", daemon=True).start()
-
-    def leave(self) -> None:
-        """Nothing is rendered for it any more."""
-        self._left = True
-        self.moved.set()
-
-    def _run(self) -> None:
-        try:
-            while not self._left:
-                self.moved.wait()
-                self.moved.clear()
-                whole = int(self.live.side.value)
-                small = int(np.clip((MOVING_SECONDS / self._per_pixel) ** 0.5, SMALLEST, whole))
-                self._show(small)
-                if small < whole and not self.moved.wait(REST) and not self._left:
-                    self._show(whole)
-        except BaseException as error:  # a thread's own would be lost
-            time.sleep(GOODBYE)
-            if not self._left:
-                self.live.fail(error)
-
-    def _show(self, long_side: int) -> None:
-        """Render what the camera sees, and send it."""
-        if self._left:
-            return
-        camera = self.client.camera
-        lens = lens_of(camera.fov, camera.aspect, long_side)
-        with self.live.rendering:
-            begin = time.perf_counter()
-            rendered = self.live.shown.render(lens, pose_of(camera.wxyz, camera.position))
-            self._per_pixel = (time.perf_counter() - begin) / (lens.width * lens.height)
-        depth = np.where(rendered.depth > 0, rendered.depth, NOTHING)
-        self.client.scene.set_background_image(picture(rendered, self.live.what.value), format="jpeg", jpeg_quality=85, depth=depth)
-
-
-def picture(rendered: Any, what: str) -> Array:
-    """(H, W, 3) uint8 of what was asked for."""
-    from toolkit.evaluate.pictures import depth_picture, depth_range
-
-    if what == DEPTH:
-        return depth_picture(rendered.depth, depth_range([rendered.depth]))
-    if what == OPACITY:
-        return np.repeat((np.clip(rendered.opacity, 0, 1) * 255 + 0.5).astype(np.uint8)[..., None], 3, axis=2)
-    return to_picture(rendered).rgb
-
-
-def pose_of(wxyz: Any, position: Any) -> Array:
-    """(4, 4) world_from_camera of a viewer's camera, whose axes are ours."""
-    from toolkit.capture.quaternion import rigid
-
-    return rigid(np.asarray(wxyz, dtype=np.float64), np.asarray(position, dtype=np.float64), "the viewer's camera")
-
-
 def _quaternion(pose: Array) -> Array:
-    import viser.transforms as transforms
+    from viser.transforms import SO3
 
-    return np.asarray(transforms.SO3.from_matrix(pose[:3, :3]).wxyz)
+    return np.asarray(SO3.from_matrix(pose[:3, :3]).wxyz)
 
 
 def _fov(lens: Intrinsics) -> float:

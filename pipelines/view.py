@@ -8,6 +8,8 @@ import typer
 
 from pipelines.options import Config, Device, OptionalOut, Pairs, Quiet, Target, Threads, gather
 
+KEPT = "cameras_kept.json"
+
 
 def view(
     target: Target,
@@ -40,7 +42,8 @@ def view(
     with open_job(target, out, options, make_progress(quiet), (*BEFORE, "field")) as job:
         _, _, _, scene, ready = stand(job)
         field, _ = fit_radiance_field(job, ready, scene)
-        shown = Shown(job.source.name, camera_of(job, field, ready, scene, baked), ready, scene.median_depth)
+        render, place = camera_of(job, field, ready, scene, baked), (out or target) / KEPT
+        shown = Shown(job.source.name, render, ready, scene.median_depth, place, scene.working_from_input)
     with Live(shown, host, port, image_size) as live:  # the run's folder is free again: others may work in it
         typer.echo(f"{live.address} shows the field; Ctrl-C ends it")
         live.wait()

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.live import lens_of, pose_of
+from pipelines.visitor import lens_of, pose_of
 from tests.pipelines.made import CAMERA, call, make_room
 from tests.pipelines.short import FAST, start
 from toolkit.camera import Array
@@ -89,7 +89,7 @@ def served(tmp_path: Path, capsys: Capsys) -> Iterator[tuple[Any, int, Path]]:
 
 
 @pytest.mark.slow
-def test_a_visitor_sees_what_the_cameras_saw(served: tuple[Any, int, Path]) -> None:
+def test_a_visitor_sees_what_the_cameras_saw(served: tuple[Any, int, Path], capsys: Capsys) -> None:
     process, port, out = served
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=20) as page:
         assert page.status == 200 and b"<html" in page.read().lower()
@@ -106,6 +106,14 @@ def test_a_visitor_sees_what_the_cameras_saw(served: tuple[Any, int, Path]) -> N
     kept = cv2.imread(str(next((out / "renders").glob("field_000_*[!h].png"))))  # the first camera is held out, so its picture is there
     assert kept is not None and kept.shape == shown.shape
     assert 10 * np.log10(255**2 / np.mean((kept[..., ::-1].astype(float) - shown) ** 2)) > 28  # a JPEG of the same
+
+    keep = next(message for message in browser.seen if message["type"] == "GuiButtonMessage")
+    browser.say("GuiUpdateMessage", uuid=keep["uuid"], updates={"value": True})
+    browser.until(lambda message: message["type"] == "GuiUpdateMessage" and "1 in" in str(message["updates"]))
+    answer = call(capsys, "render", out, "--cameras", out / "cameras_kept.json", "--to", out / "again", "--threads", 1, "--quiet")
+    assert answer.code == 0, answer.err
+    again = cv2.imread(str(next((out / "again").glob("*.png"))))
+    assert again is not None and abs(again.astype(int) - kept).max() <= 2  # the same camera, by way of the input's frame
 
     choice = next(message for message in browser.seen if message["type"] == "GuiDropdownMessage")
     browser.say("GuiUpdateMessage", uuid=choice["uuid"], updates={"value": "opacity"})
