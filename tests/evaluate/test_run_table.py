@@ -18,7 +18,11 @@ def run(source: str, psnr: float, seed: int = 0, tsdf: float | None = None, comm
         "evaluation": {"field": scores, "tsdf": surface, "nearest_image": {"psnr": 11.25}},
         "views": {"total": 50, "test": 7, "width": 240, "height": 135},
         "settings": {"fit": {"finetune": True, "budget": 30.0}, "engine": "auto", "threads": 1, "seed": seed},
-        "stages": [{"name": "field", "peak_memory_mb": 900.0}, {"name": "views", "peak_memory_mb": None}],
+        "stages": [
+            {"name": "network", "seconds": 20.0, "peak_memory_mb": None},
+            {"name": "field", "seconds": 31.0, "peak_memory_mb": 900.0},
+            {"name": "views", "seconds": 5.0, "peak_memory_mb": 300.0},
+        ],
         "timeline": [],
         "machine": {"python": "3.11", "device": "cpu"},
     }
@@ -32,8 +36,8 @@ def test_seeds_stand_side_by_side() -> None:
     text = run_table([run("/data/fox", 29.5), run("/data/gum", 24.0), run("/data/fox", 29.1, seed=1)], ["one", "two", "three"])
     same = ["43 / 7", "240×135", "30 s, one thread"]
     assert rows(text) == [
-        ["fox", *same, "29.5, 29.1", "0.900, 0.900", "0.100, 0.100", "11.2", "900 MB", "1 min, 1 min 1 s"],
-        ["gum", *same, "24.0", "0.900", "0.100", "11.2", "900 MB", "1 min"],
+        ["fox", *same, "29.5, 29.1", "0.900, 0.900", "0.100, 0.100", "11.2", "51 s", "900 MB", "1 min, 1 min 1 s"],
+        ["gum", *same, "24.0", "0.900", "0.100", "11.2", "51 s", "900 MB", "1 min"],
     ]
     assert text.startswith("Measured 2026-11-23, Python 3.11, device cpu:") and "    three\n" in text
 

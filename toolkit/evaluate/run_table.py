@@ -10,7 +10,8 @@ from typing import Any
 from toolkit.evaluate import words
 from toolkit.evaluate.page import short_name
 
-HEAD = ("capture", "views", "pixels", "how", "PSNR", "SSIM", "LPIPS", "nearest picture", "peak memory", "whole run")
+HEAD = ("capture", "views", "pixels", "how", "PSNR", "SSIM", "LPIPS", "nearest picture", "field made in", "peak memory", "whole run")
+MAKING = ("network", "direct", "field")
 NOT_TOLD = ("export.", "tsdf.enabled")  # settings that change no score
 
 
@@ -31,11 +32,12 @@ def run_table(reports: Sequence[dict[str, Any]], commands: Sequence[str]) -> str
     lines = ["| " + " | ".join(HEAD) + " |", "| " + " | ".join(["---"] * len(HEAD)) + " |"]
     for key, group in rows.items():
         nearest = (group[0]["evaluation"].get("nearest_image") or {}).get("psnr")
-        whole = [_each(group, _peak, words.memory), _each(group, lambda data: data["seconds_total"], words.duration)]
+        whole = [_each(group, _making, words.duration), _each(group, _peak, words.memory)]
+        whole.append(_each(group, lambda data: data["seconds_total"], words.duration))
         lines.append("| " + " | ".join([*key, *_scores(group, "field"), words.decimal(nearest, 1), *whole]) + " |")
         shown = surfaces.pop((*key[:3], "its TSDF"), None)
         if shown:
-            lines.append("| " + " | ".join([*key[:3], "its TSDF", *_scores(shown[:1], "tsdf"), words.decimal(nearest, 1), "", ""]) + " |")
+            lines.append("| " + " | ".join([*key[:3], "its TSDF", *_scores(shown[:1], "tsdf"), words.decimal(nearest, 1), "", "", ""]) + " |")
     days = sorted({str(data["created"])[:10] for data in reports})
     when = days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}"
     return "\n".join([f"Measured {when}, {_machine(reports)}:", "", *lines, "", "By:", "", *(f"    {one}" for one in commands)]) + "\n"
@@ -76,6 +78,11 @@ def _how(data: dict[str, Any]) -> str:
     given = shlex.split(str(data["command"]))
     pairs = [value for name, value in pairwise(given) if name == "--set" and not value.startswith(NOT_TOLD)]
     return ", ".join([*parts, *(f"`{pair}`" for pair in pairs)])
+
+
+def _making(data: dict[str, Any]) -> float:
+    """Seconds of the stages that make the field: matching and fitting, and the networks where they took part."""
+    return float(sum(stage["seconds"] for stage in data["stages"] if stage["name"] in MAKING))
 
 
 def _peak(data: dict[str, Any]) -> float | None:
