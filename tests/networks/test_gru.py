@@ -167,3 +167,12 @@ def test_colour_latents_decode_to_their_colour() -> None:
     torch.testing.assert_close(back, colour, atol=1e-5, rtol=1e-4)
     extreme = colour_latent(torch.tensor([[0.0, 1.0, 0.5]]))
     assert bool(torch.isfinite(extreme).all()) and float(extreme.abs().max()) < 2
+
+
+def test_fewer_digits_without_gradients_are_those_with_them() -> None:
+    topology, _ = cube(2, 1.0, 0)
+    gru, given = trained(), inputs(topology, 3)
+    with torch.autocast("cpu", torch.bfloat16):
+        with torch.no_grad():
+            quick = gru(**given, topology=topology)
+        assert torch.equal(quick, gru(**given, topology=topology))

@@ -95,6 +95,13 @@ def test_points_reproject_and_opencv_axes_hold(found):
     assert np.mean(local[:, 2] > 0) > 0.99  # before the camera: z is forward
 
 
+def test_what_would_not_repeat_takes_one_thread_unless_pictures_are_many():
+    from toolkit.poses.job import REPEATABLE, Job, Picture
+
+    for count, expected in ((2, 1), (REPEATABLE, 1), (REPEATABLE + 1, 4)):
+        assert Job("out", (Picture("a", "a.png"),) * count, True, True, False, 1600, 4096, 0, 4).repeating == expected
+
+
 def test_a_second_run_reuses_features_and_gives_the_same(found, pictures, tmp_path):
     result, out, _ = found
     before = (out / "sparse" / "pictures.json").stat().st_mtime_ns

@@ -78,12 +78,12 @@ class FusionGRU(nn.Module):
         Returns:
             (M · 512 + 1, C), zero outside.
         """
-        both = torch.cat([state, local], 1)
+        both = _beside(state, local)
         known = torch.log(count.clamp_max(self.most)) - torch.log(weight.clamp_min(LEAST))  # −∞ where nothing is known: z = 1
         known = torch.cat([known, known.new_full((1,), -torch.inf)])[:, None]
         update, reset = self._gates(both, topology, inside)
         z, r = torch.sigmoid(update - known), torch.sigmoid(reset)
-        candidate = torch.tanh(raw + held(self.candidate(torch.cat([r * state, local], 1), topology, inside)))
+        candidate = torch.tanh(raw + held(self.candidate(_beside(r * state, local), topology, inside)))
         return torch.lerp(state, candidate, z)
 
     def _gates(self, both: Tensor, topology: Topology, inside: Tensor) -> list[Tensor]:
@@ -93,6 +93,15 @@ class FusionGRU(nn.Module):
         weight, bias = torch.cat([one.weight, other.weight]), torch.cat([one.bias, other.bias])
         rows = block_conv3d(both, topology, weight, bias, inside, one.chunk)
         return [gate(both, topology, inside, part) for gate, part in zip((self.update, self.reset), rows.chunk(2, 1), strict=True)]
+
+
+def _beside(one: Tensor, other: Tensor) -> Tensor:
+    """Both rows' channels. Without gradients they are at once in the numbers that convolutions compute in, which is half as much to write."""
+    kind = one.device.type
+    if torch.is_autocast_enabled(kind) and not torch.is_grad_enabled():
+        reduced = torch.get_autocast_dtype(kind)
+        one, other = one.to(reduced), other.to(reduced)
+    return torch.cat([one, other], 1)
 
 
 def mean_gate(count: Tensor, weight: Tensor, most: int = MOST) -> Tensor:

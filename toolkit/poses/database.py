@@ -183,7 +183,8 @@ def sketches(job: Job, database: pycolmap.Database) -> list[Array]:
 def match(job: Job, pairs: list[tuple[int, int]], report: Report) -> None:
     """Match and verify `pairs` (indices into the job's pictures); pairs in the database already are skipped by COLMAP."""
     matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = job.threads
+    # A second thread verifies what this one matched. With more of these four of 1881 pairs had other matches now and then.
+    matching.num_threads = job.repeating
     matching.use_gpu = False
     matching.guided_matching = False
     verification = pycolmap.TwoViewGeometryOptions()

@@ -15,6 +15,7 @@ MAX_EXHAUSTIVE = 120  # photos; beyond it pairs are chosen
 GONE_ON = "incremental, gone on with small angles"  # the attempt that adds to the strict one's model what that had no place for
 GLOBAL = "global"  # the last attempt, which takes what no other can begin with
 VERSION = 2  # of what is found and how; a change discards what earlier versions left in out/sparse
+REPEATABLE = 300  # pictures up to which poses repeat: one thread matches and one maps (docs/performance.md)
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,11 @@ class Job:
     @property
     def result(self) -> Path:
         return Path(self.folder) / "result.json"
+
+    @property
+    def repeating(self) -> int:
+        """Threads for what would not repeat with several: COLMAP's matching and mapping. Only many pictures take all the same."""
+        return 1 if len(self.pictures) <= REPEATABLE else self.threads
 
     def key(self) -> str:
         """Of what features and matches depend on: not on threads, not on what the mapper is told."""

@@ -22,7 +22,6 @@ WORSE = 1.25  # times the error of the strict model that a model which went on f
 ENOUGH = 0.6  # share of registered pictures below which a looser attempt is worth its time
 FEW_POINTS = 12  # a picture that sees fewer of the model's points hangs in the air: not registered
 SMALLEST = 3  # registered pictures that make a model
-REPEATABLE = 300  # pictures up to which mapping takes one thread, so that it repeats
 MAX_ERROR = 3.0  # pixels; the mean reprojection error of a model that can be trusted
 STEP_TOLERANCE = 1e-5  # share of the error by which an adjustment has to get better to go on, while mapping …
 LAST_TOLERANCE, LAST_STEPS = 1e-9, 30  # … and at the end; a point that flees to infinity would go on for ever
@@ -86,7 +85,7 @@ def _registered(reconstruction: pycolmap.Reconstruction) -> list[int]:
 
 def _options(job: Job, loose: bool) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = _threads(job)
+    options.num_threads = job.repeating
     options.random_seed = job.seed
     options.extract_colors = False  # pictures may be frames of a video or turned: the points are coloured later where needed
     options.min_model_size = SMALLEST
@@ -140,11 +139,6 @@ def _incremental(job: Job, report: Report, loose: bool, start: pycolmap.Reconstr
     return list(found.values())
 
 
-def _threads(job: Job) -> int:
-    """With several the result depends on which is first now and then; they gain a tenth of the time (docs/performance.md)."""
-    return 1 if len(job.pictures) <= REPEATABLE else job.threads
-
-
 def _global(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
     report(0, len(job.pictures), "mapping all at once")
     # Calibrating the view graph rewrites cameras and pairs: on a copy, so that a re-run starts from the same matches.
@@ -181,7 +175,7 @@ def finish(job: Job, model: Model, report: Report) -> None:
     options.print_summary = False
     options.ceres.solver_options.function_tolerance = LAST_TOLERANCE
     options.ceres.solver_options.max_num_iterations = LAST_STEPS
-    options.ceres.solver_options.num_threads = _threads(job)
+    options.ceres.solver_options.num_threads = job.repeating
     pycolmap.bundle_adjustment(model.reconstruction, options)
     # As after each of the mapper's own: a point that hardly any parallax held may have gone behind a camera, or to where numbers end.
     rules = _options(job, loose=model.attempt != STRICT).mapper

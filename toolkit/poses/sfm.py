@@ -41,7 +41,7 @@ def find_poses(
     """Structure from motion over the capture's pictures; poses and intrinsics that it brings are not looked at.
 
     COLMAP's database, log and model stay in `out/sparse`; features and matches there are used again when the pictures and
-    settings are the same. With the same seed the result repeats; up to `mapping.REPEATABLE` pictures that of the incremental
+    settings are the same. With the same seed the result repeats; up to `job.REPEATABLE` pictures that of the incremental
     mapper does bit for bit, whatever the threads. A capture with depth maps gets the depth's scale.
 
     Raises:
