@@ -55,6 +55,13 @@ def test_a_surface_is_scored_twice() -> None:
     assert surface[3:5] == ["its TSDF", "17.5 (19.5 on the 50% where it has surface)"]
 
 
+def test_bare_photos_are_named_by_what_holds_them() -> None:
+    assert [row[0] for row in rows(run_table([run("/data/fox/images/", 29.5), run("photos", 20.0)], ["one", "two"]))] == [
+        "fox/images",
+        "photos",
+    ]
+
+
 def test_only_reports_are_reports() -> None:
     assert is_report(run("/data/fox", 29.5))
     assert not is_report({"rows": []}) and not is_report(None)

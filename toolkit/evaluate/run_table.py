@@ -11,6 +11,7 @@ from toolkit.evaluate import words
 from toolkit.evaluate.page import short_name
 
 HEAD = ("capture", "views", "pixels", "how", "PSNR", "SSIM", "LPIPS", "nearest picture", "field made in", "peak memory", "whole run")
+PLAIN = ("images", "frames", "photos")
 MAKING = ("network", "direct", "field")
 NOT_TOLD = ("export.", "tsdf.enabled")  # settings that change no score
 
@@ -25,7 +26,7 @@ def run_table(reports: Sequence[dict[str, Any]], commands: Sequence[str]) -> str
     rows: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     surfaces: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for data in reports:
-        key: tuple[str, ...] = (short_name(data["source"]), _views(data), _pixels(data), _how(data))
+        key: tuple[str, ...] = (_capture(data), _views(data), _pixels(data), _how(data))
         rows.setdefault(key, []).append(data)
         if data["evaluation"].get("tsdf"):
             surfaces.setdefault((*key[:3], "its TSDF"), []).append(data)
@@ -37,7 +38,9 @@ def run_table(reports: Sequence[dict[str, Any]], commands: Sequence[str]) -> str
         lines.append("| " + " | ".join([*key, *_scores(group, "field"), words.decimal(nearest, 1), *whole]) + " |")
         shown = surfaces.pop((*key[:3], "its TSDF"), None)
         if shown:
-            lines.append("| " + " | ".join([*key[:3], "its TSDF", *_scores(shown[:1], "tsdf"), words.decimal(nearest, 1), "", "", ""]) + " |")
+            lines.append(
+                "| " + " | ".join([*key[:3], "its TSDF", *_scores(shown[:1], "tsdf"), words.decimal(nearest, 1), "", "", ""]) + " |"
+            )
     days = sorted({str(data["created"])[:10] for data in reports})
     when = days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}"
     return "\n".join([f"Measured {when}, {_machine(reports)}:", "", *lines, "", "By:", "", *(f"    {one}" for one in commands)]) + "\n"
@@ -56,6 +59,13 @@ def _scores(group: Sequence[dict[str, Any]], what: str) -> list[str]:
     if masked is not None and coverage is not None:
         cells[0] += f" ({masked:.1f} on the {100 * coverage:.0f}% where it has surface)"
     return cells
+
+
+def _capture(data: dict[str, Any]) -> str:
+    """The last part of its path; where that says nothing, the one before, too."""
+    name = short_name(data["source"])
+    before = short_name(str(data["source"]).rstrip("/").removesuffix(name)) if name in PLAIN else ""
+    return f"{before}/{name}" if before else name
 
 
 def _views(data: dict[str, Any]) -> str:
