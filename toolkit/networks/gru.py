@@ -96,7 +96,7 @@ class FusionGRU(nn.Module):
 
 
 def _beside(one: Tensor, other: Tensor) -> Tensor:
-    """Both rows' channels. Without gradients they are at once in the numbers that convolutions compute in, which is half as much to write."""
+    """Both rows' channels; without gradients at once in the numbers that convolutions compute in, which is half as much to write."""
     kind = one.device.type
     if torch.is_autocast_enabled(kind) and not torch.is_grad_enabled():
         reduced = torch.get_autocast_dtype(kind)
