@@ -6,6 +6,7 @@ The page shows the working frame (z up); the training cameras stand in it, and a
 from __future__ import annotations
 
 import io
+import signal
 import socket
 import threading
 import warnings
@@ -116,15 +117,19 @@ class Live:
         return f"http://{'localhost' if self.host in ('127.0.0.1', '0.0.0.0', '::') else self.host}:{self.server.get_port()}"
 
     def wait(self) -> None:
-        """Until Ctrl-C.
+        """Until Ctrl-C. Handlers of its own: what a shell starts in the background ignores Ctrl-C otherwise.
 
         Raises:
             whatever went wrong while a picture was rendered.
         """
+        asked: list[int] = []
+        before = {number: signal.signal(number, lambda number, _: asked.append(number)) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
-            self._ends.wait()
-        except KeyboardInterrupt:
-            return
+            while not asked and not self._ends.wait(0.2):
+                pass
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
         if self.failed is not None:
             raise self.failed
 
