@@ -110,7 +110,8 @@ class Live:
     def __exit__(self, *_: object) -> None:
         for visitor in list(self._visitors.values()):
             visitor.leave()
-        self.server.stop()
+        with redirect_stdout(io.StringIO()):  # "Server stopped"
+            self.server.stop()
 
     @property
     def address(self) -> str:

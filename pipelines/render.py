@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pipelines.options import Config, Device, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
+from pipelines.options import Baked, Config, Device, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
 
 
 def render(
@@ -23,9 +23,7 @@ def render(
     frames: Annotated[int, typer.Option(min=2, help="Pictures of the orbit.")] = 90,
     fps: Annotated[float, typer.Option(min=1, help="Pictures a second of a video.")] = 30,
     image_size: Annotated[int | None, typer.Option(min=16, help="Long side of the pictures in pixels.", show_default=False)] = None,
-    baked: Annotated[
-        bool, typer.Option("--baked", help="Render the baked field (about twice as fast on a CPU); it is made if need be.")
-    ] = False,
+    baked: Baked = False,
     device: Device = None,
     threads: Threads = None,
     config: Config = None,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.options import Config, Device, OptionalOut, Pairs, Quiet, Target, Threads, gather
+from pipelines.options import Baked, Config, Device, OptionalOut, Pairs, Quiet, Target, Threads, gather
 
 KEPT = "cameras_kept.json"
 
@@ -17,9 +17,7 @@ def view(
     port: Annotated[int, typer.Option(min=0, max=65535, help="Where the page is served; the next free one if it is taken. 0: any.")] = 8080,
     host: Annotated[str, typer.Option(help="Address to listen at. 0.0.0.0: others in the network can look, too.")] = "127.0.0.1",
     image_size: Annotated[int, typer.Option(min=64, max=4096, help="Long side in pixels of a picture at rest.")] = 800,
-    baked: Annotated[
-        bool, typer.Option("--baked", help="Show the baked field (about twice as fast on a CPU); it is made if need be.")
-    ] = False,
+    baked: Baked = False,
     device: Device = None,
     threads: Threads = None,
     config: Config = None,

@@ -15,6 +15,7 @@ from toolkit.evaluate.budget import KINDS, Choice, Speed, Work, amounts, effects
 from toolkit.evaluate.budget_probe import self_test
 from toolkit.evaluate.budget_table import budget_table
 from toolkit.files import write_json
+from toolkit.poses.job import MAX_EXHAUSTIVE
 
 UNITS = {"decode": 0.02, "features": 0.1, "ray": 3e-6, "fit": 1e-5, "score": 5.0}
 FOX = Work(50, 540, 960, 7, posed=True, depth=False, outlined=False)
@@ -130,7 +131,10 @@ def test_poses_take_what_pictures_pairs_and_their_size_ask_for() -> None:
             assert seconds / 1.6 < predicted < 1.6 * seconds
             assert amounts(video, Choice(320, frames))["poses"] == sfm_work(video, frames)
     photos = replace(video, video=False)
-    assert sfm_work(photos, 50) > 2 * sfm_work(video, 50)  # all pairs are matched
+    assert sfm_work(photos, 50) > 2 * sfm_work(video, 50)  # all pairs are matched …
+    assert sfm_work(photos, MAX_EXHAUSTIVE) > sfm_work(photos, MAX_EXHAUSTIVE + 1)  # … of so many, and then those that look alike
+    fox = Work(50, 540, 960, 7, posed=False, depth=False, outlined=False)
+    assert 1.25 * 75 > unit * sfm_work(fox, 50) > 75 / 1.25  # bare photos, whose matching verifies on a second thread
     assert sfm_work(replace(video, width=3 * 720, height=3 * 1280), 50) < 2 * sfm_work(video, 50)  # it works on 1600 pixels
 
 

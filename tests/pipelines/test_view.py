@@ -123,8 +123,8 @@ def test_a_visitor_sees_what_the_cameras_saw(served: tuple[Any, int, Path], caps
     time.sleep(0.5)
     assert process.poll() is None  # a visitor who leaves ends nothing
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
-    assert process.returncode == 0 and errors == ""
+    said, errors = process.communicate(timeout=30)
+    assert process.returncode == 0 and said == errors == ""
 
 
 def test_an_address_that_is_not_ours_is_told(tmp_path: Path, capsys: Capsys) -> None:

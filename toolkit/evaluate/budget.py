@@ -14,6 +14,7 @@ from typing import Any
 from toolkit.config import PosesSettings
 from toolkit.errors import FieldfuseError
 from toolkit.files import fingerprint, read_json, write_json
+from toolkit.poses.job import MAX_EXHAUSTIVE
 
 SIZES = (160, 240, 320, 400, 480, 640, 800, 960)  # long sides that pictures are brought to
 RAYS_A_PIXEL = 0.6  # rays that a fit should have for each training pixel: with fewer, smaller pictures end better in the same time
@@ -36,7 +37,7 @@ SIFT_FRAMES = 100
 # Pictures' worth of features that poses take: a picture, a megapixel of one and of each pair that is matched, and for each other
 # picture that is adjusted with it. Of two videos with 24 to 100 frames (0.3 and 0.9 megapixels) it tells the seconds within 60%.
 SFM_PICTURE, SFM_FEATURES, SFM_PAIR, SFM_MAPPING = 0.5, 1.6, 0.7, 0.018
-NEIGHBOURS, ALL_PAIRS = 5, 60  # pairs that a video's frame is matched in; photos up to which all pairs are
+NEIGHBOURS, ALIKE = 5, 15  # pairs for each frame of a video; for each of more photos than are matched with all others
 EFFECTS_LOOKED_AT = 40  # training pictures at most that are looked at for effects; all, when one is corrected picture by picture
 EFFECTS_SHARE = 0.4  # of the seconds, at most, that looking for effects may take
 AGREES = 0.15  # relative error of a prediction that is still good
@@ -158,7 +159,7 @@ def effects_work(work: Work, choice: Choice | None = None, every: bool = True) -
 def sfm_work(work: Work, frames: int) -> float:
     """Pictures' worth of features that structure from motion takes. It matches neighbours of a video and all pairs of few photos; adjusting
     a model takes the longer the more pictures it has."""
-    pairs = NEIGHBOURS if work.video else min(frames, ALL_PAIRS) / 2
+    pairs = NEIGHBOURS if work.video else frames / 2 if frames <= MAX_EXHAUSTIVE else ALIKE
     each = (SFM_FEATURES + SFM_PAIR * pairs) * work.pixels(PosesSettings.image_size) / 1e6
     return frames * (SFM_PICTURE + each + SFM_MAPPING * frames)
 

@@ -24,23 +24,19 @@ def is_report(found: Any) -> bool:
 def run_table(reports: Sequence[dict[str, Any]], commands: Sequence[str]) -> str:
     """A section of Markdown. `reports` as `report.json` holds them, with the command of each."""
     rows: dict[tuple[str, ...], list[dict[str, Any]]] = {}
-    surfaces: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for data in reports:
-        key: tuple[str, ...] = (_capture(data), _views(data), _pixels(data), _how(data))
-        rows.setdefault(key, []).append(data)
-        if data["evaluation"].get("tsdf"):
-            surfaces.setdefault((*key[:3], "its TSDF"), []).append(data)
+        rows.setdefault((_capture(data), _views(data), _pixels(data), _how(data)), []).append(data)
+    told = set()  # captures whose surface has its row
     lines = ["| " + " | ".join(HEAD) + " |", "| " + " | ".join(["---"] * len(HEAD)) + " |"]
     for key, group in rows.items():
         nearest = (group[0]["evaluation"].get("nearest_image") or {}).get("psnr")
         whole = [_each(group, _making, words.duration), _each(group, _peak, words.memory)]
         whole.append(_each(group, lambda data: data["seconds_total"], words.duration))
         lines.append("| " + " | ".join([*key, *_scores(group, "field"), words.decimal(nearest, 1), *whole]) + " |")
-        shown = surfaces.pop((*key[:3], "its TSDF"), None)
-        if shown:
-            lines.append(
-                "| " + " | ".join([*key[:3], "its TSDF", *_scores(shown[:1], "tsdf"), words.decimal(nearest, 1), "", "", ""]) + " |"
-            )
+        if group[0]["evaluation"].get("tsdf") and key[:3] not in told:
+            told.add(key[:3])
+            surface = [*key[:3], "its TSDF", *_scores(group[:1], "tsdf"), words.decimal(nearest, 1), "", "", ""]
+            lines.append("| " + " | ".join(surface) + " |")
     days = sorted({str(data["created"])[:10] for data in reports})
     when = days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}"
     return "\n".join([f"Measured {when}, {_machine(reports)}:", "", *lines, "", "By:", "", *(f"    {one}" for one in commands)]) + "\n"
