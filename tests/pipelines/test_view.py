@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from pipelines.visitor import lens_of, pose_of
+from tests.evaluate.driven import driven, until
 from tests.pipelines.made import CAMERA, call, make_room
 from tests.pipelines.short import FAST, start
 from toolkit.camera import Array
@@ -125,6 +126,36 @@ def test_a_visitor_sees_what_the_cameras_saw(served: tuple[Any, int, Path], caps
     process.send_signal(signal.SIGINT)
     said, errors = process.communicate(timeout=30)
     assert process.returncode == 0 and said == errors == ""
+
+
+@pytest.mark.slow
+def test_the_page_shows_the_field_in_a_browser(served: tuple[Any, int, Path], capsys: Capsys, tmp_path: Path) -> None:
+    _, port, out = served
+    with driven(f"http://127.0.0.1:{port}", tmp_path, (640, 620)) as page:
+
+        def at_rest() -> Array | None:
+            """What stays the same for a while and is a picture of something."""
+            first = page.picture()
+            time.sleep(1.5)
+            second = page.picture()
+            return second if second[240:].std() > 10 and abs(first.astype(int) - second).max() < 8 else None
+
+        before = until(at_rest)
+        page.drag((260, 340), (380, 320))
+        shown = until(at_rest)
+        assert abs(shown.astype(int) - before).mean() > 3  # another view of the room
+        page.run("[...document.querySelectorAll('button')].find(one => one.textContent.includes('Keep')).click()")
+        kept = out / "cameras_kept.json"
+        until(kept.exists)
+        assert not page.errors
+    answer = call(capsys, "render", out, "--cameras", kept, "--to", out / "kept", "--threads", 1, "--quiet")
+    assert answer.code == 0, answer.err
+    picture = cv2.imread(str(next((out / "kept").glob("*.png"))))
+    assert picture is not None
+    again = cv2.resize(picture, shown.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    below = slice(shown.shape[0] // 2, None)  # the upper half is beside, or behind, the page's controls
+    off = [np.mean((again[below].astype(float) - one[below]) ** 2) for one in (shown, before)]
+    assert 10 * np.log10(255**2 / off[0]) > 30 and off[0] < off[1] / 4, "the kept camera shows something else than the page did"
 
 
 def test_an_address_that_is_not_ours_is_told(tmp_path: Path, capsys: Capsys) -> None:
