@@ -63,9 +63,9 @@ def again(walked) -> Again:
     job = Job.load(walked[1] / "sparse" / "job.json")
     model, attempts = map_pictures(job, silent)
     assert model is not None
-    before = loops.turns(job, model)
+    before = loops.turns(job, model.reconstruction.cameras)
     better, _, facts = loops.without_folds(job, model, attempts, silent)
-    return Again(job, model, before, loops.turns(job, model), better, facts)
+    return Again(job, model, before, loops.turns(job, model.reconstruction.cameras), better, facts)
 
 
 def centres(model: Model) -> np.ndarray:
@@ -85,6 +85,34 @@ def test_true_cameras_agree_with_their_neighbours_and_not_with_matches_across_th
     true = {i: pose[:3, :3].T for i, pose in enumerate(POSES)}
     assert loops.contradictions(again.before, true) == 0
     assert np.count_nonzero(loops.disagreement(again.before, true)[again.before.apart > 10] > loops.AGREES) > 10
+
+
+def test_a_fold_that_pairs_tell_of_is_never_mapped(again):
+    """The same without the pairs of the second turn that are right: nearly all that is matched far apart contradicts the way."""
+    true = {i: pose[:3, :3].T for i, pose in enumerate(POSES)}
+    right = (again.before.apart > loops.NEAR[0]) & (loops.disagreement(again.before, true) < loops.AGREES)
+    with loops._copy(again.job) as job:
+        loops._drop(job, again.before, right)
+        found = loops.never_folded(job, silent)
+    assert found is not None
+    model, attempts, facts = found
+    assert len(attempts) == 1 and facts is not None and facts["dropped"] > 10 and facts["left"] == 0
+    assert "were taken back" in fold({"folded": facts}, True)[0]
+    assert len(model.registered) == FRAMES and aligned_error(centres(model), POSES[:, :3, 3]) < 0.005
+
+
+def test_a_circle_without_a_fold_is_mapped_as_ever(tmp_path):
+    """All sides differ, and the second turn meets the first."""
+    capture = write_capture(tmp_path / "photos", [render(pose, planes=post((3, 4, 13, 14)))[0] for pose in POSES], ordered=True)
+    result = find_poses(capture, tmp_path, PosesSettings(max_features=800), seed=3, threads=1)
+    assert result.registered == FRAMES and aligned_error(result.world_from_camera[:, :3, 3], POSES[:, :3, 3]) < 0.005
+    job = Job.load(tmp_path / "sparse" / "job.json")
+    seen = loops.turns(job)
+    assert loops.contradicted(seen, loops.chained(seen, FRAMES)) > 0.5  # with a guessed lens the circle does not close
+    seen = loops.turns(job, loops._calibrated(job, seen))
+    assert np.count_nonzero(seen.apart > loops.NEAR[0]) > 10 and loops.contradicted(seen, loops.chained(seen, FRAMES)) < 0.2
+    assert loops.never_folded(job, silent) is None
+    assert json.loads((tmp_path / "sparse" / "result.json").read_text())["folded"] is None
 
 
 def test_what_was_matched_is_as_it_was(again):
@@ -109,7 +137,7 @@ def made_up(seed: int, count: int, noise: float) -> tuple[loops.Turns, dict[int,
     pairs = [(i, j) for i in range(count) for j in range(i + 1, min(i + 4, count))]
     turn = [Rotation.from_rotvec(random.normal(0, noise, 3)).as_matrix() @ rotations[j] @ rotations[i].T for i, j in pairs]
     first, second = np.array(pairs).T
-    return loops.Turns(first, second, np.array(turn), np.array(pairs)), dict(enumerate(rotations))
+    return loops.Turns(first, second, np.array(turn), np.array(pairs), np.full(len(pairs), 50)), dict(enumerate(rotations))
 
 
 @settings(max_examples=25, deadline=None)
@@ -129,6 +157,22 @@ def test_one_fold_parts_at_least_three_pairs_of_neighbours(seed, count, at, angl
     turned = Rotation.from_rotvec([0, np.radians(angle), 0]).as_matrix()
     folded = {i: rotation @ turned if i >= at * count else rotation for i, rotation in rotations.items()}
     assert loops.contradictions(seen, folded) >= loops.LEAST
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 1000), count=st.integers(4, 30))
+def test_turns_put_one_after_the_other_are_the_way(seed, count):
+    seen, rotations = made_up(seed, count, 0.0)
+    found = loops.chained(seen, count)
+    assert loops.disagreement(seen, found).max() < 1e-5 and loops.contradicted(seen, found) == 0
+    assert all(np.allclose(found[i], rotations[i] @ rotations[0].T) for i in range(count))
+
+
+def test_what_hangs_on_no_earlier_frame_is_not_in_the_chain():
+    seen, _ = made_up(0, 12, 0.0)
+    kept = ~((seen.first < 6) & (seen.second >= 6))
+    parted = loops.Turns(*(part[kept] for part in (seen.first, seen.second, seen.turn, seen.images, seen.shared)))
+    assert set(loops.chained(parted, 12)) == set(range(6))
 
 
 def test_frames_that_are_not_in_the_model_say_nothing():

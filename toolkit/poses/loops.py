@@ -11,7 +11,7 @@ Runs in the child process only.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +24,7 @@ from toolkit.camera import Array, Intrinsics
 from toolkit.files import remove
 from toolkit.poses.database import MIN_INLIERS, match
 from toolkit.poses.job import Job
-from toolkit.poses.mapping import Model, Report, map_pictures, plain
+from toolkit.poses.mapping import Model, Report, calibrate, map_pictures, plain
 from toolkit.poses.overlap import guessed_depth, overlap, parallax
 
 NEIGHBOURS = 2  # frames apart that show the same side of things
@@ -32,11 +32,16 @@ CONTRADICTS = np.radians(60.0)  # between the turn that a pair of pictures tells
 LEAST = 3  # such pairs of neighbours that make a fold: one fold between two frames parts so many
 NEAR = (10, 5, 3)  # frames apart whose matches are believed when a model is folded; fewer when the model of these is folded, too
 AGREES = np.radians(30.0)  # matches farther apart stay within this: what a long way adds up to without loops
+CHAINED = 5  # frames apart whose turns are put one after the other before anything is mapped
+# Share of the pairs far apart that contradict these: with a fold 0.84 to 0.99 with guessed lenses and 0.58 to 0.97 with calibrated ones,
+# without up to 0.95 and 0.31 (docs/performance.md).
+SUSPECT, TOLD = 0.8, 0.5
+BORNE_OUT = 0.5  # … and that contradict the model of near neighbours, too
 MEETINGS = 4  # pairs far apart that are matched for each picture, where the near model says that cameras meet
 WIDEST = 25.0  # degrees of parallax between two such cameras
 COMMON = 0.4  # of both pictures, that they have to share
 KEPT = 0.5  # share of the folded model's frames that another one has to hold …
-KEPT_PHOTOS = 0.9  # … and of photos', whose neighbours by name may be of other things
+KEPT_PHOTOS = 0.9  # … and of photos', whose neighbours by name may be of other things, or where none was mapped
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,7 @@ class Turns:
     second: Array  # (P,) int64
     turn: Array  # (P, 3, 3) the second camera's axes from the first's
     images: Array  # (P, 2) int64 the pictures' ids in the database
+    shared: Array  # (P,) int64 verified matches
 
     @property
     def apart(self) -> Array:
@@ -54,9 +60,40 @@ class Turns:
         return np.abs(self.second - self.first)
 
 
-def without_folds(
-    job: Job, model: Model, attempts: list[dict[str, Any]], report: Report
-) -> tuple[Model, list[dict[str, Any]], dict[str, int] | None]:
+Mapped = tuple[Model, list[dict[str, Any]], dict[str, int] | None]  # a model, its attempts, and what is told of folds (`without_folds`)
+
+
+def never_folded(job: Job, report: Report) -> Mapped | None:
+    """What `without_folds` would come to, without mapping the folded way first, where the pairs of pictures alone tell of a fold: most of
+    those far apart contradict the turns from frame to frame, and then the model of near neighbours. None where they do not, or nothing came
+    of it: then everything is mapped."""
+
+    def alone(done: float, total: float, note: str) -> None:
+        report(0, total, f"{note} (near neighbours alone)")
+
+    count, seen = len(job.pictures), turns(job)
+    # A guessed focal length that is off turns every step too far or too little, so that a circle does not close: a first sieve, and cheap.
+    if contradicted(seen, chained(seen, count)) < SUSPECT:
+        return None
+    seen = turns(job, _calibrated(job, seen))
+    if contradicted(seen, chained(seen, count)) < TOLD:
+        return None
+    for reach in NEAR:
+        near = _by_neighbours(job, seen, reach, alone)
+        if near is None or len(near.registered) < KEPT_PHOTOS * count:
+            return None
+        if contradictions(seen, axes(near)) >= LEAST:
+            continue  # what looks alike is so near that it is among the neighbours
+        if contradicted(seen, axes(near)) < BORNE_OUT:
+            return None
+        found, tried, facts = _held_against(job, near, reach, report)
+        if found is None or len(found.registered) < KEPT_PHOTOS * len(near.registered) or facts["left"] >= LEAST:
+            return None
+        return found, tried, facts | {"contradicting": int((seen.apart > NEAR[0]).sum())}
+    return None
+
+
+def without_folds(job: Job, model: Model, attempts: list[dict[str, Any]], report: Report) -> Mapped:
     """The model and its attempts as they came from `map_pictures`, or, where the way of the camera is folded, better ones.
 
     Returns:
@@ -64,7 +101,7 @@ def without_folds(
         of them are `left` in the one that is answered (as many as before: nothing better was found, it is the same); matches between
         frames `far` apart, and how many of these were `dropped`.
     """
-    seen = turns(job, model)
+    seen = turns(job, model.reconstruction.cameras)
     before = contradictions(seen, axes(model))
     if before < LEAST:
         return model, attempts, None
@@ -72,24 +109,30 @@ def without_folds(
     def again(done: float, total: float, note: str) -> None:
         report(total, total, f"{note} (again, the way was folded)")
 
-    facts = {"contradicting": before, "left": before, "far": int((seen.apart > NEAR[0]).sum()), "dropped": 0}
     for reach in NEAR:
         near = _by_neighbours(job, seen, reach, again)
         if near is None or contradictions(seen, axes(near)) >= LEAST:
             continue  # what looks alike is so near that it is among the neighbours
-        with _copy(job) as copy:
-            match(copy, meetings(near), again)
-            every = turns(copy, near)
-            far = every.apart > reach
-            false = far & ~(disagreement(every, axes(near)) < AGREES)  # where the near model has no answer a pair is not believed
-            _drop(copy, every, false)
-            found, tried = map_pictures(copy, again)
+        found, tried, facts = _held_against(job, near, reach, again)
         if found is None or len(found.registered) < (KEPT if job.sequential else KEPT_PHOTOS) * len(model.registered):
             break
-        left = contradictions(every, axes(found))
-        if left < LEAST:
-            return found, tried, {"contradicting": before, "left": left, "far": int(far.sum()), "dropped": int(false.sum())}
-    return model, attempts, facts
+        if facts["left"] < LEAST:
+            return found, tried, facts | {"contradicting": before}
+    return model, attempts, {"contradicting": before, "left": before, "far": int((seen.apart > NEAR[0]).sum()), "dropped": 0}
+
+
+def _held_against(job: Job, near: Model, reach: int, report: Report) -> tuple[Model | None, list[dict[str, Any]], dict[str, int]]:
+    """The model of all that agrees with the one of near neighbours, matched once more where that meets itself, and counts as of
+    `without_folds`."""
+    with _copy(job) as copy:
+        match(copy, meetings(near), report)
+        every = turns(copy, near.reconstruction.cameras)
+        far = every.apart > reach
+        false = far & ~(disagreement(every, axes(near)) < AGREES)  # where the near model has no answer a pair is not believed
+        _drop(copy, every, false)
+        found, tried = map_pictures(copy, report)
+    left = 0 if found is None else contradictions(every, axes(found))
+    return found, tried, {"left": left, "far": int(far.sum()), "dropped": int(false.sum())}
 
 
 def _by_neighbours(job: Job, seen: Turns, reach: int, report: Report) -> Model | None:
@@ -99,21 +142,34 @@ def _by_neighbours(job: Job, seen: Turns, reach: int, report: Report) -> Model |
         return map_pictures(copy, report)[0]
 
 
-def turns(job: Job, model: Model) -> Turns:
-    """Of all verified pairs of the job's database, with the lenses that `model` found."""
+def _calibrated(job: Job, seen: Turns) -> dict[int, pycolmap.Camera]:
+    """Cameras by id, their focal lengths by what near neighbours tell (of every pair's fundamental matrix)."""
+    with _copy(job) as copy:
+        _drop(copy, seen, seen.apart > CHAINED)
+        calibrate(copy.database, job.seed)
+        database = pycolmap.Database.open(copy.database)
+        try:
+            return {camera.camera_id: camera for camera in database.read_all_cameras()}
+        finally:
+            database.close()
+
+
+def turns(job: Job, lenses: Mapping[int, pycolmap.Camera] | None = None) -> Turns:
+    """Of all verified pairs of the job's database, with `lenses` by camera id, as a model or a calibration found them, else as guessed."""
     database = pycolmap.Database.open(job.database)
     try:
         images = {image.image_id: image for image in database.read_all_images()}
-        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()} | dict(model.reconstruction.cameras)
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()} | dict(lenses or {})
         points = {image_id: np.asarray(database.read_keypoints(image_id), dtype=np.float64).reshape(-1, 4)[:, :2] for image_id in images}
         rows = []
         for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
             if len(geometry.inlier_matches) < MIN_INLIERS:
                 continue
             a, b = pycolmap.pair_id_to_image_pair(pair_id)
-            lenses = cameras[images[a].camera_id], cameras[images[b].camera_id]
-            if pycolmap.estimate_two_view_geometry_pose(lenses[0], points[a], lenses[1], points[b], geometry):
-                rows.append((int(images[a].name), int(images[b].name), geometry.cam2_from_cam1.rotation.matrix(), (a, b)))
+            pair = cameras[images[a].camera_id], cameras[images[b].camera_id]
+            if pycolmap.estimate_two_view_geometry_pose(pair[0], points[a], pair[1], points[b], geometry):
+                turn, shared = geometry.cam2_from_cam1.rotation.matrix(), len(geometry.inlier_matches)
+                rows.append((int(images[a].name), int(images[b].name), turn, (a, b), shared))
     finally:
         database.close()
     return Turns(
@@ -121,6 +177,7 @@ def turns(job: Job, model: Model) -> Turns:
         np.array([row[1] for row in rows], dtype=np.int64),
         np.array([row[2] for row in rows], dtype=np.float64).reshape(-1, 3, 3),
         np.array([row[3] for row in rows], dtype=np.int64).reshape(-1, 2),
+        np.array([row[4] for row in rows], dtype=np.int64),
     )
 
 
@@ -128,6 +185,29 @@ def axes(model: Model) -> dict[int, Array]:
     """(3, 3) camera_from_world rotations of the registered pictures, by their index."""
     images = (model.reconstruction.image(image_id) for image_id in model.registered)
     return {int(image.name): np.asarray(image.cam_from_world().rotation.matrix()) for image in images}
+
+
+def chained(seen: Turns, count: int) -> dict[int, Array]:
+    """(3, 3) camera_from_world rotations of the first of `count` pictures and all that hang on it by pairs of near neighbours, as `axes`:
+    each by way of the earlier one that it shares most with for the frames between them. They drift, but they are not folded."""
+    best: dict[int, dict[int, tuple[float, Array]]] = {}
+    for row in np.flatnonzero((seen.apart <= CHAINED) & (seen.apart > 0)):
+        i, j, turn = int(seen.first[row]), int(seen.second[row]), seen.turn[row]
+        best.setdefault(max(i, j), {})[min(i, j)] = (seen.shared[row] / seen.apart[row], turn if i < j else turn.T)
+    known = {0: np.eye(3)}
+    for later in range(1, count):
+        links = [(share, earlier, turn) for earlier, (share, turn) in best.get(later, {}).items() if earlier in known]
+        if links:
+            _, earlier, turn = max(links, key=lambda link: link[:2])
+            known[later] = turn @ known[earlier]
+    return known
+
+
+def contradicted(seen: Turns, rotations: dict[int, Array]) -> float:
+    """Share of the pairs far apart that tell clearly of another turn than `rotations`, or of pictures that these know nothing of; 0: there
+    is no such pair."""
+    far = seen.apart > NEAR[0]
+    return float(np.mean(~(disagreement(seen, rotations)[far] < CONTRADICTS))) if far.any() else 0.0
 
 
 def disagreement(seen: Turns, rotations: dict[int, Array]) -> Array:

@@ -147,9 +147,7 @@ def _global(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
     shutil.copyfile(job.database, copy)
     try:
         pycolmap.set_random_seed(job.seed)
-        calibration = pycolmap.ViewGraphCalibrationOptions()
-        calibration.random_seed = job.seed
-        pycolmap.calibrate_view_graph(copy, calibration)
+        calibrate(copy, job.seed)
         options = pycolmap.GlobalPipelineOptions()
         options.num_threads = job.threads
         options.random_seed = job.seed
@@ -157,6 +155,13 @@ def _global(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
         return list(pycolmap.global_mapping(copy, folder, folder, options).values())
     finally:
         remove(copy)
+
+
+def calibrate(database: Path, seed: int) -> None:
+    """Put focal lengths into the cameras of a database that make most of its pairs' fundamental matrices essential ones."""
+    options = pycolmap.ViewGraphCalibrationOptions()
+    options.random_seed = seed
+    pycolmap.calibrate_view_graph(database, options)
 
 
 def _empty(folder: Path) -> Path:

@@ -89,9 +89,12 @@ def work(job_file: Path, mouth: Mouth) -> None:
             def report(done: float, total: float, note: str) -> None:
                 mouth.progress("mapping", done, total, note)
 
-            model, facts["attempts"] = mapping.map_pictures(job, report)
-            if model is not None:
-                model, facts["attempts"], facts["folded"] = loops.without_folds(job, model, facts["attempts"], report)
+            mapped = loops.never_folded(job, report) if job.sequential else None
+            if mapped is None:
+                model, facts["attempts"] = mapping.map_pictures(job, report)
+                mapped = None if model is None else loops.without_folds(job, model, facts["attempts"], report)
+            if mapped is not None:
+                model, facts["attempts"], facts["folded"] = mapped
                 mapping.finish(job, model, report)
                 facts["model"] = mapping.plain(model)
                 mapping.save_model(model, [picture.name for picture in job.pictures], Path(job.folder) / "model")
