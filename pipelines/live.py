@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 MOST_CAMERAS = 150  # that are drawn
 FRUSTUM = 0.06  # of the median depth
+LINE = 0.03  # thickness of a camera's lines, in its own size
 TRAINING, HELD_OUT = (40, 110, 200), (230, 120, 30)
 
 
@@ -177,6 +178,7 @@ class Live:
             _fov(lens),
             lens.width / lens.height,
             scale=FRUSTUM * self.shown.median_depth,
+            thickness=LINE * FRUSTUM * self.shown.median_depth,
             color=HELD_OUT if views.test[index] else TRAINING,
             wxyz=_quaternion(pose),
             position=pose[:3, 3],

@@ -15,7 +15,7 @@ from toolkit.networks.encoding import SH, spherical_harmonics
 from toolkit.render.sky import SHAPE
 
 Tensor = torch.Tensor
-PIXELS = 20_000  # that are looked at of a picture
+PIXELS = 5_000  # that are looked at of a picture
 PARTS = 8  # of the pictures in their order, each of which is predicted from the others
 # Harmonics and ridge, beside a mean square of 0.08 of each harmonic over the sphere: from the mean colour alone to all of them.
 CHOICES = ((1, 0.1), (4, 0.1), (4, 0.01), (4, 0.001), (9, 0.1), (9, 0.01), (9, 0.001), (9, 0.0001))
