@@ -131,10 +131,10 @@ def test_poses_take_what_pictures_pairs_and_their_size_ask_for() -> None:
             assert seconds / 1.6 < predicted < 1.6 * seconds
             assert amounts(video, Choice(320, frames))["poses"] == sfm_work(video, frames)
     photos = replace(video, video=False)
-    assert sfm_work(photos, 50) > 2 * sfm_work(video, 50)  # all pairs are matched …
+    assert sfm_work(photos, MAX_EXHAUSTIVE) > 2 * sfm_work(video, MAX_EXHAUSTIVE)  # all pairs are matched …
     assert sfm_work(photos, MAX_EXHAUSTIVE) > sfm_work(photos, MAX_EXHAUSTIVE + 1)  # … of so many, and then those that look alike
     fox = Work(50, 540, 960, 7, posed=False, depth=False, outlined=False)
-    assert 1.25 * 75 > unit * sfm_work(fox, 50) > 75 / 1.25  # bare photos, whose matching verifies on a second thread
+    assert 1.25 * 40 > unit * sfm_work(fox, 50) > 40 / 1.25  # bare photos, whose matching verifies on a second thread
     assert sfm_work(replace(video, width=3 * 720, height=3 * 1280), 50) < 2 * sfm_work(video, 50)  # it works on 1600 pixels
 
 

@@ -91,7 +91,7 @@ def test_a_fold_that_pairs_tell_of_is_never_mapped(again):
     """The same without the pairs of the second turn that are right: nearly all that is matched far apart contradicts the way."""
     true = {i: pose[:3, :3].T for i, pose in enumerate(POSES)}
     right = (again.before.apart > loops.NEAR[0]) & (loops.disagreement(again.before, true) < loops.AGREES)
-    with loops._copy(again.job) as job:
+    with loops.copied(again.job) as job:
         loops._drop(job, again.before, right)
         found = loops.never_folded(job, silent)
     assert found is not None

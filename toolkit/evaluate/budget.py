@@ -37,7 +37,7 @@ SIFT_FRAMES = 100
 # Pictures' worth of features that poses take: a picture, a megapixel of one and of each pair that is matched, and for each other
 # picture that is adjusted with it. Of two videos with 24 to 100 frames (0.3 and 0.9 megapixels) it tells the seconds within 60%.
 SFM_PICTURE, SFM_FEATURES, SFM_PAIR, SFM_MAPPING = 0.5, 1.6, 0.7, 0.018
-NEIGHBOURS, ALIKE = 5, 15  # pairs for each frame of a video; for each of more photos than are matched with all others
+NEIGHBOURS, ALIKE = 5, 12  # pairs for each frame of a video; for each of more photos than are matched with all others
 EFFECTS_LOOKED_AT = 40  # training pictures at most that are looked at for effects; all, when one is corrected picture by picture
 EFFECTS_SHARE = 0.4  # of the seconds, at most, that looking for effects may take
 AGREES = 0.15  # relative error of a prediction that is still good

@@ -11,10 +11,11 @@ from toolkit.capture.types import Capture, Frame
 from toolkit.config import PosesSettings
 from toolkit.files import fingerprint, read_json, write_json
 
-MAX_EXHAUSTIVE = 120  # photos; beyond it pairs are chosen
+MAX_EXHAUSTIVE = 40  # photos; beyond it pairs are chosen
+MAX_ASKED_AGAIN = 120  # photos; up to it those that find no place so are matched with all others
 GONE_ON = "incremental, gone on with small angles"  # the attempt that adds to the strict one's model what that had no place for
 GLOBAL = "global"  # the last attempt, which takes what no other can begin with
-VERSION = 2  # of what is found and how; a change discards what earlier versions left in out/sparse
+VERSION = 3  # of what is found and how; a change discards what earlier versions left in out/sparse
 REPEATABLE = 300  # pictures up to which poses repeat: one thread matches and one maps (docs/performance.md)
 
 

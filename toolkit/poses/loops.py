@@ -124,7 +124,7 @@ def without_folds(job: Job, model: Model, attempts: list[dict[str, Any]], report
 def _held_against(job: Job, near: Model, reach: int, report: Report) -> tuple[Model | None, list[dict[str, Any]], dict[str, int]]:
     """The model of all that agrees with the one of near neighbours, matched once more where that meets itself, and counts as of
     `without_folds`."""
-    with _copy(job) as copy:
+    with copied(job) as copy:
         match(copy, meetings(near), report)
         every = turns(copy, near.reconstruction.cameras)
         far = every.apart > reach
@@ -137,14 +137,14 @@ def _held_against(job: Job, near: Model, reach: int, report: Report) -> tuple[Mo
 
 def _by_neighbours(job: Job, seen: Turns, reach: int, report: Report) -> Model | None:
     """The model of what pictures at most `reach` apart share."""
-    with _copy(job) as copy:
+    with copied(job) as copy:
         _drop(copy, seen, seen.apart > reach)
         return map_pictures(copy, report)[0]
 
 
 def _calibrated(job: Job, seen: Turns) -> dict[int, pycolmap.Camera]:
     """Cameras by id, their focal lengths by what near neighbours tell (of every pair's fundamental matrix)."""
-    with _copy(job) as copy:
+    with copied(job) as copy:
         _drop(copy, seen, seen.apart > CHAINED)
         calibrate(copy.database, job.seed)
         database = pycolmap.Database.open(copy.database)
@@ -253,7 +253,7 @@ def _drop(job: Job, seen: Turns, which: Array) -> None:
 
 
 @contextmanager
-def _copy(job: Job) -> Iterator[Job]:
+def copied(job: Job) -> Iterator[Job]:
     """The job in a folder of its own, which goes again: what was matched stays as it is for later runs."""
     folder = Path(job.folder) / "again"
     remove(folder)

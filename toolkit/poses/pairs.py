@@ -23,6 +23,11 @@ def exhaustive_pairs(count: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(count) for j in range(i + 1, count)]
 
 
+def pairs_with(some: list[int], count: int) -> list[tuple[int, int]]:
+    """All pairs (i, j), i < j, of which one is in `some`."""
+    return sorted({(min(i, j), max(i, j)) for i in some for j in range(count) if i != j})
+
+
 def sequential_pairs(count: int, overlap: int = 10, quadratic: int = 4) -> list[tuple[int, int]]:
     """Each frame with the next `overlap`, then with those 2·overlap, 4·overlap, … (`quadratic` doublings) later."""
     steps = list(range(1, overlap + 1)) + [overlap * 2**k for k in range(1, quadratic + 1)]

@@ -61,9 +61,10 @@ def work(job_file: Path, mouth: Mouth) -> None:
     """
     from toolkit.files import write_json
     from toolkit.poses import database as store
-    from toolkit.poses import loops, mapping
+    from toolkit.poses import mapping
     from toolkit.poses.health import hopeless
     from toolkit.poses.job import Job
+    from toolkit.poses.placing import place
     from toolkit.poses.selection import choose_pairs
 
     job = Job.load(job_file)
@@ -81,23 +82,18 @@ def work(job_file: Path, mouth: Mouth) -> None:
     if hopeless(records) is None:
         pairs = choose_pairs(job, database, lambda done, total, note: mouth.progress("matching", 0, total, note))
         store.match(job, pairs, lambda done, total, note: mouth.progress("matching", done, total, note))
-        facts["pairs"] = store.pair_facts(job, database)
         step("matching")
         database.close()
-        if facts["pairs"]:
 
-            def report(done: float, total: float, note: str) -> None:
-                mouth.progress("mapping", done, total, note)
+        def report(done: float, total: float, note: str) -> None:
+            mouth.progress("mapping", done, total, note)
 
-            mapped = loops.never_folded(job, report) if job.sequential else None
-            if mapped is None:
-                model, facts["attempts"] = mapping.map_pictures(job, report)
-                mapped = None if model is None else loops.without_folds(job, model, facts["attempts"], report)
-            if mapped is not None:
-                model, facts["attempts"], facts["folded"] = mapped
-                mapping.finish(job, model, report)
-                facts["model"] = mapping.plain(model)
-                mapping.save_model(model, [picture.name for picture in job.pictures], Path(job.folder) / "model")
+        model, told = place(job, report)
+        facts |= told
+        if model is not None:
+            mapping.finish(job, model, report)
+            facts["model"] = mapping.plain(model)
+            mapping.save_model(model, [picture.name for picture in job.pictures], Path(job.folder) / "model")
         step("mapping")
     write_json(job.result, facts)
 
