@@ -36,8 +36,8 @@ def matched(tmp_path_factory) -> Job:
     Path(job.folder).mkdir()
     database = store.open_database(job)
     store.extract(job, database, silent)
-    store.match(job, sorted(set(exhaustive_pairs(COUNT)) - set(pairs_with(LATE, COUNT))), silent)
     database.close()
+    store.match(job, sorted(set(exhaustive_pairs(COUNT)) - set(pairs_with(LATE, COUNT))), silent)
     return job
 
 

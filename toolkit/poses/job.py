@@ -16,7 +16,7 @@ MAX_ASKED_AGAIN = 120  # photos; up to it those that find no place so are matche
 GONE_ON = "incremental, gone on with small angles"  # the attempt that adds to the strict one's model what that had no place for
 GLOBAL = "global"  # the last attempt, which takes what no other can begin with
 VERSION = 3  # of what is found and how; a change discards what earlier versions left in out/sparse
-REPEATABLE = 300  # pictures up to which poses repeat: one thread matches and one maps (docs/performance.md)
+REPEATABLE = 300  # pictures up to which poses repeat: one thread maps (docs/performance.md)
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Job:
 
     @property
     def repeating(self) -> int:
-        """Threads for what would not repeat with several: COLMAP's matching and mapping. Only many pictures take all the same."""
+        """Threads for what would not repeat with several: COLMAP's mapping. Only many pictures take all the same."""
         return 1 if len(self.pictures) <= REPEATABLE else self.threads
 
     def key(self) -> str:

@@ -81,9 +81,9 @@ def work(job_file: Path, mouth: Mouth) -> None:
     step("features")
     if hopeless(records) is None:
         pairs = choose_pairs(job, database, lambda done, total, note: mouth.progress("matching", 0, total, note))
+        database.close()
         store.match(job, pairs, lambda done, total, note: mouth.progress("matching", done, total, note))
         step("matching")
-        database.close()
 
         def report(done: float, total: float, note: str) -> None:
             mouth.progress("mapping", done, total, note)

@@ -1,0 +1,129 @@
+"""Matching by several processes: the same as by one, with nothing left behind; with the real matcher."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+
+from tests.poses.textured import orbit, post, render, write_capture
+from toolkit.config import PosesSettings
+from toolkit.poses import database as store
+from toolkit.poses.job import Job, plan
+from toolkit.poses.pairs import exhaustive_pairs
+
+COUNT = 12
+PAIRS = exhaustive_pairs(COUNT)  # two steps, and a part of one
+
+
+def silent(done: float, total: float, note: str) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def featured(tmp_path_factory) -> Job:
+    """Pictures of a post, their features in the database and nothing matched."""
+    folder = tmp_path_factory.mktemp("post")
+    pictures = [render(pose, planes=post((3, 4, 13, 14)))[0] for pose in orbit(COUNT, 0.35)]
+    capture = write_capture(folder / "photos", pictures, ordered=True)
+    job = plan(capture, folder / "sparse", PosesSettings(max_features=800), seed=3, threads=1)
+    Path(job.folder).mkdir()
+    database = store.open_database(job)
+    store.extract(job, database, silent)
+    database.close()
+    return job
+
+
+def copy_of(job: Job, folder: Path, threads: int) -> Job:
+    folder.mkdir()
+    other = replace(job, folder=str(folder), threads=threads)
+    shutil.copyfile(job.database, other.database)
+    return other
+
+
+def found(job: Job) -> dict[tuple[int, int], tuple[Any, ...]]:
+    """All that matching left, by pair of image ids."""
+    database = pycolmap.Database.open(job.database)
+    try:
+        ids = sorted(image.image_id for image in database.read_all_images())
+        out = {}
+        for at, first in enumerate(ids):
+            for second in ids[at + 1 :]:
+                if database.exists_matches(first, second):
+                    told = database.read_two_view_geometry(first, second)
+                    flat = [np.zeros(0) if one is None else np.asarray(one) for one in (told.F, told.E, told.H, told.inlier_matches)]
+                    out[first, second] = (np.asarray(database.read_matches(first, second)), told.config, *flat)
+        return out
+    finally:
+        database.close()
+
+
+def test_what_is_matched_does_not_hang_on_the_threads(featured, tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "PAIRS_A_STEP", 8)  # nine steps
+    alone, together = copy_of(featured, tmp_path / "one", 1), copy_of(featured, tmp_path / "three", 3)
+    told: list[float] = []
+    store.match(alone, PAIRS, silent)
+    store.match(together, PAIRS, lambda done, total, note: told.append(done))
+    first, second = found(alone), found(together)
+    assert set(first) == set(second) and len(first) == len(PAIRS)
+    for pair, values in first.items():
+        for one, other in zip(values, second[pair], strict=True):
+            np.testing.assert_array_equal(one, other)
+    assert sum(len(values[-1]) >= store.MIN_INLIERS for values in first.values()) > COUNT
+    assert told == sorted(told) and told[0] == 0 and told[-1] == len(PAIRS)
+    assert not (tmp_path / "three" / "matching").exists()
+
+
+def test_what_is_there_already_stays(featured, tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "PAIRS_A_STEP", 8)
+    job = copy_of(featured, tmp_path / "job", 2)
+    store.match(job, PAIRS[:20], silent)
+    before = found(job)
+    store.match(job, PAIRS, silent)
+    after = found(job)
+    assert len(before) == 20 and len(after) == len(PAIRS)
+    for pair, values in before.items():
+        for one, other in zip(values, after[pair], strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("room", [0, 1])
+def test_without_room_for_copies_fewer_match(featured, tmp_path, monkeypatch, room):
+    monkeypatch.setattr(store, "PAIRS_A_STEP", 8)
+    made = 0
+    real = shutil.copyfile
+
+    def copyfile(source: Any, target: Any) -> Any:
+        nonlocal made
+        if "matching" in Path(target).parts:
+            if made >= room:
+                raise OSError(28, "No space left on device")
+            made += 1
+        return real(source, target)
+
+    job = copy_of(featured, tmp_path / "job", 3)
+    monkeypatch.setattr(store.shutil, "copyfile", copyfile)
+    store.match(job, PAIRS[:24], silent)
+    assert made == room and len(found(job)) == 24 and not (tmp_path / "job" / "matching").exists()
+
+
+def test_an_error_of_one_matcher_ends_all(featured, tmp_path, monkeypatch):
+    """A copy that is no database: the process that has it says so, and it is not taken for pairs without matches."""
+    monkeypatch.setattr(store, "PAIRS_A_STEP", 8)
+    job = copy_of(featured, tmp_path / "job", 2)
+    real = shutil.copyfile
+
+    def copyfile(source: Any, target: Any) -> Any:
+        if Path(target).parent.name == "1":
+            return Path(target).write_bytes(b"no database")
+        return real(source, target)
+
+    monkeypatch.setattr(store.shutil, "copyfile", copyfile)
+    with pytest.raises(RuntimeError):
+        store.match(job, PAIRS, silent)
+    assert len(found(job)) < len(PAIRS) and not (tmp_path / "job" / "matching").exists()
