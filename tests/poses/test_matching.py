@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import pytest
 from tests.poses.textured import orbit, post, render, write_capture
 from toolkit.config import PosesSettings
 from toolkit.poses import database as store
+from toolkit.poses import match
 from toolkit.poses.job import Job, plan
 from toolkit.poses.pairs import exhaustive_pairs
 
@@ -64,11 +66,11 @@ def found(job: Job) -> dict[tuple[int, int], tuple[Any, ...]]:
 
 
 def test_what_is_matched_does_not_hang_on_the_threads(featured, tmp_path, monkeypatch):
-    monkeypatch.setattr(store, "PAIRS_A_STEP", 8)  # nine steps
+    monkeypatch.setattr(match, "PAIRS_A_STEP", 8)  # nine steps
     alone, together = copy_of(featured, tmp_path / "one", 1), copy_of(featured, tmp_path / "three", 3)
     told: list[float] = []
-    store.match(alone, PAIRS, silent)
-    store.match(together, PAIRS, lambda done, total, note: told.append(done))
+    match.match(alone, PAIRS, silent)
+    match.match(together, PAIRS, lambda done, total, note: told.append(done))
     first, second = found(alone), found(together)
     assert set(first) == set(second) and len(first) == len(PAIRS)
     for pair, values in first.items():
@@ -80,21 +82,23 @@ def test_what_is_matched_does_not_hang_on_the_threads(featured, tmp_path, monkey
 
 
 def test_what_is_there_already_stays(featured, tmp_path, monkeypatch):
-    monkeypatch.setattr(store, "PAIRS_A_STEP", 8)
+    monkeypatch.setattr(match, "PAIRS_A_STEP", 8)
     job = copy_of(featured, tmp_path / "job", 2)
-    store.match(job, PAIRS[:20], silent)
+    match.match(job, PAIRS[:20], silent)
     before = found(job)
-    store.match(job, PAIRS, silent)
+    match.match(job, PAIRS, silent)
     after = found(job)
     assert len(before) == 20 and len(after) == len(PAIRS)
     for pair, values in before.items():
         for one, other in zip(values, after[pair], strict=True):
             np.testing.assert_array_equal(one, other)
+    monkeypatch.setattr(match, "_copies", lambda job, count: pytest.fail("copied for nothing") if count else nullcontext([]))
+    match.match(job, PAIRS, silent)  # nothing is left to do
 
 
 @pytest.mark.parametrize("room", [0, 1])
 def test_without_room_for_copies_fewer_match(featured, tmp_path, monkeypatch, room):
-    monkeypatch.setattr(store, "PAIRS_A_STEP", 8)
+    monkeypatch.setattr(match, "PAIRS_A_STEP", 8)
     made = 0
     real = shutil.copyfile
 
@@ -107,14 +111,14 @@ def test_without_room_for_copies_fewer_match(featured, tmp_path, monkeypatch, ro
         return real(source, target)
 
     job = copy_of(featured, tmp_path / "job", 3)
-    monkeypatch.setattr(store.shutil, "copyfile", copyfile)
-    store.match(job, PAIRS[:24], silent)
+    monkeypatch.setattr(match.shutil, "copyfile", copyfile)
+    match.match(job, PAIRS[:24], silent)
     assert made == room and len(found(job)) == 24 and not (tmp_path / "job" / "matching").exists()
 
 
 def test_an_error_of_one_matcher_ends_all(featured, tmp_path, monkeypatch):
     """A copy that is no database: the process that has it says so, and it is not taken for pairs without matches."""
-    monkeypatch.setattr(store, "PAIRS_A_STEP", 8)
+    monkeypatch.setattr(match, "PAIRS_A_STEP", 8)
     job = copy_of(featured, tmp_path / "job", 2)
     real = shutil.copyfile
 
@@ -123,7 +127,7 @@ def test_an_error_of_one_matcher_ends_all(featured, tmp_path, monkeypatch):
             return Path(target).write_bytes(b"no database")
         return real(source, target)
 
-    monkeypatch.setattr(store.shutil, "copyfile", copyfile)
+    monkeypatch.setattr(match.shutil, "copyfile", copyfile)
     with pytest.raises(RuntimeError):
-        store.match(job, PAIRS, silent)
+        match.match(job, PAIRS, silent)
     assert len(found(job)) < len(PAIRS) and not (tmp_path / "job" / "matching").exists()

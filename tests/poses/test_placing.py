@@ -15,6 +15,7 @@ from toolkit.poses import database as store
 from toolkit.poses import placing
 from toolkit.poses.job import MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, Job, plan
 from toolkit.poses.mapping import plain
+from toolkit.poses.match import match
 from toolkit.poses.pairs import exhaustive_pairs, pairs_with
 from toolkit.poses.selection import choose_pairs
 
@@ -37,7 +38,7 @@ def matched(tmp_path_factory) -> Job:
     database = store.open_database(job)
     store.extract(job, database, silent)
     database.close()
-    store.match(job, sorted(set(exhaustive_pairs(COUNT)) - set(pairs_with(LATE, COUNT))), silent)
+    match(job, sorted(set(exhaustive_pairs(COUNT)) - set(pairs_with(LATE, COUNT))), silent)
     return job
 
 

@@ -1,16 +1,10 @@
-"""COLMAP's database: features in, matches in, facts out. Runs in the child process only."""
+"""COLMAP's database: features in, facts out (`match.py` puts matches in). Runs in the child process only."""
 
 from __future__ import annotations
 
-import os
-import shutil
-import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
 import cv2
@@ -20,16 +14,13 @@ import pycolmap
 from toolkit.camera import Array
 from toolkit.capture.images import load_image, load_mask
 from toolkit.errors import InputError
-from toolkit.files import atomic_path, read_json, remove, write_json
+from toolkit.files import read_json, remove, write_json
 from toolkit.poses.features import sift
 from toolkit.poses.job import Job, Picture
 from toolkit.poses.pairs import coarse
 
 THUMBNAIL = 32  # pixels a side of the picture kept to tell identical ones
 GUESSED_FOCAL = 1.2  # of the long side, when nothing is known
-PAIRS_A_STEP = 40  # matched between two progress reports
-MOST_MATCHERS = 8  # processes, each of a hundred megabytes and more
-MOST_COPIED = 2**30  # bytes of all copies of the database, of which each process that matches has one
 MIN_INLIERS = 15  # COLMAP's own bound for a verified pair
 
 Report = Callable[[float, float, str], None]
@@ -186,120 +177,6 @@ def sketches(job: Job, database: pycolmap.Database) -> list[Array]:
         keypoints = np.asarray(database.read_keypoints(image_id)).reshape(-1, 4)
         out.append(coarse(np.asarray(database.read_descriptors(image_id).data).reshape(-1, 128), keypoints[:, 2]))
     return out
-
-
-def match(job: Job, pairs: list[tuple[int, int]], report: Report) -> None:
-    """Match and verify `pairs` (indices into the job's pictures); pairs in the database already are skipped by COLMAP. Nobody else has the
-    database open meanwhile.
-
-    What is found does not depend on the threads. Two threads that match in one process, COLMAP's or ours, gave some pairs other matches now
-    and then (docs/performance.md), so each is a process with its own copy of the features, and a second thread that verifies.
-    """
-    steps = [pairs[start : start + PAIRS_A_STEP] for start in range(0, len(pairs), PAIRS_A_STEP)]
-    done = 0
-
-    def tell(step: list[tuple[int, int]]) -> None:
-        nonlocal done
-        done += len(step)
-        report(done, len(pairs), f"matching, pair {done} of {len(pairs)}")
-
-    tell([])
-    with _copies(job, min(job.threads, MOST_MATCHERS, len(steps))) as folders:
-        if len(folders) < 2:
-            for step in steps:
-                _match(job, Path(job.folder), step)
-                tell(step)
-            return
-        free: SimpleQueue[Path] = SimpleQueue()
-        for folder in folders:
-            free.put(folder)
-        lock = threading.Lock()
-        with ProcessPoolExecutor(len(folders), get_context("spawn"), _end_with_parent) as processes:
-
-            def one(step: list[tuple[int, int]]) -> None:
-                folder = free.get()
-                try:
-                    processes.submit(_match, job, folder, step).result()
-                    with lock:
-                        _bring(folder / job.database.name, job.database, step)
-                        tell(step)
-                finally:
-                    free.put(folder)
-
-            with ThreadPoolExecutor(len(folders)) as pool:
-                try:
-                    for _ in pool.map(one, steps):
-                        pass
-                finally:
-                    pool.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _copies(job: Job, count: int) -> Iterator[list[Path]]:
-    """Folders with a copy of the job's database each, `count` of them or as many as there is room for, while the block lasts."""
-    place, made = Path(job.folder) / "matching", []
-    remove(place)
-    try:
-        for number in range(min(count, MOST_COPIED // max(1, job.database.stat().st_size)) if count > 1 else 0):
-            folder = place / str(number)
-            folder.mkdir(parents=True)
-            try:
-                shutil.copyfile(job.database, folder / job.database.name)
-            except OSError:  # no room: those that are there take turns
-                remove(folder)
-                break
-            made.append(folder)
-        yield made
-    finally:
-        remove(place)
-
-
-def _end_with_parent() -> None:
-    """In a process that matches: never outlive the one that asked."""
-    parent = parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(3)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _match(job: Job, folder: Path, pairs: list[tuple[int, int]]) -> None:
-    """COLMAP's matcher on the database in `folder`."""
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = 1
-    matching.use_gpu = False
-    matching.guided_matching = False
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = job.seed
-    pairing = pycolmap.ImportedPairingOptions()
-    with atomic_path(folder / "pairs.txt") as listing:
-        listing.write_text("".join(f"{label(i)} {label(j)}\n" for i, j in pairs), encoding="utf-8")
-        pairing.match_list_path = listing
-        pycolmap.match_image_pairs(folder / job.database.name, matching, pairing, verification, pycolmap.Device.cpu)
-
-
-def _bring(source: Path, target: Path, pairs: list[tuple[int, int]]) -> None:
-    """Copy what was found for `pairs` from one database to another with the same pictures.
-
-    By COLMAP's own SQLite: two of these libraries in one process know nothing of each other's locks.
-    """
-    found, database = pycolmap.Database.open(source), pycolmap.Database.open(target)
-    try:
-        ids = {int(image.name): image.image_id for image in found.read_all_images()}
-        with pycolmap.DatabaseTransaction(database):
-            for i, j in pairs:
-                first, second = ids[i], ids[j]
-                if not found.exists_matches(first, second) or database.exists_matches(first, second):
-                    continue
-                database.write_matches(first, second, found.read_matches(first, second))
-                if found.exists_two_view_geometry(first, second):
-                    database.write_two_view_geometry(first, second, found.read_two_view_geometry(first, second))
-    finally:
-        found.close()
-        database.close()
 
 
 def pair_facts(job: Job, database: pycolmap.Database) -> list[dict[str, Any]]:

@@ -22,9 +22,10 @@ import pycolmap
 
 from toolkit.camera import Array, Intrinsics
 from toolkit.files import remove
-from toolkit.poses.database import MIN_INLIERS, match
+from toolkit.poses.database import MIN_INLIERS
 from toolkit.poses.job import Job
 from toolkit.poses.mapping import Model, Report, calibrate, map_pictures, plain
+from toolkit.poses.match import match
 from toolkit.poses.overlap import guessed_depth, overlap, parallax
 
 NEIGHBOURS = 2  # frames apart that show the same side of things

@@ -7,9 +7,10 @@ from typing import Any
 import pycolmap
 
 from toolkit.poses import loops
-from toolkit.poses.database import match, pair_facts
+from toolkit.poses.database import pair_facts
 from toolkit.poses.job import MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, Job
 from toolkit.poses.mapping import Model, Report, map_pictures
+from toolkit.poses.match import match
 from toolkit.poses.pairs import pairs_with
 
 

@@ -64,6 +64,7 @@ def work(job_file: Path, mouth: Mouth) -> None:
     from toolkit.poses import mapping
     from toolkit.poses.health import hopeless
     from toolkit.poses.job import Job
+    from toolkit.poses.match import match
     from toolkit.poses.placing import place
     from toolkit.poses.selection import choose_pairs
 
@@ -82,7 +83,7 @@ def work(job_file: Path, mouth: Mouth) -> None:
     if hopeless(records) is None:
         pairs = choose_pairs(job, database, lambda done, total, note: mouth.progress("matching", 0, total, note))
         database.close()
-        store.match(job, pairs, lambda done, total, note: mouth.progress("matching", done, total, note))
+        match(job, pairs, lambda done, total, note: mouth.progress("matching", done, total, note))
         step("matching")
 
         def report(done: float, total: float, note: str) -> None:

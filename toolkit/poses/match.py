@@ -1,0 +1,148 @@
+"""Matching and verifying pairs of pictures by COLMAP, in several processes. Runs in the child process only."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context, parent_process
+from pathlib import Path
+from queue import SimpleQueue
+
+import pycolmap
+
+from toolkit.files import atomic_path, remove
+from toolkit.poses.database import Report, label
+from toolkit.poses.job import Job
+
+PAIRS_A_STEP = 40  # matched between two progress reports
+MOST_MATCHERS = 8  # processes, each of a hundred megabytes and more
+MOST_COPIED = 2**30  # bytes of all copies of the database, of which each process that matches has one
+
+
+def match(job: Job, pairs: list[tuple[int, int]], report: Report) -> None:
+    """Match and verify `pairs` (indices into the job's pictures); those in the database already are skipped. Nobody else has the database
+    open meanwhile.
+
+    What is found does not depend on the threads. Two threads that match in one process, COLMAP's or ours, gave some pairs other matches now
+    and then (docs/performance.md), so each is a process with its own copy of the features, and a second thread that verifies.
+    """
+    pairs = _left(job, pairs)
+    steps = [pairs[start : start + PAIRS_A_STEP] for start in range(0, len(pairs), PAIRS_A_STEP)]
+    done = 0
+
+    def tell(step: list[tuple[int, int]]) -> None:
+        nonlocal done
+        done += len(step)
+        report(done, len(pairs), f"matching, pair {done} of {len(pairs)}")
+
+    tell([])
+    with _copies(job, min(job.threads, MOST_MATCHERS, len(steps))) as folders:
+        if len(folders) < 2:
+            for step in steps:
+                _match(job, Path(job.folder), step)
+                tell(step)
+            return
+        free: SimpleQueue[Path] = SimpleQueue()
+        for folder in folders:
+            free.put(folder)
+        lock = threading.Lock()
+        with ProcessPoolExecutor(len(folders), get_context("spawn"), _end_with_parent) as processes:
+
+            def one(step: list[tuple[int, int]]) -> None:
+                folder = free.get()
+                try:
+                    processes.submit(_match, job, folder, step).result()
+                    with lock:
+                        _bring(folder / job.database.name, job.database, step)
+                        tell(step)
+                finally:
+                    free.put(folder)
+
+            with ThreadPoolExecutor(len(folders)) as pool:
+                try:
+                    for _ in pool.map(one, steps):
+                        pass
+                finally:
+                    pool.shutdown(cancel_futures=True)
+
+
+def _left(job: Job, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Those of the pairs that are not both matched and verified."""
+    database = pycolmap.Database.open(job.database)
+    try:
+        ids = {int(image.name): image.image_id for image in database.read_all_images()}
+        both = (database.exists_matches, database.exists_two_view_geometry)
+        return [(i, j) for i, j in pairs if not all(exists(ids[i], ids[j]) for exists in both)]
+    finally:
+        database.close()
+
+
+@contextmanager
+def _copies(job: Job, count: int) -> Iterator[list[Path]]:
+    """Folders with a copy of the job's database each, `count` of them or as many as there is room for, while the block lasts."""
+    place, made = Path(job.folder) / "matching", []
+    remove(place)
+    try:
+        for number in range(min(count, MOST_COPIED // max(1, job.database.stat().st_size)) if count > 1 else 0):
+            folder = place / str(number)
+            folder.mkdir(parents=True)
+            try:
+                shutil.copyfile(job.database, folder / job.database.name)
+            except OSError:  # no room: those that are there take turns
+                remove(folder)
+                break
+            made.append(folder)
+        yield made
+    finally:
+        remove(place)
+
+
+def _end_with_parent() -> None:
+    """In a process that matches: never outlive the one that asked."""
+    parent = parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(3)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _match(job: Job, folder: Path, pairs: list[tuple[int, int]]) -> None:
+    """COLMAP's matcher on the database in `folder`."""
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = 1
+    matching.use_gpu = False
+    matching.guided_matching = False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = job.seed
+    pairing = pycolmap.ImportedPairingOptions()
+    with atomic_path(folder / "pairs.txt") as listing:
+        listing.write_text("".join(f"{label(i)} {label(j)}\n" for i, j in pairs), encoding="utf-8")
+        pairing.match_list_path = listing
+        pycolmap.match_image_pairs(folder / job.database.name, matching, pairing, verification, pycolmap.Device.cpu)
+
+
+def _bring(source: Path, target: Path, pairs: list[tuple[int, int]]) -> None:
+    """Copy what was found for `pairs` from one database to another with the same pictures.
+
+    By COLMAP's own SQLite: two of these libraries in one process know nothing of each other's locks.
+    """
+    found, database = pycolmap.Database.open(source), pycolmap.Database.open(target)
+    try:
+        ids = {int(image.name): image.image_id for image in found.read_all_images()}
+        with pycolmap.DatabaseTransaction(database):
+            for i, j in pairs:
+                first, second = ids[i], ids[j]
+                if found.exists_matches(first, second) and not database.exists_matches(first, second):
+                    database.write_matches(first, second, found.read_matches(first, second))
+                if found.exists_two_view_geometry(first, second) and not database.exists_two_view_geometry(first, second):
+                    database.write_two_view_geometry(first, second, found.read_two_view_geometry(first, second))
+    finally:
+        found.close()
+        database.close()
