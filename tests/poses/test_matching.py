@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from contextlib import nullcontext
 from dataclasses import replace
@@ -116,18 +117,25 @@ def test_without_room_for_copies_fewer_match(featured, tmp_path, monkeypatch, ro
     assert made == room and len(found(job)) == 24 and not (tmp_path / "job" / "matching").exists()
 
 
-def test_an_error_of_one_matcher_ends_all(featured, tmp_path, monkeypatch):
-    """A copy that is no database: the process that has it says so, and it is not taken for pairs without matches."""
+@pytest.mark.parametrize("broken", ["database", "process"])
+def test_what_fails_together_is_matched_alone(featured, tmp_path, monkeypatch, broken):
+    """A copy that is no database, and a process that dies: neither is taken for pairs without matches, and all are matched in the end."""
     monkeypatch.setattr(match, "PAIRS_A_STEP", 8)
-    job = copy_of(featured, tmp_path / "job", 2)
+    job, alone = copy_of(featured, tmp_path / "job", 2), copy_of(featured, tmp_path / "alone", 1)
+    if broken == "process":
+        monkeypatch.setattr(match, "_end_with_parent", os.abort)
     real = shutil.copyfile
 
     def copyfile(source: Any, target: Any) -> Any:
-        if Path(target).parent.name == "1":
+        if broken == "database" and Path(target).parent.name == "1":
             return Path(target).write_bytes(b"no database")
         return real(source, target)
 
     monkeypatch.setattr(match.shutil, "copyfile", copyfile)
-    with pytest.raises(RuntimeError):
-        match.match(job, PAIRS, silent)
-    assert len(found(job)) < len(PAIRS) and not (tmp_path / "job" / "matching").exists()
+    told: list[float] = []
+    match.match(job, PAIRS, lambda done, total, note: told.append(done))
+    monkeypatch.undo()
+    match.match(alone, PAIRS, silent)
+    first, second = found(job), found(alone)
+    assert set(first) == set(second) and all(len(first[pair][0]) == len(second[pair][0]) for pair in second)
+    assert told[-1] == len(PAIRS) and not (tmp_path / "job" / "matching").exists()

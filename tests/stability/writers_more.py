@@ -99,6 +99,7 @@ def more_writers(place: Path) -> dict[str, Write]:
 ELSEWHERE = {
     "toolkit/files.py": "what all others write through",
     "toolkit/poses/database.py": "COLMAP's own files: tests/poses puts their folder on a full disk",
+    "toolkit/poses/match.py": "as above",
     "toolkit/poses/job.py": "as above",
     "toolkit/poses/sfm.py": "as above",
     "toolkit/poses/child.py": "as above",

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from queue import SimpleQueue
@@ -30,44 +30,61 @@ def match(job: Job, pairs: list[tuple[int, int]], report: Report) -> None:
     What is found does not depend on the threads. Two threads that match in one process, COLMAP's or ours, gave some pairs other matches now
     and then (docs/performance.md), so each is a process with its own copy of the features, and a second thread that verifies.
     """
-    pairs = _left(job, pairs)
-    steps = [pairs[start : start + PAIRS_A_STEP] for start in range(0, len(pairs), PAIRS_A_STEP)]
-    done = 0
+    left = _left(job, pairs)
+    total = len(left)
 
-    def tell(step: list[tuple[int, int]]) -> None:
-        nonlocal done
-        done += len(step)
-        report(done, len(pairs), f"matching, pair {done} of {len(pairs)}")
+    def tell(done: int) -> None:
+        report(done, total, f"matching, pair {done} of {total}")
 
-    tell([])
+    tell(0)
+    with suppress(RuntimeError):  # no room for what copies grow to, or a process ended for its memory: what is left is matched here
+        _together(job, left, tell)
+    left = _left(job, left)
+    done = total - len(left)
+    for step in _steps(left):
+        _match(job, Path(job.folder), step)
+        tell(done := done + len(step))
+
+
+def _steps(pairs: list[tuple[int, int]]) -> list[list[tuple[int, int]]]:
+    """Pairs that are matched before the next word is heard."""
+    return [pairs[start : start + PAIRS_A_STEP] for start in range(0, len(pairs), PAIRS_A_STEP)]
+
+
+def _together(job: Job, pairs: list[tuple[int, int]], tell: Callable[[int], None]) -> None:
+    """Match in several processes, where there is more than one thread and one step, and room; else nothing.
+
+    Raises:
+        RuntimeError: one of them failed; what the others did is kept.
+    """
+    steps, done, lock = _steps(pairs), 0, threading.Lock()
+    free: SimpleQueue[Path] = SimpleQueue()
     with _copies(job, min(job.threads, MOST_MATCHERS, len(steps))) as folders:
         if len(folders) < 2:
-            for step in steps:
-                _match(job, Path(job.folder), step)
-                tell(step)
             return
-        free: SimpleQueue[Path] = SimpleQueue()
         for folder in folders:
             free.put(folder)
-        lock = threading.Lock()
-        with ProcessPoolExecutor(len(folders), get_context("spawn"), _end_with_parent) as processes:
+        with (
+            ProcessPoolExecutor(len(folders), get_context("spawn"), _end_with_parent) as processes,
+            ThreadPoolExecutor(len(folders)) as pool,
+        ):
 
             def one(step: list[tuple[int, int]]) -> None:
+                nonlocal done
                 folder = free.get()
                 try:
                     processes.submit(_match, job, folder, step).result()
                     with lock:
                         _bring(folder / job.database.name, job.database, step)
-                        tell(step)
+                        tell(done := done + len(step))
                 finally:
                     free.put(folder)
 
-            with ThreadPoolExecutor(len(folders)) as pool:
-                try:
-                    for _ in pool.map(one, steps):
-                        pass
-                finally:
-                    pool.shutdown(cancel_futures=True)
+            try:
+                for _ in pool.map(one, steps):
+                    pass
+            finally:
+                pool.shutdown(cancel_futures=True)
 
 
 def _left(job: Job, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
