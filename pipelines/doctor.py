@@ -67,7 +67,7 @@ class Check:
 def collect() -> list[Check]:
     """Look at everything (a few seconds). Never raises: what goes wrong in a check is its finding."""
     checks = [_python(), *_packages()]
-    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _video, _lpips, _viewer, _cores, _memory, _disk)
+    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _video, _lpips, _viewer, _heic, _cores, _memory, _disk)
     for look in looks:
         try:
             checks.append(look())
@@ -189,12 +189,21 @@ def _video() -> Check:
 
 
 def _viewer() -> Check:
+    return _package("viewer", "viser", "`fieldfuse view` is not there", "pip install 'viser>=1'")
+
+
+def _heic() -> Check:
+    return _package("heic", "pillow-heif", "photos of phones in HEIC (.heic) are not read", "pip install 'pillow-heif>=1'")
+
+
+def _package(name: str, package: str, without: str, ask: str) -> Check:
+    """A package that one thing needs and all else does without."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:
-        return Check("viewer", OK, f"viser {version('viser')}")
+        return Check(name, OK, f"{package} {version(package)}")
     except PackageNotFoundError:
-        return Check("viewer", WARN, "no viser: `fieldfuse view` is not there", "pip install 'viser>=1'")
+        return Check(name, WARN, f"no {package}: {without}", ask)
 
 
 def _lpips() -> Check:

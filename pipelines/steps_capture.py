@@ -24,12 +24,17 @@ MAX_LISTED = 200_000  # files of a source that are looked at for changes
 
 
 def find_capture(job: Job) -> Capture:
-    """Detect what the source is, read what it says, look at every picture once."""
+    """Detect what the source is, read what it says, look at every picture once (at those that `choose_frames` writes, then)."""
     from toolkit.capture import open_capture
     from toolkit.capture.checks import check_capture
+    from toolkit.capture.convert import to_convert
     from toolkit.capture.storage import capture_from_dict, capture_to_dict
 
     path = job.folder / "capture.json"
+
+    def make() -> Capture:
+        capture = open_capture(job.source)
+        return capture if to_convert(capture) else check_capture(capture, job.progress)
 
     def save(capture: Capture) -> list[Path]:
         write_json(path, capture_to_dict(capture))
@@ -37,7 +42,7 @@ def find_capture(job: Job) -> Capture:
 
     return job.stages.run(
         "capture",
-        make=lambda: check_capture(open_capture(job.source), job.progress),
+        make=make,
         save=save,
         load=lambda: capture_from_dict(read_json(path)),
         uses=source_state(job.source, job.folder.path),
@@ -45,35 +50,40 @@ def find_capture(job: Job) -> Capture:
 
 
 def choose_frames(job: Job, capture: Capture) -> Capture:
-    """Pictures of a video; other captures pass as they are."""
+    """Pictures of a video, and JPEGs of HEIF pictures; other captures pass as they are."""
+    from toolkit.capture.convert import convert_pictures, to_convert
     from toolkit.capture.select import select_frames
     from toolkit.capture.storage import capture_from_dict, capture_to_dict
 
-    if capture.kind != "video":
+    video = capture.kind == "video"
+    if not video and not to_convert(capture):
         return capture
-    path = job.folder / "frames" / "capture.json"
+    folder = job.folder / "frames"
+    path = folder / "capture.json"
 
     def make() -> Capture:
         set_seeds(job.settings.seed)
+        if not video:
+            return convert_pictures(capture, job.folder.path, job.settings.threads or os.cpu_count() or 1, job.progress)
         return select_frames(capture, job.folder.path, job.settings.capture, job.progress)
 
     def save(chosen: Capture) -> list[Path]:
         write_json(path, capture_to_dict(chosen))
-        return [*(frame.image for frame in chosen.frames), path]
+        return [*(frame.image for frame in chosen.frames if frame.image.parent == folder.resolve()), path]
 
     return job.stages.run(
         "frames",
         make=make,
         save=save,
         load=lambda: capture_from_dict(read_json(path)),
-        uses=job.settings.capture.max_frames,
+        uses=job.settings.capture.max_frames if video else pixel_state(capture),
         after=["capture"],
         in_place=True,
     )
 
 
 def last_of(job: Job, *names: str) -> list[str]:
-    """Those of the stages that this run has; `frames`, for one, exists only for videos."""
+    """Those of the stages that this run has; `frames`, for one, exists only for videos and HEIF pictures."""
     return [name for name in names if name in job.stages.records]
 
 

@@ -242,6 +242,7 @@ def _round(value: float | None) -> float | None:
 def work_of(capture: Capture, settings: Any) -> model.Work:
     """What the capture asks for, from what its headers say."""
     from pipelines.summary import picture_size
+    from toolkit.capture.convert import to_convert
     from toolkit.capture.prepare import held_out
 
     width, height = picture_size(capture)
@@ -257,7 +258,20 @@ def work_of(capture: Capture, settings: Any) -> model.Work:
     total = int(capture.extra.get("frames") or len(capture.frames)) if video else frames
     depth = settings.tsdf.enabled != "off" and capture.has_depth
     effects = settings.effects.mode != "off" or bool(settings.effects.on)
-    return model.Work(frames, width or 640, height or 480, test, posed, depth, bool(outlined), video, total, effects, capture.alpha)
+    return model.Work(
+        frames,
+        width or 640,
+        height or 480,
+        test,
+        posed,
+        depth,
+        bool(outlined),
+        video=video,
+        total=total,
+        effects=effects,
+        alpha=capture.alpha,
+        converted=len(to_convert(capture)),
+    )
 
 
 def finest(job: Job, views: Views, scene: Scene) -> int:

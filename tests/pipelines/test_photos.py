@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import psutil
 import pytest
+from PIL import Image
 
 from tests.pipelines.made import CAMERA, call, circle, command, environment, look_at, make_photos, shoot
 
@@ -57,6 +58,34 @@ def test_video_is_cut_into_frames(tmp_path: Path, capsys: Capsys) -> None:
     again = as_json(call(capsys, "poses", path, "--out", tmp_path / "out", "--set", "capture.max_frames=12", "--quiet", "--json").out)
     assert {stage["name"]: stage["cached"] for stage in again["stages"]} == {"capture": True, "frames": False, "poses": False}
     assert frames[2].is_file()
+
+
+def test_heic_photos_become_jpegs_that_the_cameras_name(tmp_path: Path, capsys: Capsys) -> None:
+    pillow_heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not installed; make test brings it")
+    pillow_heif.register_heif_opener()
+    source = make_photos(tmp_path / "photos", circle(12, 0.3), PHOTO)
+    pictures = sorted(source.glob("*.*"))
+    for path in pictures:
+        Image.open(path).save(path.with_suffix(".HEIC"), format="HEIF", quality=90)
+        path.unlink()
+    out = tmp_path / "out"
+    answer = call(capsys, "poses", source, "--out", out, "--threads", 2, "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    data = as_json(answer.out)
+    assert data["capture"]["kind"] == "photos" and data["capture"]["extra"]["converted"] == 12 and data["poses"]["registered"] >= 10
+    named = json.loads((out / "exports" / "cameras" / "transforms.json").read_text())["frames"][0]["file_path"]
+    assert named.endswith(".jpg") and (out / named).is_file()
+    (out / named).unlink()
+    again = as_json(call(capsys, "poses", source, "--out", out, "--threads", 2, "--quiet", "--json").out)
+    assert {stage["name"]: stage["cached"] for stage in again["stages"]} == {"capture": True, "frames": False, "poses": False}
+    assert (out / named).is_file()
+
+
+def test_camera_raw_is_named(tmp_path: Path, capsys: Capsys) -> None:
+    for index in range(3):
+        (tmp_path / f"IMG_{index}.DNG").write_bytes(b"II*\0")
+    answer = call(capsys, "info", tmp_path)
+    assert answer.code == 2 and "3 camera raw files (IMG_0.DNG, …)" in answer.sentence() and "JPEG" in answer.sentence()
 
 
 def test_turning_on_the_spot_is_named(tmp_path: Path, capsys: Capsys) -> None:

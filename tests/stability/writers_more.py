@@ -8,7 +8,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pillow_heif
 import torch
+from PIL import Image
 
 from pipelines.folder import RunFolder
 from tests.evaluate.test_compare_page import made, pictures
@@ -16,6 +18,8 @@ from tests.evaluate.test_tradeoff import ladder
 from tests.simulate.test_simulate import SMALL
 from tests.training.nerfusion.tiny import tiny_settings
 from toolkit.camera import Intrinsics
+from toolkit.capture.convert import convert_pictures
+from toolkit.capture.photos import read_photos
 from toolkit.capture.select import select_frames
 from toolkit.capture.video import read_video
 from toolkit.config import CaptureSettings, Settings
@@ -63,6 +67,10 @@ def more_writers(place: Path) -> dict[str, Write]:
         writer.write(texture(index, 48, 64))
     writer.release()
     film = read_video(video)
+    photos = place / "photos"
+    photos.mkdir()
+    for index in range(3):
+        pillow_heif.from_pillow(Image.fromarray(texture(index, 48, 64))).save(photos / f"{index}.heic")
 
     def curve(folder: Path) -> None:
         curve = Curve(folder)
@@ -91,6 +99,7 @@ def more_writers(place: Path) -> dict[str, Write]:
         "write_picture": lambda folder: write_picture(folder / "a.png", texture(0, 48, 64)),
         "simulate": lambda folder: simulate(scene, folder / f"film{next(numbers)}", workers=1),
         "select_frames": lambda folder: select_frames(film, folder / f"video{next(numbers)}", CaptureSettings(max_frames=4)),
+        "convert_pictures": lambda folder: convert_pictures(read_photos(photos), folder / f"photos{next(numbers)}", 2),
         "RunFolder": run_folder,
     }  # fmt: skip
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from toolkit.camera import Array
+from toolkit.capture import heif
 from toolkit.capture.depth_checks import check_depth
 from toolkit.capture.headers import Header, read_bytes, read_header
 from toolkit.capture.images import turns_by_exif
@@ -117,8 +118,12 @@ def thumbnail(data: bytes, header: Header, path: Path) -> Array:
         if ratio >= factor and header.format in ("JPEG", "MPO"):
             flags = reduced
             break
+    grey: Array | None
     try:
-        grey = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+        if header.format == heif.FORMAT:
+            grey = heif.small(data, THUMB_SIDE, path)
+        else:
+            grey = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         grey = None
     if grey is None:

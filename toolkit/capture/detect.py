@@ -18,7 +18,7 @@ from pathlib import Path
 from toolkit.capture.blender import looks_like_blender, read_blender
 from toolkit.capture.colmap import image_folders, looks_like_colmap, read_colmap
 from toolkit.capture.dtu import looks_like_dtu, read_dtu
-from toolkit.capture.listing import pictures_in, require_folder
+from toolkit.capture.listing import counted, pictures_in, require_folder
 from toolkit.capture.llff import looks_like_llff, read_llff
 from toolkit.capture.photos import looks_like_photos, read_photos
 from toolkit.capture.redwood import looks_like_redwood, read_redwood
@@ -29,6 +29,8 @@ from toolkit.capture.tum import looks_like_tum, read_tum
 from toolkit.capture.types import Capture
 from toolkit.capture.video import VIDEO_SUFFIXES, read_video
 from toolkit.errors import InputError
+
+CAMERA_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 
 
 def _colmap_without_llff(path: Path) -> bool:
@@ -79,6 +81,12 @@ def read_source(path: Path) -> Capture:
         return read_video(videos[0])
     if videos:
         raise InputError(f"{folder} holds {len(videos)} videos; give one of them, for instance {videos[0]}")
+    raw = pictures_in(folder, CAMERA_RAW)
+    if raw:
+        raise InputError(
+            f"{folder} holds {counted(len(raw), 'camera raw file')} ({raw[0].name}{', …' if len(raw) > 1 else ''}), which cannot be read; "
+            "develop them to JPEG, all in the same way"
+        )
     held = ", ".join(sorted(child.name for child in folder.iterdir())[:4])
     raise InputError(
         f"{folder} holds no capture of a known kind (it holds {held}); "

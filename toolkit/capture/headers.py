@@ -10,6 +10,7 @@ from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
+from toolkit.capture import heif
 from toolkit.errors import InputError
 
 MAX_PIXELS = 200_000_000
@@ -19,7 +20,7 @@ _pillow_limit = threading.Lock()
 
 @dataclass(frozen=True)
 class Header:
-    """Stored size (before any EXIF turn), file format in Pillow's name for it, EXIF orientation (1: as stored)."""
+    """Stored size (before any EXIF turn; of HEIF as it is seen), file format in Pillow's name for it, EXIF orientation (1: as stored)."""
 
     width: int
     height: int
@@ -46,8 +47,12 @@ def read_header(data: bytes, path: Path) -> Header:
     """Size, format and orientation of the picture in `data` (of the file `path`), with nothing decoded.
 
     Raises:
-        InputError: not a picture, more than `MAX_PIXELS` pixels, or the file ends before the picture does.
+        InputError: not a picture, more than `MAX_PIXELS` pixels, the file ends before the picture does, or what reads HEIF is not there.
     """
+    if heif.is_heif(data):
+        heif.register(path)
+        if not heif.complete(data):
+            raise _cut_short(path)
     try:
         # Pillow's own limit is lower than ours and global; it is lifted for the header only, and ours is applied below.
         with _pillow_limit, warnings.catch_warnings():
@@ -62,7 +67,7 @@ def read_header(data: bytes, path: Path) -> Header:
                 Image.MAX_IMAGE_PIXELS = limit
     except UnidentifiedImageError as error:
         raise InputError(f"{path} is not a picture that can be read; convert it to JPEG or PNG, or remove it") from error
-    except (OSError, ValueError, SyntaxError, EOFError, KeyError, TypeError) as error:  # what Pillow's parsers raise on damaged headers
+    except Exception as error:  # Pillow's parsers raise many families on damaged headers
         raise InputError(f"the header of the picture {path} is damaged; copy it again or remove it") from error
     if width * height > MAX_PIXELS:
         raise InputError(
@@ -71,8 +76,12 @@ def read_header(data: bytes, path: Path) -> Header:
     if width < 1 or height < 1:
         raise InputError(f"the picture {path} has no pixels ({width}×{height}); remove it")
     if not _complete(data, kind):
-        raise InputError(f"the picture {path} is cut short (the file ends before the picture does); copy it again or remove it")
+        raise _cut_short(path)
     return Header(width, height, kind, orientation)
+
+
+def _cut_short(path: Path) -> InputError:
+    return InputError(f"the picture {path} is cut short (the file ends before the picture does); copy it again or remove it")
 
 
 def _orientation(picture: Image.Image) -> int:

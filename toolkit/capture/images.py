@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from toolkit.camera import Array
+from toolkit.capture import heif
 from toolkit.capture.headers import MAX_PIXELS, read_bytes, read_header
 from toolkit.capture.types import Capture, Frame
 from toolkit.capture.video import iterate_video
@@ -109,6 +110,8 @@ def _decode(path: Path) -> tuple[Array, int]:
     """The pixels as stored (OpenCV's channel order and depth), and the EXIF orientation."""
     data = read_bytes(path)
     header = read_header(data, path)
+    if header.format == heif.FORMAT:
+        return heif.decode(data, path), 1
     try:
         # UNCHANGED keeps alpha and 16 bits, and leaves the orientation to us.
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)

@@ -14,10 +14,11 @@ from PIL import Image
 
 from toolkit import files
 from toolkit.camera import Array, Intrinsics
+from toolkit.capture import heif
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 
-PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", *heif.SUFFIXES)
 MAX_TEXT_BYTES = 64 * 2**20
 
 
@@ -107,6 +108,8 @@ def picture_header(path: Path) -> Header:
     Raises:
         InputError: not a picture that can be read.
     """
+    if heif.file_is_heif(path):
+        heif.register(path)
     try:
         if path.suffix.lower() == ".npy":
             height, width = np.load(path, mmap_mode="r", allow_pickle=False).shape[:2]

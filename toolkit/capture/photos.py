@@ -13,7 +13,8 @@ from typing import Any
 
 from PIL import Image
 
-from toolkit.capture.listing import assemble, picture_header, pictures_in, require_folder, unique_names
+from toolkit.capture.heif import SUFFIXES as HEIF_SUFFIXES
+from toolkit.capture.listing import assemble, counted, picture_header, pictures_in, require_folder, unique_names
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 
@@ -38,12 +39,24 @@ def read_photos(path: Path | str) -> Capture:
     root = require_folder(path)
     pictures = max((pictures_in(root / folder) for folder in FOLDERS), key=len)
     if not pictures:
-        raise InputError(f"no photo (jpg, png, webp, bmp, tif) was found in {root}; give the folder that holds them")
+        raise InputError(f"no photo (jpg, heic, png, webp, bmp, tif) was found in {root}; give the folder that holds them")
+    pictures, remarks = _once_each(pictures)
     frames = [
         Frame(name=name, image=picture, focal_prior=focal_from_exif(picture))
         for name, picture in zip(unique_names(pictures), pictures, strict=True)
     ]
-    return assemble("photos", root, frames)
+    return assemble("photos", root, frames, remarks)
+
+
+def _once_each(pictures: list[Path]) -> tuple[list[Path], list[str]]:
+    """The pictures without those `.heic` that lie beside another picture of their name, as phones and programs leave them that convert
+    them: a photo that is there twice would be fitted and held out at once."""
+    others = {picture.stem for picture in pictures if picture.suffix.lower() not in HEIF_SUFFIXES}
+    kept = [picture for picture in pictures if picture.suffix.lower() not in HEIF_SUFFIXES or picture.stem not in others]
+    double = len(pictures) - len(kept)
+    if not double:
+        return kept, []
+    return kept, [f"{counted(double, 'picture is', 'pictures are')} there as HEIC and in another format; the latter is used"]
 
 
 def focal_from_exif(path: Path) -> float | None:

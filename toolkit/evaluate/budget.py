@@ -37,6 +37,7 @@ SIFT_FRAMES = 100
 # Pictures' worth of features that poses take: a picture, a megapixel of one and of each pair that is matched, and for each other
 # picture that is adjusted with it. Of two videos with 24 to 100 frames (0.3 and 0.9 megapixels) it tells the seconds within 60%.
 SFM_PICTURE, SFM_FEATURES, SFM_PAIR, SFM_MAPPING = 0.5, 1.6, 0.7, 0.018
+HEIF = 4.0  # times as long as choosing a frame of a video takes: decoding a picture and writing it as JPEG, two threads
 NEIGHBOURS, ALIKE = 5, 12  # pairs for each frame of a video; for each of more photos than are matched with all others
 EFFECTS_LOOKED_AT = 40  # training pictures at most that are looked at for effects; all, when one is corrected picture by picture
 EFFECTS_SHARE = 0.4  # of the seconds, at most, that looking for effects may take
@@ -82,6 +83,7 @@ class Work:
     total: int = 0
     effects: bool = False  # they are looked for
     alpha: bool = False  # pictures of an object alone
+    converted: int = 0  # pictures that are HEIF, and are written as JPEG first
 
     @property
     def megapixels(self) -> float:
@@ -135,7 +137,7 @@ def amounts(work: Work, choice: Choice) -> dict[str, float]:
     methods = 2 if work.depth else 1
     return {
         "capture": (0.0 if work.video else frames * work.megapixels),
-        "frames": work.total * work.megapixels if work.video else 0.0,
+        "frames": (work.total if work.video else HEIF * work.converted) * work.megapixels,
         "poses": 0.0 if work.posed else sfm_work(work, frames),
         "effects": effects_work(work, choice) if work.effects else 0.0,
         "scene": 0.05 * frames * work.megapixels if work.outlined else float(min(frames, SIFT_FRAMES)),

@@ -1,0 +1,109 @@
+"""HEIF pictures written once as JPEG: they take ten times as long to decode, which every stage would do again, and few other programs
+read them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+
+from toolkit.capture.checks import check_capture
+from toolkit.capture.headers import read_bytes
+from toolkit.capture.heif import decode, file_is_heif
+from toolkit.capture.images import to_rgba
+from toolkit.capture.listing import counted, unique_names
+from toolkit.capture.types import Capture, Frame
+from toolkit.errors import InputError, OutputError, first_line
+from toolkit.files import atomic_path, fingerprint, read_json, write_json
+from toolkit.progress import SILENT, Progress
+from toolkit.threads import share
+
+VERSION = 1
+QUALITY = 97  # of the JPEG files, as of a video's frames
+MOST_AT_ONCE = 8  # a decoded picture of 48 megapixels takes half a gigabyte on its way
+CONVERTED = "converted"  # in `Capture.extra`: how many pictures were
+
+
+def to_convert(capture: Capture) -> list[int]:
+    """Indices of the frames whose pictures are HEIF."""
+    return [i for i, frame in enumerate(capture.frames) if frame.video_index is None and file_is_heif(frame.image)]
+
+
+def convert_pictures(capture: Capture, out: Path, threads: int, progress: Progress = SILENT) -> Capture:
+    """The capture with every HEIF picture replaced by a JPEG (with alpha: PNG) of the same name and size in `out/frames`.
+
+    What is there and is of the same file is not written again, so a killed run goes on where it stopped.
+
+    Returns:
+        the capture, checked; `extra["converted"]` counts the pictures.
+
+    Raises:
+        InputError: a picture is damaged, or the capture is unusable (see `check_capture`).
+        OutputError: a picture cannot be written.
+    """
+    indices = to_convert(capture)
+    folder = Path(out) / "frames"
+    names = unique_names([capture.frames[i].image for i in indices])
+    done = _still_good(folder, {name: fingerprint(VERSION, capture.frames[i].image) for name, i in zip(names, indices, strict=True)})
+    finished = 0
+
+    def convert(one: tuple[str, int]) -> tuple[int, Path]:
+        nonlocal finished
+        name, index = one
+        progress.check()
+        path = done.get(name) or write_picture(capture.frames[index].image, folder / name)
+        finished += 1
+        progress.update(finished, len(indices), f"{finished} of {counted(len(indices), 'picture')} as JPEG")
+        return index, path
+
+    written = dict(share(convert, list(zip(names, indices, strict=True)), min(threads, MOST_AT_ONCE)))
+    frames = tuple(_with_picture(frame, written.get(i)) for i, frame in enumerate(capture.frames))
+    return check_capture(replace(capture, frames=frames, extra={**capture.extra, CONVERTED: len(indices)}), progress)
+
+
+def write_picture(source: Path, target: Path) -> Path:
+    """A HEIF picture as `target` with `.jpg` added, or `.png` where it has alpha; which of the two is told.
+
+    Raises:
+        InputError: it cannot be decoded.
+        OutputError: it cannot be written.
+    """
+    picture = to_rgba(decode(read_bytes(source), source))
+    alpha = picture.shape[2] == 4
+    path = target.with_name(f"{target.name}.{'png' if alpha else 'jpg'}")
+    order = cv2.COLOR_RGBA2BGRA if alpha else cv2.COLOR_RGB2BGR
+    coded, data = cv2.imencode(path.suffix, cv2.cvtColor(picture, order), [] if alpha else [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    if not coded:
+        raise OutputError(f"the picture {source} cannot be encoded as {path.suffix[1:].upper()}; convert it by another program")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data.tobytes())
+    return path
+
+
+def _still_good(folder: Path, wanted: dict[str, str]) -> dict[str, Path]:
+    """Of the pictures wanted (name → state of its source) those that an earlier attempt left there; what it left of other sources is
+    removed, and what is wanted is noted down."""
+    marker = folder / "converted.json"
+    try:
+        before = read_json(marker) if marker.is_file() else {}
+    except InputError:
+        before = {}
+    found = {}
+    for name, state in wanted.items():
+        for path in (folder / f"{name}.jpg", folder / f"{name}.png"):
+            if not path.is_file():
+                continue
+            if isinstance(before, dict) and before.get(name) == state:
+                found[name] = path
+                continue
+            try:
+                path.unlink()
+            except OSError as error:
+                raise OutputError(f"cannot replace {path}: {first_line(error)}; choose another --out folder") from error
+    write_json(marker, wanted)
+    return found
+
+
+def _with_picture(frame: Frame, path: Path | None) -> Frame:
+    return frame if path is None else replace(frame, image=path.resolve())
