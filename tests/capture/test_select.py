@@ -18,7 +18,7 @@ from tests.capture.films import film, turn
 from tests.conftest import shared_data
 from toolkit.camera import Array
 from toolkit.capture.images import load_image
-from toolkit.capture.select import Measure, choose, displacement, measure_frames, select_frames
+from toolkit.capture.select import Measure, choose, displacement, measure_frames, select_frames, stride_of
 from toolkit.capture.types import Capture
 from toolkit.capture.video import iterate_video, read_video
 from toolkit.config import CaptureSettings
@@ -225,6 +225,29 @@ def test_a_black_video_is_refused(tmp_path: Path) -> None:
     video = film(tmp_path / "clip.avi", [np.zeros((*SIZE, 3), np.uint8)] * 20)
     with pytest.raises(InputError, match="shows nothing"):
         select(video, tmp_path / "run", 20)
+
+
+def test_of_a_long_video_every_nth_frame_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert [stride_of(count, fps) for count, fps in ((1200, 30), (1201, 30), (9000, 30), (9000, 60), (9000, 0), (9000, 8))] == [
+        1,
+        2,
+        3,
+        6,
+        1,
+        1,
+    ]
+    offsets = list(np.linspace(0, 300, 120))
+    blurred = set(range(2, 120, 6))  # even ones, which are those looked at
+    video = film(tmp_path / "clip.avi", pan(offsets, blurred), fps=30)
+    monkeypatch.setattr("toolkit.capture.select.MEASURED", 60)
+    chosen = select(video, tmp_path / "run", 15)
+    assert 12 <= len(chosen.frames) <= 15 and chosen.extra["selected_from"] == 120 and not chosen.warnings
+    assert all(index % 2 == 0 for index in indices(chosen)) and not set(indices(chosen)) & blurred
+    way = np.diff(np.array(offsets)[indices(chosen)])
+    assert way.max() < 35 and np.median(way) == pytest.approx(20, rel=0.4)
+    everything = pan(offsets, blurred)
+    for frame, index in zip(chosen.frames, indices(chosen), strict=True):
+        assert np.abs(load_image(frame).astype(int) - everything[index]).mean() < 6
 
 
 def test_a_video_that_stops_early_is_told(tmp_path: Path) -> None:

@@ -33,12 +33,14 @@ ANCHOR = 0.012  # motion after which a new reference frame is taken
 STILL = 0.03  # motion in a whole video below which nothing can be learnt from it
 BLANK = 0.05  # sharpness of frames that show one colour
 BLURRED = 0.6  # of the sharpness around it: a frame that may be left out
+MEASURED = 1200  # frames of a long video that are measured, evenly spread: converting one of 3840×2160 takes longer than decoding it …
+MEASURED_A_SECOND = 10  # … but never fewer, so that what is seen in one is still seen in the next
 JUMP = 0.30  # motion booked where tracking fails (a cut, a blank wall, strong blur)
 
 
 @dataclass(frozen=True)
 class Measure:
-    """One number per readable frame of the video."""
+    """One number per readable frame of the video, or of every `stride`-th."""
 
     sharpness: list[float]  # variance of the Laplacian of the small grey picture
     motion: list[float]  # way that the picture's corners have moved since the start, in long sides; never decreases
@@ -47,9 +49,9 @@ class Measure:
 def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progress: Progress = SILENT) -> Capture:
     """At most `settings.max_frames` sharp, well-spread frames of a video, written as pictures under `out/frames`.
 
-    Two passes: the first measures every frame small, the second writes the chosen ones as JPEG. What was measured stays in
-    `out/selection.json` and pictures that are there are not written again, so a killed run goes on where it stopped and a
-    second run does nothing.
+    Two passes: the first measures frames small (all, or about `MEASURED` of a long video), the second writes the chosen ones as JPEG.
+    What was measured stays in `out/selection.json` and pictures that are there are not written again, so a killed run goes on where
+    it stopped and a second run does nothing.
 
     Returns:
         a capture of kind "video" whose frames are pictures, in time order; `extra["selected_from"]` is the number of readable frames.
@@ -61,8 +63,9 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
     if capture.kind != "video" or not capture.frames or capture.frames[0].video_index is None:
         raise InputError(f"{capture.root} is not a video, there are no frames to choose")
     video, announced = capture.frames[0].image, len(capture.frames)
-    measure = _measured(video, announced, Path(out) / "selection.json", progress)
-    readable = len(measure.sharpness)
+    stride = stride_of(announced, float(capture.extra.get("fps") or 0))
+    measure = _measured(video, announced, stride, Path(out) / "selection.json", progress)
+    readable = min(len(measure.sharpness) * stride, announced)
     if readable < 2:
         raise InputError(
             f"only {readable} of {announced} frames of the video {video} can be decoded; the file is damaged, copy or convert it again"
@@ -73,16 +76,21 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
         raise InputError(
             f"the camera does not move in the video {video}; depth needs views from different places, film while walking around the scene"
         )
-    chosen = choose(measure, settings.max_frames)
+    best = choose(measure, settings.max_frames)
+    chosen = [index * stride for index in best]
     folder = Path(out) / "frames"
     names = [f"frame_{index:06d}" for index in chosen]
     _write(video, chosen, folder, announced, progress)
     frames = [Frame(name=name, image=(folder / f"{name}.jpg").resolve()) for name in names]
     extra = {**capture.extra, "selected_from": readable, "video": str(video)}
-    picked = replace(
-        capture, frames=tuple(frames), ordered=True, extra=extra, warnings=capture.warnings + tuple(_remarks(measure, chosen, announced))
-    )
+    remarks = _remarks(measure, best, readable, announced)
+    picked = replace(capture, frames=tuple(frames), ordered=True, extra=extra, warnings=(*capture.warnings, *remarks))
     return check_capture(picked, progress)
+
+
+def stride_of(announced: int, fps: float) -> int:
+    """Every which frame is measured; 1 where the rate is not known."""
+    return max(1, min(math.ceil(announced / MEASURED), int(fps / MEASURED_A_SECOND)))
 
 
 def choose(measure: Measure, max_frames: int) -> list[int]:
@@ -127,7 +135,7 @@ def measure_frames(frames: Iterator[tuple[int, Array]], announced: int, progress
     way = 0.0
     for index, picture in frames:
         progress.check()
-        if index % 10 == 0:
+        if len(sharpness) % 10 == 0:
             progress.update(index, 2 * announced, f"frame {index} of {announced}")
         grey = cv2.cvtColor(_shrunk(picture, SHARP_SIDE), cv2.COLOR_RGB2GRAY)
         # A light blur first: otherwise sensor noise and blocks of the codec count as detail.
@@ -155,9 +163,9 @@ def displacement(before: Array, after: Array) -> float:
     return float(min(np.mean(np.clip(length, 0, np.quantile(length, 0.9))) / long_side, JUMP))
 
 
-def _measured(video: Path, announced: int, path: Path, progress: Progress) -> Measure:
+def _measured(video: Path, announced: int, stride: int, path: Path, progress: Progress) -> Measure:
     """The measurement kept at `path` when it is of this very file, else a new one, kept there."""
-    key = fingerprint(VERSION, video)
+    key = fingerprint(VERSION, video, *([stride] if stride > 1 else []))
     if path.is_file():
         try:
             kept = read_json(path)
@@ -170,7 +178,8 @@ def _measured(video: Path, announced: int, path: Path, progress: Progress) -> Me
                 return measure
         except (InputError, KeyError, TypeError, ValueError):
             log.info("%s is not readable, frames are measured again", path)
-    measure = measure_frames(iterate_video(video), announced, progress)
+    wanted = None if stride == 1 else range(0, announced, stride)
+    measure = measure_frames(iterate_video(video, wanted), announced, progress)
     write_json(path, {"key": key, **{name: [round(value, 6) for value in values] for name, values in asdict(measure).items()}})
     return measure
 
@@ -210,10 +219,10 @@ def _relative_sharpness(sharpness: Array) -> Array:
     return np.clip(sharpness / np.maximum(median, 1e-6), 0.05, 20.0)
 
 
-def _remarks(measure: Measure, chosen: list[int], announced: int) -> list[str]:
+def _remarks(measure: Measure, chosen: list[int], readable: int, announced: int) -> list[str]:
     remarks = []
-    if len(measure.sharpness) < 0.95 * announced:
-        remarks.append(f"the video announces {announced} frames, {len(measure.sharpness)} could be decoded")
+    if readable < 0.95 * announced:
+        remarks.append(f"the video announces {announced} frames, {readable} could be decoded")
     steps = np.diff(np.asarray(measure.motion)[chosen])
     wide = int((steps > MAX_STEP).sum())
     if wide:
