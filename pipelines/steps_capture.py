@@ -55,7 +55,7 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
     from toolkit.capture.select import select_frames
     from toolkit.capture.storage import capture_from_dict, capture_to_dict
 
-    video = capture.kind == "video"
+    video = capture.filmed
     if not video and not to_convert(capture):
         return capture
     folder = job.folder / "frames"
@@ -248,7 +248,7 @@ def _files(root: Path, without: Path) -> Iterable[Path]:
 
 def pixel_state(capture: Capture) -> str:
     """Hash of the files that hold the capture's pictures, wherever they are."""
-    paths = {path for frame in capture.frames for path in (frame.image, frame.depth, frame.mask) if path is not None}
+    paths = {path for frame in capture.frames for path in (frame.image, frame.depth, frame.mask, frame.confidence) if path is not None}
     return fingerprint([_state(path) for path in sorted(paths)])
 
 

@@ -246,7 +246,7 @@ def work_of(capture: Capture, settings: Any) -> model.Work:
     from toolkit.capture.prepare import held_out
 
     width, height = picture_size(capture)
-    video = capture.kind == "video"
+    video = capture.filmed
     frames = settings.capture.max_frames if video else len(capture.frames)
     test = (
         round(frames / settings.capture.holdout)

@@ -8,8 +8,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
+from tests.capture.films import film
 from tests.capture.made import Eye, Pinhole, eyes, render, save_depth, save_picture
 from toolkit.camera import Array
 
@@ -17,6 +19,7 @@ OFF_CENTRE = Pinhole(80, 60, 71.0, 73.0, 42.25, 27.5)
 CENTRED = Pinhole(80, 60, 72.0, 72.0, 40.0, 30.0)
 EIGHTH_525 = Pinhole(80, 60, 525 / 8, 525 / 8, 40.0, 30.0)
 EIGHTH_585 = Pinhole(80, 60, 585 / 8, 585 / 8, 40.0, 30.0)
+PHONE = Pinhole(160, 120, 128.0, 128.0, 81.0, 59.0)
 SCANNET_COLOUR = Pinhole(96, 72, 86.0, 87.0, 47.25, 37.5)
 
 
@@ -195,6 +198,58 @@ def write_redwood(root: Path) -> Pinhole:
     return c
 
 
+def write_polycam(root: Path) -> Pinhole:
+    """As the app exports it: depth and confidence at a quarter of the pictures' size, and cameras before and after loops were closed."""
+    quarter, place = quarter_size(PHONE), root / "keyframes"
+    for index, eye in enumerate(eyes()):
+        name = f"{100000 + 333 * index}"
+        save_picture(place / f"corrected_images/{name}.jpg", render(eye, PHONE)[0])
+        depth = render(eye, quarter)[1]
+        save_depth(place / f"depth/{name}.png", depth)
+        assert (place / "confidence").mkdir(exist_ok=True) is None
+        assert cv2.imwrite(
+            str(place / f"confidence/{name}.png"), np.where(np.arange(quarter.width) < 2, 0, 255 - 0 * depth).astype(np.uint8)
+        )
+        pose = eye.opengl()
+        told = {f"t_{row}{column}": float(pose[row, column]) for row in range(3) for column in range(4)}
+        c = PHONE
+        told |= {
+            "fx": c.fx,
+            "fy": c.fy,
+            "cx": c.cx,
+            "cy": c.cy,
+            "width": c.width,
+            "height": c.height,
+            "blur_score": 90.1,
+            "timestamp": index,
+        }
+        for folder, shift in (("corrected_cameras", 0.0), ("cameras", 0.07 * index)):
+            (place / folder).mkdir(exist_ok=True)
+            (place / folder / f"{name}.json").write_text(json.dumps({**told, "t_03": told["t_03"] + shift}))
+    return PHONE
+
+
+def write_stray(root: Path, header: bool = True) -> Pinhole:
+    """As the app records it; `header`: as it does since 2022."""
+    quarter, c = quarter_size(PHONE), PHONE
+    root.mkdir(parents=True, exist_ok=True)
+    lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw"] if header else []
+    for index, eye in enumerate(eyes()):
+        depth = render(eye, quarter)[1]
+        save_depth(root / f"depth/{index:06d}.png", depth)
+        (root / "confidence").mkdir(exist_ok=True)
+        assert cv2.imwrite(
+            str(root / f"confidence/{index:06d}.png"), np.where(np.arange(quarter.width) < 2, 0, 2 - 0 * depth).astype(np.uint8)
+        )
+        w, x, y, z = quaternion(eye.rotation().T)
+        values = [f"{value:.9f}" for value in (*eye.centre, x, y, z, w)]
+        lines.append(", ".join([f"{7.5 + index / 60:.6f}", f"{index:06d}", *values] if header else values))
+    (root / "odometry.csv").write_text("\n".join(lines))
+    (root / "camera_matrix.csv").write_text(f"{c.fx}, 0.0, {c.cx}\n0.0, {c.fy}, {c.cy}\n0.0, 0.0, 1.0")
+    film(root / "rgb.mp4", [render(eye, PHONE)[0] for eye in eyes()], fps=60)
+    return PHONE
+
+
 LAYOUTS: dict[str, tuple[str, Callable[[Path], Pinhole]]] = {
     "transforms": ("transforms", write_transforms),
     "blender": ("blender", write_blender),
@@ -206,6 +261,8 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], Pinhole]]] = {
     "llff": ("llff", write_llff),
     "dtu": ("dtu", write_dtu),
     "redwood": ("redwood", write_redwood),
+    "polycam": ("polycam", write_polycam),
+    "stray": ("stray", write_stray),
 }
 
 
@@ -213,6 +270,10 @@ def true_eyes(layout: str) -> list[Eye]:
     """The cameras in the order in which the capture's frames stand: by name, and a split's name comes first (test before train)."""
     made = eyes()
     return made[3:] + made[:3] if layout == "blender" else made
+
+
+def quarter_size(camera: Pinhole) -> Pinhole:
+    return half_size(half_size(camera))
 
 
 def half_size(camera: Pinhole) -> Pinhole:

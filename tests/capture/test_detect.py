@@ -13,6 +13,7 @@ from tests.capture.made import colour_difference, eyes, pixel_error, render, rep
 from toolkit.camera import Intrinsics
 from toolkit.capture import open_capture
 from toolkit.capture.detect import READERS, detect_kind
+from toolkit.capture.images import load_image
 from toolkit.capture.listing import fitted, natural_key, unique_names
 from toolkit.errors import InputError
 
@@ -40,7 +41,7 @@ def test_pictures_agree_when_reprojected_and_not_with_another_convention(tmp_pat
     camera = LAYOUTS[layout][1](tmp_path)
     frames = open_capture(tmp_path).frames[:2]
     depths = [render(eye, camera)[1] for eye in true_eyes(layout)[:2]]
-    pictures = [cv2.imread(str(frame.image))[..., ::-1] for frame in frames]
+    pictures = [load_image(frame)[..., :3] for frame in frames]
 
     def difference(poses: list[np.ndarray]) -> tuple[float, float]:
         views = [(frame.intrinsics, pose, depth) for frame, pose, depth in zip(frames, poses, depths, strict=True)]
@@ -56,7 +57,7 @@ def test_pictures_agree_when_reprojected_and_not_with_another_convention(tmp_pat
 
     poses = [frame.world_from_camera for frame in frames]
     colour, depth = difference(poses)
-    assert colour < 4
+    assert colour < (8 if layout == "stray" else 4)  # a small video loses more than pictures do
     assert depth < 0.01
     for name, mistake in MISTAKES.items():
         assert difference([pose @ mistake for pose in poses])[1] > 0.05, name
@@ -77,7 +78,7 @@ def test_what_is_written_on_purpose_goes_before_what_is_left_behind(tmp_path: Pa
 
 def test_each_kind_has_one_reader() -> None:
     kinds = [kind for kind, _, _ in READERS]
-    assert len(set(kinds)) == len(kinds) == 10
+    assert len(set(kinds)) == len(kinds) == 12
 
 
 def test_a_json_file_names_its_capture(tmp_path: Path) -> None:
@@ -116,7 +117,7 @@ def test_a_file_that_is_no_picture_is_named(tmp_path: Path, layout: str) -> None
         open_capture(tmp_path)
 
 
-@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name != "blender"])  # Blender's JSON tells no picture size
+@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name not in ("blender", "stray")])  # these tell no size
 def test_a_cropped_picture_does_not_pass_as_a_resized_one(tmp_path: Path, layout: str) -> None:
     LAYOUTS[layout][1](tmp_path)
     victim = open_capture(tmp_path).frames[0].image

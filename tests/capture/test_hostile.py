@@ -25,6 +25,8 @@ FILES = {
     "llff": ("poses_bounds.npy",),
     "dtu": ("cameras.npz",),
     "redwood": ("trajectory.log", "camera_intrinsics.json"),
+    "polycam": ("keyframes/corrected_cameras/100333.json",),
+    "stray": ("odometry.csv", "camera_matrix.csv"),
 }
 CASES = [(layout, name) for layout, names in FILES.items() for name in names]
 

@@ -3,7 +3,8 @@
 The order is deliberate: what somebody wrote for this very purpose goes before what another step left behind.
 1. `transforms.json`: nerfstudio leaves its COLMAP model beside it;
 2. Blender's `transforms_train.json`;
-3. RGB-D layouts, whose depth would be lost by reading them as anything else (ScanNet before 7-Scenes: they share file names);
+3. RGB-D layouts, whose depth would be lost by reading them as anything else (ScanNet before 7-Scenes: they share file names), those of
+   phones with a depth sensor among them;
 4. DTU's `cameras*.npz`;
 5. a COLMAP model before LLFF's `poses_bounds.npy`: sets that have both keep lens and points only in the model, but only
    when its pictures are there (sets at 1/8 size often come without them);
@@ -21,9 +22,11 @@ from toolkit.capture.dtu import looks_like_dtu, read_dtu
 from toolkit.capture.listing import counted, pictures_in, require_folder
 from toolkit.capture.llff import looks_like_llff, read_llff
 from toolkit.capture.photos import looks_like_photos, read_photos
+from toolkit.capture.polycam import looks_like_polycam, read_polycam
 from toolkit.capture.redwood import looks_like_redwood, read_redwood
 from toolkit.capture.scannet import looks_like_scannet, read_scannet
 from toolkit.capture.seven_scenes import looks_like_seven_scenes, read_seven_scenes
+from toolkit.capture.stray import looks_like_stray, read_stray
 from toolkit.capture.transforms import looks_like_transforms, read_transforms
 from toolkit.capture.tum import looks_like_tum, read_tum
 from toolkit.capture.types import Capture
@@ -46,6 +49,8 @@ READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ..
     ("redwood", looks_like_redwood, read_redwood),
     ("scannet", looks_like_scannet, read_scannet),
     ("7scenes", looks_like_seven_scenes, read_seven_scenes),
+    ("stray", looks_like_stray, read_stray),
+    ("polycam", looks_like_polycam, read_polycam),
     ("dtu", looks_like_dtu, read_dtu),
     ("colmap", _colmap_without_llff, read_colmap),
     ("llff", looks_like_llff, read_llff),

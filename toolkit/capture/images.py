@@ -43,8 +43,8 @@ def load_image(frame: Frame, *, exif: bool = False) -> Array:
 def load_depth(frame: Frame, capture: Capture) -> Array:
     """The frame's depth map, (H, W) float32 along z in units of the input's poses, 0 = missing.
 
-    Stored values are divided by `capture.depth_scale`. 0, negative, NaN and infinite values are missing, and so is 65535 in
-    16-bit pictures. Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, and .npy arrays.
+    Stored values are divided by `capture.depth_scale`. 0, negative, NaN and infinite values are missing, so is 65535 in 16-bit pictures,
+    and so is where the frame's confidence is 0. Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, and .npy arrays.
 
     Raises:
         InputError: naming the file, when it is missing, damaged, or not one value a pixel.
@@ -63,6 +63,13 @@ def load_depth(frame: Frame, capture: Capture) -> Array:
     missing = ~np.isfinite(depth) | (depth <= 0)
     if raw.dtype == np.uint16:
         missing |= raw == 65535
+    if frame.confidence is not None:
+        confidence = _decode(frame.confidence)[0]
+        if confidence.shape != depth.shape:
+            raise InputError(
+                f"the confidence {frame.confidence} has the shape {confidence.shape}, its depth map {depth.shape}; export both again"
+            )
+        missing |= confidence == 0
     depth[missing] = 0
     return depth
 

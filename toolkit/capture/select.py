@@ -23,6 +23,7 @@ from toolkit.progress import SILENT, Progress
 
 log = logging.getLogger(__name__)
 
+SELECTED = "selected_from"  # in `Capture.extra`: readable frames of the video that pictures were taken from
 VERSION = 1  # of the measurement kept beside the frames
 QUALITY = 97
 TRACK_SIDE = 320  # long side of the pictures that motion is measured on
@@ -54,17 +55,20 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
     it stopped and a second run does nothing.
 
     Returns:
-        a capture of kind "video" whose frames are pictures, in time order; `extra["selected_from"]` is the number of readable frames.
+        the capture with pictures as its frames, in time order, with what was known of each; `extra["selected_from"]` is the number of
+        readable frames.
 
     Raises:
         InputError: not a video, or its frames are unusable (all alike, black, fewer than two).
         OutputError: the frames cannot be written.
     """
-    if capture.kind != "video" or not capture.frames or capture.frames[0].video_index is None:
+    if not capture.filmed:
         raise InputError(f"{capture.root} is not a video, there are no frames to choose")
     video, announced = capture.frames[0].image, len(capture.frames)
     stride = stride_of(announced, float(capture.extra.get("fps") or 0))
-    measure = _measured(video, announced, stride, Path(out) / "selection.json", progress)
+    # What is posed has as many frames as poses, and not what the video may have beyond them.
+    wanted = range(0, announced, stride) if stride > 1 or capture.posed else None
+    measure = _measured(video, announced, wanted, Path(out) / "selection.json", progress)
     readable = min(len(measure.sharpness) * stride, announced)
     if readable < 2:
         raise InputError(
@@ -81,8 +85,12 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
     folder = Path(out) / "frames"
     names = [f"frame_{index:06d}" for index in chosen]
     _write(video, chosen, folder, announced, progress)
-    frames = [Frame(name=name, image=(folder / f"{name}.jpg").resolve()) for name in names]
-    extra = {**capture.extra, "selected_from": readable, "video": str(video)}
+    known = {frame.video_index: frame for frame in capture.frames}
+    frames = [
+        replace(known.get(index, Frame("", video)), name=name, image=(folder / f"{name}.jpg").resolve(), video_index=None)
+        for index, name in zip(chosen, names, strict=True)
+    ]
+    extra = {**capture.extra, SELECTED: readable, "video": str(video)}
     remarks = _remarks(measure, best, readable, announced)
     picked = replace(capture, frames=tuple(frames), ordered=True, extra=extra, warnings=(*capture.warnings, *remarks))
     return check_capture(picked, progress)
@@ -163,9 +171,9 @@ def displacement(before: Array, after: Array) -> float:
     return float(min(np.mean(np.clip(length, 0, np.quantile(length, 0.9))) / long_side, JUMP))
 
 
-def _measured(video: Path, announced: int, stride: int, path: Path, progress: Progress) -> Measure:
+def _measured(video: Path, announced: int, wanted: range | None, path: Path, progress: Progress) -> Measure:
     """The measurement kept at `path` when it is of this very file, else a new one, kept there."""
-    key = fingerprint(VERSION, video, *([stride] if stride > 1 else []))
+    key = fingerprint(VERSION, video, *([] if wanted is None else [wanted.stop, wanted.step]))
     if path.is_file():
         try:
             kept = read_json(path)
@@ -178,7 +186,6 @@ def _measured(video: Path, announced: int, stride: int, path: Path, progress: Pr
                 return measure
         except (InputError, KeyError, TypeError, ValueError):
             log.info("%s is not readable, frames are measured again", path)
-    wanted = None if stride == 1 else range(0, announced, stride)
     measure = measure_frames(iterate_video(video, wanted), announced, progress)
     write_json(path, {"key": key, **{name: [round(value, 6) for value in values] for name, values in asdict(measure).items()}})
     return measure

@@ -74,6 +74,7 @@ def _frame_to_dict(frame: Frame) -> dict[str, Any]:
         "split": frame.split,
         "video_index": frame.video_index,
         "focal_prior": frame.focal_prior,
+        "confidence": None if frame.confidence is None else str(frame.confidence),
     }
 
 
@@ -89,6 +90,7 @@ def _frame_from_dict(data: dict[str, Any]) -> Frame:
         split=data["split"],
         video_index=data["video_index"],
         focal_prior=data["focal_prior"],
+        confidence=None if data.get("confidence") is None else Path(data["confidence"]),
     )
 
 

@@ -25,13 +25,15 @@ class Frame:
     split: str | None = None  # "train" or "test" when the source says so
     video_index: int | None = None  # frame number when `image` is a video
     focal_prior: float | None = None  # pixels, from EXIF, when intrinsics are unknown
+    confidence: Path | None = None  # picture of the depth map's size; 0 = the sensor does not believe this depth itself
 
 
 @dataclass(frozen=True)
 class Capture:
     """A source as found on disk, in its own frame of reference."""
 
-    kind: str  # "video", "photos", "transforms", "blender", "colmap", "7scenes", "tum", "scannet", "llff", "dtu", "redwood"
+    kind: str  # "video", "photos", "transforms", "blender", "colmap", "7scenes", "tum", "scannet", "llff", "dtu", "redwood",
+    # "polycam", "stray"
     root: Path
     frames: tuple[Frame, ...]
     ordered: bool = False  # neighbours in the list are neighbours in time
@@ -46,6 +48,11 @@ class Capture:
     @property
     def posed(self) -> bool:
         return bool(self.frames) and all(frame.world_from_camera is not None and frame.intrinsics is not None for frame in self.frames)
+
+    @property
+    def filmed(self) -> bool:
+        """Whether the frames are still inside a video."""
+        return bool(self.frames) and self.frames[0].video_index is not None
 
     @property
     def has_depth(self) -> bool:

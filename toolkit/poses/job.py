@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from toolkit.capture.images import turns_by_exif
+from toolkit.capture.select import SELECTED
 from toolkit.capture.types import Capture, Frame
 from toolkit.config import PosesSettings
 from toolkit.files import fingerprint, read_json, write_json
@@ -113,7 +114,7 @@ def plan(capture: Capture, folder: Path, settings: PosesSettings, seed: int, thr
         folder=str(folder),
         pictures=pictures,
         sequential=sequential,
-        one_camera=capture.kind == "video" or len(priors) == 1,
+        one_camera=capture.kind == "video" or SELECTED in capture.extra or len(priors) == 1,
         exif=turns_by_exif(capture),
         image_size=settings.image_size,
         max_features=settings.max_features,

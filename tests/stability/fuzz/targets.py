@@ -94,6 +94,8 @@ FILES = {
     "llff": ("poses_bounds.npy",),
     "dtu": ("cameras.npz",),
     "redwood": ("trajectory.log", "camera_intrinsics.json"),
+    "polycam": ("keyframes/corrected_cameras/100333.json", "keyframes/depth/100333.png", "keyframes/confidence/100333.png"),
+    "stray": ("odometry.csv", "camera_matrix.csv", "depth/000001.png"),
 }
 
 
