@@ -3,6 +3,7 @@ read them."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from toolkit.capture.checks import check_capture
 from toolkit.capture.headers import read_bytes
 from toolkit.capture.heif import decode, file_is_heif
 from toolkit.capture.images import to_rgba
-from toolkit.capture.listing import counted, unique_names
+from toolkit.capture.listing import counted, picture_header, unique_names
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError, OutputError, first_line
 from toolkit.files import atomic_path, fingerprint, read_json, write_json
@@ -21,7 +22,7 @@ from toolkit.threads import share
 
 VERSION = 1
 QUALITY = 97  # of the JPEG files, as of a video's frames
-MOST_AT_ONCE = 8  # a decoded picture of 48 megapixels takes half a gigabyte on its way
+MOST_AT_ONCE, PIXELS_AT_ONCE = 8, 200e6  # pictures, and their pixels, on their way at a time: a pixel takes about ten bytes
 CONVERTED = "converted"  # in `Capture.extra`: how many pictures were
 
 
@@ -57,7 +58,9 @@ def convert_pictures(capture: Capture, out: Path, threads: int, progress: Progre
         progress.update(finished, len(indices), f"{finished} of {counted(len(indices), 'picture')} as JPEG")
         return index, path
 
-    written = dict(share(convert, list(zip(names, indices, strict=True)), min(threads, MOST_AT_ONCE)))
+    largest = max((math.prod(picture_header(capture.frames[i].image).size) for i in indices), default=1)
+    at_once = max(1, min(threads, MOST_AT_ONCE, int(PIXELS_AT_ONCE / largest)))
+    written = dict(share(convert, list(zip(names, indices, strict=True)), at_once))
     frames = tuple(_with_picture(frame, written.get(i)) for i, frame in enumerate(capture.frames))
     return check_capture(replace(capture, frames=frames, extra={**capture.extra, CONVERTED: len(indices)}), progress)
 

@@ -116,11 +116,12 @@ def make_extras(root: Path) -> None:
 
 
 LAYOUTS_CAMERA = LAYOUTS["transforms"][1].__globals__["OFF_CENTRE"]
-PHOTOS = ("a.jpg", "b.png", "c.webp", "d.bmp", "e.tif", "f.png", "g.jpg")
+PHOTOS = ("a.jpg", "b.png", "c.webp", "d.bmp", "e.tif", "f.png", "g.jpg", "h.heic")
 
 
 def make_photos(root: Path) -> None:
     """Photos in every format that is read, with EXIF, alpha and 16 bits."""
+    import pillow_heif
     from PIL import Image
 
     pictures = [render(eye, LAYOUTS_CAMERA)[0] for eye in eyes()]
@@ -135,6 +136,8 @@ def make_photos(root: Path) -> None:
     Image.fromarray(pictures[4]).save(root / "e.tif", compression="tiff_deflate")
     cv2.imwrite(str(root / "f.png"), pictures[0].astype(np.uint16) * 257)
     Image.fromarray(pictures[1]).save(root / "g.jpg", progressive=True)
+    small = pillow_heif.from_pillow(Image.fromarray(pictures[2]))
+    small.save(root / "h.heic", quality=80, exif=tags.tobytes())
 
 
 def read_photo_folder(root: Path, number: int) -> None:
