@@ -27,7 +27,7 @@ from toolkit.config import PosesSettings
 from toolkit.errors import InputError, Interrupted, PoseError
 from toolkit.files import read_json
 from toolkit.poses.child import run_child
-from toolkit.poses.job import GONE_ON
+from toolkit.poses.job import GONE_FAR, GONE_ON
 from toolkit.poses.result import PoseResult
 from toolkit.poses.sfm import find_poses
 from toolkit.progress import Progress
@@ -283,3 +283,21 @@ def test_what_the_strict_mapper_has_no_place_for_is_added_and_said(tmp_path):
     true = np.array([poses[int(name)] for name in result.names])
     assert aligned_error(result.world_from_camera[:, :3, 3], true[:, :3, 3]) < 0.01
     assert not (tmp_path / "sparse" / "start").exists()
+
+
+def test_a_camera_that_turns_far_and_hardly_moves_is_followed(tmp_path):
+    """As before a bare wall: 70° in steps of five, with so little way that no point is seen from two sides by the usual measure."""
+    poses = list(arc(8))
+    for k in range(1, 15):
+        turned = poses[7].copy()
+        turned[:3, :3] = poses[7][:3, :3] @ cv2.Rodrigues(np.array([0, -np.radians(5 * k), 0]))[0]
+        turned[:3, 3] += 0.004 * k * poses[7][:3, 0]
+        poses.append(turned)
+    result = find_poses(write_capture(tmp_path / "photos", [render(pose)[0] for pose in poses]), tmp_path, SMALL, seed=3, threads=1)
+    attempts = read_json(tmp_path / "sparse" / "result.json")["attempts"]
+    assert [attempt["attempt"] for attempt in attempts] == ["incremental", GONE_ON, GONE_FAR]
+    strict, far = attempts[0]["models"][0], attempts[2]["models"][0]
+    assert strict < far == result.registered and far >= 20
+    assert any(f"{far - strict} of {far} frames were placed by fewer matches" in warning for warning in result.warnings)
+    true = np.array([poses[int(name)] for name in result.names])
+    assert aligned_error(result.world_from_camera[:, :3, 3], true[:, :3, 3]) < 0.01

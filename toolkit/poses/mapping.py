@@ -14,10 +14,12 @@ import pycolmap
 from toolkit.camera import OPENCV, Intrinsics
 from toolkit.errors import PoseError
 from toolkit.files import remove
-from toolkit.poses.job import GLOBAL, GONE_ON, Job
+from toolkit.poses.job import GLOBAL, GONE_FAR, GONE_ON, Job
 
 Report = Callable[[float, float, str], None]
 STRICT = "incremental"  # the attempt by COLMAP's own rules
+SMALL_ANGLE, TINY_ANGLE = 1.0, 0.25  # degrees between rays that a point needs in a looser attempt, and in the last that adds pictures
+LEFT_OUT, LEFT_OUT_SHARE = 3, 0.02  # pictures without a place, and share of all, that are worth that last one
 WORSE = 1.25  # times the error of the strict model that a model which went on from it may have
 ENOUGH = 0.6  # share of registered pictures below which a looser attempt is worth its time
 FEW_POINTS = 12  # a picture that sees fewer of the model's points hangs in the air: not registered
@@ -50,16 +52,17 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
     """The largest trustworthy model in a settled frame, and what every attempt gave: `{"attempt", "models": [frames, …]}`, largest
     first."""
     attempts: list[tuple[str, Callable[[], list[pycolmap.Reconstruction]]]] = [
-        (STRICT, lambda: _incremental(job, report, loose=False)),
-        (GONE_ON, lambda: [] if best is None else _incremental(job, report, loose=True, start=best.reconstruction)),
-        ("incremental, small angles", lambda: _incremental(job, report, loose=True)),
+        (STRICT, lambda: _incremental(job, report)),
+        (GONE_ON, lambda: [] if best is None else _incremental(job, report, SMALL_ANGLE, best.reconstruction)),
+        (GONE_FAR, lambda: [] if best is None else _incremental(job, report, TINY_ANGLE, best.reconstruction)),
+        ("incremental, small angles", lambda: _incremental(job, report, SMALL_ANGLE)),
         (GLOBAL, lambda: _global(job, report)),
     ]
     best: Model | None = None
     history = []
     for name, attempt in attempts:
-        if best is not None and best.size[0] >= (1.0 if name == GONE_ON else ENOUGH) * len(job.pictures):
-            break
+        if best is not None and best.size[0] >= _enough(name, len(job.pictures)):
+            continue
         models = sorted((Model(found, name, _registered(found)) for found in attempt()), key=lambda model: model.size, reverse=True)
         models = [model for model in models if len(model.registered) >= SMALLEST]
         history.append({"attempt": name, "models": [len(model.registered) for model in models]})
@@ -71,10 +74,19 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
     return best, history
 
 
+def _enough(attempt: str, pictures: int) -> float:
+    """Registered pictures from which an attempt is not worth its time."""
+    if attempt == GONE_ON:
+        return pictures
+    if attempt == GONE_FAR:
+        return pictures - max(LEFT_OUT, LEFT_OUT_SHARE * pictures) + 0.5
+    return ENOUGH * pictures
+
+
 def _better(model: Model, best: Model) -> bool:
     """Whether a looser attempt is worth it. One from scratch has to find clearly more: a few frames on top come at the price of accuracy.
     One that went on left the others where they were."""
-    if model.attempt == GONE_ON:
+    if model.attempt in (GONE_ON, GONE_FAR):
         return model.size[0] > best.size[0] and model.error <= WORSE * best.error
     return model.size[0] > 1.1 * best.size[0]
 
@@ -83,7 +95,8 @@ def _registered(reconstruction: pycolmap.Reconstruction) -> list[int]:
     return sorted(i for i in reconstruction.reg_image_ids() if reconstruction.image(i).num_points3D >= FEW_POINTS)
 
 
-def _options(job: Job, loose: bool) -> pycolmap.IncrementalPipelineOptions:
+def _options(job: Job, angle: float | None = None) -> pycolmap.IncrementalPipelineOptions:
+    """COLMAP's own rules, or with `angle` (degrees that a point needs) looser ones."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = job.repeating
     options.random_seed = job.seed
@@ -95,21 +108,24 @@ def _options(job: Job, loose: bool) -> pycolmap.IncrementalPipelineOptions:
     options.triangulation.random_seed = job.seed
     # COLMAP would go on to the last bit after every few pictures, and find the same in twice the time (docs/performance.md).
     options.ba_local_function_tolerance = options.ba_global_function_tolerance = STEP_TOLERANCE
-    if loose:
+    if angle is not None:
         options.mapper.init_min_tri_angle = 4.0
         options.mapper.init_min_num_inliers = 40
         options.mapper.abs_pose_min_num_inliers = 18
         options.mapper.abs_pose_min_inlier_ratio = 0.15
-        options.mapper.filter_min_tri_angle = 1.0
-        options.triangulation.min_angle = 1.0
+        options.mapper.filter_min_tri_angle = options.triangulation.min_angle = angle
     return options
 
 
-def _incremental(job: Job, report: Report, loose: bool, start: pycolmap.Reconstruction | None = None) -> list[pycolmap.Reconstruction]:
-    """The models that COLMAP's incremental mapper makes; with `start` that one, gone on from."""
-    options = _options(job, loose)
+def _incremental(
+    job: Job, report: Report, angle: float | None = None, start: pycolmap.Reconstruction | None = None
+) -> list[pycolmap.Reconstruction]:
+    """The models that COLMAP's incremental mapper makes, by its own rules or with `angle` by looser ones; with `start` that one, gone on
+    from."""
+    options = _options(job, angle)
     total = len(job.pictures)
-    what = "mapping" if not loose else "mapping again with small angles" if start is None else "going on with small angles"
+    how = "small" if angle == SMALL_ANGLE else "tiny"
+    what = "mapping" if angle is None else f"mapping again with {how} angles" if start is None else f"going on with {how} angles"
     count = 0 if start is None else start.num_reg_images()
 
     def started() -> None:
@@ -183,7 +199,7 @@ def finish(job: Job, model: Model, report: Report) -> None:
     options.ceres.solver_options.num_threads = job.repeating
     pycolmap.bundle_adjustment(model.reconstruction, options)
     # As after each of the mapper's own: a point that hardly any parallax held may have gone behind a camera, or to where numbers end.
-    rules = _options(job, loose=model.attempt != STRICT).mapper
+    rules = _options(job, None if model.attempt == STRICT else TINY_ANGLE if model.attempt == GONE_FAR else SMALL_ANGLE).mapper
     pycolmap.ObservationManager(model.reconstruction).filter_all_points3D(rules.filter_max_reproj_error, rules.filter_min_tri_angle)
     model.registered = _registered(model.reconstruction)
     settle(model)
