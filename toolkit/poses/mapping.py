@@ -25,6 +25,7 @@ ENOUGH = 0.6  # share of registered pictures below which a looser attempt is wor
 FEW_POINTS = 12  # a picture that sees fewer of the model's points hangs in the air: not registered
 SMALLEST = 3  # registered pictures that make a model
 MAX_ERROR = 3.0  # pixels; the mean reprojection error of a model that can be trusted
+ADJUSTED_AFTER = 1.4  # times the pictures or points of the last time, after which all are adjusted again
 STEP_TOLERANCE = 1e-5  # share of the error by which an adjustment has to get better to go on, while mapping …
 LAST_TOLERANCE, LAST_STEPS = 1e-9, 30  # … and at the end; a point that flees to infinity would go on for ever
 ANGLE_SAMPLE = 2000  # points looked at for the triangulation angle
@@ -107,6 +108,7 @@ def _options(job: Job, angle: float | None = None) -> pycolmap.IncrementalPipeli
     options.mapper.random_seed = job.seed
     options.triangulation.random_seed = job.seed
     # COLMAP would go on to the last bit after every few pictures, and find the same in twice the time (docs/performance.md).
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = ADJUSTED_AFTER
     options.ba_local_function_tolerance = options.ba_global_function_tolerance = STEP_TOLERANCE
     if angle is not None:
         options.mapper.init_min_tri_angle = 4.0
