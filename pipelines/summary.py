@@ -102,11 +102,11 @@ def summarise_poses(job: Job, capture: Capture, poses: PoseResult) -> dict[str, 
 
 def put_cameras(folder: Path, poses: PoseResult, posed: Capture) -> None:
     """Cameras as transforms.json and COLMAP text, to be put into the capture's folder: pictures are named as they lie there."""
-    from toolkit.capture.convert import CONVERTED
+    from toolkit.capture.convert import all_converted
     from toolkit.capture.select import SELECTED
     from toolkit.export.cameras import write_cameras
 
-    made_here = SELECTED in posed.extra or CONVERTED in posed.extra  # then some or all pictures lie in the run's folder
+    made_here = SELECTED in posed.extra or all_converted(posed)  # then the pictures lie in the run's folder
     root = posed.frames[0].image.parent.parent if made_here else posed.root
     files = [frame.image.relative_to(root).as_posix() if frame.image.is_relative_to(root) else str(frame.image) for frame in posed.frames]
     # Those of the frames that take part, which may be fewer than have a pose.

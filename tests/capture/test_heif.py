@@ -16,7 +16,7 @@ from tests.capture.board import texture
 from toolkit.camera import Array
 from toolkit.capture import open_capture
 from toolkit.capture.checks import check_capture
-from toolkit.capture.convert import CONVERTED, convert_pictures, to_convert
+from toolkit.capture.convert import CONVERTED, all_converted, convert_pictures, to_convert
 from toolkit.capture.headers import read_header
 from toolkit.capture.images import load_image
 from toolkit.capture.types import Frame
@@ -173,6 +173,8 @@ def test_pictures_are_written_as_jpeg_and_the_others_stay(tmp_path: Path) -> Non
     assert [frame.focal_prior for frame in got.frames] == [frame.focal_prior for frame in capture.frames]
     assert got.extra[CONVERTED] == 7 and got.extra["sizes"] == {"120x90": 8}
     places = {frame.name: frame.image for frame in got.frames}
+    assert not all_converted(capture) and not all_converted(got)  # one was a JPEG before
+    assert all_converted(got.with_frames([frame for frame in got.frames if frame.name != "z"]))
     assert places["z"] == (source / "z.jpg").resolve()
     assert places["with_alpha"] == tmp_path / "run" / "frames" / "with_alpha.png"
     assert places["IMG_0003"] == tmp_path / "run" / "frames" / "IMG_0003.jpg"

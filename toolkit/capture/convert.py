@@ -24,11 +24,17 @@ VERSION = 1
 QUALITY = 97  # of the JPEG files, as of a video's frames
 MOST_AT_ONCE, PIXELS_AT_ONCE = 8, 200e6  # pictures, and their pixels, on their way at a time: a pixel takes about ten bytes
 CONVERTED = "converted"  # in `Capture.extra`: how many pictures were
+MARKER = "converted.json"  # beside them: what each was made of
 
 
 def to_convert(capture: Capture) -> list[int]:
     """Indices of the frames whose pictures are HEIF."""
     return [i for i, frame in enumerate(capture.frames) if frame.video_index is None and file_is_heif(frame.image)]
+
+
+def all_converted(capture: Capture) -> bool:
+    """Whether every picture is one that `convert_pictures` wrote."""
+    return CONVERTED in capture.extra and all((folder / MARKER).is_file() for folder in {frame.image.parent for frame in capture.frames})
 
 
 def convert_pictures(capture: Capture, out: Path, threads: int, progress: Progress = SILENT) -> Capture:
@@ -87,7 +93,7 @@ def write_picture(source: Path, target: Path) -> Path:
 def _still_good(folder: Path, wanted: dict[str, str]) -> dict[str, Path]:
     """Of the pictures wanted (name → state of its source) those that an earlier attempt left there; what it left of other sources is
     removed, and what is wanted is noted down."""
-    marker = folder / "converted.json"
+    marker = folder / MARKER
     try:
         before = read_json(marker) if marker.is_file() else {}
     except InputError:
