@@ -20,7 +20,7 @@ from toolkit.poses.health import (
     turned_only,
     way,
 )
-from toolkit.poses.job import GLOBAL
+from toolkit.poses.job import GLOBAL, LOOSE
 
 
 def picture(n: int, keypoints: int = 900, grey: int | None = None) -> dict[str, Any]:
@@ -112,6 +112,23 @@ def test_a_model_that_moves_farther_than_its_pairs_tell_has_a_wrong_lens(moved, 
     assert reason is None if believed else "turned on the spot" in str(reason)
     last_resort = {**found, "attempt": GLOBAL}
     assert "turned on the spot" in str(failure(facts(10, pairs, last_resort))), "no other mapper found a pair to begin with"
+
+
+def test_a_few_pictures_of_many_by_looser_rules_are_no_model_where_pairs_are_flat():
+    turning = [pair(i, i + 1, homography=homography(r, 600).tolist()) for i, r in enumerate(rotations(1, 9, 8.0))]
+    wall = [
+        pair(i, i + 1, homography=homography(r, 600, np.array([0.4, 0, 0.1]), np.array([0, 0, 1.0])).tolist())
+        for i, r in enumerate(rotations(2, 9, 5.0))
+    ]
+    placed = {**model([0, 1, 2, 3]), "attempt": LOOSE, "world_from_camera": np.tile(np.eye(4), (4, 1, 1)).tolist(), "points": [[0, 0, 7.0]]}
+    assert "turned on the spot" in str(failure(facts(10, turning, placed)))
+    assert "one plane" in str(failure(facts(10, wall, placed)))
+    assert failure(facts(10, wall, {**placed, "pictures": list(range(5))})) is None
+    half = [*turning[:5], *(pair(i, i + 1) for i in range(5, 9))]
+    assert "for the most part" in str(failure(facts(10, half, {**placed, "pictures": list(range(10))})))
+    assert failure(facts(10, half, model(list(range(10))))) is None
+    assert failure(facts(10, wall, {**placed, "attempt": "incremental"})) is None
+    assert failure(facts(10, [pair(i, i + 1) for i in range(9)], placed)) is None
 
 
 def test_each_failure_has_its_own_sentence():

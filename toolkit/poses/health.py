@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from toolkit.camera import Array
-from toolkit.poses.job import GLOBAL
+from toolkit.poses.job import GLOBAL, LOOSE
 from toolkit.poses.result import listed
 
 FEW_KEYPOINTS = 40  # below which a picture cannot be matched reliably
 BARE = 0.6  # of the usual number of keypoints, below which missing texture is named as a cause
 SAME = 1.0  # grey levels between thumbnails of pictures that count as identical
 BLACK = 2.0  # grey deviation of a picture without content
+MOST = 0.5  # of them: enough where COLMAP's own rules have found nothing
 FLAT_SHARE = 0.8  # of verified pairs explained by a homography before the scene or the motion is called degenerate
 ROTATION_RESIDUAL = 0.06  # distance of K⁻¹HK from a rotation, relative
 STILL = 0.004  # features moved by less than this share of the long side: the camera stood still
@@ -91,10 +92,10 @@ def rotation_residual(homographies: Array, width: int, height: int) -> float:
     return best
 
 
-def turned_only(facts: dict[str, Any]) -> bool:
-    """True when every verified pair says that the camera turned on the spot."""
+def turned_only(facts: dict[str, Any], share: float = FLAT_SHARE) -> bool:
+    """True when the verified pairs (at least this share of them) say that the camera turned on the spot."""
     seen = motion(facts)
-    return seen is not None and seen.flat_share >= FLAT_SHARE and seen.residual < ROTATION_RESIDUAL
+    return seen is not None and seen.flat_share >= share and seen.residual < ROTATION_RESIDUAL
 
 
 def failure(facts: dict[str, Any]) -> str | None:
@@ -122,10 +123,11 @@ def failure(facts: dict[str, Any]) -> str | None:
             f"the camera hardly moved: features shift by {100 * seen.moved:.2g}% of the picture on the median; move sideways "
             f"around the scene while recording"
         )
-    # A turning camera can be fitted by a wrong lens and a shift, so the verdict of the pairs stands whatever the mapper says.
+    # A turning camera can be fitted by a wrong lens and a shift, some of its pictures the better, so the verdict of the pairs stands whatever
+    # the mapper says.
     if turned_only(facts) and (
         model is None
-        or found < TOO_FEW
+        or found < max(TOO_FEW, count / 2)
         or model["angle"] < 2 * SMALL_ANGLE
         or model["attempt"] == GLOBAL
         or way(facts) > PRETENDED * seen.residual
@@ -139,7 +141,14 @@ def failure(facts: dict[str, Any]) -> str | None:
             f"there is too little parallax: rays meet at {model['angle']:.2g}° on the median; move sideways around the scene "
             f"while recording"
         )
-    if found >= TOO_FEW:
+    # Where homographies explain the pairs, looser rules nearly always find something, whatever the camera did.
+    loose = model is not None and model["attempt"] in (LOOSE, GLOBAL)
+    if loose and turned_only(facts, MOST):
+        return (
+            "the camera turned on the spot for the most part (rotations explain most matches), so depth cannot be told; move sideways "
+            "around the scene while recording"
+        )
+    if found >= TOO_FEW and not (loose and found < count / 2 and seen.flat_share >= FLAT_SHARE):
         return None
     if seen.flat_share >= FLAT_SHARE:
         return (

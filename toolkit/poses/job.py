@@ -16,6 +16,7 @@ MAX_EXHAUSTIVE = 40  # photos; beyond it pairs are chosen
 MAX_ASKED_AGAIN = 120  # photos; up to it those that find no place so are matched with all others
 GONE_ON = "incremental, gone on with small angles"  # the attempt that adds to the strict one's model what that had no place for
 GONE_FAR = "incremental, gone on with tiny angles"  # the same from there, where cameras turn before a wall and hardly move
+LOOSE = "incremental, small angles"  # from scratch, by looser rules
 GLOBAL = "global"  # the last attempt, which takes what no other can begin with
 VERSION = 4  # of what is found and how; a change discards what earlier versions left in out/sparse
 REPEATABLE = 300  # pictures up to which poses repeat: one thread maps (docs/performance.md)

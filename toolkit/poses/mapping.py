@@ -14,7 +14,7 @@ import pycolmap
 from toolkit.camera import OPENCV, Intrinsics
 from toolkit.errors import PoseError
 from toolkit.files import remove
-from toolkit.poses.job import GLOBAL, GONE_FAR, GONE_ON, Job
+from toolkit.poses.job import GLOBAL, GONE_FAR, GONE_ON, LOOSE, Job
 
 Report = Callable[[float, float, str], None]
 STRICT = "incremental"  # the attempt by COLMAP's own rules
@@ -56,7 +56,7 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
         (STRICT, lambda: _incremental(job, report)),
         (GONE_ON, lambda: [] if best is None else _incremental(job, report, SMALL_ANGLE, best.reconstruction)),
         (GONE_FAR, lambda: [] if best is None else _incremental(job, report, TINY_ANGLE, best.reconstruction)),
-        ("incremental, small angles", lambda: _incremental(job, report, SMALL_ANGLE)),
+        (LOOSE, lambda: _incremental(job, report, SMALL_ANGLE)),
         (GLOBAL, lambda: _global(job, report)),
     ]
     best: Model | None = None
