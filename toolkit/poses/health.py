@@ -123,8 +123,8 @@ def failure(facts: dict[str, Any]) -> str | None:
             f"the camera hardly moved: features shift by {100 * seen.moved:.2g}% of the picture on the median; move sideways "
             f"around the scene while recording"
         )
-    # A turning camera can be fitted by a wrong lens and a shift, some of its pictures the better, so the verdict of the pairs stands whatever
-    # the mapper says.
+    # A turning camera can be fitted by a wrong lens and a shift, some of its pictures the better, so the verdict of the pairs stands
+    # whatever the mapper says.
     if turned_only(facts) and (
         model is None
         or found < max(TOO_FEW, count / 2)
