@@ -17,8 +17,8 @@ from toolkit.training.fused import FusedOptimiser
 
 
 def test_the_compiled_step_is_at_least_twice_as_fast_as_torch() -> None:
-    """By processor time, best of three in turns: other work on the machine slows both."""
-    (case,) = speed_cases.step_cases((128,), repetitions=3)
+    """By processor time, best of fifteen in turns: other work slows both, and a process's first steps find no memory yet."""
+    (case,) = speed_cases.step_cases((128,), repetitions=15)
     assert case.ratio > 2, case.to_dict()
 
 
