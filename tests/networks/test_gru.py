@@ -23,15 +23,15 @@ def trained(seed: int = 0, gain: float = 4.0) -> FusionGRU:
     return gru
 
 
-def inputs(topology: Topology, seed: int, share: float = 0.6) -> dict[str, torch.Tensor]:
+def inputs(topology: Topology, seed: int, share: float = 0.6, channels: int = CHANNELS) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     size = topology.zero_row
     inside = torch.rand(size, generator=generator) < share
     count = torch.randint(0, 5, (size,), generator=generator).float() * inside
     mask = torch.cat([inside, inside.new_zeros(1)])[:, None]
-    raw = torch.randn((size + 1, CHANNELS), generator=generator) * mask
+    raw = torch.randn((size + 1, channels), generator=generator) * mask
     known = torch.cat([count > 0, inside.new_zeros(1)])[:, None]
-    state = torch.tanh(torch.randn((size + 1, CHANNELS), generator=generator)) * known
+    state = torch.tanh(torch.randn((size + 1, channels), generator=generator)) * known
     weight = (0.01 + 0.99 * torch.rand(size, generator=generator)) * inside
     return {"state": state, "count": count, "local": torch.tanh(raw), "raw": raw, "weight": weight, "inside": inside}
 

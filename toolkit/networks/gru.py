@@ -19,7 +19,9 @@ import torch
 from torch import Tensor, nn
 
 from toolkit.networks.block_conv import BlockConv3d, block_conv3d
-from toolkit.networks.local import held
+from toolkit.networks.compiled_gru import Step
+from toolkit.networks.lattice import LatentVolume, LocalVolume
+from toolkit.networks.local import CHANGE, INSIDE, held
 from toolkit.volume.topology import Topology
 
 LEAST = 1e-3  # of a local volume's weight
@@ -85,6 +87,24 @@ class FusionGRU(nn.Module):
         z, r = torch.sigmoid(update - known), torch.sigmoid(reset)
         candidate = torch.tanh(raw + held(self.candidate(_beside(r * state, local), topology, inside)))
         return torch.lerp(state, candidate, z)
+
+    def compiled(self, part: LatentVolume, local: LocalVolume) -> Tensor:
+        """The running mean on all rows of `part` (the global volume on the local one's blocks) and `forward` on those of busy blocks,
+        without gradients, on the CPU (float32; convolutions in what autocast says).
+
+        Returns:
+            (M · 512 + 1, C), zero outside the local volume.
+        """
+        place, busy = local.place[:-1], local.busy
+        step = Step(place, part, local, LEAST, self.most)
+        rows = step.average()
+        if busy.blocks:
+            inside = local.known[place]
+            both = step.beside(torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else torch.float32)
+            update, reset = self._gates(both, busy, inside)
+            step.forget(reset, both)
+            step.update(update, self.candidate(both, busy, inside), INSIDE, CHANGE, rows)
+        return rows
 
     def _gates(self, both: Tensor, topology: Topology, inside: Tensor) -> list[Tensor]:
         """M_z and M_r of [H, V]; their first convolutions are one, which costs as much as either alone."""

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from toolkit.networks.aggregate import CUES, FLAGS, aggregate, agreement, direction_spread, evidence
 from toolkit.networks.cameras import Cameras
+from toolkit.networks.compiled import fits
 from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
 from toolkit.networks.decoder import make_decoder
 from toolkit.networks.direction import DirectionCode
@@ -220,6 +221,8 @@ class NerfusionModel(nn.Module):
 
     def fuse_part(self, part: LatentVolume, local: LocalVolume) -> LatentVolume:
         """One step of the recurrence on the blocks of a local volume alone: `part` is the global volume there."""
+        if isinstance(self.fusion, FusionGRU) and not torch.is_grad_enabled() and fits(part.rows, part.count, local.rows, local.raw):
+            return replace(part, rows=self.fusion.compiled(part, local), count=part.count * local.known + local.weight)
         inside = local.known
         count = part.count * inside
         mask = torch.cat([count > 0, inside.new_zeros(1)])[:, None]
