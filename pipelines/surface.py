@@ -148,6 +148,7 @@ def export_surface(
     from toolkit.export.surface import field_volume
     from toolkit.render.image import make_renderer, render_view
     from toolkit.stereo.polish import Polisher
+    from toolkit.stereo.settle import settled
 
     shown = views.subset(np.flatnonzero(~views.test))  # held-out pictures are not looked at
     cameras = [at_most(camera, MESH_SIDE) for camera in shown.intrinsics]
@@ -156,12 +157,14 @@ def export_surface(
     require_pictures(lenses, kept=True, advice="lower export.mesh_views")
     view = make_renderer(field, job.settings.engine)
     polisher = Polisher(shown, cameras, scene.near, scene.far, scene.median_depth)
+    seen = shown.subset(np.array(chosen))
     volume = field_volume(
         lambda lens, pose: render_view(field, lens, pose, view),
         shown.world_from_camera[chosen],
         lenses,
         region=(scene.centre - scene.half_size, scene.centre + scene.half_size),
         polish=[partial(polisher.polished, index) for index in chosen],
+        settle=lambda reliable, opaque: settled(reliable, opaque, seen, lenses, scene.median_depth, job.progress),
         progress=job.progress,
     )
     input_from_working = scene.working_from_input.inverse()

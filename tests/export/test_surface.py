@@ -73,6 +73,20 @@ def test_the_region_is_kept_and_the_rest_is_not() -> None:
     assert mesh.vertices[:, 2].min() < CENTRE[2] - RADIUS + 0.03
 
 
+def test_what_is_made_of_all_maps_together_is_what_is_fused() -> None:
+    """It is given what is reliable, and all that is opaque, edges too."""
+    asked: list[tuple[int, int]] = []
+
+    def settle(reliable: list[Array], opaque: list[Array]) -> list[Array]:
+        asked.extend(((depth > 0).sum(), (all_of_it > 0).sum()) for depth, all_of_it in zip(reliable, opaque, strict=True))
+        return [np.where(np.arange(depth.shape[1]) < depth.shape[1] // 2, depth, 0).astype(np.float32) for depth in reliable]
+
+    half = field_volume(faulty, POSES[:1], CAMERA, 0.02, settle=settle, carve=False).mesh()
+    assert len(asked) == 1 and 0 < asked[0][0] < asked[0][1]
+    there = (half.vertices - POSES[0][:3, 3]) @ POSES[0][:3, :3]
+    assert (there[:, 0] < 0.03).all() and len(half.vertices) > 100
+
+
 def test_thinned_when_asked() -> None:
     mesh = field_volume(exact, POSES, CAMERA, 0.02).mesh().cleaned().decimated(1500)
     assert 1000 < len(mesh.triangles) <= 1500

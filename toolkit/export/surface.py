@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -19,9 +20,12 @@ from toolkit.tsdf.volume import TsdfVolume
 # (intrinsics, world_from_camera) → (rgb, depth, opacity), or an object with these names, as `render_view` gives.
 Render = Callable[[Intrinsics, Array], Any]
 Polish = Callable[[Array], Array]  # depth (H, W) → better depth, 0 = none
+# Reliable depth of all views, and all of their depth that is opaque enough → better depth, 0 = none.
+Settle = Callable[[list[Array], list[Array]], list[Array]]
 
 STEEPEST = 4.0  # tangent of the angle between view and surface normal (76°) beyond which a depth step is taken as an edge
 SMALLEST_EDGE = 0.02  # share of depth: smaller steps are never an edge
+AFTERWARDS = 0.2  # of the time that rendering takes, for the progress
 
 
 def reliable_depth(depth: Array, opacity: Array, focal: float, min_opacity: float = 0.7) -> Array:
@@ -38,28 +42,28 @@ def reliable_depth(depth: Array, opacity: Array, focal: float, min_opacity: floa
 
 
 def rendered_frame(
-    render: Render,
-    intrinsics: Intrinsics,
-    world_from_camera: Array,
-    min_opacity: float = 0.7,
-    region: tuple[Array, Array] | None = None,
-    polish: Polish | None = None,
-) -> DepthFrame:
-    """Render one view and keep its reliable depth, polished before; `region` (lowest corner, highest corner) drops what lies outside it."""
+    render: Render, intrinsics: Intrinsics, world_from_camera: Array, min_opacity: float = 0.7, polish: Polish | None = None
+) -> tuple[DepthFrame, Array]:
+    """Render one view: a frame of its reliable depth, polished before, and (H, W) all of its depth that is opaque enough."""
     rendered = render(intrinsics, world_from_camera)
     rgb, depth, opacity = (rendered.rgb, rendered.depth, rendered.opacity) if hasattr(rendered, "rgb") else rendered
     camera = intrinsics.pinhole()
     depth = np.asarray(depth) if polish is None else polish(np.asarray(depth))
+    opaque = np.where(np.isfinite(depth) & (np.asarray(opacity) >= min_opacity), depth, 0).astype(np.float32)
     depth = reliable_depth(depth, np.asarray(opacity), camera.fx, min_opacity)
-    pose = np.asarray(world_from_camera, dtype=np.float64)
-    if region is not None:
-        v, u = np.nonzero(depth)
-        z = depth[v, u].astype(np.float64)
-        points = np.stack([(u + 0.5 - camera.cx) / camera.fx * z, (v + 0.5 - camera.cy) / camera.fy * z, z], axis=1)
-        points = points @ pose[:3, :3].T + pose[:3, 3]
-        outside = ((points < region[0]) | (points > region[1])).any(axis=1)
-        depth[v[outside], u[outside]] = 0
-    return DepthFrame(depth, as_bytes(np.asarray(rgb)), camera, camera, pose)
+    return DepthFrame(depth, as_bytes(np.asarray(rgb)), camera, camera, np.asarray(world_from_camera, dtype=np.float64)), opaque
+
+
+def within(frame: DepthFrame, region: tuple[Array, Array]) -> DepthFrame:
+    """The frame without depth of points outside the box (lowest corner, highest corner)."""
+    depth, camera, pose = frame.depth.copy(), frame.depth_intrinsics, frame.world_from_camera
+    v, u = np.nonzero(depth)
+    z = depth[v, u].astype(np.float64)
+    points = np.stack([(u + 0.5 - camera.cx) / camera.fx * z, (v + 0.5 - camera.cy) / camera.fy * z, z], axis=1)
+    points = points @ pose[:3, :3].T + pose[:3, 3]
+    outside = ((points < region[0]) | (points > region[1])).any(axis=1)
+    depth[v[outside], u[outside]] = 0
+    return replace(frame, depth=depth)
 
 
 def field_volume(
@@ -73,6 +77,7 @@ def field_volume(
     region: tuple[Array, Array] | None = None,
     carve: bool = True,
     polish: Sequence[Polish] | None = None,
+    settle: Settle | None = None,
     progress: Progress = SILENT,
 ) -> TsdfVolume:
     """Render all (N, 4, 4) poses and fuse their reliable depth; its `mesh()` and `points()` are the field's surface.
@@ -84,6 +89,7 @@ def field_volume(
         region: lowest and highest corner (3,) of the box that is kept, working frame.
         carve: views also empty what others put in front of their surface, which removes most floaters.
         polish: for each pose what its rendered depth is made better by; see `stereo/polish.py`.
+        settle: what all depth maps together are made better by; see `stereo/settle.py`.
 
     Raises:
         InputError: no view shows a surface, or the voxel size that was asked for is too fine for the memory.
@@ -94,8 +100,21 @@ def field_volume(
     if len(cameras) != len(poses) or not cameras:
         raise InputError(f"a surface needs one camera a pose, there are {len(cameras)} cameras and {len(poses)} poses")
     better = [None] * len(poses) if polish is None else list(polish)
+    made: list[DepthFrame] = []
+    opaque: list[Array] = []
+    for camera, pose, how in zip(cameras, poses, better, strict=True):
+        progress.check()
+        frame, all_depth = rendered_frame(render, camera, pose, min_opacity, how)
+        made.append(frame)
+        opaque.append(all_depth)
+        progress.update(len(made), (1 + AFTERWARDS) * len(poses), "views made for the surface")
+    if settle is not None:
+        depths = settle([frame.depth for frame in made], opaque)
+        # Planes and what is left beside them have edges of their own.
+        depths = [reliable_depth(depth, np.ones_like(depth), frame.depth_intrinsics.fx) for frame, depth in zip(made, depths, strict=True)]
+        made = [replace(frame, depth=depth) for frame, depth in zip(made, depths, strict=True)]
     return fuse_held(
-        (rendered_frame(render, camera, pose, min_opacity, region, how) for camera, pose, how in zip(cameras, poses, better, strict=True)),
+        made if region is None else [within(frame, region) for frame in made],
         len(poses),
         voxel_size,
         depth_max,

@@ -38,7 +38,9 @@ BLUR = (0.7, 1.0)  # pixels, before votes and before colours are compared
 
 
 @dataclass(frozen=True)
-class _Proposed:
+class Proposed:
+    """A view's depth, and where planes go on in it."""
+
     depth: Array  # (H, W) float32 as matched, and where a plane goes on
     new: Array  # (H, W) bool where a plane goes on
 
@@ -58,7 +60,7 @@ def continued(found: Sequence[StereoDepth], views: Views, median_depth: float, p
     """
     poses = np.asarray(views.world_from_camera, dtype=np.float64)
     cameras = [one.intrinsics for one in found]
-    planes = find_planes(_points(found, poses))
+    planes = find_planes(points_of(found, poses))
     neighbours = usable_neighbours(poses, cameras, median_depth, CHECKED) if len(found) > 1 else [[]]
     if not len(planes) or not any(neighbours):
         return list(found)
@@ -66,9 +68,9 @@ def continued(found: Sequence[StereoDepth], views: Views, median_depth: float, p
     small = [shrunk(picture, camera) for picture, camera in zip(views.images, cameras, strict=True)]
     soft = [cv2.GaussianBlur(picture, (0, 0), BLUR[1]) for picture in small]
 
-    def proposal(index: int) -> _Proposed:
+    def proposed_for(index: int) -> Proposed:
         progress.check()
-        return _proposal(found[index], small[index], poses[index], planes, usable_pixels(views, index, cameras[index]))
+        return proposal(found[index], small[index], poses[index], planes, usable_pixels(views, index, cameras[index]))
 
     def compared(index: int) -> tuple[Array, StereoDepth]:
         progress.check()
@@ -80,7 +82,7 @@ def continued(found: Sequence[StereoDepth], views: Views, median_depth: float, p
 
     with ThreadPoolExecutor(max(1, min(MOST_WORKERS, cv2.getNumThreads()))) as pool:
         try:
-            proposed = list(pool.map(proposal, range(len(found))))
+            proposed = list(pool.map(proposed_for, range(len(found))))
             depths = [one.depth for one in proposed]
             differences, sure = zip(*pool.map(compared, range(len(found))), strict=True)
         finally:
@@ -90,8 +92,8 @@ def continued(found: Sequence[StereoDepth], views: Views, median_depth: float, p
     return [replace(one, depth=one.depth * kept, confidence=one.confidence * kept) for one, kept in zip(sure, alike, strict=True)]
 
 
-def _points(found: Sequence[StereoDepth], poses: Array) -> Points:
-    """Even shares of all pictures, each at random places."""
+def points_of(found: Sequence[StereoDepth], poses: Array) -> Points:
+    """Points of depth maps, even shares of all of them, each at random places."""
     generator = np.random.default_rng(0)
     most = max(1, POINTS // max(len(found), 1))
     places, depths, views, pixels = [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0, np.int64)], [np.zeros((0, 2))]
@@ -108,18 +110,26 @@ def _points(found: Sequence[StereoDepth], poses: Array) -> Points:
     return Points(np.concatenate(places), np.concatenate(depths), np.concatenate(views), np.concatenate(pixels))
 
 
-def _proposal(one: StereoDepth, picture: Array, pose: Array, planes: Array, usable: Array | None) -> _Proposed:
-    """Where the pixels that have a depth, by their votes, let one of the planes go on."""
+def proposal(one: StereoDepth, picture: Array, pose: Array, planes: Array, usable: Array | None, on: float = ON) -> Proposed:
+    """Where the pixels that have a depth, by their votes, let one of the planes go on.
+
+    Args:
+        picture: (H, W, 3) uint8 of the depth map's size; votes do not go across its edges.
+        pose: (4, 4) world from camera.
+        planes: (K, 4) of `find_planes`.
+        usable: (H, W) bool where there is something to see, None: everywhere.
+        on: share of its depth by which a pixel may miss the plane that it votes for.
+    """
     camera = numbers(one.intrinsics)
     normals = planes[:, :3] @ pose[:3, :3]
     local = np.column_stack([normals, planes[:, 3] - planes[:, :3] @ pose[:3, 3]])  # the planes in the camera's frame
     voter = np.empty(one.depth.shape, np.int32)
     slant = float(np.cos(np.deg2rad(SLANT)))
-    _voters(one.depth, camera, local, ON, slant, voter)
+    _voters(one.depth, camera, local, on, slant, voter)
     guide = cv2.GaussianBlur(picture, (0, 0), BLUR[0])
     present = [plane for plane in np.unique(voter) if plane >= 0]  # len(planes): those that lie on none
     if not present:
-        return _Proposed(one.depth, np.zeros(one.depth.shape, bool))
+        return Proposed(one.depth, np.zeros(one.depth.shape, bool))
     votes = np.stack([voter == plane for plane in present], axis=2).astype(np.float32)
     spread_along(guide, votes, AWAY * max(one.depth.shape), EDGE)
     total, first = votes.sum(axis=2), votes.argmax(axis=2)
@@ -129,7 +139,7 @@ def _proposal(one: StereoDepth, picture: Array, pose: Array, planes: Array, usab
         open_ &= usable
     depth = one.depth.copy()
     _go_on(camera, local, slant, np.where(open_, winner, np.int32(-1)), depth)
-    return _Proposed(depth, open_ & (depth > 0))
+    return Proposed(depth, open_ & (depth > 0))
 
 
 def spread_along(guide: Array, values: Array, away: float, edge: float) -> None:

@@ -29,10 +29,10 @@ class Points:
     pixel: Array  # (N, 2) float64 x, y in shares of the picture's long side
 
 
-def find_planes(points: Points, seed: int = 0) -> Array:
+def find_planes(points: Points, seed: int = 0, on: float = ON) -> Array:
     """(K, 4) float64 planes, those with most points first: n · p = d with a unit normal n in the first three columns, d in the last.
 
-    What lies on a plane, within twice `ON`, is no longer asked for the next one.
+    What lies on a plane, within twice `on` (a share of its depth), is no longer asked for the next one.
     """
     generator = np.random.default_rng(seed)
     left = np.arange(len(points.depth))
@@ -41,15 +41,15 @@ def find_planes(points: Points, seed: int = 0) -> Array:
     while len(found) < MOST and len(left) >= least:
         tried = _planes_through(points, _triples(points, left, generator))
         some = generator.permutation(left)[:SCORED]
-        counts = (_misses(points, some, tried) < ON).sum(axis=0)
-        fitted = [_fitted(points, left, tried[best]) for best in np.argsort(-counts, kind="stable")[:BEST]]
+        counts = (_misses(points, some, tried) < on).sum(axis=0)
+        fitted = [_fitted(points, left, tried[best], on) for best in np.argsort(-counts, kind="stable")[:BEST]]
         if not fitted:
             break
         number, plane = max(fitted, key=lambda one: one[0])
         if number < least:
             break
         found.append(plane)
-        left = left[_misses(points, left, plane[None])[:, 0] >= 2 * ON]
+        left = left[_misses(points, left, plane[None])[:, 0] >= 2 * on]
     return np.array(found).reshape(-1, 4)
 
 
@@ -81,15 +81,15 @@ def _misses(points: Points, which: Array, planes: Array) -> Array:
     return np.asarray(np.abs(points.place[which] @ planes[:, :3].T - planes[:, 3]) / points.depth[which, None])
 
 
-def _fitted(points: Points, left: Array, plane: Array) -> tuple[int, Array]:
+def _fitted(points: Points, left: Array, plane: Array, on: float) -> tuple[int, Array]:
     """A plane by least squares over what lies on it, nearer points counting more since they are known better; and how many they are."""
     for number in range(REFITS):
-        on = left[_misses(points, left, plane[None])[:, 0] < (2 * ON if number == 0 else ON)]
-        if len(on) < 3:
+        near = left[_misses(points, left, plane[None])[:, 0] < (2 * on if number == 0 else on)]
+        if len(near) < 3:
             return 0, plane
-        weight = 1 / points.depth[on]
-        middle = (points.place[on] * weight[:, None]).sum(axis=0) / weight.sum()
-        spread = (points.place[on] - middle) * weight[:, None]
+        weight = 1 / points.depth[near]
+        middle = (points.place[near] * weight[:, None]).sum(axis=0) / weight.sum()
+        spread = (points.place[near] - middle) * weight[:, None]
         normal = np.linalg.eigh(spread.T @ spread)[1][:, 0]
         plane = np.append(normal, normal @ middle)
-    return int((_misses(points, left, plane[None])[:, 0] < ON).sum()), plane
+    return int((_misses(points, left, plane[None])[:, 0] < on).sum()), plane

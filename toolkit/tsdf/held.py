@@ -25,7 +25,8 @@ def fuse_held(
     nothing: str = "no view shows a surface",
     progress: Progress = SILENT,
 ) -> TsdfVolume:
-    """Take all `frames` (`total` of them; they may be made one by one as they are asked for), and fuse those that show depth.
+    """Take all `frames` (`total` of them; they may be made one by one as they are asked for, which is told), and fuse those that show
+    depth.
 
     Args:
         voxel_size, depth_max: working units; None: from the frames' depth, the voxel size made coarser until it fits into memory.
@@ -36,11 +37,14 @@ def fuse_held(
         InputError: no frame shows depth, or the voxel size that was asked for is too fine for the memory.
         Interrupted: the user asked to stop.
     """
-    held = []
-    for number, frame in enumerate(frames, 1):
-        progress.check()
-        held.append(frame)
-        progress.update(number, (1 + FUSION) * total, "views made for the surface")
+    held: list[DepthFrame] = []
+    if isinstance(frames, Sequence):
+        held += frames
+    else:
+        for number, frame in enumerate(frames, 1):
+            progress.check()
+            held.append(frame)
+            progress.update(number, (1 + FUSION) * total, "views made for the surface")
     shown = [frame for frame in held if (frame.depth > 0).any()]
     if not shown:
         raise InputError(nothing)

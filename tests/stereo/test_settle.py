@@ -1,0 +1,98 @@
+"""Depth maps of a corner, with the faults that fields have, made to agree."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.stereo.test_bare import filmed
+from tests.stereo.test_match import CAMERA, MEDIAN
+from toolkit.camera import Array
+from toolkit.capture.types import Views
+from toolkit.errors import Interrupted
+from toolkit.progress import Progress
+from toolkit.stereo.settle import settled
+
+FLOOR_OR_WALL = slice(70, 100), slice(20, 70)  # rows, columns
+
+
+@pytest.fixture(scope="module")
+def corner() -> tuple[Views, list[Array]]:
+    views, truth = filmed({1: (129, 100), 2: (130, 100)})
+    return views, [depth.astype(np.float32) for depth in truth]
+
+
+def made(views: Views, depths: list[Array], guesses: list[Array] | None = None) -> list[Array]:
+    return settled(depths, depths if guesses is None else guesses, views, [CAMERA] * len(views), MEDIAN)
+
+
+def off(depth: Array, truth: Array, where: Array) -> Array:
+    """Relative errors where there is a depth."""
+    kept = where & (depth > 0) & (truth > 0)
+    return np.asarray(np.abs(depth - truth)[kept] / truth[kept])
+
+
+def guessed(views: Views, truth: list[Array]) -> tuple[list[Array], list[Array]]:
+    """What is bare is off in every second view, in each by so much that no two agree; and where that is."""
+    shares = np.array([0, -0.04, 0, 0.03, 0, 0.045, 0])
+    bare = [np.abs(picture[..., 0].astype(int) - 129) <= 2 for picture in views.images]
+    depths = [np.where(grey, depth * (1 + share), depth).astype(np.float32) for depth, share, grey in zip(truth, shares, bare, strict=True)]
+    return depths, [grey & (depth > 0) & (share != 0) for depth, share, grey in zip(truth, shares, bare, strict=True)]
+
+
+def test_exact_depth_stays(corner: tuple[Views, list[Array]]) -> None:
+    views, truth = corner
+    for depth, true in zip(made(views, truth), truth, strict=True):
+        assert (depth > 0)[true > 0].mean() > 0.97 and depth.dtype == np.float32
+        assert not depth[true <= 0].any()
+        assert np.quantile(off(depth, true, true > 0), 0.98) < 0.005
+
+
+def test_a_guess_becomes_the_plane_that_goes_on_there(corner: tuple[Views, list[Array]]) -> None:
+    views, truth = corner
+    depths, wrong = guessed(views, truth)
+    better = made(views, depths)
+    before = np.concatenate([off(*case) for case in zip(depths, truth, wrong, strict=True)])
+    after = np.concatenate([off(*case) for case in zip(better, truth, wrong, strict=True)])
+    assert np.median(before) > 0.01
+    assert np.median(after) < 0.2 * np.median(before)
+    assert np.mean([(depth > 0)[patch].mean() for depth, patch in zip(better, wrong, strict=True) if patch.any()]) > 0.7
+
+
+def test_no_plane_goes_where_nothing_was_or_far_from_what_was(corner: tuple[Views, list[Array]]) -> None:
+    views, truth = corner
+    hole = np.zeros(truth[0].shape, bool)
+    hole[FLOOR_OR_WALL] = True
+    missing = [np.where(hole, 0, depth).astype(np.float32) for depth in truth]
+    assert not any(depth[hole].any() for depth in made(views, missing))
+    near = [np.where(hole, 0.4 * depth, 0).astype(np.float32) for depth in truth]  # many pixels of parallax before the wall
+    for depth, true in zip(made(views, missing, [a + b for a, b in zip(missing, near, strict=True)]), truth, strict=True):
+        assert not depth[hole & (true > 0)].any()
+
+
+def test_a_floater_is_dropped_and_what_one_view_alone_sees_stays(corner: tuple[Views, list[Array]]) -> None:
+    views, truth = corner
+    floating = [depth.copy() for depth in truth]
+    floating[3][50:62, 60:76] *= 0.6  # others see through it
+    depth = made(views, floating)[3][50:62, 60:76]
+    assert not (np.abs(depth - floating[3][50:62, 60:76]) < 0.05).any()
+    alone = [np.zeros_like(depth) for depth in truth]
+    alone[3] = truth[3]
+    kept = made(views, alone)[3]
+    assert np.array_equal(kept, truth[3])
+
+
+def test_a_view_alone_is_left_as_it_was(corner: tuple[Views, list[Array]]) -> None:
+    views, truth = corner
+    assert np.array_equal(made(views.subset(np.array([0])), truth[:1])[0], truth[0])
+
+
+def test_stops_when_asked(corner: tuple[Views, list[Array]]) -> None:
+    views, truth = corner
+
+    class Stop(Progress):
+        def check(self) -> None:
+            raise Interrupted("stop")
+
+    with pytest.raises(Interrupted):
+        settled(truth, truth, views, [CAMERA] * len(views), MEDIAN, Stop())
