@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 RENDER_BYTES = 260  # a pixel of the picture that is being rendered: rays, samples of a part of them, colour, depth, opacity
 SCORE_BYTES = 320  # a pixel of the picture that is being scored
 KEPT_BYTES = 8  # a pixel of a picture that is kept until all are there: colour, depth, mask
+SURFACE_BYTES = 40  # the same when depth maps are made to agree before they become a surface: 33 measured
 ROW_COPIES = 3  # of a field's values while it is baked: its own, sorted ones for the range, the bytes
 MESH_COPIES = 6  # of a mesh file's size in memory while meshes are compared: float64, a tree to search in, samples
 
@@ -25,8 +26,8 @@ def pixels(lens: Intrinsics) -> int:
     return lens.width * lens.height
 
 
-def require_pictures(lenses: Sequence[Intrinsics], kept: bool, advice: str = "lower --image-size") -> None:
-    """Refuse to render pictures, all of which are held in memory when they are `kept`, that do not fit.
+def require_pictures(lenses: Sequence[Intrinsics], kept: bool, advice: str = "lower --image-size", each: int = KEPT_BYTES) -> None:
+    """Refuse to render pictures, all of which are held in memory when they are `kept` (`each` byte a pixel), that do not fit.
 
     Raises:
         InputError: with what is needed and what is free.
@@ -34,7 +35,7 @@ def require_pictures(lenses: Sequence[Intrinsics], kept: bool, advice: str = "lo
     if lenses:
         largest, whole = max(map(pixels, lenses)), sum(map(pixels, lenses)) if kept else 0
         what = f"rendering {len(lenses)} pictures of up to {largest / 1e6:.1f} million pixels"
-        memory.require(RENDER_BYTES * largest + KEPT_BYTES * whole, what, advice)
+        memory.require(RENDER_BYTES * largest + each * whole, what, advice)
 
 
 def require_scores(views: Views, methods: int) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from pipelines.job import Job
 from pipelines.pictures import camera_of, orbit_cameras, pictures
 from pipelines.rendered import Pictures, to_picture
-from pipelines.room import require_pictures
+from pipelines.room import SURFACE_BYTES, require_pictures
 from pipelines.summary import put_cameras
 from toolkit.camera import Intrinsics, Similarity
 from toolkit.errors import InputError
@@ -154,7 +154,7 @@ def export_surface(
     cameras = [at_most(camera, MESH_SIDE) for camera in shown.intrinsics]
     chosen = spread(len(shown), job.settings.export.mesh_views)
     lenses = [cameras[index] for index in chosen]
-    require_pictures(lenses, kept=True, advice="lower export.mesh_views")
+    require_pictures(lenses, kept=True, advice="lower export.mesh_views", each=SURFACE_BYTES)
     view = make_renderer(field, job.settings.engine)
     polisher = Polisher(shown, cameras, scene.near, scene.far, scene.median_depth)
     seen = shown.subset(np.array(chosen))
