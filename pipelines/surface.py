@@ -164,7 +164,7 @@ def export_surface(
         lenses,
         region=(scene.centre - scene.half_size, scene.centre + scene.half_size),
         polish=[partial(polisher.polished, index) for index in chosen],
-        settle=lambda reliable, opaque: settled(reliable, opaque, seen, lenses, scene.median_depth, job.progress),
+        settle=lambda reliable, opaque, told: settled(reliable, opaque, told, seen, lenses, scene.median_depth, job.progress),
         progress=job.progress,
     )
     input_from_working = scene.working_from_input.inverse()

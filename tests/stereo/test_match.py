@@ -313,11 +313,14 @@ def test_depth_that_is_nearly_right_is_polished() -> None:
     before, after = [], []
     for index, true in enumerate(truth):
         given = np.where(np.arange(120)[:, None] < 6, 0, true * waves).astype(np.float32)
-        got = polisher.polished(index, given)
+        got, told = polisher.polished(index, given)
         assert got.dtype == np.float32 and ((got > 0) == (given > 0)).all()
+        assert told.mean() > 0.5 and not told[given == 0].any()
         known = given > 0
         before.append(np.abs(given - true)[known] / true[known])
         after.append(np.abs(got - true)[known] / true[known])
     assert np.median(np.concatenate(after)) < 0.4 * np.median(np.concatenate(before))
     alone = Polisher(views.subset([0]), views.intrinsics[:1], NEAR, FAR, MEDIAN)
-    np.testing.assert_array_equal(alone.polished(0, truth[0]), np.where(truth[0] > 0, truth[0], 0).astype(np.float32))
+    got, told = alone.polished(0, truth[0])
+    np.testing.assert_array_equal(got, np.where(truth[0] > 0, truth[0], 0).astype(np.float32))
+    assert not told.any()

@@ -22,8 +22,9 @@ def corner() -> tuple[Views, list[Array]]:
     return views, [depth.astype(np.float32) for depth in truth]
 
 
-def made(views: Views, depths: list[Array], guesses: list[Array] | None = None) -> list[Array]:
-    return settled(depths, depths if guesses is None else guesses, views, [CAMERA] * len(views), MEDIAN)
+def made(views: Views, depths: list[Array], guesses: list[Array] | None = None, told: list[Array] | None = None) -> list[Array]:
+    told = [np.ones(depth.shape, bool) for depth in depths] if told is None else told
+    return settled(depths, depths if guesses is None else guesses, told, views, [CAMERA] * len(views), MEDIAN)
 
 
 def off(depth: Array, truth: Array, where: Array) -> Array:
@@ -57,6 +58,18 @@ def test_a_guess_becomes_the_plane_that_goes_on_there(corner: tuple[Views, list[
     assert np.median(before) > 0.01
     assert np.median(after) < 0.2 * np.median(before)
     assert np.mean([(depth > 0)[patch].mean() for depth, patch in zip(better, wrong, strict=True) if patch.any()]) > 0.7
+
+
+def test_what_pictures_do_not_tell_becomes_the_plane_even_if_all_views_agree(corner: tuple[Views, list[Array]]) -> None:
+    """A field is one thing: where its bare wall is wavy, it is so from everywhere."""
+    views, truth = corner
+    bare = [np.abs(picture[..., 0].astype(int) - 129) <= 2 for picture in views.images]
+    nearer = [np.where(grey, 0.985 * depth, depth).astype(np.float32) for depth, grey in zip(truth, bare, strict=True)]
+    blind, seeing = made(views, nearer), made(views, nearer, told=[~grey for grey in bare])
+    patches = [grey & (true > 0) for grey, true in zip(bare, truth, strict=True)]
+    before, after = (np.concatenate([off(*case) for case in zip(maps, truth, patches, strict=True)]) for maps in (blind, seeing))
+    assert np.median(before) > 0.01 and np.median(after) < 0.003
+    assert np.mean([(depth > 0)[patch].mean() for depth, patch in zip(seeing, patches, strict=True)]) > 0.9
 
 
 def test_no_plane_goes_where_nothing_was_or_far_from_what_was(corner: tuple[Views, list[Array]]) -> None:
@@ -95,4 +108,4 @@ def test_stops_when_asked(corner: tuple[Views, list[Array]]) -> None:
             raise Interrupted("stop")
 
     with pytest.raises(Interrupted):
-        settled(truth, truth, views, [CAMERA] * len(views), MEDIAN, Stop())
+        settled(truth, truth, [depth > 0 for depth in truth], views, [CAMERA] * len(views), MEDIAN, Stop())

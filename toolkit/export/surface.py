@@ -19,9 +19,9 @@ from toolkit.tsdf.volume import TsdfVolume
 
 # (intrinsics, world_from_camera) → (rgb, depth, opacity), or an object with these names, as `render_view` gives.
 Render = Callable[[Intrinsics, Array], Any]
-Polish = Callable[[Array], Array]  # depth (H, W) → better depth, 0 = none
-# Reliable depth of all views, and all of their depth that is opaque enough → better depth, 0 = none.
-Settle = Callable[[list[Array], list[Array]], list[Array]]
+Polish = Callable[[Array], tuple[Array, Array]]  # depth (H, W) → better depth, 0 = none, and bool where pictures tell it
+# Reliable depth of all views, all of their depth that is opaque enough, where pictures tell it → better depth, 0 = none.
+Settle = Callable[[list[Array], list[Array], list[Array]], list[Array]]
 
 STEEPEST = 4.0  # tangent of the angle between view and surface normal (76°) beyond which a depth step is taken as an edge
 SMALLEST_EDGE = 0.02  # share of depth: smaller steps are never an edge
@@ -43,15 +43,15 @@ def reliable_depth(depth: Array, opacity: Array, focal: float, min_opacity: floa
 
 def rendered_frame(
     render: Render, intrinsics: Intrinsics, world_from_camera: Array, min_opacity: float = 0.7, polish: Polish | None = None
-) -> tuple[DepthFrame, Array]:
-    """Render one view: a frame of its reliable depth, polished before, and (H, W) all of its depth that is opaque enough."""
+) -> tuple[DepthFrame, Array, Array]:
+    """Render one view: a frame of its reliable depth, polished before; (H, W) all depth that is opaque enough; and where pictures tell it."""
     rendered = render(intrinsics, world_from_camera)
     rgb, depth, opacity = (rendered.rgb, rendered.depth, rendered.opacity) if hasattr(rendered, "rgb") else rendered
     camera = intrinsics.pinhole()
-    depth = np.asarray(depth) if polish is None else polish(np.asarray(depth))
+    depth, told = (np.asarray(depth), np.ones(np.shape(depth), bool)) if polish is None else polish(np.asarray(depth))
     opaque = np.where(np.isfinite(depth) & (np.asarray(opacity) >= min_opacity), depth, 0).astype(np.float32)
     depth = reliable_depth(depth, np.asarray(opacity), camera.fx, min_opacity)
-    return DepthFrame(depth, as_bytes(np.asarray(rgb)), camera, camera, np.asarray(world_from_camera, dtype=np.float64)), opaque
+    return DepthFrame(depth, as_bytes(np.asarray(rgb)), camera, camera, np.asarray(world_from_camera, dtype=np.float64)), opaque, told
 
 
 def within(frame: DepthFrame, region: tuple[Array, Array]) -> DepthFrame:
@@ -102,14 +102,16 @@ def field_volume(
     better = [None] * len(poses) if polish is None else list(polish)
     made: list[DepthFrame] = []
     opaque: list[Array] = []
+    told: list[Array] = []
     for camera, pose, how in zip(cameras, poses, better, strict=True):
         progress.check()
-        frame, all_depth = rendered_frame(render, camera, pose, min_opacity, how)
+        frame, all_depth, where = rendered_frame(render, camera, pose, min_opacity, how)
         made.append(frame)
         opaque.append(all_depth)
+        told.append(where)
         progress.update(len(made), (1 + AFTERWARDS) * len(poses), "views made for the surface")
     if settle is not None:
-        depths = settle([frame.depth for frame in made], opaque)
+        depths = settle([frame.depth for frame in made], opaque, told)
         # Planes and what is left beside them have edges of their own.
         depths = [reliable_depth(depth, np.ones_like(depth), frame.depth_intrinsics.fx) for frame, depth in zip(made, depths, strict=True)]
         made = [replace(frame, depth=depth) for frame, depth in zip(made, depths, strict=True)]

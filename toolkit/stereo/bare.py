@@ -110,7 +110,7 @@ def points_of(found: Sequence[StereoDepth], poses: Array) -> Points:
     return Points(np.concatenate(places), np.concatenate(depths), np.concatenate(views), np.concatenate(pixels))
 
 
-def proposal(one: StereoDepth, picture: Array, pose: Array, planes: Array, usable: Array | None, on: float = ON) -> Proposed:
+def proposal(one: StereoDepth, picture: Array, pose: Array, planes: Array, usable: Array | None) -> Proposed:
     """Where the pixels that have a depth, by their votes, let one of the planes go on.
 
     Args:
@@ -118,14 +118,13 @@ def proposal(one: StereoDepth, picture: Array, pose: Array, planes: Array, usabl
         pose: (4, 4) world from camera.
         planes: (K, 4) of `find_planes`.
         usable: (H, W) bool where there is something to see, None: everywhere.
-        on: share of its depth by which a pixel may miss the plane that it votes for.
     """
     camera = numbers(one.intrinsics)
     normals = planes[:, :3] @ pose[:3, :3]
     local = np.column_stack([normals, planes[:, 3] - planes[:, :3] @ pose[:3, 3]])  # the planes in the camera's frame
     voter = np.empty(one.depth.shape, np.int32)
     slant = float(np.cos(np.deg2rad(SLANT)))
-    _voters(one.depth, camera, local, on, slant, voter)
+    _voters(one.depth, camera, local, ON, slant, voter)
     guide = cv2.GaussianBlur(picture, (0, 0), BLUR[0])
     present = [plane for plane in np.unique(voter) if plane >= 0]  # len(planes): those that lie on none
     if not present:

@@ -31,19 +31,22 @@ class Polisher:
         self._grey: dict[int, GreyView] = {}
         self._neighbours = usable_neighbours(views.world_from_camera, self._cameras, median_depth, NEIGHBOURS) if len(views) > 1 else [[]]
 
-    def polished(self, index: int, depth: Array) -> Array:
-        """(H, W) float32 depth of the view `index` along z, 0 = missing; moved by at most about a pixel of parallax, or as it was."""
+    def polished(self, index: int, depth: Array) -> tuple[Array, Array]:
+        """(H, W) float32 depth of the view `index` along z, 0 = missing; moved by at most about a pixel of parallax, or as it was.
+
+        And (H, W) bool, where it was recognised in other pictures: elsewhere, on bare walls, these tell nothing of the depth.
+        """
         near, far = self._range
         known = np.isfinite(depth) & (depth > 0)
         others = [self._picture(other) for other in self._neighbours[index]]
         if not others or not known.any() or not 0 < near < far:
-            return np.asarray(depth, dtype=np.float32)
+            return np.asarray(depth, dtype=np.float32), np.zeros(depth.shape, bool)
         view = self._picture(index)
         planes = inverse_depths(view, others, near, far)
         start = 1 / np.where(known, depth, np.median(depth[known]))
         inverse, cost = refined(view, others, start, float(planes[1] - planes[0]))
         moved = known & (cost <= RECOGNISED) & (inverse > 0)
-        return np.where(moved, 1 / np.maximum(inverse, 1e-12), np.where(known, depth, 0)).astype(np.float32)
+        return np.where(moved, 1 / np.maximum(inverse, 1e-12), np.where(known, depth, 0)).astype(np.float32), moved
 
     def _picture(self, index: int) -> GreyView:
         if index not in self._grey:

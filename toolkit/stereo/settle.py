@@ -24,7 +24,6 @@ from toolkit.stereo.match import CHECKED, MOST_WORKERS, StereoDepth, usable_neig
 from toolkit.stereo.planes import find_planes
 
 ON = 0.004  # share of its depth by which a point may miss a plane that it is counted to: a quarter of what matched depth needs
-VOTES = 0.01  # the same for a pixel that votes for a plane
 REACH = 3.0  # pixels of parallax between a guess and the plane that takes its place, at most
 
 T = TypeVar("T")
@@ -33,6 +32,7 @@ T = TypeVar("T")
 def settled(
     reliable: Sequence[Array],
     guesses: Sequence[Array],
+    told: Sequence[Array],
     views: Views,
     cameras: Sequence[Intrinsics],
     median_depth: float,
@@ -43,6 +43,7 @@ def settled(
     Args:
         reliable: (H, W) along z, working units, one a view, 0 = missing.
         guesses: the same with what is less than reliable, such as edges; planes take the place of these, and none of missing ones.
+        told: (H, W) bool where the pictures tell the depth; other views of one field agree on bare walls without knowing more.
         cameras: of the depth maps.
         median_depth: what parallax and overlap of pictures are judged at.
 
@@ -63,7 +64,7 @@ def settled(
         progress.check()
         depth, confidence = confirmed(index, others[index], reliable, lenses, poses, needed=min(CONFIRMED, max(1, len(others[index]))))
         # Its own depth, not the mean with theirs, which are looked up at the nearest pixel; fusing the maps averages better.
-        return StereoDepth(np.where(depth > 0, reliable[index], 0).astype(np.float32), confidence, lenses[index])
+        return StereoDepth(np.where((depth > 0) & told[index], reliable[index], 0).astype(np.float32), confidence, lenses[index])
 
     sure = _each(checked, len(views))
     planes = find_planes(points_of(sure, poses), on=ON)
@@ -72,7 +73,7 @@ def settled(
         progress.check()
         one = sure[index]
         picture, usable = shrunk(views.images[index], lenses[index]), usable_pixels(views, index, lenses[index])
-        plan = proposal(one, picture, poses[index], planes, usable, VOTES)
+        plan = proposal(one, picture, poses[index], planes, usable)
         near = _near(guesses[index], plan.depth, _parallax(index, others, lenses, poses))
         return np.where(plan.new & near, plan.depth, one.depth)
 
