@@ -44,7 +44,7 @@ def reliable_depth(depth: Array, opacity: Array, focal: float, min_opacity: floa
 def rendered_frame(
     render: Render, intrinsics: Intrinsics, world_from_camera: Array, min_opacity: float = 0.7, polish: Polish | None = None
 ) -> tuple[DepthFrame, Array, Array]:
-    """Render one view: a frame of its reliable depth, polished before; (H, W) all depth that is opaque enough; and where pictures tell it."""
+    """Render one view: a frame of its reliable depth, polished before; (H, W) all depth that is opaque enough; where pictures tell it."""
     rendered = render(intrinsics, world_from_camera)
     rgb, depth, opacity = (rendered.rgb, rendered.depth, rendered.opacity) if hasattr(rendered, "rgb") else rendered
     camera = intrinsics.pinhole()
