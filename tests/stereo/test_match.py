@@ -163,10 +163,10 @@ def slow_cost(view: GreyView, other: GreyView, inverse_depth: Array, half: int =
     inside = (depth > 0) & (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1)
     x, y = np.clip(np.where(inside, x, 0), 0, columns - 1), np.clip(np.where(inside, y, 0), 0, rows - 1)
     i, j = np.minimum(x.astype(int), columns - 2), np.minimum(y.astype(int), rows - 2)
-    fx, fy, grey = x - i, y - j, other.grey.astype(float)
+    fx, fy, grey = x - i, y - j, other.grey.astype(float) - 128
     upper, lower = grey[j, i] * (1 - fx) + grey[j, i + 1] * fx, grey[j + 1, i] * (1 - fx) + grey[j + 1, i + 1] * fx
     warped = np.where(inside, upper * (1 - fy) + lower * fy, 0).reshape(height, width)
-    own, theirs = (np.pad(picture.astype(float), half, mode="edge") for picture in (view.grey, warped))
+    own, theirs = (np.pad(picture.astype(float), half, mode="edge") for picture in (view.grey.astype(float) - 128, warped))
     out = np.full((height, width), -1.0)
     for v, u in np.ndindex(height, width):
         if inside[v * width + u]:
@@ -181,31 +181,36 @@ def test_cost_is_what_its_definition_says() -> None:
     first, second = (grey_view(views.images[i], CAMERA, views.world_from_camera[i]) for i in (0, 2))
     small = grey_view(views.images[2], CAMERA.scaled(80, 60), views.world_from_camera[2])
     for other, inverse_depth in ((second, 1 / truth[0]), (second, np.full((120, 160), 0.3)), (small, 1 / truth[0])):
-        cost = Matcher(first).cost(other.grey, between(first, other), inverse_depth.astype(np.float32))
+        cost = Matcher(first).cost(other, between(first, other), inverse_depth.astype(np.float32))
         expected = slow_cost(first, other, inverse_depth)
         alike = (cost < 0) == (expected < 0)
         assert alike.mean() > 0.995 and (cost >= 0).mean() > 0.4  # a point on the very border may round either way
         assert np.abs(cost - expected)[alike].max() < 2e-3
     volume = sweep(first, [second], np.array([0.1, 0.3]))
-    cost = Matcher(first).cost(second.grey, between(first, second), np.full((120, 160), 0.3, np.float32))
+    cost = Matcher(first).cost(second, between(first, second), np.full((120, 160), 0.3, np.float32))
     assert np.array_equal(volume[:, :, 1], np.where(cost < 0, np.float32(UNKNOWN), cost))
 
 
 def test_cost_is_correlation() -> None:
     rng = np.random.default_rng(0)
     camera = Intrinsics(40, 30, 30.0, 30.0, 20.0, 15.0)
-    grey = rng.normal(0, 40, (30, 40)).astype(np.float32)
+    grey = rng.integers(0, 256, (30, 40)).astype(np.uint8)
     here, plane = GreyView(grey, camera, np.eye(4)), np.ones((30, 40), np.float32)
-    matcher, same = Matcher(here, 5), between(here, here)
-    inner = slice(3, -3), slice(3, -3)
-    assert matcher.cost(0.5 * grey + 20, same, plane)[inner].max() < 0.01  # brightness and contrast do not matter
-    assert matcher.cost(-grey, same, plane)[inner].min() > 0.99
-    other = rng.normal(0, 40, (30, 40)).astype(np.float32)
-    expected = 0.5 - 0.5 * np.corrcoef(grey[8:13, 8:13].ravel(), other[8:13, 8:13].ravel())[0, 1]
-    assert matcher.cost(other, same, plane)[10, 10] == pytest.approx(expected, abs=0.005)
+    matcher = Matcher(here)
+
+    def cost_of(other: Array, pose: Array) -> Array:
+        view = GreyView(other, camera, pose)
+        return matcher.cost(view, between(here, view), plane)
+
+    inner = slice(4, -4), slice(4, -4)
+    assert cost_of(grey // 2 + 20, np.eye(4))[inner].max() < 0.01  # brightness and contrast do not matter
+    assert cost_of(255 - grey, np.eye(4))[inner].min() > 0.99
+    other = rng.integers(0, 256, (30, 40)).astype(np.uint8)
+    expected = 0.5 - 0.5 * np.corrcoef(grey[7:14, 7:14].ravel(), other[7:14, 7:14].ravel())[0, 1]
+    assert cost_of(other, np.eye(4))[10, 10] == pytest.approx(expected, abs=0.005)
     aside = np.eye(4)
     aside[0, 3] = 20 / 30  # 20 pixels at a depth of 1: the left half of the picture was left behind
-    cost = matcher.cost(other, between(here, GreyView(other, camera, aside)), plane)
+    cost = cost_of(other, aside)
     assert (cost[:, :19] == -1).all() and (cost[:, 21:] >= 0).all()
 
 
@@ -219,10 +224,10 @@ def test_cameras_out_of_this_world_are_not_read_at(far: float) -> None:
         other = grey_view(views.images[1], CAMERA, pose)
         for inverse_depth in (1e-30, 0.3, 1e30):
             with np.errstate(all="ignore"):
-                cost = Matcher(first).cost(other.grey, between(first, other), np.full((120, 160), inverse_depth, np.float32))
+                cost = Matcher(first).cost(other, between(first, other), np.full((120, 160), inverse_depth, np.float32))
             assert np.all((cost == -1) | ((cost >= -1e-3) & (cost <= 1.001)))
     thin = grey_view(views.images[1][:1], CAMERA.scaled(160, 1), views.world_from_camera[1])
-    assert (Matcher(first).cost(thin.grey, between(first, thin), np.full((120, 160), 0.3, np.float32)) == -1).all()
+    assert (Matcher(first).cost(thin, between(first, thin), np.full((120, 160), 0.3, np.float32)) == -1).all()
 
 
 @pytest.mark.parametrize("count", [1, 3, 4, 5])

@@ -15,7 +15,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from toolkit.stereo.smooth import PATHS, summed_paths
+from toolkit.stereo.smooth import DOWN, STRAIGHT, UP, summed_paths
 from toolkit.threads import share, slices
 
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "nsz", "arcp"}}
@@ -140,8 +140,7 @@ def semi_global(cost: Tensor, small: float, large: float) -> Tensor:
     """`matching.semi_global` of float32 costs (D, h, w) of at least three planes on the CPU, by the kernel of matching; pixel-major."""
     volume = array(cost.permute(1, 2, 0))
     even = np.zeros(volume.shape[:2], np.float32)  # depth may step anywhere
-    pairs, threads = (PATHS[:2], PATHS[2:4]), min(2, torch.get_num_threads())
-    one, other = share(lambda paths: summed_paths(volume, even, small, large, paths), pairs, threads)
+    one, other = share(lambda way: summed_paths(volume, even, small, large, STRAIGHT, (way,)), (DOWN, UP), torch.get_num_threads())
     one += other
     one /= F(4)
     return torch.from_numpy(one).permute(2, 0, 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -13,8 +14,15 @@ import numpy as np
 from toolkit.camera import Array, Intrinsics, invert
 
 WINDOW = 7  # pixels a side that are compared
+HALF = WINDOW // 2
+RING = 8  # rows that are kept, a power of two: those of a window and the one that leaves it
 NOISE = 4.0  # variance (grey levels²) below which a window holds nothing to compare: correlation is drawn to 0 there
 UNKNOWN = 0.5  # cost where no neighbour shows anything, which is that of no correlation
+GROUP = 16  # planes that are put into the volume at once: as many costs as a cache line holds
+MIDDLE = 128  # is taken from grey levels so that their squares keep their digits
+# What is looked up is rounded to quarters of a grey level (adding this leaves no finer digits). Sums of such values, of their squares and of
+# their products with whole ones, over a window, are exact in float32, so a window may move on by adding what comes and taking what goes.
+ROUNDER = 1.5 * 2**21
 F = np.float32
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}  # exact: the same whichever way a loop becomes vectors
 
@@ -23,9 +31,16 @@ OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 class GreyView:
     """A picture for matching."""
 
-    grey: Array  # (H, W) float32, 0 to 255, less 128 so that squares keep their digits
+    grey: Array  # (H, W) uint8
     camera: Intrinsics  # pinhole, of exactly this size
     world_from_camera: Array  # (4, 4) float64
+
+    @cached_property
+    def quads(self) -> Array:
+        """(H, W) uint32: each pixel with its right, lower and lower right neighbours, from the lowest byte up, so that what lies between
+        them is one look into memory. Of the last row and column nothing is asked."""
+        wide = np.pad(self.grey, ((0, 1), (0, 1))).astype(np.uint32)
+        return wide[:-1, :-1] | wide[:-1, 1:] << 8 | wide[1:, :-1] << 16 | wide[1:, 1:] << 24
 
 
 def shrunk(picture: Array, camera: Intrinsics) -> Array:
@@ -37,8 +52,8 @@ def shrunk(picture: Array, camera: Intrinsics) -> Array:
 
 def grey_view(picture: Array, camera: Intrinsics, world_from_camera: Array) -> GreyView:
     """(h, w, 3) uint8 RGB, shrunk to the camera's size where it is larger."""
-    grey = cv2.cvtColor(shrunk(picture, camera), cv2.COLOR_RGB2GRAY).astype(np.float32) - 128
-    return GreyView(grey, camera, np.asarray(world_from_camera, dtype=np.float64))
+    grey = cv2.cvtColor(shrunk(picture, camera), cv2.COLOR_RGB2GRAY)
+    return GreyView(np.asarray(grey), camera, np.asarray(world_from_camera, dtype=np.float64))
 
 
 def plane_homography(view: GreyView, other: GreyView, inverse_depth: float) -> Array:
@@ -56,14 +71,15 @@ def between(view: GreyView, other: GreyView) -> tuple[Array, Array]:
 
 
 @numba.njit(**OPTIONS)
-def _places(other: Array, far: Array, move: Array, inverse: Array, v: int, place: Array, share: Array, inside: Array) -> None:
-    """Where `other` (h, w) shows the points of row `v` with the inverse depths inverse[v]: upper left pixel, shares of its right and lower
-    neighbours, and 1 where it is in the picture, 0 elsewhere. A loop of its own, because it becomes vectors, and what is read by it not."""
+def _places(height: int, width: int, far: Array, move: Array, inverse: Array, v: int, place: Array, share: Array, inside: Array) -> None:
+    """Where a picture of this size shows the points of row `v` with the inverse depths inverse[v]: upper left pixel, shares of its right and
+    lower neighbours, and 1 where it is in the picture, 0 elsewhere. A loop of its own, because it becomes vectors, and what is read by it
+    not."""
     zero, one, least = F(0), F(1), F(1e-6)
-    bottom, right = F(other.shape[0] - 1), F(other.shape[1] - 1)
+    bottom, right = F(height - 1), F(width - 1)
     bx, by, bz = far[0, 1] * F(v) + far[0, 2], far[1, 1] * F(v) + far[1, 2], far[2, 1] * F(v) + far[2, 2]
     ax, ay, az, mx, my, mz = far[0, 0], far[1, 0], far[2, 0], move[0], move[1], move[2]
-    height, width = np.int32(other.shape[0]), np.int32(other.shape[1])
+    last, below, across = np.int32(width - 2), np.int32(height - 2), np.int32(width)
     for u in range(len(place)):
         depth = inverse[v, u]
         z = az * F(u) + bz + depth * mz
@@ -72,77 +88,85 @@ def _places(other: Array, far: Array, move: Array, inverse: Array, v: int, place
         x_in, y_in = min(max(x, zero), right), min(max(y, zero), bottom)
         inside[u] = one if (z > least) & (x == x_in) & (y == y_in) else zero
         # Whole numbers are bounded once more: what is no number (a camera out of this world) must not be read at.
-        column = min(max(np.int32(min(x_in, right - one)), np.int32(0)), width - np.int32(2))
-        row = min(max(np.int32(min(y_in, bottom - one)), np.int32(0)), height - np.int32(2))
+        column = min(max(np.int32(min(x_in, right - one)), np.int32(0)), last)
+        row = min(max(np.int32(min(y_in, bottom - one)), np.int32(0)), below)
         share[0, u], share[1, u] = x_in - F(column), y_in - F(row)
-        place[u] = row * width + column
+        place[u] = row * across + column
 
 
 @numba.njit(**OPTIONS)
-def _take(pixels: Array, width: int, place: Array, share: Array, inside: Array, out: Array) -> None:
-    """Bilinear values of `pixels` (h · w,) at `_places`, 0 outside."""
-    one, below = np.uintp(1), np.uintp(width)
+def _take(quads: Array, place: Array, share: Array, inside: Array, found: Array, out: Array) -> None:
+    """Grey levels less `MIDDLE` between the pixels of `quads` (h · w,) at `_places`, in quarters; 0 outside."""
+    low, rounder = np.uint32(255), F(ROUNDER)
     for u in range(len(place)):
-        at = np.uintp(place[u])
-        left, right, lower_left, lower_right = pixels[at], pixels[at + one], pixels[at + below], pixels[at + below + one]
-        upper = left + share[0, u] * (right - left)
-        lower = lower_left + share[0, u] * (lower_right - lower_left)
-        out[u] = upper + share[1, u] * (lower - upper) if inside[u] > F(0) else F(0)
+        found[u] = quads[np.uintp(place[u])]
+    across, down = share[0], share[1]
+    for u in range(len(place)):
+        four = found[u]
+        left, right = F(np.int32(four & low)), F(np.int32((four >> np.uint32(8)) & low))
+        lower_left, lower_right = F(np.int32((four >> np.uint32(16)) & low)), F(np.int32(four >> np.uint32(24)))
+        upper = left + across[u] * (right - left)
+        lower = lower_left + across[u] * (lower_right - lower_left)
+        value = (upper + down[u] * (lower - upper) - F(MIDDLE) + rounder) - rounder
+        out[u] = value if inside[u] > F(0) else F(0)
 
 
 @numba.njit(**OPTIONS)
-def _sum_across(values: Array, out: Array) -> None:
-    """Sums of values[x …] over as many neighbours as `values` is longer than `out`, and one."""
+def _move_on(new: Array, new_own: Array, old: Array, old_own: Array, sums: Array) -> None:
+    """Sums over the rows of a window, (3, W + 2 HALF) of values, squares and products: one row more and one less. Loops apart, because
+    each becomes vectors."""
+    first, second, third = sums[0, HALF:], sums[1, HALF:], sums[2, HALF:]
+    for x in range(len(new)):
+        first[x] += new[x] - old[x]
+    for x in range(len(new)):
+        second[x] += new[x] * new[x] - old[x] * old[x]
+    for x in range(len(new)):
+        third[x] += new[x] * new_own[x] - old[x] * old_own[x]
+    for part in range(3):
+        for x in range(HALF):  # the ends are repeated
+            sums[part, x], sums[part, HALF + len(new) + x] = sums[part, HALF], sums[part, HALF + len(new) - 1]
+
+
+@numba.njit(**OPTIONS)
+def _correlated(sums: Array, mean: Array, steep: Array, seen: Array, out: Array) -> None:
+    """Costs of a row from the sums over the rows of its windows; `mean` and `steep` (1 / deviation) are those of the windows that they are
+    compared with."""
+    zero, half, part_of = F(0), F(0.5), F(1 / (WINDOW * WINDOW))
+    values, squares, products = sums[0], sums[1], sums[2]
     for x in range(len(out)):
-        out[x] = values[x]
-    for shift in range(1, len(values) - len(out) + 1):
-        for x in range(len(out)):
-            out[x] += values[x + shift]
+        value, square, product = zero, zero, zero
+        for shift in range(WINDOW):
+            value += values[x + shift]
+            square += squares[x + shift]
+            product += products[x + shift]
+        their = value * part_of
+        spread = max(square * part_of - their * their, zero) + F(NOISE)
+        cost = half - half * (product * part_of - mean[x] * their) * steep[x] / np.sqrt(spread)
+        out[x] = cost if seen[x] > zero else F(-1)
 
 
 @numba.njit(**OPTIONS)
-def _compare(
-    grey: Array, mean: Array, variance: Array, half: int, other: Array, far: Array, move: Array, inverse: Array, out: Array
-) -> None:
+def _compare(own: Array, mean: Array, steep: Array, quads: Array, far: Array, move: Array, inverse: Array, out: Array) -> None:
     """`Matcher.cost`, a row at a time: what was warped stays in the cache until all windows that hold it are done."""
-    height, width = grey.shape
-    window = 2 * half + 1
-    pixels = other.reshape(-1)
-    place, share, warped = np.empty(width, np.int32), np.empty((2, width), np.float32), np.empty(width, np.float32)
-    wide = np.empty((3, width + 2 * half), np.float32)
-    inside, sums = np.empty((window, width), np.float32), np.empty((window, 3, width), np.float32)
-    total = np.empty((3, width), np.float32)
-    zero, part_of = F(0), F(1 / (window * window))
-    for ahead in range(height + half):
-        if ahead < height:
-            newest = sums[ahead % window]
-            _places(other, far, move, inverse, ahead, place, share, inside[ahead % window])
-            _take(pixels, other.shape[1], place, share, inside[ahead % window], warped)
-            own, first, second, third = grey[ahead], wide[0, half:], wide[1, half:], wide[2, half:]
-            for x in range(width):
-                first[x] = warped[x]
-                second[x] = warped[x] * warped[x]
-                third[x] = warped[x] * own[x]
-            for part in range(3):
-                for x in range(half):  # the ends are repeated
-                    wide[part, x], wide[part, half + width + x] = wide[part, half], wide[part, half + width - 1]
-                _sum_across(wide[part], newest[part])
-        y = ahead - half
-        if y < 0:
-            continue
-        total[:] = zero
-        for near in range(y - half, y + half + 1):
-            row = sums[min(max(near, 0), height - 1) % window]
-            for part in range(3):
-                for x in range(width):
-                    total[part, x] += row[part, x]
-        seen, result = inside[y % window], out[y]
-        for x in range(width):
-            their = total[0, x] * part_of
-            spread = max(total[1, x] * part_of - their * their, zero) + F(NOISE)
-            product = total[2, x] * part_of - mean[y, x] * their
-            value = F(0.5) - F(0.5) * product / np.sqrt(variance[y, x] * spread)
-            result[x] = value if seen[x] > zero else F(-1)
+    height, width = own.shape
+    pixels = quads.reshape(-1)
+    place, found, share = np.empty(width, np.int32), np.empty(width, np.uint32), np.empty((2, width), np.float32)
+    warped, inside = np.empty((RING, width), np.float32), np.empty((RING, width), np.float32)
+    sums, nothing = np.zeros((3, width + 2 * HALF), np.float32), np.zeros(width, np.float32)
+    bottom = height - 1
+    for ahead in range(-HALF, height + HALF):
+        new, old = min(max(ahead, 0), bottom), ahead - WINDOW  # rows at the ends are repeated
+        if ahead == -HALF or 0 < ahead < height:
+            _places(quads.shape[0], quads.shape[1], far, move, inverse, new, place, share, inside[new % RING])
+            _take(pixels, place, share, inside[new % RING], found, warped[new % RING])
+        if old < -HALF:
+            _move_on(warped[new % RING], own[new], nothing, nothing, sums)
+        else:
+            old = max(old, 0)
+            _move_on(warped[new % RING], own[new], warped[old % RING], own[old], sums)
+        y = ahead - HALF
+        if y >= 0:
+            _correlated(sums, mean[y], steep[y], inside[y % RING], out[y])
 
 
 class Matcher:
@@ -151,28 +175,27 @@ class Matcher:
     The cost is (1 − zero-mean normalised cross-correlation) / 2: 0 alike, ½ unrelated, 1 inverted; brightness and contrast do not matter.
     """
 
-    def __init__(self, view: GreyView, window: int = WINDOW) -> None:
-        self.view, self.half = view, window // 2
-        self.mean = self._mean(view.grey)
-        self.variance = np.maximum(self._mean(view.grey * view.grey) - self.mean**2, 0) + np.float32(NOISE)
+    def __init__(self, view: GreyView) -> None:
+        self.own = view.grey.astype(np.float32) - MIDDLE
+        self.mean = self._mean(self.own)
+        self.steep = 1 / np.sqrt(np.maximum(self._mean(self.own * self.own) - self.mean**2, 0) + np.float32(NOISE))
 
-    def _mean(self, values: Array) -> Array:
-        window = 2 * self.half + 1
-        return np.asarray(cv2.boxFilter(values, cv2.CV_32F, (window, window), borderType=cv2.BORDER_REPLICATE))
+    @staticmethod
+    def _mean(values: Array) -> Array:
+        return np.asarray(cv2.boxFilter(values, cv2.CV_32F, (WINDOW, WINDOW), borderType=cv2.BORDER_REPLICATE))
 
-    def cost(self, other: Array, way: tuple[Array, Array], inverse_depth: Array, out: Array | None = None) -> Array:
-        """(H, W) float32 costs of the picture `other` where it shows the points at `inverse_depth` (H, W); −1 where it does not.
+    def cost(self, other: GreyView, way: tuple[Array, Array], inverse_depth: Array, out: Array | None = None) -> Array:
+        """(H, W) float32 costs of the picture of `other` where it shows the points at `inverse_depth` (H, W); −1 where it does not.
 
         Args:
-            other: (h, w) float32 grey levels as in `GreyView`.
-            way: `between` the matcher's view and the other's.
+            way: `between` the matcher's view and the other one.
             out: (H, W) float32 to be filled.
         """
-        out = np.empty(self.view.grey.shape, np.float32) if out is None else out
-        if min(other.shape) < 2:  # nothing lies between its pixels
+        out = np.empty(self.own.shape, np.float32) if out is None else out
+        if min(other.grey.shape) < 2:  # nothing lies between its pixels
             out[:] = -1
             return out
-        _compare(self.view.grey, self.mean, self.variance, self.half, other, *way, inverse_depth, out)
+        _compare(self.own, self.mean, self.steep, other.quads, *way, inverse_depth, out)
         return out
 
 
@@ -222,16 +245,29 @@ def best_half(costs: Array, out: Array) -> None:
             out[y, x] = total / half
 
 
-def sweep(view: GreyView, others: Sequence[GreyView], inverse_depths: Array, window: int = WINDOW) -> Array:
+@numba.njit(**OPTIONS)
+def _put(costs: Array, first: int, volume: Array) -> None:
+    """Costs of some planes (G, H, W) into volume[:, :, first …], pixel by pixel: plane by plane each cost would go to a line of its own."""
+    for y in range(costs.shape[1]):
+        for x in range(costs.shape[2]):
+            for d in range(costs.shape[0]):
+                volume[y, x, first + d] = costs[d, y, x]
+
+
+def sweep(view: GreyView, others: Sequence[GreyView], inverse_depths: Array) -> Array:
     """(H, W, D) float32 costs of the planes at `inverse_depths` (D,)."""
     height, width = view.grey.shape
-    matcher = Matcher(view, window)
+    matcher = Matcher(view)
     ways = [between(view, other) for other in others]
     volume = np.empty((height, width, len(inverse_depths)), np.float32)
-    costs = np.empty((len(others), height, width), np.float32)
-    for d, inverse_depth in enumerate(inverse_depths):
-        plane = np.full((height, width), inverse_depth, np.float32)
-        for k, other in enumerate(others):
-            matcher.cost(other.grey, ways[k], plane, costs[k])
-        best_half(costs, volume[:, :, d])
+    costs, group = np.empty((len(others), height, width), np.float32), np.empty((GROUP, height, width), np.float32)
+    plane = np.empty((height, width), np.float32)
+    for first in range(0, len(inverse_depths), GROUP):
+        some = inverse_depths[first : first + GROUP]
+        for d, inverse_depth in enumerate(some):
+            plane[:] = inverse_depth
+            for k, other in enumerate(others):
+                matcher.cost(other, ways[k], plane, costs[k])
+            best_half(costs, group[d])
+        _put(group[: len(some)], first, volume)
     return volume

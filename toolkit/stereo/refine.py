@@ -8,22 +8,20 @@ import cv2
 import numpy as np
 
 from toolkit.camera import Array
-from toolkit.stereo.cost import WINDOW, GreyView, Matcher, best_half, between
+from toolkit.stereo.cost import GreyView, Matcher, best_half, between
 
 EVEN = 5  # pixels a side of the median that the depth map is evened out with before pictures are warped by it
 LEAST_BEND = 1e-4  # of the costs' parabola; flatter ones have no lowest point worth moving to
 
 
-def refined(
-    view: GreyView, others: Sequence[GreyView], inverse_depth: Array, step: float, rounds: int = 2, window: int = WINDOW
-) -> tuple[Array, Array]:
+def refined(view: GreyView, others: Sequence[GreyView], inverse_depth: Array, step: float, rounds: int = 2) -> tuple[Array, Array]:
     """Each pixel moved to the lowest point of a parabola through three costs; the first round reaches half a `step` (the planes' distance)
     to either side, each next one half as far.
 
     Returns:
         (H, W) float32 inverse depth, and (H, W) float32 the lowest of the last round's costs.
     """
-    matcher = Matcher(view, window)
+    matcher = Matcher(view)
     ways = [between(view, other) for other in others]
     now = inverse_depth.astype(np.float32)
     costs = np.empty((len(others), *now.shape), np.float32)
@@ -33,7 +31,7 @@ def refined(
         even = cv2.medianBlur(now, EVEN)
         for place, side in enumerate((-1, 0, 1)):
             for k, other in enumerate(others):
-                matcher.cost(other.grey, ways[k], even + side * reach, costs[k])
+                matcher.cost(other, ways[k], even + side * reach, costs[k])
             best_half(costs, three[place])
         low, mid, high = three
         bend = low - 2 * mid + high
