@@ -1,4 +1,4 @@
-"""What compiled loops need to become vectors and numba's own operations do not give."""
+"""What compiled loops need to be fast and numba's own operations do not give."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class Baked(NamedTuple):
     low: Any
 
 
-@njit(**K.OPTIONS)
+@njit(**K.LEAF)
 def corner_starts(baked: Any, slot: Any, x: Any, y: Any, z: Any, starts: Any, kept: Any) -> None:
     """Stored corners at (x, y | y + 1, z | z + 1) of a block into starts[kept, 0 … 3]; the one at x + 1 follows each.
 
@@ -62,7 +62,7 @@ def corner_starts(baked: Any, slot: Any, x: Any, y: Any, z: Any, starts: Any, ke
         starts[kept, pair] = np.int32(baked.base[slot] + (row >> CORNERS) + int(ones(np.uint64(row & below))))
 
 
-@njit(**K.OPTIONS)
+@njit(**K.LEAF)
 def packed_density(packed: Any, x: Any, y: Any, z: Any) -> Any:
     """Trilinear quantised raw density of a voxel, in steps."""
     low, high = np.uint32(packed & np.uint64(0xFFFFFFFF)), np.uint32(packed >> np.uint64(32))
@@ -80,7 +80,7 @@ def packed_density(packed: Any, x: Any, y: Any, z: Any) -> Any:
     return p0 + z * (p2 - p0)
 
 
-@njit(**K.OPTIONS)
+@njit(**K.LEAF)
 def baked_march(
     space: Any,
     baked: Any,

@@ -17,7 +17,7 @@ MOST_KEPT = 512  # samples of one ray that are coloured
 TILE = 16  # pixels a side: rays of a tile share what they read while it is still in the cache
 
 
-@njit(**K.OPTIONS)
+@njit(**K.LEAF)
 def add_feature(width: Any, feature: Any, starts: Any, kept_at: Any, i: Any, total: Any) -> None:
     """Add the trilinear feature of kept sample `i`, in steps and times its weight, to total[:C]."""
     x, y, z, weight = kept_at[i, VX], kept_at[i, VY], kept_at[i, VZ], kept_at[i, VW]
@@ -89,7 +89,7 @@ def render_tiles(
                 share = ONE / total
                 for k in range(channels):
                     given[k] = baked.low[k] + baked.scale[k] * (given[k] * share)
-                encode_direction(dx, dy, dz, given[channels:])
+                encode_direction(dx, dy, dz, given, channels)
                 decode(space, decoder, given, h1, h2, colour)
                 for k in range(3):
                     out[pixel, k] = min(max(colour[k] * opacity + (ONE - opacity) * background[k], ZERO), ONE)

@@ -105,7 +105,7 @@ def render_pass(
     rows, weights = np.empty((MOST_KEPT, 8), np.int32), np.empty((MOST_KEPT, 8), np.float32)
     features, given = np.empty((MOST_KEPT, channels), np.float32), np.zeros(channels + K.PADDED, np.float32)
     h1, h2, colour, result = np.empty(hidden, np.float32), np.empty(hidden, np.float32), np.empty(3, np.float32), np.empty(4, np.float32)
-    marks = np.empty(0, np.uint16)
+    marks, feature = np.empty(0, np.uint16), volume.feature
     for ray in range(len(origins)):
         ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
         dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
@@ -114,7 +114,7 @@ def render_pass(
             given[c] = K.ZERO
         opacity = K.ZERO
         for i in range(kept):
-            gather_row(space.width, volume.feature, rows, values, weights, features, i)
+            gather_row(space.width, feature, rows, values, weights, features, i)
             weight = values[i, K.WEIGHT]
             opacity += weight
             for c in range(channels):
@@ -126,7 +126,7 @@ def render_pass(
             continue
         for c in range(channels):
             given[c] /= max(opacity, K.F(1e-6))
-        encode_direction(dx, dy, dz, given[channels:])
+        encode_direction(dx, dy, dz, given, channels)
         decode(space, decoder, given, h1, h2, colour)
         for k in range(3):
             out[ray, k] = min(max(colour[k] * opacity + (K.ONE - opacity) * background[k], K.ZERO), K.ONE)

@@ -8,26 +8,26 @@ from typing import Any
 from numba import njit
 
 from toolkit.networks.encoding import SH
-from toolkit.render.kernels import ONE, OPTIONS, ZERO, F
+from toolkit.render.kernels import LEAF, ONE, ZERO, F
 
 _C0, _C1, _C2, _C3, _C4 = (F(value) for value in SH)
 
 
-@njit(**OPTIONS)
-def encode_direction(x: Any, y: Any, z: Any, out: Any) -> None:
-    """Spherical harmonics up to degree 2 into out[0 … 8]; see `networks.encoding.spherical_harmonics`."""
-    out[0], out[1], out[2], out[3] = _C0, -_C1 * y, _C1 * z, -_C1 * x
-    out[4], out[5], out[6] = _C2 * x * y, -_C2 * y * z, _C3 * (F(3) * z * z - ONE)
-    out[7], out[8] = -_C2 * x * z, _C4 * (x * x - y * y)
+@njit(**LEAF)
+def encode_direction(x: Any, y: Any, z: Any, out: Any, at: Any) -> None:
+    """Spherical harmonics up to degree 2 into out[at … at + 8]; see `networks.encoding.spherical_harmonics`."""
+    out[at], out[at + 1], out[at + 2], out[at + 3] = _C0, -_C1 * y, _C1 * z, -_C1 * x
+    out[at + 4], out[at + 5], out[at + 6] = _C2 * x * y, -_C2 * y * z, _C3 * (F(3) * z * z - ONE)
+    out[at + 7], out[at + 8] = -_C2 * x * z, _C4 * (x * x - y * y)
 
 
-@njit(**OPTIONS)
+@njit(**LEAF)
 def sigmoid(value: Any) -> Any:
     """1 / (1 + e^{-v}) without overflow."""
     return ONE / (ONE + math.exp(-min(max(value, F(-80)), F(80))))
 
 
-@njit(**OPTIONS)
+@njit(**LEAF)
 def multiply(rows: Any, columns: Any, matrix: Any, given: Any, out: Any) -> None:
     """out[j] = Σ_i matrix[j, i] given[i]; four sums at a time, which the compiler turns into seven times faster code than one."""
     n = len(columns)
@@ -48,7 +48,7 @@ def multiply(rows: Any, columns: Any, matrix: Any, given: Any, out: Any) -> None
         out[j] = a
 
 
-@njit(**OPTIONS)
+@njit(**LEAF)
 def decode(space: Any, decoder: Any, given: Any, h1: Any, h2: Any, colour: Any) -> None:
     """`Deferred.forward` of one ray: given (I,) mean features, encoded direction and zeros → h1, h2 (H,) hidden layers and colour (3,)."""
     hidden = len(space.hidden)

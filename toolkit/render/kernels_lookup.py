@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numba import njit
 
-from toolkit.render.kernels import ONE, OPTIONS, X, Y, Z
+from toolkit.render.kernels import LEAF, ONE, X, Y, Z
+
+X_ROW, Y_ROW, Z_ROW = np.uintp(1), np.uintp(8), np.uintp(64)  # rows from a corner of a block to the next one along each axis
 
 
-@njit(**OPTIONS)
+@njit(**LEAF)
 def corner_rows(upper: Any, cell: Any, rows: Any) -> None:
     """The eight lattice corners of voxel `cell` into rows[0 … 7], x fastest; an absent block's corner is the zero row."""
     slot, local = cell >> 9, cell & 511
@@ -25,7 +28,7 @@ def corner_rows(upper: Any, cell: Any, rows: Any) -> None:
         rows[corner] = min(block * 512 + ((w & 7) * 8 + (v & 7)) * 8 + (u & 7), zero_row)
 
 
-@njit(**OPTIONS)
+@njit(**LEAF)
 def corner_rows_of(upper: Any, cell: Any, rows: Any, index: Any) -> None:
     """`corner_rows` into rows[index, 0 … 7]."""
     slot, local = cell >> 9, cell & 511
@@ -41,7 +44,7 @@ def corner_rows_of(upper: Any, cell: Any, rows: Any, index: Any) -> None:
         rows[index, corner] = min(block * 512 + ((w & 7) * 8 + (v & 7)) * 8 + (u & 7), zero_row)
 
 
-@njit(**OPTIONS)
+@njit(**LEAF)
 def corner_weights(x: Any, y: Any, z: Any, weights: Any) -> None:
     """Trilinear weights of the place (x, y, z) in a voxel, in the order of `corner_rows`."""
     a, b, c = ONE - x, ONE - y, ONE - z
@@ -49,25 +52,27 @@ def corner_weights(x: Any, y: Any, z: Any, weights: Any) -> None:
     weights[4], weights[5], weights[6], weights[7] = a * b * z, x * b * z, a * y * z, x * y * z
 
 
-@njit(**OPTIONS)
-def raw_density(volume: Any, cell: Any, x: Any, y: Any, z: Any) -> Any:
+@njit(**LEAF)
+def raw_density(density: Any, upper: Any, cell: Any, x: Any, y: Any, z: Any) -> Any:
     """Trilinear raw density in voxel `cell`."""
     slot, local = cell >> 9, cell & 511
     u, v, w = local & 7, (local >> 3) & 7, local >> 6
-    d = volume.density
     if u < 7 and v < 7 and w < 7:
-        p0, p1, p2, p3 = d[cell], d[cell + 8], d[cell + 64], d[cell + 72]
-        q0, q1, q2, q3 = d[cell + 1], d[cell + 9], d[cell + 65], d[cell + 73]
+        at = np.uintp(cell)  # what cannot be negative need not be asked whether it is
+        p0, p1, p2, p3 = density[at], density[at + Y_ROW], density[at + Z_ROW], density[at + Y_ROW + Z_ROW]
+        at += X_ROW
+        q0, q1, q2, q3 = density[at], density[at + Y_ROW], density[at + Z_ROW], density[at + Y_ROW + Z_ROW]
     else:
-        up = volume.upper
-        zero_row = up.shape[0] * 512
+        zero_row = upper.shape[0] * 512
         hx, hy, hz = (u + 1) >> 3, (v + 1) >> 3, (w + 1) >> 3
         x1, y0, y1, z0, z1 = (u + 1) & 7, v * 8, ((v + 1) & 7) * 8, w * 64, ((w + 1) & 7) * 64
-        p0, q0 = d[cell], d[min(up[slot, hx] * 512 + z0 + y0 + x1, zero_row)]
-        p1, q1 = d[min(up[slot, hy * 2] * 512 + z0 + y1 + u, zero_row)], d[min(up[slot, hy * 2 + hx] * 512 + z0 + y1 + x1, zero_row)]
-        p2, q2 = d[min(up[slot, hz * 4] * 512 + z1 + y0 + u, zero_row)], d[min(up[slot, hz * 4 + hx] * 512 + z1 + y0 + x1, zero_row)]
-        p3 = d[min(up[slot, hz * 4 + hy * 2] * 512 + z1 + y1 + u, zero_row)]
-        q3 = d[min(up[slot, hz * 4 + hy * 2 + hx] * 512 + z1 + y1 + x1, zero_row)]
+        p0, q0 = density[cell], density[min(upper[slot, hx] * 512 + z0 + y0 + x1, zero_row)]
+        p1 = density[min(upper[slot, hy * 2] * 512 + z0 + y1 + u, zero_row)]
+        q1 = density[min(upper[slot, hy * 2 + hx] * 512 + z0 + y1 + x1, zero_row)]
+        p2 = density[min(upper[slot, hz * 4] * 512 + z1 + y0 + u, zero_row)]
+        q2 = density[min(upper[slot, hz * 4 + hx] * 512 + z1 + y0 + x1, zero_row)]
+        p3 = density[min(upper[slot, hz * 4 + hy * 2] * 512 + z1 + y1 + u, zero_row)]
+        q3 = density[min(upper[slot, hz * 4 + hy * 2 + hx] * 512 + z1 + y1 + x1, zero_row)]
     p0 += x * (q0 - p0)
     p1 += x * (q1 - p1)
     p2 += x * (q2 - p2)
@@ -77,7 +82,7 @@ def raw_density(volume: Any, cell: Any, x: Any, y: Any, z: Any) -> Any:
     return p0 + z * (p2 - p0)
 
 
-@njit(**OPTIONS)
+@njit(**LEAF)
 def gather_feature(width: Any, feature: Any, rows: Any, x: Any, y: Any, z: Any, weights: Any, out: Any) -> None:
     """Trilinear feature of the corners rows (8,) into out[:C]; weights (8,) are left for the caller."""
     corner_weights(x, y, z, weights)
@@ -89,7 +94,7 @@ def gather_feature(width: Any, feature: Any, rows: Any, x: Any, y: Any, z: Any, 
         out[c] = low + w4 * feature[r4, c] + w5 * feature[r5, c] + w6 * feature[r6, c] + w7 * feature[r7, c]
 
 
-@njit(**OPTIONS)
+@njit(**LEAF)
 def gather_row(width: Any, feature: Any, rows: Any, values: Any, weights: Any, out: Any, index: Any) -> None:
     """`gather_feature` of sample `index`: rows, weights (S, 8), values (S, 8), out (S, C).
 

@@ -12,8 +12,8 @@ from toolkit.render.kernels import (
     AFTER,
     ALONG,
     HALF,
+    LEAF,
     ONE,
-    OPTIONS,
     PLACE,
     RAW,
     RAW_MAX,
@@ -35,7 +35,7 @@ from toolkit.render.kernels import (
 from toolkit.render.kernels_lookup import corner_rows_of, raw_density
 
 
-@njit(**OPTIONS)
+@njit(**LEAF)
 def mark(marks: Any, cell: Any, weight: Any) -> None:
     """Remember of a voxel the largest weight it was seen with (12 bits) and how often it was visited (4 bits, saturating)."""
     old = np.uint32(marks[cell])
@@ -43,13 +43,13 @@ def mark(marks: Any, cell: Any, weight: Any) -> None:
     marks[cell] = np.uint16((level << np.uint32(4)) | min((old & np.uint32(15)) + np.uint32(1), np.uint32(15)))
 
 
-@njit(**OPTIONS)
+@njit(**LEAF)
 def mark_surface(marks: Any, cell: Any) -> None:
     """Remember a voxel as seen with all the light there is."""
     marks[cell] = np.uint16(np.uint32(marks[cell]) | np.uint32(0xFFF0))
 
 
-@njit(**OPTIONS)
+@njit(**LEAF)
 def brick_distance(bricks: Any, x: Any, y: Any, z: Any, scale: Any) -> Any:
     """Distance in bricks from a place in lattice-cube coordinates (0 at its low corner) to the nearest occupied brick."""
     top = bricks.shape[0] - 1
@@ -59,7 +59,7 @@ def brick_distance(bricks: Any, x: Any, y: Any, z: Any, scale: Any) -> Any:
     return int(bricks[k, j, i])
 
 
-@njit(**OPTIONS)
+@njit(**LEAF)
 def march_ray(
     space: Any,
     volume: Any,
@@ -123,7 +123,7 @@ def march_ray(
     transmittance = ONE
     step_index = 0
     unit = step / (TWO * extent)
-    table = volume.table
+    table, bricks, bits, density, upper, feature = volume.table, volume.bricks, volume.bits, volume.density, volume.upper, volume.feature
     most = F(space.resolution) - F(1e-3)
     lx, ly, lz = -1, -1, -1
     slot = -1
@@ -157,7 +157,7 @@ def march_ray(
         if n1 > ONE:
             q = (extent - shell / n1) / n1
         p1x, p1y, p1z = yx * q + extent, yy * q + extent, yz * q + extent
-        gap = brick_distance(volume.bricks, HALF * (p0x + p1x), HALF * (p0y + p1y), HALF * (p0z + p1z), per_brick)
+        gap = brick_distance(bricks, HALF * (p0x + p1x), HALF * (p0y + p1y), HALF * (p0z + p1z), per_brick)
         if gap > 1:
             # What is `gap` bricks away cannot be next to the middle of any of the following gap - 2 steps.
             known = gap == 2
@@ -193,11 +193,13 @@ def march_ray(
                         slot = table[tz, ty, tx]
                 if slot < 0:
                     continue
-                if (volume.bits[slot, k & 7] >> np.uint64((j & 7) * 8 + (i & 7))) & np.uint64(1) == 0:
+                if (bits[np.uintp(slot), np.uintp(k & 7)] >> np.uint64((j & 7) * 8 + (i & 7))) & np.uint64(1) == 0:
                     continue
                 cell = slot * 512 + ((k & 7) * 8 + (j & 7)) * 8 + (i & 7)
+                if marking:
+                    prefetch(marks, np.int64(cell))
                 fx, fy, fz = x - F(i), y - F(j), z - F(k)
-                raw = raw_density(volume, cell, fx, fy, fz)
+                raw = raw_density(density, upper, cell, fx, fy, fz)
                 tau = math.exp(min(raw, RAW_MAX)) * UNITS * length
                 looked += 1
                 depth += tau
@@ -215,14 +217,14 @@ def march_ray(
                         strongest, strongest_cell = weight, cell
                 if weight > threshold and kept < cells.shape[0]:
                     cells[kept] = cell
-                    corner_rows_of(volume.upper, cell, all_rows, kept)
+                    corner_rows_of(upper, cell, all_rows, kept)
                     values[kept, X], values[kept, Y], values[kept, Z] = fx, fy, fz
                     values[kept, RAW], values[kept, TAU] = raw, tau
                     values[kept, WEIGHT], values[kept, AFTER] = weight, after
                     values[kept, PLACE] = (F(step_index) + where) * unit
                     values[kept, ALONG] = (s + (s1 - s) * where) * half
                     for corner in range(8):
-                        prefetch(volume.feature, np.int64(all_rows[kept, corner]))
+                        prefetch(feature, np.int64(all_rows[kept, corner]))
                     kept += 1
                 transmittance = after
                 if transmittance < stop:

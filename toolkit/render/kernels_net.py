@@ -60,7 +60,7 @@ def make_tape(net: Net) -> Tape:
     return Tape(np.zeros((SAMPLES, 8), np.int32), np.zeros((SAMPLES, K.VALUES), np.float32), *floats)
 
 
-@njit(**K.OPTIONS)
+@njit(**K.LEAF)
 def encode(width: Any, out: Any) -> None:
     """Fill out[C : 11 C] with sin and cos of 2^k π v of the features v in out[:C]; see `networks.encoding.positional`.
 
@@ -88,7 +88,7 @@ def encode(width: Any, out: Any) -> None:
             out[first_cosine + c_count * k + c] = ONE - TWO * sine * sine
 
 
-@njit(**K.OPTIONS)
+@njit(**K.LEAF)
 def rectify(values: Any, first: Any, count: Any, bias: Any) -> None:
     """values[first : first + count, :H] = max(values + bias, 0)."""
     for row in range(first, first + count):

@@ -205,7 +205,7 @@ def march_ray(
                 for corner in range(8):
                     K.prefetch(volume.feature, np.int64(rows[corner]))
                 values[K.X], values[K.Y], values[K.Z] = x - F(i), y - F(j), z - F(k)
-                values[K.RAW] = raw_density(volume, cell, x - F(i), y - F(j), z - F(k))
+                values[K.RAW] = raw_density(volume.density, volume.upper, cell, x - F(i), y - F(j), z - F(k))
                 values[K.TAU] = length
                 values[K.PLACE] = (F(step_index) + where) * unit
                 values[K.ALONG] = (s + (s1 - s) * where) * half
@@ -230,7 +230,7 @@ def march_ray(
     if marks.shape[0] > 0 and light[1] < K.SOLID:
         mark_surface(marks, strongest_cell)
     directions = np.empty(9, np.float32)
-    encode_direction(dx, dy, dz, directions)
+    encode_direction(dx, dy, dz, directions, 0)
     hidden = len(net.density)
     for i in range(first, first + kept):
         for j in range(9):

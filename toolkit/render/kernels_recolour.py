@@ -61,7 +61,7 @@ def project_back_pass(
                 K.prefetch(sums, np.int64(rows[i, corner]))
         for c in range(channels):
             given[c] /= opacity
-        encode_direction(dx, dy, dz, given[channels:])
+        encode_direction(dx, dy, dz, given, channels)
         decode(space, decoder, given, h1, h2, own)
         for k in range(3):
             slope = max(own[k] * (K.ONE - own[k]), steepest)

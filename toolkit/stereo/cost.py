@@ -20,8 +20,9 @@ NOISE = 4.0  # variance (grey levels²) below which a window holds nothing to co
 UNKNOWN = 0.5  # cost where no neighbour shows anything, which is that of no correlation
 GROUP = 16  # planes that are put into the volume at once: as many costs as a cache line holds
 MIDDLE = 128  # is taken from grey levels so that their squares keep their digits
-# What is looked up is rounded to quarters of a grey level (adding this leaves no finer digits). Sums of such values, of their squares and of
-# their products with whole ones, over a window, are exact in float32, so a window may move on by adding what comes and taking what goes.
+# What is looked up is rounded to quarters of a grey level (adding this leaves no finer digits). Sums of such values, of their squares and
+# of their products with whole ones, over a window, are exact in float32, so a window may move on by adding what comes and taking what
+# goes.
 ROUNDER = 1.5 * 2**21
 F = np.float32
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}  # exact: the same whichever way a loop becomes vectors
@@ -72,9 +73,9 @@ def between(view: GreyView, other: GreyView) -> tuple[Array, Array]:
 
 @numba.njit(**OPTIONS)
 def _places(height: int, width: int, far: Array, move: Array, inverse: Array, v: int, place: Array, share: Array, inside: Array) -> None:
-    """Where a picture of this size shows the points of row `v` with the inverse depths inverse[v]: upper left pixel, shares of its right and
-    lower neighbours, and 1 where it is in the picture, 0 elsewhere. A loop of its own, because it becomes vectors, and what is read by it
-    not."""
+    """Where a picture of this size shows the points of row `v` with the inverse depths inverse[v]: upper left pixel, shares of its right
+    and lower neighbours, and 1 where it is in the picture, 0 elsewhere. A loop of its own, because it becomes vectors, and what is read
+    by it not."""
     zero, one, least = F(0), F(1), F(1e-6)
     bottom, right = F(height - 1), F(width - 1)
     bx, by, bz = far[0, 1] * F(v) + far[0, 2], far[1, 1] * F(v) + far[1, 2], far[2, 1] * F(v) + far[2, 2]

@@ -27,7 +27,7 @@ ONE, TWO = np.uintp(1), np.uintp(2)  # places that cannot be negative need not b
 
 
 @numba.njit(**OPTIONS)
-def _begin(cost: Array, total: Array, at: Any, line: Array, own: Any, planes: int) -> float:
+def _begin(cost: Array, total: Array, at: Any, line: Array, own: Any, planes: int) -> Any:
     """The first pixel of a path; arguments and answer as in `_go_on`."""
     lowest = HIGH
     for number in range(planes):
@@ -40,7 +40,7 @@ def _begin(cost: Array, total: Array, at: Any, line: Array, own: Any, planes: in
 
 
 @numba.njit(**OPTIONS)
-def _go_on(cost: Array, total: Array, at: Any, line: Array, past: Any, own: Any, planes: int, base: Any, most: Any, small: Any) -> float:
+def _go_on(cost: Array, total: Array, at: Any, line: Array, past: Any, own: Any, planes: int, base: Any, most: Any, small: Any) -> Any:
     """One pixel further along a path; equation 13 of the paper.
 
     Args:
@@ -127,8 +127,8 @@ def _lowest(total: Array, plane: Array, margin: Array) -> None:
 
 
 def summed_paths(cost: Array, grey: Array, small: float, large: float, slants: tuple[int, ...], ways: Sequence[int] = (DOWN, UP)) -> Array:
-    """(H, W, D) float32: costs aggregated along the rows and, from row to row, along each of `slants` (`STRAIGHT` or `ALL`), there and back,
-    summed; `ways` may name one of both. Other arguments as in `smoothed_planes`."""
+    """(H, W, D) float32: costs aggregated along the rows and, from row to row, along each of `slants` (`STRAIGHT` or `ALL`), there and
+    back, summed; `ways` may name one of both. Other arguments as in `smoothed_planes`."""
     total = np.zeros(cost.size, np.float32)
     for way in ways:
         _add_paths(cost.reshape(-1), grey, way, slants, small, large, SOFT_EDGE, total)

@@ -20,7 +20,7 @@ AHEAD = 32  # candidates on their way: memory is slow, so it is asked for early,
 LOW = np.uint64(0xFFFFFFFF)
 
 
-@njit(**K.OPTIONS)
+@njit(**K.LEAF)
 def tile_of(pixels: Any, pick: Any, high: Any, wide: Any) -> Any:
     """The tile of pixel `pick`."""
     view, place = pixels.source[pick], pixels.place[pick]
@@ -43,7 +43,7 @@ def densities(error: Any, out: Any) -> None:
         out[tile] = ONE - SHARE + SHARE * ratio
 
 
-@njit(**K.OPTIONS)
+@njit(**K.LEAF)
 def _mixed(state: Any) -> Any:
     """64 bits that look random, of a counter (splitmix64)."""
     z = state

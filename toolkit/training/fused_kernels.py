@@ -58,7 +58,7 @@ class Losses(NamedTuple):
     slow_within: Any  # working units; samples nearer than this move slowly (`near`), 0: none
 
 
-@njit(**K.OPTIONS)
+@njit(**K.LEAF)
 def pixel_ray(pixels: Any, pick: Any, ray: Any) -> None:
     """Origin and unit direction of pixel `pick` into ray[0 … 5]."""
     view = np.int64(pixels.source[pick])
@@ -75,7 +75,7 @@ def pixel_ray(pixels: Any, pick: Any, ray: Any) -> None:
     ray[3], ray[4], ray[5] = dx * scale, dy * scale, dz * scale
 
 
-@njit(**K.OPTIONS)
+@njit(**K.LEAF)
 def depth_pull(along: Any, distance: Any, noise: Any) -> Any:
     """`depth.depth_gradient` of one sample."""
     if distance <= ZERO:
@@ -83,14 +83,14 @@ def depth_pull(along: Any, distance: Any, noise: Any) -> Any:
     return min(max(abs(along - distance) / distance - noise, ZERO) / REACH, ONE) - ONE
 
 
-@njit(**K.OPTIONS)
+@njit(**K.LEAF)
 def slow_near(along: Any, within: Any) -> Any:
     """`near.slowness` of one sample."""
     share = max(along, ZERO) / within if along < within and within > ZERO else ONE  # a sample may lie behind its camera
     return share * share
 
 
-@njit(**K.OPTIONS)
+@njit(**K.LEAF)
 def _decoder_backward(space: Any, decoder: Any, h1: Any, h2: Any, g_logit: Any, g1: Any, g2: Any, g_given: Any) -> None:
     """Back through `kernels.decode`, from logits (3,) to hidden layers and to the features g_given[:C].
 
@@ -148,6 +148,14 @@ def gradient_pass(
     g_weight = np.empty(most, np.float32)
     g_given = np.empty(channels, np.float32)
     colour, result, ray = np.empty(3, np.float32), np.empty(4, np.float32), np.empty(6, np.float32)
+    # A row of an array is never taken as an array of its own inside the loops, nor an array out of its tuple: each is counted, by an atomic
+    # operation. So a ray's own rows lie here, and are put where they belong at its end.
+    inputs, hidden = len(space.inputs), len(space.hidden)
+    given, g_logit = np.zeros(inputs, np.float32), np.empty(3, np.float32)
+    h1, h2 = np.empty(hidden, np.float32), np.empty(hidden, np.float32)
+    g1, g2 = np.empty(hidden, np.float32), np.empty(hidden, np.float32)
+    all_given, all_h1, all_h2, all_g1, all_g2 = gradients.given, gradients.h1, gradients.h2, gradients.g1, gradients.g2
+    all_g_logit, feature, truth, distances = gradients.g_logit, volume.feature, pixels.colour, pixels.distance
     touched, density_sums, feature_sums = gradients.touched, gradients.density, gradients.feature
     column = thread + 1
     zero_row = volume.density.shape[0] - 1
@@ -178,14 +186,12 @@ def gradient_pass(
         looked += int(result[2])
         if met.shape[0] > 0:
             met[number, 0], met[number, 1] = result[0], result[2] + WALK_WORK * result[3]
-        given, h1, h2 = gradients.given[number], gradients.h1[number], gradients.h2[number]
-        g1, g2, g_logit = gradients.g1[number], gradients.g2[number], gradients.g_logit[number]
         # composite the features
         for c in range(channels):
             given[c] = ZERO
         opacity = ZERO
         for i in range(kept):
-            gather_row(space.width, volume.feature, rows, values, weights, features, i)
+            gather_row(space.width, feature, rows, values, weights, features, i)
             for corner in range(8):
                 K.prefetch(index, np.int64(rows[i, corner]))
             weight = values[i, K.WEIGHT]
@@ -195,14 +201,14 @@ def gradient_pass(
         scale = ONE / max(opacity, F(1e-6))
         for c in range(channels):
             given[c] *= scale
-        encode_direction(ray[3], ray[4], ray[5], given[channels:])
+        encode_direction(ray[3], ray[4], ray[5], given, channels)
         decode(space, decoder, given, h1, h2, colour)
         # loss: mean over rays and channels of the squared error
         share = shares[number]
         g_opacity = -(ONE - opacity) * (TWO * losses.opacity * share)
         own_error = ZERO
         for k in range(3):
-            residual = opacity * colour[k] + (ONE - opacity) * background[k] - F(pixels.colour[pick, k]) * F(1 / 255)
+            residual = opacity * colour[k] + (ONE - opacity) * background[k] - F(truth[pick, k]) * F(1 / 255)
             own_error += residual * residual * K.THIRD
             g_mixed = residual * (TWO * K.THIRD * share)
             g_opacity += g_mixed * (colour[k] - background[k])
@@ -211,6 +217,12 @@ def gradient_pass(
         if met.shape[0] > 0:
             met[number, 2] = own_error
         _decoder_backward(space, decoder, h1, h2, g_logit, g1, g2, g_given)
+        for c in range(inputs):
+            all_given[number, c] = given[c]
+        for j in range(hidden):
+            all_h1[number, j], all_h2[number, j], all_g1[number, j], all_g2[number, j] = h1[j], h2[j], g1[j], g2[j]
+        for k in range(3):
+            all_g_logit[number, k] = g_logit[k]
         if kept == 0:
             continue
         # ∂L/∂w: mean = Σ w f / A and A = Σ w
@@ -224,7 +236,7 @@ def gradient_pass(
             total += values[i, K.WEIGHT]
             total_place += values[i, K.WEIGHT] * values[i, K.PLACE]
         distortion, depth_loss = losses.distortion * share, losses.depth * share
-        distance = pixels.distance[pick] if pixels.distance.shape[0] > 0 else ZERO
+        distance = distances[pick] if distances.shape[0] > 0 else ZERO
         before, before_place = ZERO, ZERO
         for i in range(kept):
             g = constant + depth_loss * depth_pull(values[i, K.ALONG], distance, losses.depth_noise)
@@ -269,7 +281,7 @@ def gradient_pass(
     return used, error, looked
 
 
-@njit(**K.OPTIONS)
+@njit(**K.LEAF)
 def add_products(columns: Any, inputs: Any, gradients: Any, weight: Any, bias: Any) -> None:
     """Gradients of a layer: inputs (B, I)ᵀ @ gradients (B, O) into weight (I, O), and the sums of `gradients` into bias (O,).
 

@@ -21,7 +21,7 @@ KEEP = F(KEEP_)
 AHEAD = 8  # pixels for which memory is asked before they are needed
 
 
-@njit(**K.OPTIONS)
+@njit(**K.LEAF)
 def _spread_bits(value: Any) -> Any:
     """10 bits → every third bit."""
     v = np.uint32(value)
