@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from toolkit.capture.types import Capture, Views
     from toolkit.poses.result import PoseResult
     from toolkit.poses.scene import Scene
+    from toolkit.progress import Progress
     from toolkit.render.field import Field
     from toolkit.stereo.match import StereoDepth
     from toolkit.tsdf.fuse import Points
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 SMALL_PART = 0.002  # components of a mesh with less than this share of its area are specks
 MOST_TRIANGLES = 2_000_000
 MESHES = ("ply", "obj", "glb")
+TEXTURE = "texture"
+TEXTURED_TRIANGLES = 80_000  # detail is in the texture
+TEXEL_BYTES = 40  # while a texture is made and packed
 MESH_SIDE = 400  # pixels; finer depth than this adds little to a mesh and much to the time
 VIDEO_SIDE = 640
 FPS = 30
@@ -117,7 +121,7 @@ def export_field(
     formats = set(job.settings.export.formats)
     facts: dict[str, Any] = {"mesh": None}
     written: list[Path] = []
-    if formats & {"points", *MESHES}:
+    if formats & {"points", *MESHES, TEXTURE}:
         try:
             facts["mesh"], written = export_surface(job, folder, formats, field, scene, views)
         except InputError as error:
@@ -169,12 +173,30 @@ def export_surface(
     )
     input_from_working = scene.working_from_input.inverse()
     written = [put_points(folder / "points.ply", volume.points(), input_from_working)] if "points" in formats else []
-    mesh = volume.mesh().cleaned(min_area_share=SMALL_PART).decimated(MOST_TRIANGLES).transformed(input_from_working)
+    whole = volume.mesh().cleaned(min_area_share=SMALL_PART)
+    if TEXTURE in formats:
+        written.append(put_textured(folder / "textured.glb", whole, shown, scene, job.progress))
+    mesh = whole.decimated(MOST_TRIANGLES).transformed(input_from_working)
     facts = mesh_facts(mesh)
     for path in [job.folder / "mesh.ply", *(folder / f"mesh.{suffix}" for suffix in MESHES if suffix in formats)]:
         write_mesh(path, mesh)
         written.append(path)
     return facts, written
+
+
+def put_textured(path: Path, mesh: Mesh, shown: Views, scene: Scene, progress: Progress) -> Path:
+    """A coarser mesh (working frame) with a texture of the pictures `shown`, in the input's frame."""
+    from toolkit import memory
+    from toolkit.export.mesh import write_textured
+    from toolkit.export.texture import LARGEST, textured
+
+    largest = LARGEST
+    while largest > 1024 and TEXEL_BYTES * largest**2 > memory.bounded(TEXEL_BYTES * LARGEST**2):
+        largest //= 2
+    thin = mesh.decimated(TEXTURED_TRIANGLES)
+    atlas, texture = textured(thin, shown.images, shown.intrinsics, shown.world_from_camera, largest, progress)
+    write_textured(path, thin, atlas, texture, scene.working_from_input)
+    return path
 
 
 def at_most(lens: Intrinsics, long_side: int) -> Intrinsics:

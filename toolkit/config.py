@@ -100,9 +100,12 @@ class TsdfSettings:
     depth_max: float | None = None  # working units; None: from the capture's depth
 
 
+EXPORTS = ("points", "ply", "obj", "glb", "texture", "cameras", "video")
+
+
 @dataclass
 class ExportSettings:
-    formats: list[str] = default(default_factory=lambda: ["points", "ply", "obj", "glb", "cameras", "video"])
+    formats: list[str] = default(default_factory=lambda: list(EXPORTS))
     mesh_views: int = 60  # views whose rendered depth is fused into the mesh
     video_frames: int = 90
 
@@ -301,12 +304,16 @@ def _check_ranges(settings: Settings) -> None:
     for name, value in positive.items():
         if value is not None and not 0 < value < 1e9:
             raise InputError(f"{name} is {value:g}; it must be a positive number")
-    for key, names in (("effects.on", settings.effects.on), ("effects.off", settings.effects.off)):
-        for effect in names:
-            if effect not in EFFECTS:
-                near = difflib.get_close_matches(effect, EFFECTS, n=1)
+    for key, names, kind, known in (
+        ("effects.on", settings.effects.on, "effect", EFFECTS),
+        ("effects.off", settings.effects.off, "effect", EFFECTS),
+        ("export.formats", settings.export.formats, "format", EXPORTS),
+    ):
+        for name in names:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
                 hint = f" (did you mean {near[0]!r}?)" if near else ""
-                raise InputError(f"{key}: there is no effect {effect!r}{hint}; known are {', '.join(EFFECTS)}")
+                raise InputError(f"{key}: there is no {kind} {name!r}{hint}; known are {', '.join(known)}")
     both = sorted(set(settings.effects.on) & set(settings.effects.off))
     if both:
         raise InputError(f"effects.on and effects.off both name {both[0]!r}; it can be in one of them")

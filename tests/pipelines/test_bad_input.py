@@ -278,6 +278,12 @@ def test_damaged_run_json(tmp_path: Path, capsys: Capsys) -> None:
     assert "run.json is damaged" in answer.sentence()
 
 
+def test_an_unknown_format(tmp_path: Path, capsys: Capsys) -> None:
+    answer = call(capsys, "export", tmp_path, "--formats", "ply,textur")
+    assert answer.code == 2
+    assert answer.sentence().endswith("there is no format 'textur' (did you mean 'texture'?); known are points, ply, obj, glb, texture, cameras, video")
+
+
 @pytest.mark.parametrize("limit", [4096, 30_000, 200_000])
 def test_full_disk(limit: int, tmp_path: Path) -> None:
     """No file may grow beyond the limit, as on a disk that is full: which file it is differs with the limit."""

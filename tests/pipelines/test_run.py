@@ -58,7 +58,7 @@ def test_surface_lies_on_the_walls_in_the_input_frame(done: Path) -> None:
 
 
 def test_exports_are_there_and_open(done: Path) -> None:
-    for name in ("points.ply", "mesh.ply", "mesh.obj", "mesh.glb"):
+    for name in ("points.ply", "mesh.ply", "mesh.obj", "mesh.glb", "textured.glb"):
         loaded = trimesh.load(done / "exports" / name)
         points = loaded.to_geometry().vertices if isinstance(loaded, trimesh.Scene) else loaded.vertices
         assert len(points) > 50, name

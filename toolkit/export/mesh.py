@@ -1,21 +1,27 @@
-"""Meshes as PLY, OBJ or GLB with vertex colours, in the input's frame; and facts about a mesh."""
+"""Meshes as PLY, OBJ or GLB with vertex colours, or as GLB with a texture, in the input's frame; and facts about a mesh."""
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from toolkit.camera import Array, Similarity
 from toolkit.errors import InputError
+from toolkit.export.atlas import Atlas
 from toolkit.export.ply import single_precision, write_ply
 from toolkit.files import atomic_path
 from toolkit.tsdf.mesh import Mesh
 
 FORMATS = (".ply", ".obj", ".glb")
+JPEG_QUALITY = 95
 ROWS_AT_ONCE = 100_000
 
 
@@ -42,6 +48,48 @@ def write_mesh(path: Path | str, mesh: Mesh, working_from_input: Similarity | No
         _write_obj(path, mesh)
     else:
         _write_glb(path, mesh)
+
+
+def write_textured(path: Path | str, mesh: Mesh, atlas: Atlas, texture: Array, working_from_input: Similarity | None = None) -> None:
+    """Write a mesh with its texture (S, S, 3) uint8 as one .glb file; frames and axes as in `write_mesh`.
+
+    What is lit is in the pictures already, so the material is marked as one that takes no light (KHR_materials_unlit).
+
+    Raises:
+        InputError: an empty mesh.
+        OutputError: the file cannot be written.
+    """
+    path = Path(path)
+    if len(mesh.triangles) == 0:
+        raise InputError(f"the mesh has no triangles, which {path.name} cannot hold; check the depth it was made from")
+    if working_from_input is not None:
+        mesh = mesh.transformed(working_from_input.inverse())
+    offset = np.zeros(3) if single_precision(mesh.vertices) else mesh.bounds().mean(axis=0)
+    packed = io.BytesIO()
+    # Neighbouring triangles of the texture need not be neighbours in space, so colours are kept for each texel, not for four of them.
+    Image.fromarray(texture).save(packed, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
+    material = PBRMaterial(baseColorTexture=Image.open(packed), metallicFactor=0.0, roughnessFactor=1.0)
+    visual = TextureVisuals(uv=atlas.coordinates().reshape(-1, 2), material=material)
+    # Each triangle has a place of its own in the texture, so it has vertices of its own.
+    vertices = (mesh.vertices - offset)[mesh.triangles].reshape(-1, 3)
+    triangles = np.arange(len(vertices)).reshape(-1, 3)
+    solid = trimesh.Trimesh(vertices, triangles, visual=visual, process=False)
+
+    def put_picture(buffers: dict[Any, bytes], tree: dict[str, Any]) -> None:
+        """In place of what trimesh makes of the picture, which it packs again, worse."""
+        data = packed.getvalue()
+        buffers[list(buffers)[tree["images"][0]["bufferView"]]] = data + bytes(-len(data) % 4)
+
+    data = _as_glb(solid, offset, include_normals=False, buffer_postprocessor=put_picture, tree_postprocessor=_unlit)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def _unlit(tree: dict[str, Any]) -> None:
+    """Mark the materials of a glTF file as such that show their texture whatever the light."""
+    for material in tree["materials"]:
+        material["extensions"] = {"KHR_materials_unlit": {}}
+    tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", []), "KHR_materials_unlit"})
 
 
 def mesh_facts(mesh: Mesh) -> dict[str, Any]:
@@ -90,10 +138,15 @@ def _write_glb(path: Path, mesh: Mesh) -> None:
         raise InputError(f"the mesh has no triangles, which {path.name} cannot hold; write it as .ply or check the depth it was made from")
     # glTF positions are float32: a model far from its origin keeps its place in the node, whose matrix is written in full.
     offset = np.zeros(3) if single_precision(mesh.vertices) else mesh.bounds().mean(axis=0)
+    data = _as_glb(to_trimesh(mesh, offset), offset, include_normals=mesh.normals is not None)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def _as_glb(mesh: trimesh.Trimesh, offset: Array, **options: Any) -> bytes:
+    """A file of one mesh in a node that moves it by `offset`."""
     node = np.eye(4)
     node[:3, 3] = offset
     scene = trimesh.Scene()
-    scene.add_geometry(to_trimesh(mesh, offset), node_name="mesh", geom_name="mesh", transform=node)
-    data = scene.export(file_type="glb", include_normals=mesh.normals is not None)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
+    scene.add_geometry(mesh, node_name="mesh", geom_name="mesh", transform=node)
+    return bytes(scene.export(file_type="glb", **options))
