@@ -194,7 +194,8 @@ def put_textured(path: Path, mesh: Mesh, shown: Views, scene: Scene, progress: P
     while largest > 1024 and TEXEL_BYTES * largest**2 > memory.bounded(TEXEL_BYTES * LARGEST**2):
         largest //= 2
     thin = mesh.decimated(TEXTURED_TRIANGLES)
-    atlas, texture = textured(thin, shown.images, shown.intrinsics, shown.world_from_camera, largest, progress)
+    cameras = (shown.intrinsics, shown.world_from_camera, shown.valid, shown.weight)
+    atlas, texture = textured(thin, shown.images, *cameras, largest=largest, progress=progress)
     write_textured(path, thin, atlas, texture, scene.working_from_input)
     return path
 

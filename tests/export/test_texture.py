@@ -50,6 +50,11 @@ def texels(atlas: Atlas, index: int) -> set[tuple[int, int]]:
     return {(row + way * j, column + way * i) for j in range(reach + 1) for i in range(reach + 1 - j)}
 
 
+def painted_texels(texture: Array, atlas: Atlas, indices: Array) -> Array:
+    """(N, 3) float the texels of some triangles."""
+    return np.concatenate([texture[tuple(np.array(sorted(texels(atlas, int(index)))).T)] for index in indices]).astype(float)
+
+
 def looked_up(texture: Array, atlas: Atlas, shares: Array) -> Array:
     """(T, 3) colours of the texture at one place of each triangle, by its shares (3,) of the vertices."""
     place = np.einsum("tki,k->ti", atlas.coordinates(), shares)
@@ -107,7 +112,7 @@ def test_colours_are_the_vertices_in_the_large_and_the_pictures_in_the_small() -
     mesh = replace(board(), colours=np.full((169, 3), 100, np.uint8))
     atlas, texture = textured(mesh, [dots], [CAMERA], FRONT)
     whole = (picture_weights(mesh, [CAMERA], FRONT)[mesh.triangles, 0] > 0).all(axis=1)
-    seen = np.concatenate([texture[tuple(np.array(sorted(texels(atlas, index))).T)] for index in np.flatnonzero(whole)]).astype(float)
+    seen = painted_texels(texture, atlas, np.flatnonzero(whole))
     assert seen.mean() == pytest.approx(100, abs=6)
     assert seen.std() > 30
 
@@ -145,6 +150,23 @@ def test_what_is_hidden_is_not_painted_on_what_is_behind() -> None:
     assert own[(np.abs(front.vertices[:, :2]) < 0.2).all(axis=1)].min() > 0
     away = look_at(np.array([[0.0, 0.0, -3.0]]), np.zeros(3), np.array([0.0, 1, 0]))
     assert (picture_weights(both, [CAMERA], away)[:, 0] == 0).all()  # from behind nothing is seen
+
+
+def test_what_is_masked_is_not_looked_at_and_blurred_pictures_count_less() -> None:
+    mesh = replace(board(), colours=np.full((169, 3), 50, np.uint8))
+    left = np.arange(96)[None] < 48 + np.zeros((72, 1), int)
+    weight = picture_weights(mesh, [CAMERA], FRONT, [left])[:, 0]
+    place, _ = project(CAMERA, FRONT[0], mesh.vertices)
+    assert (weight[place[:, 0] > 48] == 0).all() and weight[(place[:, 0] > 20) & (place[:, 0] < 40)].max() > 0
+    # The same camera twice, once blurred (all grey): lines stay lines.
+    lines = np.where(np.arange(96)[None, :, None] // 2 % 2 > 0, np.uint8(100), np.uint8(0)) + np.zeros((72, 1, 3), np.uint8)
+    blurred = np.full((72, 96, 3), 50, np.uint8)
+    poses = np.concatenate([FRONT, FRONT])
+    spread = []
+    for worth in ((1.0, 1.0), (1.0, 0.05)):
+        atlas, texture = textured(mesh, [lines, blurred], [CAMERA] * 2, poses, worth=worth)
+        spread.append(painted_texels(texture, atlas, np.arange(len(mesh.triangles))).std())
+    assert spread[1] > 1.5 * spread[0]
 
 
 def test_the_best_pictures_count() -> None:

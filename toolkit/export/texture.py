@@ -41,6 +41,8 @@ def textured(
     images: Sequence[Array],
     intrinsics: Sequence[Intrinsics],
     world_from_camera: Array,
+    valid: Sequence[Array | None] = (),
+    worth: Sequence[float] = (),
     largest: int = LARGEST,
     progress: Progress = SILENT,
 ) -> tuple[Atlas, Array]:
@@ -52,13 +54,17 @@ def textured(
         mesh: in the frame of the cameras.
         images: (H, W, 3) uint8 RGB; intrinsics: pinhole, of the same sizes.
         world_from_camera: (N, 4, 4).
+        valid: (H, W) bool pixels that may be looked at, None: all; empty: all of all pictures.
+        worth: what a picture counts beside the others, as a blurred one counts less; empty: 1.
         largest: texels along the texture at most.
 
     Raises:
         InputError: the mesh has too many triangles for such a texture.
         Interrupted: the user asked to stop.
     """
-    weights = picture_weights(mesh, intrinsics, world_from_camera, progress)
+    weights = picture_weights(mesh, intrinsics, world_from_camera, valid, progress)
+    if len(worth):
+        weights *= np.asarray(worth, np.float32)
     resolution = weights.max(axis=1, initial=0.0)[mesh.triangles].max(axis=1, initial=0.0) ** (1 / SHARP)
     atlas = make_atlas(mesh, _quantile(resolution, mesh.areas(), FINE_SHARE), largest)
     return atlas, bake_texture(mesh, atlas, strongest(weights), images, intrinsics, world_from_camera, progress)
@@ -92,7 +98,13 @@ def bake_texture(
     return np.round(np.clip(texture, 0, 255)).astype(np.uint8)
 
 
-def picture_weights(mesh: Mesh, intrinsics: Sequence[Intrinsics], world_from_camera: Array, progress: Progress = SILENT) -> Array:
+def picture_weights(
+    mesh: Mesh,
+    intrinsics: Sequence[Intrinsics],
+    world_from_camera: Array,
+    valid: Sequence[Array | None] = (),
+    progress: Progress = SILENT,
+) -> Array:
     """(V, N) float32 how well each picture shows each vertex: the power `SHARP` of its pixels per unit of length there, less towards what
     hides something; 0: not at all."""
     scene = o3d.t.geometry.RaycastingScene()
@@ -103,7 +115,7 @@ def picture_weights(mesh: Mesh, intrinsics: Sequence[Intrinsics], world_from_cam
         progress.check()
         factor = min(1.0, SIDE / max(camera.width, camera.height))
         small = camera.scaled(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
-        depth, open_ = _shown(scene, small, pose)
+        depth, open_ = _shown(scene, small, pose, valid[index] if len(valid) else None)
         local = (mesh.vertices - pose[:3, 3]) @ pose[:3, :3]
         z = np.maximum(local[:, 2], 1e-9)
         u, v = local[:, 0] / z * small.fx + small.cx, local[:, 1] / z * small.fy + small.cy
@@ -140,14 +152,17 @@ def _quantile(values: Array, weights: Array, share: float) -> float:
     return float(values[order][np.searchsorted(below, share * below[-1])]) if len(values) else 0.0
 
 
-def _shown(scene: Any, camera: Intrinsics, pose: Array) -> tuple[Array, Array]:
-    """(H, W) depth of what a camera sees of the scene, and (H, W) 0 … 1 how far each pixel is from a step in it and from the border."""
+def _shown(scene: Any, camera: Intrinsics, pose: Array, valid: Array | None) -> tuple[Array, Array]:
+    """(H, W) depth of what a camera sees of the scene, and (H, W) 0 … 1 how far each pixel is from a step in it, from what is not to be
+    looked at, and from the border."""
     rays = scene.create_rays_pinhole(camera.matrix(), invert(pose), camera.width, camera.height)
     depth = scene.cast_rays(rays)["t_hit"].numpy()  # rays of length 1 along z: distances are depths
     known = np.where(np.isfinite(depth), depth, np.float32(1e9))
     window = np.ones((3, 3), np.uint8)
-    step = cv2.dilate(known, window) - cv2.erode(known, window) > STEP * known
-    whole = np.pad((~step).astype(np.uint8), 1)  # the border is an edge, too
+    even = cv2.dilate(known, window) - cv2.erode(known, window) <= STEP * known
+    if valid is not None:
+        even &= cv2.resize(valid.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA) > 0.999
+    whole = np.pad(even.astype(np.uint8), 1)  # the border is an edge, too
     away = cv2.distanceTransform(whole, cv2.DIST_L2, 3)[1:-1, 1:-1]
     return known, np.clip(away / FADE, 0, 1)
 
