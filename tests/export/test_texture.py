@@ -17,7 +17,8 @@ from toolkit.camera import Array, Intrinsics, project
 from toolkit.errors import InputError
 from toolkit.export.atlas import GUTTER, Atlas, make_atlas
 from toolkit.export.mesh import write_textured
-from toolkit.export.texture import picture_weights, strongest, textured
+from toolkit.export.sighted import picture_weights, strongest
+from toolkit.export.texture import textured
 from toolkit.render.paths import look_at
 from toolkit.tsdf.mesh import Mesh
 
