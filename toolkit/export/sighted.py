@@ -1,7 +1,7 @@
 """How well pictures see the vertices of a mesh.
 
-Pictures are weighed by angle, resolution, and distance from their border and from what hides something behind it; of each vertex the three
-best count, less what the fourth would, so that weights fade to zero where pictures take over from each other. Between vertices weights are
+Pictures are weighed by angle, resolution, and distance from their border and from what hides something behind it; of each vertex the four
+best count, less what the fifth would, so that weights fade to zero where pictures take over from each other. Between vertices weights are
 interpolated like anything else.
 """
 
@@ -18,12 +18,12 @@ from toolkit.camera import Array, Intrinsics, invert
 from toolkit.progress import SILENT, Progress
 from toolkit.tsdf.mesh import Mesh
 
-BEST = 3  # pictures of a vertex
+BEST = 4  # pictures of a vertex
 SIDE = 320  # pixels along the depth maps that tell what is hidden
 BEHIND = 0.02  # of the depth: what lies so far behind what a picture shows is hidden
 STEP = 0.05  # of the depth: a larger step between neighbours hides something
-FADE = 4.0  # pixels of these maps over which a picture fades out towards such a step, and towards its border
-SHARP = 4.0  # exponent of a picture's resolution on the surface: the best one counts for most
+FADE = 8.0  # pixels of these maps over which a picture fades out towards such a step, and towards its border
+SHARP = 2.0  # exponent of a picture's resolution on the surface: the better ones count for more
 ALIKE = 1e-4  # of the weights: smaller differences between the best pictures do not tell which are better
 
 

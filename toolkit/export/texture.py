@@ -19,7 +19,7 @@ from toolkit.tsdf.mesh import Mesh
 
 LARGEST = 4096  # texels along a texture
 FINE_SHARE = 0.75  # of the surface that has texels as small as its pixels; a little that is seen from very near does not decide for all
-EVENED = 20  # rounds of even mixing with the neighbours: differences in colour over less than some five triangles are the pictures' own
+EVENED = 8  # rounds of even mixing with the neighbours: differences in colour over less than some three triangles are the pictures' own
 
 
 def textured(
