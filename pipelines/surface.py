@@ -174,13 +174,13 @@ def export_surface(
     input_from_working = scene.working_from_input.inverse()
     written = [put_points(folder / "points.ply", volume.points(), input_from_working)] if "points" in formats else []
     whole = volume.mesh().cleaned(min_area_share=SMALL_PART)
-    if TEXTURE in formats:
-        written.append(put_textured(folder / "textured.glb", whole, shown, scene, job.progress))
     mesh = whole.decimated(MOST_TRIANGLES).transformed(input_from_working)
     facts = mesh_facts(mesh)
     for path in [job.folder / "mesh.ply", *(folder / f"mesh.{suffix}" for suffix in MESHES if suffix in formats)]:
         write_mesh(path, mesh)
         written.append(path)
+    if TEXTURE in formats:
+        written.append(put_textured(folder / "textured.glb", whole, shown, scene, job.progress))
     return facts, written
 
 

@@ -100,6 +100,7 @@ class TsdfSettings:
     depth_max: float | None = None  # working units; None: from the capture's depth
 
 
+# Files for other programs: "texture" is a mesh with one (textured.glb), the others are named as they end, or as what they hold.
 EXPORTS = ("points", "ply", "obj", "glb", "texture", "cameras", "video")
 
 

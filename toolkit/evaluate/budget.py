@@ -178,9 +178,7 @@ def mesh_work(work: Work, choice: Choice, texture: bool = False) -> tuple[float,
     return MESH_FIXED + MESH_TRIANGLES * megapixels + (TEXTURE if texture else 0.0), MESH_DEPTH * megapixels
 
 
-def most_export_seconds(
-    speed: Speed, work: Work, choice: Choice, mesh_views: int, video_frames: int, texture: bool = False
-) -> float:
+def most_export_seconds(speed: Speed, work: Work, choice: Choice, mesh_views: int, video_frames: int, texture: bool = False) -> float:
     """What exports take when nothing of them is left out: more than that they cannot use."""
     once, each = mesh_work(work, choice, texture)
     video = video_rays(work, replace(choice, video_frames=video_frames)) * EXPORT_RAY * speed.seconds("render", 1.0)
