@@ -189,6 +189,10 @@ def test_a_step_moves_rows_as_the_reference_does() -> None:
             a = reference.step(pool.take(picks), rates, torch.Generator())
         b = fused.step_on(picks.numpy(), np.zeros(400, np.float32), rates)
         assert b[0] == pytest.approx(a[0], rel=2e-4)
+        if number == 0:  # no row has moved yet, so every voxel was seen alike
+            seen = reference.seen > 0.01
+            assert bool(seen.any())
+            torch.testing.assert_close(fused.seen[seen], reference.seen[seen], atol=1e-2, rtol=0)
     moved = (fields[0].feature_rows - before).abs() > 1e-3
     assert float(moved.float().mean()) > 0.01
     for name in ("feature_rows", "density_rows"):
@@ -199,8 +203,8 @@ def test_a_step_moves_rows_as_the_reference_does() -> None:
         torch.testing.assert_close(a_weight, b_weight, atol=5e-4, rtol=1e-3)
     seen = reference.seen > 0.01
     assert bool(seen.any())
-    # The last step looks at rows of which, as above, a few went the other way; how many depends on the processor's rounding.
-    assert float(((fused.seen - reference.seen)[seen].abs() < 1e-2).float().mean()) > 0.99
+    # Later steps look at rows of which, as above, a few went the other way; how many depends on the processor's rounding.
+    assert float(((fused.seen - reference.seen)[seen].abs() < 1e-2).float().mean()) > 0.995
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -27,7 +27,7 @@ F = np.float32
 MATHS = {"contract", "reassoc", "nsz", "arcp", "afn"}
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": MATHS, "error_model": "numpy", "boundscheck": False}
 # Of functions that make no arrays of their own, called for each ray or sample: without this every array among their arguments, also those
-# in tuples, is counted by an atomic operation when they begin and when they end, which was a tenth of a training step.
+# in tuples, is counted by an atomic operation when they begin and when they end: a tenth of a profile of the training step.
 LEAF: dict[str, Any] = {**OPTIONS, **({"_nrt": False} if hasattr(DefaultOptions, "_nrt") else {})}
 
 ZERO, HALF, ONE, TWO = F(0), F(0.5), F(1), F(2)
