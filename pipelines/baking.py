@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from toolkit.render.field import Field
 
 SEEN = 0.01  # see `fieldfuse bake --seen`
+FLIGHT = 90  # cameras along a page's flight
 
 
 def default_place(job: Job) -> Path:
@@ -27,12 +28,23 @@ def write(job: Job, field: Field, views: Views, scene: Scene, seen: float, place
         InputError: a decoder that cannot be baked.
         OutputError: the file cannot be written.
     """
+    from toolkit.render.bake_file import read_baked, write_baked
+
+    write_baked(place, baked(job, field, views, seen), scene.working_from_input)
+    return read_baked(place)
+
+
+def baked(job: Job, field: Field, views: Views, seen: float = SEEN) -> BakedField:
+    """Bake `field` (on the CPU) in memory.
+
+    Raises:
+        InputError: a decoder that cannot be baked.
+    """
     import numpy as np
     import torch
 
     from pipelines.room import require_baking
     from toolkit.render.bake import bake as quantise
-    from toolkit.render.bake_file import read_baked, write_baked
     from toolkit.render.bake_views import seen_voxels
 
     require_baking(field)
@@ -40,8 +52,24 @@ def write(job: Job, field: Field, views: Views, scene: Scene, seen: float, place
     if seen > 0:
         lenses = [views.intrinsics[i] for i in train]
         keep = seen_voxels(field, lenses, views.world_from_camera[train], seen, torch.get_num_threads(), job.progress)
-    write_baked(place, quantise(field, keep), scene.working_from_input)
-    return read_baked(place)
+    return quantise(field, keep)
+
+
+def put_page(job: Job, path: Path, field: Field, views: Views, scene: Scene) -> Path:
+    """The baked field as a page that any browser walks through, with all photos and an orbit.
+
+    Raises:
+        InputError: a decoder that cannot be baked, or is too wide for a page.
+        OutputError: the file cannot be written.
+    """
+    from pipelines.pictures import orbit_cameras
+    from toolkit.export.page import Tour, require_page, write_page
+
+    require_page(field)
+    _, _, around = orbit_cameras(views, scene, FLIGHT)
+    cameras = (views.names, views.intrinsics, views.world_from_camera, views.test)
+    write_page(path, baked(job, field.to("cpu"), views), Tour(*cameras, around, scene.median_depth), job.source.name)
+    return path
 
 
 def baked_of(job: Job, field: Field, views: Views, scene: Scene) -> BakedField:

@@ -13,7 +13,7 @@ def export(
     target: Target,
     out: OptionalOut = None,
     formats: Annotated[
-        str | None, typer.Option(help="Comma-separated part of points,ply,obj,glb,texture,cameras,video.", show_default=False)
+        str | None, typer.Option(help="Comma-separated part of points,ply,obj,glb,texture,page,cameras,video.", show_default=False)
     ] = None,
     threads: Threads = None,
     config: Config = None,

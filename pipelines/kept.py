@@ -41,7 +41,7 @@ FEW_VIEWS = {
     "*": ANY
 }  # fmt: skip
 MEASURED_POINT = {"key": TEXT, "crashed": FLAG, "wall_seconds": NUMBER, "rows": [POINT]}
-EXPORT_FACTS = {"mesh": (None, MESH), "?note": TEXT}
+EXPORT_FACTS = {"mesh": (None, MESH), "notes": [TEXT]}
 TIMELINE = [{"seconds": NUMBER, "psnr": (None, NUMBER), "*": (None, NUMBER, TEXT)}]
 NOTES = [TEXT]
 MATCHED = {"views": NUMBER, "pixels": NUMBER, "share": NUMBER, "?bare": NUMBER, "seconds": NUMBER}

@@ -33,7 +33,7 @@ MATCHED = (
     " knew a depth for {percent:.0f}% of their pixels{bare}."
 )
 BARE = " ({percent:.0f}% are bare and lie on planes that go on from beside them)"
-OPENED = {".ply", ".obj", ".glb", ".mp4", ".txt", ".json"}
+OPENED = {".html", ".ply", ".obj", ".glb", ".mp4", ".txt", ".json"}
 NO_TEST_VIEWS = "no picture was held out, so there are no scores; give --holdout 8 to keep every 8th picture for testing"
 
 
@@ -186,7 +186,7 @@ def put_report(
     from toolkit.evaluate.pictures import method_pictures
     from toolkit.evaluate.report import report_data, write_report
 
-    notes = [export_facts["note"]] if export_facts and "note" in export_facts else []
+    notes = export_facts["notes"] if export_facts else []
     began, told = time.monotonic(), None if job.plan is None else job.plan.told(job)
     matched = None if field is None else fit_matched(job)
     data = {

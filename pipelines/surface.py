@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipelines.baking import put_page
 from pipelines.job import Job
 from pipelines.pictures import camera_of, orbit_cameras, pictures
 from pipelines.rendered import Pictures, to_picture
@@ -114,21 +115,26 @@ def export_field(
     """What the settings' `export.formats` name, in the input's frame.
 
     Returns:
-        facts (of the mesh: triangles, watertight, …; a `note` when the field has no surface), and the files written.
+        facts (of the mesh: triangles, watertight, …; `notes` on what was left out), and the files written.
     """
     from toolkit.export.video import write_video
 
     formats = set(job.settings.export.formats)
-    facts: dict[str, Any] = {"mesh": None}
+    facts: dict[str, Any] = {"mesh": None, "notes": []}
     written: list[Path] = []
     if formats & {"points", *MESHES, TEXTURE}:
         try:
             facts["mesh"], written = export_surface(job, folder, formats, field, scene, views)
         except InputError as error:
-            facts["note"] = f"points and meshes were left out: {error}"
+            facts["notes"].append(f"points and meshes were left out: {error}")
     if "cameras" in formats:
         put_cameras(folder / "cameras", poses, posed)
         written += [path for path in sorted((folder / "cameras").rglob("*")) if path.is_file()]
+    if "page" in formats:
+        try:
+            written.append(put_page(job, folder / "field.html", field, views, scene))
+        except InputError as error:
+            facts["notes"].append(f"the page to walk through was left out: {error}")
     if "video" in formats:
         _, lenses, around = orbit_cameras(views, scene, job.settings.export.video_frames)
         job.progress.update(0, len(around), "orbit video")

@@ -113,8 +113,8 @@ class TotalBudget:
             rays = model.amounts(self.work, self.choice)["render"]
             spent = job.stages.records["render"].seconds
             after = sum(self.predicted.get(stage, 0.0) for stage in ("evaluate", "report")) * self._pace(job)
-            factor, textured = self.speed.factors.get("export", 1.0), "texture" in export.formats
-            once, each = (factor * amount * self.speed.units["features"] for amount in model.mesh_work(self.work, self.choice, textured))
+            factor, amounts = self.speed.factors.get("export", 1.0), model.mesh_work(self.work, self.choice, model.extras(export.formats))
+            once, each = (factor * amount * self.speed.units["features"] for amount in amounts)
             a_ray = factor * model.EXPORT_RAY * (spent / rays if rays else self._predicted_ray())
             a_frame = a_ray * model.video_rays(self.work, replace(self.choice, video_frames=1))
             views, frames = model.exports_for(self.asked - self.elapsed() - after - once, each, a_frame)
@@ -191,10 +191,10 @@ class TotalBudget:
         assert self.speed is not None and self.work is not None and self.choice is not None
         export = job.settings.export
         video = export.video_frames if "video" in export.formats else 0
-        textured = "texture" in export.formats
-        most = model.most_export_seconds(self.speed, self.work, self.choice, export.mesh_views, video, textured)
+        extra = model.extras(export.formats)
+        most = model.most_export_seconds(self.speed, self.work, self.choice, export.mesh_views, video, extra)
         surface = bool({"points", "ply", "obj", "glb", "texture"} & set(export.formats))
-        least = min(most, model.least_export_seconds(self.speed, self.work, self.choice, textured)) if surface else 0.0
+        least = min(most, model.least_export_seconds(self.speed, self.work, self.choice, extra)) if surface else 0.0
         return max(least, min(model.EXPORT_SHARE * max(0.0, left), most))
 
     def _learn_effects(self, job: Job, real: float | None) -> None:

@@ -100,8 +100,9 @@ class TsdfSettings:
     depth_max: float | None = None  # working units; None: from the capture's depth
 
 
-# Files for other programs: "texture" is a mesh with one (textured.glb), the others are named as they end, or as what they hold.
-EXPORTS = ("points", "ply", "obj", "glb", "texture", "cameras", "video")
+# Files for other programs: "texture" is a mesh with one (textured.glb), "page" the field itself for any browser (field.html), the others
+# are named as they end, or as what they hold.
+EXPORTS = ("points", "ply", "obj", "glb", "texture", "page", "cameras", "video")
 
 
 @dataclass

@@ -63,6 +63,7 @@ def test_exports_are_there_and_open(done: Path) -> None:
         points = loaded.to_geometry().vertices if isinstance(loaded, trimesh.Scene) else loaded.vertices
         assert len(points) > 50, name
         assert np.abs(points).max() < 4, name  # metres of the input, not working units
+    assert "16 pictures" in (done / "exports" / "field.html").read_text(encoding="utf-8")
     cameras = read_json(done / "exports" / "cameras" / "transforms.json")
     assert len(cameras["frames"]) == 16
     assert (done / "exports" / "cameras" / "colmap" / "cameras.txt").is_file()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
+from toolkit.evaluate.speed_state import sphere_field
 from toolkit.networks.decoder import make_decoder
 from toolkit.render.field import Field
 from toolkit.training.levels import all_places, first_field
@@ -35,3 +38,16 @@ def random_rays(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     origins = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1) * 3
     aims = torch.randn(count, 3, generator=generator) * 0.4
     return origins, torch.nn.functional.normalize(aims - origins, dim=1)
+
+
+def coloured_field(shell: float = 0.0) -> Field:
+    """A sphere of features that change over a few voxels, as fitted ones do, with a decoder that uses direction."""
+    field = sphere_field(32)
+    row = torch.arange(len(field.feature_rows) - 1)
+    place = field.topology.keys[row // 512] * 8 + torch.stack([row & 7, (row >> 3) & 7, (row >> 6) & 7], 1)
+    wave = torch.linspace(0.05, 0.4, 16)
+    field.feature_rows[:-1] = 2 * torch.sin(place.float().sum(1, keepdim=True) * wave + torch.arange(16))
+    generator = torch.Generator().manual_seed(1)
+    for parameter in field.decoder.parameters():
+        parameter.data.add_(0.1 * torch.randn(parameter.shape, generator=generator))
+    return replace(field, space=replace(field.space, shell=shell), background=torch.tensor([0.9, 0.2, 0.4]))

@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from safetensors.numpy import load_file, save_file
 
-from tests.render.made import random_field
+from tests.render.made import coloured_field, random_field
 from toolkit.camera import Intrinsics
 from toolkit.errors import InputError
-from toolkit.evaluate.speed_state import around, lens, sphere_field
+from toolkit.evaluate.speed_state import around, lens
 from toolkit.networks.decoder import make_decoder
 from toolkit.render.bake import BakedField, bake
 from toolkit.render.bake_file import METADATA_KEY, read_baked, write_baked
@@ -24,19 +23,6 @@ from toolkit.render.field import Field
 from toolkit.render.image import render_view
 
 CAMERA, POSE = lens(40, 30), around()[1]
-
-
-def coloured_field(shell: float = 0.0) -> Field:
-    """A sphere of features that change over a few voxels, as fitted ones do, with a decoder that uses direction."""
-    field = sphere_field(32)
-    row = torch.arange(len(field.feature_rows) - 1)
-    place = field.topology.keys[row // 512] * 8 + torch.stack([row & 7, (row >> 3) & 7, (row >> 6) & 7], 1)
-    wave = torch.linspace(0.05, 0.4, 16)
-    field.feature_rows[:-1] = 2 * torch.sin(place.float().sum(1, keepdim=True) * wave + torch.arange(16))
-    generator = torch.Generator().manual_seed(1)
-    for parameter in field.decoder.parameters():
-        parameter.data.add_(0.1 * torch.randn(parameter.shape, generator=generator))
-    return replace(field, space=replace(field.space, shell=shell), background=torch.tensor([0.9, 0.2, 0.4]))
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,8 @@ EXPORT_SHARE = 0.25  # of the seconds, at most, that are planned for exports
 # Pictures' worth of features that a mesh takes: whatever it is of; a megapixel of one view, for its triangles; and a megapixel of all
 # views, to render, polish and fuse their depth and to carve with it. A mesh of 12 views of 400 pixels takes six times that of 160 pixels.
 MESH_FIXED, MESH_TRIANGLES, MESH_DEPTH = 3.0, 240.0, 35.0
-TEXTURE = 20.0  # for a texture besides: a coarser mesh, what each picture sees of it, the texels
+# For a texture besides (a coarser mesh, what each picture sees of it, the texels), and for a page (what training rays see, bytes).
+EXTRAS = {"texture": 20.0, "page": 15.0}
 OBJECT = 0.5  # of that where pictures have alpha: the object fills a part of them
 MESH_SIDE, VIDEO_SIDE = 400, 640  # long sides that are rendered at most
 EXPORT_RAY = 1.2  # of the time of a test view's ray: writing video frames comes on top
@@ -172,22 +173,27 @@ def video_rays(work: Work, choice: Choice) -> float:
     return (choice.video_frames or 0) * work.pixels(min(VIDEO_SIDE, choice.image_size))
 
 
-def mesh_work(work: Work, choice: Choice, texture: bool = False) -> tuple[float, float]:
-    """Pictures' worth of features that a mesh takes beside its views, and for each of them."""
+def extras(formats: list[str]) -> float:
+    """Pictures' worth of features that exports beside the mesh and the video take."""
+    return sum(EXTRAS.get(name, 0.0) for name in formats)
+
+
+def mesh_work(work: Work, choice: Choice, extra: float = 0.0) -> tuple[float, float]:
+    """Pictures' worth of features that a mesh (and what is `extra`) takes beside its views, and for each of them."""
     megapixels = work.pixels(min(MESH_SIDE, choice.image_size)) / 1e6 * (OBJECT if work.alpha else 1.0)
-    return MESH_FIXED + MESH_TRIANGLES * megapixels + (TEXTURE if texture else 0.0), MESH_DEPTH * megapixels
+    return MESH_FIXED + MESH_TRIANGLES * megapixels + extra, MESH_DEPTH * megapixels
 
 
-def most_export_seconds(speed: Speed, work: Work, choice: Choice, mesh_views: int, video_frames: int, texture: bool = False) -> float:
+def most_export_seconds(speed: Speed, work: Work, choice: Choice, mesh_views: int, video_frames: int, extra: float = 0.0) -> float:
     """What exports take when nothing of them is left out: more than that they cannot use."""
-    once, each = mesh_work(work, choice, texture)
+    once, each = mesh_work(work, choice, extra)
     video = video_rays(work, replace(choice, video_frames=video_frames)) * EXPORT_RAY * speed.seconds("render", 1.0)
     return speed.factors.get("export", 1.0) * ((once + mesh_views * each) * speed.units["features"] + video)
 
 
-def least_export_seconds(speed: Speed, work: Work, choice: Choice, texture: bool = False) -> float:
+def least_export_seconds(speed: Speed, work: Work, choice: Choice, extra: float = 0.0) -> float:
     """What exports take at least: a mesh of the fewest views, and no video."""
-    return most_export_seconds(speed, work, choice, MESH_VIEWS[0], 0, texture)
+    return most_export_seconds(speed, work, choice, MESH_VIEWS[0], 0, extra)
 
 
 def predict(speed: Speed, work: Work, choice: Choice) -> dict[str, float]:

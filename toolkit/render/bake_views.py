@@ -17,8 +17,10 @@ from toolkit.render.composite import STOP
 from toolkit.render.field import Field
 from toolkit.render.kernels_march import march_ray
 from toolkit.threads import share
+from toolkit.volume.compiled import dilated
 
-SEEN = 0.01  # largest weight below which a voxel is left out
+SEEN = 0.01  # largest weight below which a voxel is left out …
+FIRM = 0.3  # … but for those beside one with as much: where thin surfaces have holes, pictures from between the views see through them
 MOST_RAYS = 3_000_000  # of all views together; of more pixels a regular part is looked at
 
 
@@ -55,7 +57,8 @@ def seen_voxels(
     threads: int = 1,
     progress: Progress = SILENT,
 ) -> torch.Tensor:
-    """(M · 512,) bool: voxels that hold more than `least` of some pixel's light, over pinhole views (N, 4, 4).
+    """(M · 512,) bool: voxels that hold more than `least` of some pixel's light, over pinhole views (N, 4, 4), and those beside a voxel
+    that holds more than `FIRM` of it.
 
     Raises:
         Interrupted: the user asked to stop.
@@ -77,4 +80,5 @@ def seen_voxels(
 
     share(part, range(threads), threads)
     progress.check()
-    return torch.from_numpy((marks.max(0) >> 4) > least * 4095)
+    weight = torch.from_numpy((marks.max(0) >> 4).astype(np.float32) / 4095)
+    return (weight > least) | (dilated(field.topology, weight > max(FIRM, least)) & field.occupied)

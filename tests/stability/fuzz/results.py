@@ -60,7 +60,7 @@ def make_results(root: Path) -> None:
     nearest = {"views": 2, "psnr": 15.0, "per_view": [{"index": 0, "name": "000", "nearest": "001", "psnr": 15.0}]}
     write_json(root / "evaluation.json", {"field": scores, "tsdf": surface, "nearest_image": nearest})
     write_json(root / "timeline.json", [{"seconds": 1.0 + i, "psnr": 20.0 + i} for i in range(4)])
-    write_json(root / "exports" / "facts.json", {"mesh": mesh, "note": "points and meshes were left out"})
+    write_json(root / "exports" / "facts.json", {"mesh": mesh, "notes": ["points and meshes were left out"]})
     write_json(root / "fit_notes.json", ["step 3 of the fit was not finite", "the field stayed at 64³"])
     write_json(root / "fit_matched.json", {"views": 7, "pixels": 128, "share": 0.31, "bare": 0.12, "seconds": 0.4})
     network = {

@@ -1,0 +1,196 @@
+"""The page with a field in it: what is packed, what it refuses, and in a browser the same pictures as the baked field's own."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.evaluate.browser import open_page
+from tests.evaluate.driven import Driven, driven, until
+from tests.render.made import coloured_field, random_field
+from toolkit.camera import Array
+from toolkit.errors import InputError
+from toolkit.evaluate.speed_state import around, lens
+from toolkit.export.page import Tour, corner_densities, decoder_blocks, page, require_page, write_page
+from toolkit.networks.decoder import make_decoder
+from toolkit.render.bake import BakedField, bake
+from toolkit.render.bake_image import BakedRenderer
+
+WIDTH, HEIGHT = 48, 36
+CAMERA, POSES = lens(WIDTH, HEIGHT), around()
+SKY = torch.linspace(-0.3, 0.5, 27).reshape(9, 3)
+
+
+def tour(names: list[str] | None = None) -> Tour:
+    names = names or [f"photo {index}" for index in range(len(POSES))]
+    test = np.arange(len(POSES)) % 4 == 0
+    return Tour(names, [CAMERA] * len(POSES), np.array(POSES), test, np.array(POSES), 3.0)
+
+
+def slow_densities(field: BakedField) -> dict[tuple[int, int, int, int], int]:
+    """(block, z, y, x) of a corner → its byte, voxel by voxel."""
+    out, arrays, number = {}, field.arrays, 0
+    for slot in range(len(arrays.base)):
+        for z in range(8):
+            for bit in range(64):
+                if int(arrays.bits[slot, z]) >> bit & 1:
+                    for corner in range(8):
+                        place = (slot, z + (corner >> 2), (bit >> 3) + (corner >> 1 & 1), (bit & 7) + (corner & 1))
+                        out[place] = int(arrays.packed[number]) >> 8 * corner & 255
+                    number += 1
+    return out
+
+
+def test_densities_of_corners_are_those_of_their_voxels() -> None:
+    baked = bake(random_field(0.0, 16, keep=0.3))
+    got, expected = corner_densities(baked), slow_densities(baked)
+    order = sorted(expected)  # corners are stored block by block, row by row
+    assert len(got) == len(order) and got.tolist() == [expected[place] for place in order]
+
+
+def test_decoder_blocks_are_the_decoder() -> None:
+    """Matrices of four by four, column by column, multiplied as the shader does."""
+    baked = bake(random_field())
+    small, large = decoder_blocks(baked)
+    given = np.random.default_rng(0).normal(size=28).astype(np.float32)
+    given[8:16], given[25:] = 0, 0  # this field has eight features
+    first = small[: 16 * 7 * 16].reshape(16, 7, 4, 4)
+    hidden = np.einsum("jicr,ic->jr", first, given.reshape(7, 4)).reshape(-1)
+    d = baked.decoder
+    expected = d.w1_out[:, :8] @ given[:8] + d.w1_out[:, 8:17] @ given[16:25]
+    assert np.allclose(hidden[:16], expected, atol=1e-5) and not hidden[16:].any()
+    second = np.einsum("jicr,ic->jr", large.reshape(16, 16, 4, 4), hidden.reshape(16, 4)).reshape(-1)
+    assert np.allclose(second[:16], d.w2_out @ hidden[:16], atol=1e-4)
+
+
+def test_what_is_packed_is_the_field() -> None:
+    baked = bake(coloured_field())
+    text = page(baked, tour(), "sphere")
+    about = json.loads(re.search(r'id="about">(.*?)</script>', text, re.DOTALL)[1])  # type: ignore[index]
+    blob = zlib.decompress(base64.b64decode(re.search(r'id="field">(.*?)</script>', text, re.DOTALL)[1]))  # type: ignore[index]
+    found, offset = {}, 0
+    for name, kind, count in about["arrays"]:
+        found[name] = np.frombuffer(blob, kind, count, offset)
+        offset += -(-found[name].nbytes // 4) * 4
+    assert offset == len(blob)
+    assert np.array_equal(found["feature"].reshape(-1, 16), baked.arrays.feature)
+    x, y, z = found["keys"].reshape(-1, 3).T
+    assert np.array_equal(baked.arrays.table[z, y, x], np.arange(len(baked.arrays.base)))
+    assert about["start"] == 1 and [photo["test"] for photo in about["photos"]][:2] == [True, False]
+
+
+def test_a_page_asks_nobody_for_anything() -> None:
+    text = page(bake(coloured_field()), tour(), "sphere")
+    assert not re.search(r'(?:src|href)\s*=\s*["\']|https?://|@import|fetch\(|XMLHttpRequest|WebSocket', text)
+
+
+def test_text_of_others_stays_text() -> None:
+    text = page(bake(coloured_field()), tour(["</script><b>", *"abcdefg"][: len(POSES)]), "</title><script>alert(1)</script>")
+    assert "<script>alert" not in text and "</script><b>" not in text
+    assert text.count("</title>") == 1
+
+
+@pytest.mark.parametrize(("channels", "hidden"), [(17, 16), (8, 65)])
+def test_what_does_not_fit_is_told(channels: int, hidden: int) -> None:
+    field = replace(random_field(), decoder=make_decoder("deferred", channels, hidden))
+    with pytest.raises(InputError, match=f"up to 16 features and 64 hidden units, and this field has {channels} and {hidden}; leave page"):
+        require_page(field)
+
+
+def test_the_papers_decoder_is_told() -> None:
+    with pytest.raises(InputError, match="deferred decoder"):
+        require_page(random_field(decoder="per_sample"))
+
+
+def loaded(browser: Driven) -> None:
+    """Wait for the field; what the page tells instead is an error."""
+    until(lambda: browser.run("!!window.fieldfuse || !document.getElementById('told').textContent.startsWith('Unpacking')"))
+    assert browser.run("document.getElementById('told').textContent") == ""
+
+
+def seen(browser: Driven, pose: Array) -> Array:
+    """(H, W, 3) what the page draws for a camera."""
+    numbers, view = pose[:3].reshape(-1).tolist(), [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy]
+    script = f"btoa(String.fromCharCode(...fieldfuse.picture({numbers}, {view}, {WIDTH}, {HEIGHT})))"
+    return np.frombuffer(base64.b64decode(browser.run(script)), np.uint8).reshape(HEIGHT, WIDTH, 4)[..., :3]
+
+
+FIELDS = {
+    "a box": coloured_field(),
+    "a shell and a sky": replace(coloured_field(1.0), sky=SKY),
+    "few features, holes": random_field(1.0, 32, keep=0.4),
+}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_browser_draws_what_the_baked_field_is(name: str, tmp_path: Path) -> None:
+    baked = bake(FIELDS[name])
+    write_page(tmp_path / "field.html", baked, tour(), name)
+    with driven((tmp_path / "field.html").as_uri(), tmp_path, (320, 240)) as browser:
+        loaded(browser)
+        for pose in POSES[:3]:
+            expected = BakedRenderer(baked, 1).render(CAMERA, pose)
+            assert expected.rgb.std() > 0.05
+            off = np.abs(seen(browser, pose) - 255 * expected.rgb)
+            # Where a sample falls on the edge between two voxels it is either's, by the last digit.
+            assert np.median(off) < 0.6 and (off > 2).mean() < 0.01, (name, off.max())
+            told = browser.run(f"[...fieldfuse.field.told(fieldfuse.field.target({WIDTH}, {HEIGHT}), {WIDTH // 2}, {HEIGHT // 2 - 1})]")
+            depth, opacity = expected.depth[HEIGHT // 2, WIDTH // 2], expected.opacity[HEIGHT // 2, WIDTH // 2]
+            if opacity > 0.5:
+                assert told[:2] == pytest.approx([depth, opacity], abs=2e-3 * float(depth))
+        assert not browser.errors
+
+
+def test_a_visitor_walks(tmp_path: Path) -> None:
+    write_page(tmp_path / "field.html", bake(coloured_field()), tour(), "sphere")
+    with driven((tmp_path / "field.html").as_uri(), tmp_path, (640, 480)) as browser:
+        loaded(browser)
+
+        def pose() -> list[float]:
+            return list(browser.run("[...fieldfuse.walker.pose.place, ...fieldfuse.walker.pose.turn.flat()]"))
+
+        def rests() -> Array:
+            until(lambda: browser.run("!fieldfuse.rough && fieldfuse.todo === 0 && !fieldfuse.walker.journey"))
+            return browser.picture()[60:-80].astype(int)
+
+        start, first = pose(), rests()
+        assert first.std() > 10
+        browser.drag((300, 160), (380, 160))
+        dragged = pose()
+        pivot = np.linalg.norm(np.array(start[:3]) + 3 * np.array(start[9:]) - np.array(dragged[:3]) - 3 * np.array(dragged[9:]))
+        assert dragged != start and pivot < 1e-6  # about what is in the middle
+        assert np.abs(rests() - first).mean() > 1
+        browser.ask("Input.dispatchMouseEvent", type="mouseWheel", x=300, y=160, deltaX=0, deltaY=-300)
+        until(lambda: pose() != dragged)
+        near = np.linalg.norm(np.array(pose()[:3]) - np.array(dragged[:3]))
+        assert 0.5 < near < 1.5
+        browser.run("document.getElementById('after').click()")
+        assert browser.run("document.getElementById('name').textContent") == "photo 2"
+        rests()
+        assert pose()[:3] == pytest.approx(POSES[2][:3, 3].tolist(), abs=1e-5)
+        for kind in ("keyDown", "keyUp"):
+            browser.ask("Input.dispatchKeyEvent", type=kind, key="w")
+            until(lambda: pose()[:3] != pytest.approx(POSES[2][:3, 3].tolist(), abs=1e-5))
+        browser.run("document.getElementById('fly').click()")
+        flying = pose()
+        until(lambda: pose() != flying)
+        browser.run("document.getElementById('fly').click()")
+        colours = rests()
+        browser.run("const s = document.getElementById('show'); s.value = 'depth'; s.onchange()")
+        assert np.abs(rests() - colours).mean() > 10
+        assert not browser.errors
+
+
+def test_a_browser_without_webgl_is_told(tmp_path: Path) -> None:
+    text = page(bake(coloured_field()), tour(), "sphere").replace("getContext('webgl2'", "getContext('none'")
+    text = text.replace("tell(error.message))", "{ tell(error.message); document.title = error.message; })")
+    (tmp_path / "field.html").write_text(text, encoding="utf-8")
+    assert open_page(tmp_path / "field.html", tmp_path).title.startswith("This page draws with WebGL 2, which this browser")

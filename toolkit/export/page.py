@@ -1,0 +1,235 @@
+"""`field.html`: a baked field and what draws it in one file, for whatever browser has WebGL 2: to walk through, to keep, to send.
+
+The page holds only what cannot be worked out (occupied voxels, a byte of density and sixteen of features a corner, the decoder), deflated;
+the scripts in `web/` unpack it and march through it as `render/bake_kernels.py` does. It asks no server for anything.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any
+
+import cv2
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+
+from toolkit import __version__
+from toolkit.camera import Array, Intrinsics
+from toolkit.errors import InputError
+from toolkit.files import atomic_path
+from toolkit.networks.decoder import Deferred
+from toolkit.networks.encoding import SH
+from toolkit.render.bake import BakedField
+from toolkit.render.bake_kernels import CORNERS, FINER
+from toolkit.render.field import Field
+from toolkit.render.march import MAX_STRETCH
+from toolkit.volume.topology import VOXELS
+
+CHANNELS, HIDDEN = 16, 64  # at most: what lies in one word of four, and in a uniform block of 16 kB
+INPUTS = CHANNELS + 12  # of the decoder: features, nine harmonics and zeros up to a multiple of four
+CHUNK = 512  # blocks at a time
+NEAREST_DEPTH, FARTHEST_DEPTH = 0.6, 2.5  # of the median depth: the range of depth's colours
+SCRIPTS = ("unpack.js", "draw.js", "walk.js", "page.js")
+
+
+@dataclass(frozen=True)
+class Tour:
+    """Where a visitor can go: photos, and a path to fly along.
+
+    Attributes:
+        names, lenses, poses: of the photos; poses (N, 4, 4) world_from_camera, working frame.
+        test: (N,) bool, held out.
+        path: (F, 4, 4) closed.
+        depth: median depth of the scene, working units: how far away what is looked at is taken to be.
+    """
+
+    names: Sequence[str]
+    lenses: Sequence[Intrinsics]
+    poses: Array
+    test: Array
+    path: Array
+    depth: float
+
+
+def require_page(field: Field) -> None:
+    """
+    Raises:
+        InputError: a field with this decoder, or of so many features, does not go into a page.
+    """
+    if not isinstance(field.decoder, Deferred):
+        raise InputError("only a field with the deferred decoder goes into a page; fit it with --decoder deferred")
+    channels, hidden = field.decoder.channels, field.decoder.hidden
+    if channels > CHANNELS or hidden > HIDDEN:
+        raise InputError(
+            f"a page draws up to {CHANNELS} features and {HIDDEN} hidden units, and this field has {channels} and {hidden}; "
+            "leave page out of export.formats, or fit with the usual field.channels and field.hidden"
+        )
+
+
+def write_page(path: Any, field: BakedField, tour: Tour, title: str) -> None:
+    """Write the page, atomically. `field` was baked from one that passed `require_page`.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    text = page(field, tour, title)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def page(field: BakedField, tour: Tour, title: str) -> str:
+    """The page's text."""
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    about, blob = packed(field, tour)
+    # What closes a script would end it, wherever it stands.
+    quoted = json.dumps(about, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    raw = environment.filters["safe"]
+    return environment.from_string(_source("index.html.j2")).render(
+        version=__version__,
+        title=title,
+        photos=len(tour.names),
+        voxels=f"{field.voxels:,}",
+        style=raw(_source("style.css")),
+        about=raw(quoted),
+        march=raw(_source("march.frag")),
+        decode=raw(_source("decode.frag")),
+        field=raw(base64.b64encode(zlib.compress(blob, 6)).decode("ascii")),
+        script=raw("\n".join(_source(name) for name in SCRIPTS)),
+    )
+
+
+def packed(field: BakedField, tour: Tour) -> tuple[dict[str, Any], bytes]:
+    """What the scripts are told, and the arrays one after the other, each filled up to whole words."""
+    arrays = field.arrays
+    slots = np.argwhere(arrays.table >= 0)  # z, y, x
+    keys = np.empty((len(arrays.base), 3), np.uint16)
+    keys[arrays.table[tuple(slots.T)]] = slots[:, ::-1]
+    small, large = decoder_blocks(field)
+    given: list[tuple[str, Array]] = [
+        ("bits", np.ascontiguousarray(arrays.bits).view(np.uint8)),
+        ("keys", keys),
+        ("bricks", arrays.bricks),
+        ("density", corner_densities(field)),
+        ("feature", _padded(np.asarray(arrays.feature), CHANNELS, 1)),
+        ("thickness", arrays.thickness.astype("<f4")),
+        ("small", small.astype("<f4")),
+        ("large", large.astype("<f4")),
+        ("palette", _palette()),
+    ]
+    blob = bytearray()
+    for _, array in given:
+        blob += array.tobytes()
+        blob += b"\0" * (-len(blob) % 4)
+    about = _about(field, tour)
+    about["arrays"] = [[name, f"{array.dtype.kind}{array.dtype.itemsize}", array.size] for name, array in given]
+    return about, bytes(blob)
+
+
+def corner_densities(field: BakedField) -> Array:
+    """(R,) uint8 quantised raw density of every stored corner, in the order of `Baked.feature`."""
+    arrays = field.arrays
+    occupied = np.unpackbits(np.ascontiguousarray(arrays.bits).view(np.uint8), axis=1, bitorder="little").astype(bool)
+    stored = (arrays.rows[:, :, None] >> np.arange(CORNERS) & 1).astype(bool).reshape(len(occupied), -1)
+    out, done = np.empty(field.corners, np.uint8), 0
+    for start in range(0, len(occupied), CHUNK):
+        part = occupied[start : start + CHUNK]
+        first = int(arrays.first[start, 0])
+        eight = np.asarray(arrays.packed[first : first + int(part.sum())]).view(np.uint8).reshape(-1, 8)
+        grid = np.zeros((len(part), CORNERS, CORNERS, CORNERS), np.uint8)
+        slot, cell = np.nonzero(part.reshape(-1, VOXELS))
+        z, y, x = cell >> 6, cell >> 3 & 7, cell & 7
+        for corner in range(8):
+            grid[slot, z + (corner >> 2), y + (corner >> 1 & 1), x + (corner & 1)] = eight[:, corner]
+        values = grid.reshape(len(part), -1)[stored[start : start + CHUNK]]
+        out[done : done + len(values)] = values
+        done += len(values)
+    return out
+
+
+def decoder_blocks(field: BakedField) -> tuple[Array, Array]:
+    """The decoder as the shader's uniform blocks: matrices of four by four, column by column, (first layer, biases, last layer) and
+    (second layer). Hidden units that are missing up to `HIDDEN` are zeros."""
+    d, channels = field.decoder, field.arrays.feature.shape[1]
+    w1 = np.zeros((HIDDEN, INPUTS), np.float32)
+    hidden = len(d.b1)
+    w1[:hidden, :channels] = d.w1_out[:, :channels]
+    w1[:hidden, CHANNELS : CHANNELS + 9] = d.w1_out[:, channels : channels + 9]
+    w2 = _padded(_padded(d.w2_out, HIDDEN, 1), HIDDEN, 0)
+    last = _padded(d.w3, HIDDEN, 1)
+    small = [_by_four(w1), _padded(d.b1, HIDDEN, 0), _padded(d.b2, HIDDEN, 0), last.reshape(-1), _padded(d.b3, 4, 0)]
+    return np.concatenate([part.reshape(-1) for part in small]), _by_four(w2).reshape(-1)
+
+
+def _about(field: BakedField, tour: Tour) -> dict[str, Any]:
+    """Numbers that are not arrays."""
+    space, resolution = field.space, field.resolution
+    voxel = 2 * space.extent / resolution
+    low, scale = (_padded(values, CHANNELS, 0) for values in (field.arrays.low, field.arrays.scale))
+    sky = np.zeros((9, 3))
+    sky[0] = field.background / SH[0]
+    march = {
+        "centre": list(space.centre),
+        "box": list(space.box),
+        "tableOrigin": list(field.table_origin),
+        "halfSize": space.half,
+        "shell": space.shell,
+        "extent": space.extent,
+        "voxel": voxel,
+        "near": field.near,
+        "low": low.tolist(),
+        "scale": scale.tolist(),
+    }
+    define: dict[str, Any] = {"FINE": field.fine, "FINER": FINER, "RESOLUTION": resolution, "HIDDEN": HIDDEN}
+    define |= {"MAX_STRETCH": f"{MAX_STRETCH:e}", "LONGEST": int(14 * space.extent / (4 * voxel)) + 32}
+    define |= {f"C{number}": repr(value) for number, value in enumerate(SH)}
+    return {
+        "define": define,
+        "march": march,
+        "sky": (sky if field.sky is None else np.asarray(field.sky, np.float64)).reshape(-1).tolist(),
+        "table": list(field.arrays.table.shape[::-1]),
+        "side": field.arrays.bricks.shape[0],
+        "depth": tour.depth,
+        "range": [1 / (FARTHEST_DEPTH * tour.depth), 1 / (NEAREST_DEPTH * tour.depth)],
+        "start": int(np.argmin(tour.test)),  # the first that the fit saw
+        "photos": [
+            {"name": name, "lens": [c.width, c.height, c.fx, c.fy], "pose": _numbers(pose), "test": bool(test)}
+            for name, c, pose, test in zip(tour.names, tour.lenses, tour.poses, tour.test, strict=True)
+        ],
+        "path": [_numbers(pose) for pose in tour.path],
+    }
+
+
+def _numbers(pose: Array) -> list[float]:
+    """Twelve of them, with as many digits as are worth it."""
+    values = [float(f"{value:.7g}") for value in np.asarray(pose)[:3].reshape(-1)]
+    if not all(math.isfinite(value) for value in values):
+        raise InputError("a camera's pose is not finite; find the poses again")
+    return values
+
+
+def _padded(values: Array, size: int, axis: int) -> Array:
+    """Zeros behind, up to `size` along `axis`."""
+    short = [(0, size - length if number == axis else 0) for number, length in enumerate(values.shape)]
+    return np.pad(values, short)
+
+
+def _by_four(matrix: Array) -> Array:
+    """(4 n, 4 m) → (n, m, 4, 4) blocks, each column by column."""
+    rows, columns = matrix.shape
+    return matrix.reshape(rows // 4, 4, columns // 4, 4).transpose(0, 2, 3, 1)
+
+
+def _palette() -> Array:
+    """(256, 4) uint8: depth's colours from far (red) to near (blue), as in the report."""
+    colours = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[::-1, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
+    return np.concatenate([colours, np.full((256, 1), 255, np.uint8)], 1)
+
+
+def _source(name: str) -> str:
+    return resources.files("toolkit.export").joinpath("web", name).read_text(encoding="utf-8")

@@ -1,0 +1,69 @@
+// From a pixel's mean features to what is shown: `render/kernels_decode.py`, and what lies behind everything (`render/sky.py`).
+
+uniform highp usampler2D first, second, rest;
+uniform highp sampler2D palette;
+uniform vec4 lens;
+uniform mat3 turn;
+uniform vec2 size, range;  // of inverse depth, from far to near
+uniform vec3 sky[9];       // of one colour: the others are 0
+uniform int show;          // 0 colours, 1 depth, 2 opacity
+
+const int INPUTS = 7, WIDE = HIDDEN / 4;
+layout(std140) uniform Small { mat4 w1[WIDE * INPUTS]; vec4 b1[WIDE], b2[WIDE], w3[3 * WIDE], b3; };
+layout(std140) uniform Large { mat4 w2[WIDE * WIDE]; };
+
+out vec4 shown;
+
+void harmonics(vec3 d, out float h[9]) {
+  h = float[9](C0, -C1 * d.y, C1 * d.z, -C1 * d.x, C2 * d.x * d.y, -C2 * d.y * d.z, C3 * (3.0 * d.z * d.z - 1.0), -C2 * d.x * d.z,
+    C4 * (d.x * d.x - d.y * d.y));
+}
+
+vec3 decoded(vec4 given[INPUTS]) {
+  vec4 h[WIDE];
+  for (int j = 0; j < WIDE; j++) {
+    vec4 sum = b1[j];
+    for (int i = 0; i < INPUTS; i++) sum += w1[j * INPUTS + i] * given[i];
+    h[j] = max(sum, 0.0);
+  }
+  vec3 out_ = given[0].xyz + b3.xyz;
+  for (int j = 0; j < WIDE; j++) {
+    vec4 sum = b2[j];
+    for (int i = 0; i < WIDE; i++) sum += w2[j * WIDE + i] * h[i];
+    sum = max(sum, 0.0);
+    out_ += vec3(dot(w3[j], sum), dot(w3[WIDE + j], sum), dot(w3[2 * WIDE + j], sum));
+  }
+  return 1.0 / (1.0 + exp(-clamp(out_, -80.0, 80.0)));
+}
+
+void main() {
+  ivec2 at = ivec2(gl_FragCoord.xy);
+  uvec4 told = texelFetch(rest, at, 0);
+  float depth = uintBitsToFloat(told.x), opacity = uintBitsToFloat(told.y);
+  if (show == 2) {
+    shown = vec4(vec3(opacity), 1);
+    return;
+  }
+  if (show == 1) {
+    float part = clamp((1.0 / max(depth, 1e-6) - range.x) / (range.y - range.x), 0.0, 1.0);
+    shown = opacity >= 0.5 && depth > 0.0 ? texture(palette, vec2(part * (255.0 / 256.0) + 0.5 / 256.0, 0.5)) : vec4(vec3(0.5), 1);
+    return;
+  }
+  vec2 pixel = (vec2(gl_FragCoord.x, size.y - gl_FragCoord.y) - lens.zw) / lens.xy;
+  vec3 d = turn * normalize(vec3(pixel, 1.0));
+  float h[9];
+  harmonics(d, h);
+  vec3 behind = vec3(0);
+  for (int i = 0; i < 9; i++) behind += sky[i] * h[i];
+  behind = clamp(behind, 0.0, 1.0);
+  if (opacity == 0.0) {
+    shown = vec4(behind, 1);
+    return;
+  }
+  uvec4 a = texelFetch(first, at, 0), b = texelFetch(second, at, 0);
+  vec4 given[INPUTS] = vec4[INPUTS](
+    vec4(unpackHalf2x16(a.x), unpackHalf2x16(a.y)), vec4(unpackHalf2x16(a.z), unpackHalf2x16(a.w)),
+    vec4(unpackHalf2x16(b.x), unpackHalf2x16(b.y)), vec4(unpackHalf2x16(b.z), unpackHalf2x16(b.w)),
+    vec4(h[0], h[1], h[2], h[3]), vec4(h[4], h[5], h[6], h[7]), vec4(h[8], 0, 0, 0));
+  shown = vec4(mix(behind, decoded(given), opacity), 1);
+}

@@ -1,0 +1,242 @@
+// The page: what the visitor does, and when which picture is drawn. While something moves pictures are as small as they have to be; at
+// rest they are drawn whole, strip by strip.
+
+const $ = id => document.getElementById(id);
+const MOVING = 45, STRIP = 30, REST = 140;  // milliseconds: a picture in motion, strips between two looks at the visitor, until it rests
+const LONGEST_SIDE = 1600, LEAST_SIDE = 96, LEAST_LINES = 8;
+const SIZES = [1, 0.75, 0.5, 0.35, 0.25, 0.18, 0.125];  // of pictures in motion
+const ROUND = 14000;  // milliseconds of a flight
+const SHOW = ['colours', 'depth', 'opacity'];
+
+function tell(text) {
+  $('told').textContent = text;
+  $('told').hidden = !text;
+}
+
+class Page {
+  constructor(about, field, gl) {
+    Object.assign(this, {about, field, gl, canvas: gl.canvas});
+    this.photo = about.start;
+    this.walker = new Walker(poseOf(about.photos[this.photo].pose), about.depth);
+    this.show = 0;
+    this.perPixel = 1e-3;  // milliseconds, learnt as it goes
+    this.keys = new Set();
+    this.fingers = new Map();
+    this.flying = null;
+    this.moved = this.now = performance.now();
+    this.todo = 0;
+    this.furnish();
+    this.fit();
+    requestAnimationFrame(now => this.tick(now));
+  }
+
+  // As many pixels as the window has, up to a bound.
+  fit() {
+    const box = this.canvas.getBoundingClientRect(), dense = window.devicePixelRatio || 1;
+    const scale = Math.min(dense, LONGEST_SIDE / Math.max(box.width, box.height, 1));
+    this.canvas.width = Math.max(16, Math.round(box.width * scale));
+    this.canvas.height = Math.max(16, Math.round(box.height * scale));
+    this.move();
+  }
+
+  move() {
+    this.moved = performance.now();
+    this.rough = true;
+  }
+
+  // The camera of a picture of this size: the photo's, so that all of the photo is in the window unless that has quite another shape.
+  view(width, height) {
+    const {lens: [w, h, fx, fy]} = this.about.photos[this.photo], whole = Math.min(width / w, height / h), full = Math.max(width / w, height / h);
+    const scale = Math.max(whole, 0.6 * full), {turn, place} = this.walker.pose;
+    const lens = [fx * scale, fy * scale, width / 2, height / 2];
+    return {turn: turn.flat(), place, lens, show: this.show, range: this.about.range};
+  }
+
+  tick(now) {
+    const passed = Math.min(100, now - this.now);
+    this.now = now;
+    if (this.step(now, passed)) this.move();
+    try {
+      if (this.rough && performance.now() - this.moved < REST) this.small();
+      else if (this.rough || this.todo) this.whole();
+    } catch (error) {
+      tell(error.message);
+      return;
+    }
+    requestAnimationFrame(next => this.tick(next));
+  }
+
+  // What goes on by itself: keys held down, journeys, flights. Whether anything moved.
+  step(now, passed) {
+    const held = (more, less) => (this.keys.has(more) ? 1 : 0) - (this.keys.has(less) ? 1 : 0), fast = this.keys.has('shift') ? 3 : 1;
+    const part = 0.6 * fast * passed / 1000 * this.walker.usual / this.walker.reach, angle = 1.2 * passed / 1000;
+    const way = [held('d', 'a') * part, held('q', 'e') * part, held('w', 's') * part];
+    const turn = [held('arrowleft', 'arrowright') * angle, held('arrowdown', 'arrowup') * angle];
+    let moved = this.walker.travel(now);
+    if (way.some(v => v)) this.walker.shift(...way), moved = true;
+    if (turn.some(v => v)) this.walker.turn(...turn, false), moved = true;
+    if (this.flying !== null) {
+      const path = this.about.path, place = (this.flying += passed / ROUND * path.length) % path.length, first = Math.floor(place);
+      this.walker.pose = between(poseOf(path[first]), poseOf(path[(first + 1) % path.length]), place - first);
+      moved = true;
+    }
+    return moved;
+  }
+
+  small() {
+    if (this.drawn === this.moved) return;
+    this.drawn = this.moved;
+    const {width, height} = this.canvas, pixels = MOVING / this.perPixel;
+    const size = SIZES.find(part => part * part * width * height <= pixels) || SIZES[SIZES.length - 1];
+    const part = Math.max(size, Math.min(1, LEAST_SIDE / Math.max(width, height)));
+    const target = this.field.target(Math.max(1, Math.round(width * part)), Math.max(1, Math.round(height * part)));
+    this.draw(target, 0, target.height);
+    this.field.put(target, null);
+    this.last = target;
+    this.todo = 0;
+    this.rough = part < 1;
+  }
+
+  // Go on with the picture at rest, from above, for as long as nobody notices.
+  whole() {
+    const {width, height} = this.canvas, target = this.field.target(width, height), begin = performance.now();
+    if (this.rough) {
+      this.rough = false;
+      this.todo = height;
+      if (this.last && this.last !== target) this.field.put(this.last, target);
+    }
+    while (this.todo > 0 && performance.now() - begin < STRIP) {
+      const lines = Math.min(this.todo, Math.max(LEAST_LINES, Math.floor(STRIP / (this.perPixel * width))));
+      this.draw(target, this.todo - lines, this.todo);
+      this.todo -= lines;
+    }
+    this.last = target;
+    this.field.put(target, null);
+  }
+
+  draw(target, from, to) {
+    const begin = performance.now();
+    this.field.strip(target, this.view(target.width, target.height), from, to);
+    this.field.told(target, 0, from);  // waits
+    const took = (performance.now() - begin) / (target.width * (to - from));
+    this.perPixel = Math.min(2 * this.perPixel, Math.max(0.5 * this.perPixel, 0.7 * this.perPixel + 0.3 * took));
+    $('size').textContent = `${target.width}×${target.height}`;
+  }
+
+  // (H, W, 4) bytes, from above, of a camera that somebody names: twelve numbers and fx, fy, cx, cy.
+  picture(pose, lens, width, height, show = 0) {
+    const {turn, place} = poseOf(pose), gl = this.gl, target = this.field.target(width, height), line = 4 * width;
+    const below = new Uint8Array(line * height), out = new Uint8Array(line * height);
+    this.field.strip(target, {turn: turn.flat(), place, lens, show, range: this.about.range}, 0, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.decoded);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, below);
+    for (let y = 0; y < height; y++) out.set(below.subarray((height - 1 - y) * line, (height - y) * line), y * line);
+    return out;
+  }
+
+  furnish() {
+    const photos = this.about.photos, canvas = this.canvas;
+    const jump = by => this.to((this.photo + by + photos.length) % photos.length);
+    $('before').onclick = () => jump(-1);
+    $('after').onclick = () => jump(1);
+    $('which').max = photos.length - 1;
+    $('which').oninput = () => this.to(Number($('which').value));
+    $('fly').onclick = () => this.fly(this.flying === null);
+    $('show').onchange = () => { this.show = SHOW.indexOf($('show').value); this.move(); };
+    $('help').onclick = () => { $('keys').hidden = !$('keys').hidden; };
+    $('keys').onclick = () => { $('keys').hidden = true; };
+    this.label();
+    new ResizeObserver(() => this.fit()).observe(canvas);
+    canvas.addEventListener('contextmenu', event => event.preventDefault());
+    canvas.addEventListener('webglcontextlost', () => tell('The graphics card gave up; load the page again.'));
+    canvas.addEventListener('pointerdown', event => {
+      canvas.setPointerCapture(event.pointerId);
+      this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
+      this.fly(false);
+      this.walker.journey = null;
+    });
+    canvas.addEventListener('pointermove', event => this.drag(event));
+    for (const name of ['pointerup', 'pointercancel']) canvas.addEventListener(name, event => this.fingers.delete(event.pointerId));
+    canvas.addEventListener('wheel', event => {
+      event.preventDefault();
+      this.fly(false);
+      this.walker.approach(Math.exp(Math.max(-1, Math.min(1, event.deltaY * (event.deltaMode ? 0.05 : 0.0015)))));
+      this.move();
+    }, {passive: false});
+    canvas.addEventListener('dblclick', event => this.lookAt(event.clientX, event.clientY));
+    window.addEventListener('keydown', event => {
+      if (event.ctrlKey || event.metaKey || event.altKey || ['INPUT', 'SELECT'].includes(event.target.tagName)) return;
+      const key = event.key.toLowerCase();
+      if (['w', 'a', 's', 'd', 'q', 'e', 'shift', 'arrowleft', 'arrowright', 'arrowup', 'arrowdown'].includes(key)) {
+        this.keys.add(key);
+        if (key !== 'shift') this.fly(false), this.walker.journey = null;
+        event.preventDefault();
+      }
+    });
+    window.addEventListener('keyup', event => this.keys.delete(event.key.toLowerCase()));
+    window.addEventListener('blur', () => this.keys.clear());
+  }
+
+  label() {
+    const {name, test} = this.about.photos[this.photo];
+    $('which').value = this.photo;
+    $('name').textContent = name + (test ? ' (held out)' : '');
+  }
+
+  to(photo) {
+    this.fly(false);
+    this.photo = photo;
+    this.label();
+    this.walker.go(poseOf(this.about.photos[photo].pose), this.about.depth, 500, performance.now());
+  }
+
+  fly(on) {
+    if (on === (this.flying !== null)) return;
+    this.flying = on ? 0 : null;
+    this.walker.journey = null;
+    if (!on) this.walker.reach = this.about.depth;
+    $('fly').textContent = on ? 'Stop' : 'Fly';
+  }
+
+  drag(event) {
+    const before = this.fingers.get(event.pointerId);
+    if (!before) return;
+    const box = this.canvas.getBoundingClientRect(), long = Math.max(box.width, box.height), now = [event.clientX, event.clientY];
+    const [dx, dy] = [now[0] - before[0], now[1] - before[1]];
+    const per = this.canvas.width / box.width / this.view(this.canvas.width, this.canvas.height).lens[0];  // of the reach, a pixel
+    if (this.fingers.size === 2) {
+      const other = [...this.fingers].find(([id]) => id !== event.pointerId)[1];
+      const apart = from => Math.hypot(from[0] - other[0], from[1] - other[1]);
+      this.walker.approach(Math.max(0.5, Math.min(2, apart(before) / Math.max(apart(now), 1))));
+      this.walker.shift(-dx * per / 2, -dy * per / 2, 0);
+    } else if (event.buttons & 6 || event.ctrlKey) this.walker.shift(-dx * per, -dy * per, 0);
+    else this.walker.turn(-dx / long * 4, dy / long * 4, !event.shiftKey);
+    this.fingers.set(event.pointerId, now);
+    this.move();
+  }
+
+  lookAt(x, y) {
+    const box = this.canvas.getBoundingClientRect(), target = this.last;
+    if (!target) return;
+    const column = (x - box.left) / box.width * target.width, row = (y - box.top) / box.height * target.height;
+    const [depth, opacity] = this.field.told(target, Math.floor(column), Math.max(0, Math.floor(target.height - 1 - row)));
+    if (!(depth > 0) || opacity < 0.5) return;
+    const {lens} = this.view(target.width, target.height), {turn, place} = this.walker.pose;
+    const ray = [(column - lens[2]) / lens[0] * depth, (row - lens[3]) / lens[1] * depth, depth];
+    this.walker.lookAt(turn.reduce((sum, axis, i) => plus(sum, axis, ray[i]), place), performance.now());
+  }
+}
+
+async function begin() {
+  const about = JSON.parse($('about').textContent);
+  const gl = $('canvas').getContext('webgl2', {alpha: false, antialias: false, powerPreference: 'high-performance'});
+  if (!gl) throw new Error('This page draws with WebGL 2, which this browser or device does not have; try another one.');
+  if (!('DecompressionStream' in window)) throw new Error('This browser is too old for this page (it has no DecompressionStream).');
+  const data = unpacked(await inflated($('field').textContent), about);
+  $('field').textContent = '';
+  const shaders = {march: $('march').textContent, decode: $('decode').textContent};
+  window.fieldfuse = new Page(about, new Field(gl, about, shaders, data), gl);
+  tell('');
+}
+
+begin().catch(error => tell(error.message));
