@@ -87,7 +87,7 @@ def make_sample(tsdf: bool) -> tuple[dict[str, Any], Pictures]:
         "baseline": nearest_image_scores(views, indices),
         "timeline": [{"seconds": s, "psnr": 20.0 + s} for s in (1.0, 2.0, 3.0)],
         "stages": [{"name": "field", "seconds": np.float32(3.5), "peak_memory_mb": np.int64(812), "cached": np.bool_(False)}],
-        "exports": [{"path": "exports/a b.ply", "points": 12}],
+        "exports": [{"path": "exports/a b.ply", "points": 12}, {"path": "exports/field.html"}],
         "settings": {"seed": 0, "fit": {"budget": None}},
     }
     if surface:
@@ -176,6 +176,7 @@ def test_page_shows_what_counts(tmp_path: Path) -> None:
     for wanted in [*numbers, *texts, "fieldfuse run fox", "fit.budget automatic"]:
         assert wanted in page.text, wanted
     assert ("a", {"href": "./exports/a%20b.ply"}) in page.tags
+    assert page.tags.count(("a", {"href": "./exports/field.html"})) == 2  # at the top, and among the files
     assert json.loads(json_path.read_text())["exports"][0] == {"path": "exports/a b.ply", "bytes": 2048, "points": 12}
     assert sum(tag == "svg" for tag, _ in page.tags) == 2
 

@@ -23,6 +23,7 @@ TEMPLATE = "report.html.j2"
 LONGEST = 480  # pixels of an embedded tile's long side: sharp at the size it is shown, small in bytes
 QUALITY = 86
 TILE_HEIGHT = 380  # CSS pixels at most, so that upright pictures do not fill the screen
+WALK = "/field.html"  # the export that is linked at the top
 OPEN_VIEWS = 3  # views shown at once; the others are one click away
 METHODS = (("field", "Field"), ("network", "Networks alone"), ("tsdf", "TSDF"))
 
@@ -178,7 +179,7 @@ def render_page(data: dict[str, Any], pictures: Pictures) -> str:
     # The plots are our own text but for stage names, which matplotlib escapes.
     time_plot, stage_plot = psnr_over_time(data["timeline"], levels), stage_bars(data["stages"])
     near, far = pictures.depth_range or (None, None)
-    rows = comparison(data)
+    rows, exports = comparison(data), export_rows(data)
     return template(TEMPLATE).render(
         data=data,
         title=short_name(data["source"]) or "Report",
@@ -199,6 +200,7 @@ def render_page(data: dict[str, Any], pictures: Pictures) -> str:
         depth_unit=pictures.unit,
         time_plot=None if time_plot is None else Markup(time_plot),
         stage_plot=None if stage_plot is None else Markup(stage_plot),
-        exports=export_rows(data),
+        exports=exports,
+        walk=next((row["href"] for row in exports if row["path"].endswith(WALK)), ""),
         settings=flat(data["settings"]),
     )

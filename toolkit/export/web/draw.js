@@ -114,10 +114,11 @@ class Field {
     gl.bindFramebuffer(gl.FRAMEBUFFER, made.marched);
     for (let i = 0; i < 3; i++) {
       made.words.push(this.texture(gl.TEXTURE_2D, gl.NEAREST));
-      gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, width, height);
+      gl.texStorage2D(gl.TEXTURE_2D, 1, i === 2 ? gl.RG32UI : gl.RGBA32UI, width, height);
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + i, gl.TEXTURE_2D, made.words[i], 0);
     }
     gl.drawBuffers([0, 1, 2].map(i => gl.COLOR_ATTACHMENT0 + i));
+    if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE) throw new Error('this device cannot draw the field (no room for its words)');
     gl.bindFramebuffer(gl.FRAMEBUFFER, made.decoded);
     made.picture = this.texture(gl.TEXTURE_2D, gl.LINEAR);
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA8, width, height);

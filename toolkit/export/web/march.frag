@@ -17,7 +17,7 @@ uniform vec2 size;
 
 layout(location = 0) out uvec4 first;
 layout(location = 1) out uvec4 second;
-layout(location = 2) out uvec4 rest;
+layout(location = 2) out uvec2 rest;
 
 const float STOP = 1e-2, THRESHOLD = 5e-3, STRETCH = MAX_STRETCH;
 
@@ -148,5 +148,5 @@ void main() {
   first = uvec4(packHalf2x16(mean[0].xy), packHalf2x16(mean[0].zw), packHalf2x16(mean[1].xy), packHalf2x16(mean[1].zw));
   second = uvec4(packHalf2x16(mean[2].xy), packHalf2x16(mean[2].zw), packHalf2x16(mean[3].xy), packHalf2x16(mean[3].zw));
   float opacity = light < STOP ? 1.0 : 1.0 - light;
-  rest = uvec4(floatBitsToUint(median * cosine), floatBitsToUint(total > 0.0 ? opacity : 0.0), 0u, 0u);
+  rest = uvec2(floatBitsToUint(median * cosine), floatBitsToUint(total > 0.0 ? opacity : 0.0));
 }
