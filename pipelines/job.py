@@ -19,6 +19,7 @@ from toolkit.errors import InputError
 if TYPE_CHECKING:
     from pipelines.steps_network import NetworkField
     from pipelines.total_budget import TotalBudget
+    from toolkit.effects.correct import Corrections
     from toolkit.keyframes import KeyFrames
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -38,6 +39,7 @@ class Job:
     other_field: bool = False  # the settings of the field differ from those that the folder was made with
     other_network: bool = False  # the same of the networks' field
     keys: KeyFrames | None = None  # the key frames, once chosen
+    corrections: Corrections | None = None  # of effects, once found
     network: NetworkField | None = None  # the networks' field, once this command has made or loaded it
     plan: TotalBudget | None = None  # chooses settings as the run goes on, so that it takes as long as was asked for
 

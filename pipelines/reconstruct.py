@@ -56,7 +56,7 @@ def stand(job: Job) -> tuple[Capture, PoseResult, Capture, Scene, Views]:
     capture = choose_frames(job, capture)
     poses = find_camera_poses(job, capture)
     posed = limited(poses.apply(capture), job.settings.capture.holdout, job.settings.views.limit)
-    corrections = find_effects(job, posed)
+    job.corrections = corrections = find_effects(job, posed)
     poses, posed = refine(poses, corrections), corrections.on_capture(posed)
     scene = measure_scene(job, posed)
     return capture, poses, posed, scene, make_views(job, posed, scene, corrections)

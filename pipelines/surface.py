@@ -15,6 +15,7 @@ from pipelines.pictures import camera_of, orbit_cameras, pictures
 from pipelines.rendered import Pictures, to_picture
 from pipelines.room import SURFACE_BYTES, require_pictures
 from pipelines.summary import put_cameras
+from pipelines.textured import put_textured
 from toolkit.camera import Intrinsics, Similarity
 from toolkit.errors import InputError
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from toolkit.capture.types import Capture, Views
     from toolkit.poses.result import PoseResult
     from toolkit.poses.scene import Scene
-    from toolkit.progress import Progress
     from toolkit.render.field import Field
     from toolkit.stereo.match import StereoDepth
     from toolkit.tsdf.fuse import Points
@@ -32,8 +32,6 @@ SMALL_PART = 0.002  # components of a mesh with less than this share of its area
 MOST_TRIANGLES = 2_000_000
 MESHES = ("ply", "obj", "glb")
 TEXTURE = "texture"
-TEXTURED_TRIANGLES = 80_000  # detail is in the texture
-TEXEL_BYTES = 40  # while a texture is made and packed
 MESH_SIDE = 400  # pixels; finer depth than this adds little to a mesh and much to the time
 VIDEO_SIDE = 640
 FPS = 30
@@ -124,7 +122,7 @@ def export_field(
     written: list[Path] = []
     if formats & {"points", *MESHES, TEXTURE}:
         try:
-            facts["mesh"], written = export_surface(job, folder, formats, field, scene, views)
+            facts["mesh"], written = export_surface(job, folder, formats, field, posed, scene, views)
         except InputError as error:
             facts["notes"].append(f"points and meshes were left out: {error}")
     if "cameras" in formats:
@@ -147,7 +145,7 @@ def export_field(
 
 
 def export_surface(
-    job: Job, folder: Path, formats: set[str], field: Field, scene: Scene, views: Views
+    job: Job, folder: Path, formats: set[str], field: Field, posed: Capture, scene: Scene, views: Views
 ) -> tuple[dict[str, Any], list[Path]]:
     """The field's depth at the training cameras, polished by their pictures and fused: points and meshes of the region of interest.
 
@@ -186,24 +184,8 @@ def export_surface(
         write_mesh(path, mesh)
         written.append(path)
     if TEXTURE in formats:
-        written.append(put_textured(folder / "textured.glb", whole, shown, scene, job.progress))
+        written.append(put_textured(job, folder / "textured.glb", whole, posed, scene, views))
     return facts, written
-
-
-def put_textured(path: Path, mesh: Mesh, shown: Views, scene: Scene, progress: Progress) -> Path:
-    """A coarser mesh (working frame) with a texture of the pictures `shown`, in the input's frame."""
-    from toolkit import memory
-    from toolkit.export.mesh import write_textured
-    from toolkit.export.texture import LARGEST, textured
-
-    largest = LARGEST
-    while largest > 1024 and TEXEL_BYTES * largest**2 > memory.bounded(TEXEL_BYTES * LARGEST**2):
-        largest //= 2
-    thin = mesh.decimated(TEXTURED_TRIANGLES)
-    cameras = (shown.intrinsics, shown.world_from_camera, shown.valid, shown.weight)
-    atlas, texture = textured(thin, shown.images, *cameras, largest=largest, progress=progress)
-    write_textured(path, thin, atlas, texture, scene.working_from_input)
-    return path
 
 
 def at_most(lens: Intrinsics, long_side: int) -> Intrinsics:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.capture.board import capture_of, corners, found_corners, photograph, posed, save, texture
 from toolkit.camera import FISHEYE, OPENCV, Intrinsics, Similarity, undistort_maps
-from toolkit.capture.prepare import held_out, prepare_views, target_size
+from toolkit.capture.prepare import held_out, pictures_at, prepare_views, target_size
 from toolkit.capture.types import Frame, Views
 from toolkit.config import CaptureSettings
 from toolkit.errors import InputError, Interrupted
@@ -50,6 +50,18 @@ def test_corners_lie_where_a_pinhole_camera_sees_them(tmp_path: Path, camera: In
     assert len(expected) >= 20
     away = np.linalg.norm(found_corners(picture, expected, window=5 if size > 200 else 3) - expected, axis=1)
     assert away.max() < 0.1
+
+
+@pytest.mark.parametrize("size", [480, 300])
+def test_pictures_in_another_size_are_those_that_views_of_it_have(tmp_path: Path, size: int) -> None:
+    frames = [posed(save(tmp_path / f"{name}.png", photograph(camera)), camera) for name, camera in (("a", PLAIN), ("b", BARREL))]
+    capture = capture_of(tmp_path, frames)
+    views = prepare_views(capture, SAME, CaptureSettings(image_size=size))
+    for index, (camera, picture) in zip((1, 0), pictures_at(capture, [1, 0], size), strict=True):
+        assert camera == views.intrinsics[index]
+        np.testing.assert_array_equal(picture, views.images[index])
+    with pytest.raises(InputError, match="no intrinsics; find poses first"):
+        next(pictures_at(capture_of(tmp_path, [replace(frames[0], intrinsics=None)]), [0], size))
 
 
 def test_a_lens_is_removed_exactly_once(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 
 import cv2
 import numpy as np
@@ -60,9 +61,7 @@ def prepare_views(capture: Capture, working_from_input: Similarity, settings: Ca
         progress.update(index, count, frame.name)
         if frame.world_from_camera is None or frame.intrinsics is None:
             raise InputError(f"the frame {frame.name} of {capture.root} has no pose or no intrinsics; find poses first")
-        picture = load_image(frame, exif=exif)
-        source = fitted(frame.intrinsics, (picture.shape[1], picture.shape[0]), str(frame.image))
-        colour, alpha = on_white(picture) if capture.alpha else (np.ascontiguousarray(picture[:, :, :3]), None)
+        source, colour, alpha = _loaded(frame, frame.intrinsics, capture, exif)
         target, image, seen = shrink(source, colour)
         usable = seen & _usable(frame, source, target)
         views.names.append(frame.name)
@@ -77,6 +76,29 @@ def prepare_views(capture: Capture, working_from_input: Similarity, settings: Ca
     views.world_from_camera = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
     progress.update(count, count)
     return views
+
+
+def pictures_at(capture: Capture, indices: Iterable[int], long_side: int) -> Iterator[tuple[Intrinsics, Array]]:
+    """The pinhole cameras and pictures (H, W, 3) uint8 of some frames as `prepare_views` makes them, in another size, one at a time.
+
+    Raises:
+        InputError: a frame without intrinsics, or a file that cannot be read.
+    """
+    shrink, exif = _Shrinker(long_side), turns_by_exif(capture)
+    for index in indices:
+        frame = capture.frames[index]
+        if frame.intrinsics is None:
+            raise InputError(f"the frame {frame.name} of {capture.root} has no intrinsics; find poses first")
+        source, colour, _ = _loaded(frame, frame.intrinsics, capture, exif)
+        target, image, _ = shrink(source, colour)
+        yield target, image
+
+
+def _loaded(frame: Frame, camera: Intrinsics, capture: Capture, exif: bool) -> tuple[Intrinsics, Array, Array | None]:
+    """A frame's camera in the size of its file, the picture (H, W, 3) uint8 on white, and its alpha (H, W), if it has one."""
+    picture = load_image(frame, exif=exif)
+    source = fitted(camera, (picture.shape[1], picture.shape[0]), str(frame.image))
+    return (source, *(on_white(picture) if capture.alpha else (np.ascontiguousarray(picture[:, :, :3]), None)))
 
 
 def expected_bytes(capture: Capture, long_side: int) -> int:

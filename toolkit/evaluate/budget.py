@@ -27,8 +27,8 @@ EXPORT_SHARE = 0.25  # of the seconds, at most, that are planned for exports
 # Pictures' worth of features that a mesh takes: whatever it is of; a megapixel of one view, for its triangles; and a megapixel of all
 # views, to render, polish and fuse their depth and to carve with it. A mesh of 12 views of 400 pixels takes six times that of 160 pixels.
 MESH_FIXED, MESH_TRIANGLES, MESH_DEPTH = 3.0, 240.0, 35.0
-# For a texture besides (a coarser mesh, what each picture sees of it, the texels), and for a page (what training rays see, bytes).
-EXTRAS = {"texture": 20.0, "page": 15.0}
+# Besides, for a texture: a coarser mesh, what each picture sees of it, large pictures read again; and for a page: what training rays see.
+EXTRAS = {"texture": 30.0, "page": 15.0}
 OBJECT = 0.5  # of that where pictures have alpha: the object fills a part of them
 MESH_SIDE, VIDEO_SIDE = 400, 640  # long sides that are rendered at most
 EXPORT_RAY = 1.2  # of the time of a test view's ray: writing video frames comes on top

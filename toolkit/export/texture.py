@@ -6,7 +6,7 @@ mean over all pictures, and only what is smaller is the best pictures' own.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -24,7 +24,7 @@ EVENED = 8  # rounds of even mixing with the neighbours: differences in colour o
 
 def textured(
     mesh: Mesh,
-    images: Sequence[Array],
+    images: Iterable[Array],
     intrinsics: Sequence[Intrinsics],
     world_from_camera: Array,
     valid: Sequence[Array | None] = (),
@@ -38,9 +38,9 @@ def textured(
 
     Args:
         mesh: in the frame of the cameras.
-        images: (H, W, 3) uint8 RGB; intrinsics: pinhole, of the same sizes.
+        images: (H, W, 3) uint8 RGB, asked for once, one after the other; intrinsics: pinhole, of the same sizes.
         world_from_camera: (N, 4, 4).
-        valid: (H, W) bool pixels that may be looked at, None: all; empty: all of all pictures.
+        valid: (H, W) bool pixels that may be looked at, in whatever size, None: all; empty: all of all pictures.
         worth: what a picture counts beside the others, as a blurred one counts less; empty: 1.
         largest: texels along the texture at most.
 
@@ -60,7 +60,7 @@ def bake_texture(
     mesh: Mesh,
     atlas: Atlas,
     chosen: tuple[Array, Array],
-    images: Sequence[Array],
+    images: Iterable[Array],
     intrinsics: Sequence[Intrinsics],
     world_from_camera: Array,
     progress: Progress = SILENT,
@@ -77,7 +77,7 @@ def bake_texture(
         seen = np.flatnonzero(share.any(axis=1))
         matrix = (camera.matrix() @ invert(pose)[:3]).astype(np.float32)
         add_picture(seen, corners, share, *layout, np.ascontiguousarray(image), matrix, texture, total)
-        progress.update(len(images) + index + 1, 2 * len(images), "texture")
+        progress.update(len(intrinsics) + index + 1, 2 * len(intrinsics), "texture")
     means = np.zeros((len(corners), 3), np.float32)
     finish(corners, mesh.colours[mesh.triangles].astype(np.float32), *layout, texture, total, means)
     shift(_level(mesh, means)[mesh.triangles], *layout, texture)

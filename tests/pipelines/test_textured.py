@@ -1,0 +1,80 @@
+"""The texture of a run is made of pictures as they were taken, also where the fit has smaller ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from pipelines.console import make_progress
+from pipelines.job import open_job
+from pipelines.options import gather
+from pipelines.reconstruct import stand
+from pipelines.textured import sharpest
+from tests.pipelines.made import CAMERA, call, make_room
+from tests.pipelines.short import ALONE
+from toolkit.effects.correct import Corrections, canonical
+
+Capsys = pytest.CaptureFixture[str]
+FEW = ["--image-size", "48", "--budget", "2", *ALONE, "--set", "field.resolution=32", "--set", "export.mesh_views=6", "--quiet"]
+TAKEN = CAMERA.scaled(192, 144)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on pictures a quarter as wide as the photos are."""
+    folder = tmp_path_factory.mktemp("textured")
+    make_room(folder / "room", 12, depth=True, camera=TAKEN)
+    return folder
+
+
+def test_a_texture_has_texels_of_the_photos(run: Path, capsys: Capsys) -> None:
+    out = run / "out"
+    assert call(capsys, "run", run / "room", "--out", out, *FEW, "--set", "export.formats=[texture]").code == 0
+    large = trimesh.load(out / "exports" / "textured.glb").to_geometry().visual.material.baseColorTexture.size
+    assert call(capsys, "export", out, "--set", "export.texture_size=48", "--formats", "texture", "--quiet").code == 0
+    small = trimesh.load(out / "exports" / "textured.glb").to_geometry().visual.material.baseColorTexture.size
+    assert large[0] > small[0]
+
+
+@pytest.mark.parametrize(("side", "expected"), [(1280, 192), (96, 96), (48, None), (20, None)])
+def test_pictures_are_as_large_as_they_were_taken(run: Path, side: int, expected: int | None) -> None:
+    """Up to `export.texture_size`; where that is no more than the fit has, its own pictures."""
+    options = gather(None, None, [f"export.texture_size={side}"], image_size=48)
+    with open_job(run / "room", run / "other", options, make_progress(True)) as job:
+        _, _, posed, _, views = stand(job)
+        train = np.flatnonzero(~views.test)
+        shown = views.subset(train)
+        lenses, pictures = sharpest(job, posed, train, shown)
+        found = list(pictures)
+    assert len(found) == len(lenses) == len(train)
+    if expected is None:
+        assert lenses == shown.intrinsics and all(a is b for a, b in zip(found, shown.images, strict=True))
+        return
+    for index, lens, picture in zip(train, lenses, found, strict=True):
+        assert picture.shape == (lens.height, lens.width, 3) == (expected * 3 // 4, expected, 3)
+        assert lens.fx == pytest.approx(TAKEN.fx * expected / 192)
+        whole = cv2.imread(str(posed.frames[index].image))
+        assert whole is not None
+        small = cv2.resize(whole, (expected, expected * 3 // 4), interpolation=cv2.INTER_AREA)[..., ::-1]
+        assert np.array_equal(picture, small)
+
+
+def test_large_pictures_are_corrected_as_those_of_the_fit(run: Path) -> None:
+    with open_job(run / "room", run / "other", gather(None, None, None, image_size=48), make_progress(True)) as job:
+        _, _, posed, _, views = stand(job)
+        shown = views.subset([1])
+        plain = next(iter(sharpest(job, posed, np.array([1]), shown)[1]))
+        job.corrections = Corrections({views.names[1]: (1.5, 1.0, 0.8)})
+        corrected = next(iter(sharpest(job, posed, np.array([1]), shown)[1]))
+    assert np.array_equal(corrected, canonical(plain, TAKEN, (1.5, 1.0, 0.8), None)[0])
+    assert (corrected[..., 0] < plain[..., 0]).mean() > 0.9 and np.array_equal(corrected[..., 1], plain[..., 1])
+
+
+def test_a_size_of_nothing_is_refused(tmp_path: Path, capsys: Capsys) -> None:
+    make_room(tmp_path / "room", 4)
+    answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", "--set", "export.texture_size=0")
+    assert answer.code == 2 and "export.texture_size is 0; it must be a positive number" in answer.sentence()
