@@ -118,7 +118,7 @@ def bound_threads(options: dict[str, Any]) -> None:
     """Tell numeric libraries the thread count that the command line gives; they read it once, when they are loaded."""
     # Threads that spin while they wait take the cores from whatever else runs: on a busy machine with two cores a fit made 83 steps
     # in 15 s with spinning threads and 306 with sleeping ones. So they sleep, but not at once (GNU's library counts the turns): to wake
-    # one for each of the networks' many short operations would cost a quarter of their time (docs/performance.md).
+    # one for each of the networks' many short operations would cost a quarter of their time (docs/measured/performance.md).
     if os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE").upper() == "PASSIVE":
         os.environ.setdefault("GOMP_SPINCOUNT", SHORT_SPIN)
     pairs = [pair.removeprefix("threads=") for pair in options.get("pairs") or [] if pair.startswith("threads=")]

@@ -15,6 +15,7 @@ from pipelines.steps_network import make_network_field, render_network_views, us
 from pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views, score_pictures, wants_tsdf
 from pipelines.steps_stereo import reuse_matched
 from pipelines.summary import put_report, summarise_poses
+from pipelines.textured import TEXTURE, TSDF_TEXTURE, texture_tsdf
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Capture, Views
@@ -77,7 +78,7 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
     """
     start = time.monotonic()
     stages = job.stages
-    stages.trust(set(RESULTS) - goals)
+    stages.trust({*RESULTS, *(() if "tsdf" in goals else (TSDF_TEXTURE,))} - goals)
     # What the networks left is what a fit begins with, whether the folder's field was fitted or not.
     stages.trust(FOR_FIELD if "field" not in goals or (go_on and not job.other_network) else ())
     capture, poses, posed, scene, views = stand(job)
@@ -89,6 +90,9 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
     reuse_matched(job, scene, views)
     if ("tsdf" in goals and wants_tsdf(job, posed)) or stages.usable("tsdf"):
         pictures["tsdf"] = fuse_tsdf(job, posed, scene, views)
+        wanted = "tsdf" in goals and TEXTURE in job.settings.export.formats and pictures["tsdf"].facts["mesh"]["triangles"]
+        if wanted or stages.usable(TSDF_TEXTURE):
+            texture_tsdf(job, posed, scene, views)
     if goals & {"field", "render", "export"} or stages.usable("field"):
         if uses_network(job, views):
             made = make_network_field(job, views, scene)

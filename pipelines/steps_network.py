@@ -57,7 +57,7 @@ def uses_network(job: Job, views: Views) -> bool:
         return False  # the seconds of the whole run are planned, and the networks' are not among them
     if not settings.fit.finetune:
         return True
-    # With few views the networks' start won by up to 3 dB on validation captures, with many it is not needed; see docs/few_views.md.
+    # With few views the networks' start won by up to 3 dB on validation captures, with many it is not needed (docs/measured/few_views.md).
     return int(np.count_nonzero(~np.asarray(views.test))) < FEW_VIEWS
 
 

@@ -15,6 +15,7 @@ from pipelines.job import Job
 from pipelines.rendered import Pictures
 from pipelines.steps_effects import effects_part, effects_warnings
 from pipelines.steps_results import fit_matched, fit_notes
+from pipelines.textured import TSDF_TEXTURE
 from toolkit import __version__
 from toolkit.config import settings_dict
 from toolkit.files import write_json
@@ -158,7 +159,7 @@ def describe_field(field: Field | None, matched: dict[str, Any] | None = None) -
 def exported_files(job: Job) -> list[dict[str, Any]]:
     """Files that other programs can open, as they stand in the records of the stages."""
     out = []
-    for name in ("tsdf", "export"):
+    for name in ("tsdf", TSDF_TEXTURE, "export"):
         record = job.stages.records.get(name)
         out += [{"path": path, "bytes": size} for path, size in (record.outputs if record else {}).items() if is_export(path)]
     return out

@@ -15,7 +15,7 @@ from pipelines.pictures import camera_of, orbit_cameras, pictures
 from pipelines.rendered import Pictures, to_picture
 from pipelines.room import SURFACE_BYTES, require_pictures
 from pipelines.summary import put_cameras
-from pipelines.textured import put_textured
+from pipelines.textured import TEXTURE, put_textured
 from toolkit.camera import Intrinsics, Similarity
 from toolkit.errors import InputError
 
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 SMALL_PART = 0.002  # components of a mesh with less than this share of its area are specks
 MOST_TRIANGLES = 2_000_000
 MESHES = ("ply", "obj", "glb")
-TEXTURE = "texture"
 MESH_SIDE = 400  # pixels; finer depth than this adds little to a mesh and much to the time
 VIDEO_SIDE = 640
 FPS = 30

@@ -16,12 +16,28 @@ if TYPE_CHECKING:
     from toolkit.poses.scene import Scene
     from toolkit.tsdf.mesh import Mesh
 
+TEXTURE = "texture"  # as `export.formats` has it
+TSDF_TEXTURE = "tsdf_texture"  # the stage
 TRIANGLES = 80_000  # detail is in the texture
 TEXEL_BYTES = 40  # while a texture is made and packed
 
 
+def texture_tsdf(job: Job, posed: Capture, scene: Scene, views: Views) -> None:
+    """`tsdf/textured.glb`, a stage of its own: what the TSDF's seconds are compared with has no texture in it."""
+    path = job.folder / "tsdf" / "textured.glb"
+
+    def make() -> Path:
+        from toolkit.evaluate.geometry import read_mesh
+
+        mesh = read_mesh(path.with_name("mesh.ply")).transformed(scene.working_from_input)
+        return put_textured(job, path, mesh.with_normals(), posed, scene, views)
+
+    settings = [job.settings.export.texture_size, TRIANGLES]
+    job.stages.run(TSDF_TEXTURE, make=make, save=lambda made: [made], load=lambda: path, uses=settings, after=["tsdf", "views"])
+
+
 def put_textured(job: Job, path: Path, mesh: Mesh, posed: Capture, scene: Scene, views: Views) -> Path:
-    """A coarser mesh (working frame) with a texture of the training pictures, in the input's frame."""
+    """A coarser mesh (working frame, with normals) with a texture of the training pictures, in the input's frame."""
     from toolkit import memory
     from toolkit.export.mesh import write_textured
     from toolkit.export.texture import LARGEST, textured

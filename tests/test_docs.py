@@ -10,16 +10,60 @@ import pytest
 import typer
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def where(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def anchors(page: Path) -> set[str]:
+    """Of the headings, as GitHub makes them: lower case, no marks, a hyphen for each space, a number for each that was there before."""
+    found: dict[str, int] = {}
+    names = set()
+    for heading in re.findall(r"^#{1,6} +(.+?) *#*$", page.read_text(encoding="utf-8"), re.MULTILINE):
+        text = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading)
+        name = re.sub(r"[^\w\- ]", "", text.lower()).replace(" ", "-")
+        before = found.get(name, 0)
+        found[name] = before + 1
+        names.add(f"{name}-{before}" if before else name)
+    return names
+
+
+@pytest.mark.parametrize("page", PAGES, ids=where)
 def test_links_lead_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
-        assert target.startswith("http") or (page.parent / target).exists(), target
+    for link in LINK.findall(page.read_text(encoding="utf-8")):
+        if link.startswith(("http://", "https://")):
+            continue
+        target, _, anchor = link.partition("#")
+        leads = (page.parent / target).resolve() if target else page
+        assert leads.is_relative_to(ROOT) and leads.exists(), link
+        if "#" in link:
+            assert leads.suffix == ".md" and anchor in anchors(leads), link
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_anchors_are_those_of_headings(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("# What `make test` holds: it's [a link](x.md)\n\n    # a comment\n\n## Again\n\n### Again\n", encoding="utf-8")
+    assert anchors(page) == {"what-make-test-holds-its-a-link", "again", "again-1"}
+
+
+def test_every_page_is_in_the_index() -> None:
+    index = ROOT / "docs" / "README.md"
+    named = {(index.parent / link).resolve() for link in LINK.findall(index.read_text(encoding="utf-8"))}
+    assert {page for page in PAGES if page != index} <= named
+
+
+def test_pages_that_the_code_names_exist() -> None:
+    for folder in ("toolkit", "pipelines", "configs", "scripts", "tests"):
+        for path in sorted((ROOT / folder).rglob("*")):
+            if path.suffix in (".py", ".yaml", ".j2", ".js", ".html"):
+                for page in re.findall(r"\bdocs/[\w/]+\.md", path.read_text(encoding="utf-8")):
+                    assert (ROOT / page).exists(), (path, page)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=where)
 def test_commands_and_options_exist(page: Path) -> None:
     from pipelines.cli import app
 

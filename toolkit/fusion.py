@@ -197,7 +197,7 @@ def fuse_views(
     Args:
         empty: see `Fusion`.
         witnesses: of each key frame, other ones (places among them, `key_sweeps.beside`) that its sweep is held against (not in the paper);
-            needs a nearest or a farthest depth, and goes without `empty` (docs/few_views.md, "Within silhouettes").
+            needs a nearest or a farthest depth, and goes without `empty` (docs/measured/few_views.md, "Within silhouettes").
 
     Raises:
         InputError: no key frames, or a lattice that does not fit the options.

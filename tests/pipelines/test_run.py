@@ -57,6 +57,12 @@ def test_surface_lies_on_the_walls_in_the_input_frame(done: Path) -> None:
     assert np.median(off) < 0.02
 
 
+def test_the_tsdf_surface_has_a_texture_too(done: Path) -> None:
+    vertices = trimesh.load(done / "tsdf" / "textured.glb").to_geometry().vertices
+    assert np.median(np.abs(np.abs(vertices) - HALF).min(axis=1)) < 0.02
+    assert "tsdf/textured.glb" in [entry["path"] for entry in report(done)["exports"]]
+
+
 def test_exports_are_there_and_open(done: Path) -> None:
     for name in ("points.ply", "mesh.ply", "mesh.obj", "mesh.glb", "textured.glb"):
         loaded = trimesh.load(done / "exports" / name)

@@ -12,14 +12,14 @@ from torch import Tensor
 
 from toolkit.networks import compiled
 
-SIDE = 256  # pixels of the long side at which pictures are compared (docs/few_views.md) …
+SIDE = 256  # pixels of the long side at which pictures are compared (docs/measured/few_views.md) …
 SIDE_WITHIN = 448  # … and where silhouettes leave a part of them
 CONTRAST = 0.03  # of a patch, added to its own: what is flatter is noise
 GREY = (0.3, 0.59, 0.11)
 COLOUR_GAIN = 8.0  # a mean difference of 1/8 in colour counts as different
 UNKNOWN = 0.6  # cost where no other view sees the place
 SMALL, LARGE = 0.1, 0.8  # penalties for a step of one plane between neighbouring pixels, and for a larger one
-TEMPERATURE = 0.05  # of the distribution; together with the penalties the best of those tried on simulated scenes (docs/few_views.md)
+TEMPERATURE = 0.05  # of the distribution; with the penalties the best of those tried on simulated scenes (docs/measured/few_views.md)
 
 
 def describe(images: Tensor, side: int = SIDE) -> Tensor:

@@ -19,7 +19,7 @@ GONE_FAR = "incremental, gone on with tiny angles"  # the same from there, where
 LOOSE = "incremental, small angles"  # from scratch, by looser rules
 GLOBAL = "global"  # the last attempt, which takes what no other can begin with
 VERSION = 4  # of what is found and how; a change discards what earlier versions left in out/sparse
-REPEATABLE = 300  # pictures up to which poses repeat: one thread maps (docs/performance.md)
+REPEATABLE = 300  # pictures up to which poses repeat: one thread maps (docs/measured/performance.md)
 
 
 @dataclass(frozen=True)

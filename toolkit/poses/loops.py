@@ -35,7 +35,7 @@ NEAR = (10, 5, 3)  # frames apart whose matches are believed when a model is fol
 AGREES = np.radians(30.0)  # matches farther apart stay within this: what a long way adds up to without loops
 CHAINED = 5  # frames apart whose turns are put one after the other before anything is mapped
 # Share of the pairs far apart that contradict these: with a fold 0.84 to 0.99 with guessed lenses and 0.58 to 0.97 with calibrated ones,
-# without up to 0.95 and 0.31 (docs/performance.md).
+# without up to 0.95 and 0.31 (docs/measured/performance.md).
 SUSPECT, TOLD = 0.8, 0.5
 BORNE_OUT = 0.5  # … and that contradict the model of near neighbours, too
 MEETINGS = 4  # pairs far apart that are matched for each picture, where the near model says that cameras meet

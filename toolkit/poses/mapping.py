@@ -107,7 +107,7 @@ def _options(job: Job, angle: float | None = None) -> pycolmap.IncrementalPipeli
     options.mapper.num_threads = options.num_threads
     options.mapper.random_seed = job.seed
     options.triangulation.random_seed = job.seed
-    # COLMAP would go on to the last bit after every few pictures, and find the same in twice the time (docs/performance.md).
+    # COLMAP would go on to the last bit after every few pictures, and find the same in twice the time (docs/measured/performance.md).
     options.ba_global_frames_ratio = options.ba_global_points_ratio = ADJUSTED_AFTER
     options.ba_local_function_tolerance = options.ba_global_function_tolerance = STEP_TOLERANCE
     if angle is not None:

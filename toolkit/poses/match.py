@@ -28,7 +28,7 @@ def match(job: Job, pairs: list[tuple[int, int]], report: Report) -> None:
     open meanwhile.
 
     What is found does not depend on the threads. Two threads that match in one process, COLMAP's or ours, gave some pairs other matches now
-    and then (docs/performance.md), so each is a process with its own copy of the features, and a second thread that verifies.
+    and then (docs/measured/performance.md), so each is a process with its own copy of the features, and a second thread that verifies.
     """
     left = _left(job, pairs)
     total = len(left)

@@ -39,7 +39,7 @@ from toolkit.volume.topology import BLOCK
 
 SHIPPED = Path(weights.__file__).parent / "weights" / "nerfusion.safetensors"
 # Voxels that make up the median depth at least, on the finer of two lattices. One lattice of 24 alone loses 1.5 to 2.5 dB, while 104
-# gain 0.25 dB for about three times the seconds (docs/few_views.md), so no voxel need be smaller than some pixels; a larger one shows.
+# gain 0.25 dB for about three times the seconds (docs/measured/few_views.md), so none need be smaller than some pixels; a larger one shows.
 VOXELS_TO_MEDIAN, LEVELS = 48.0, 2
 PIXELS = 5.0  # that a voxel spans at most: colours become finer afterwards (`finer_colours.py`) …
 MEASURED_PIXELS = 3.5  # … where a sensor's depth says more exactly where surfaces are …

@@ -22,7 +22,7 @@ from toolkit.volume.edit import resample
 
 Tensor = torch.Tensor
 THIN = -4.5  # raw density of what is see-through or unknown, as in the classical start
-THICK = 0.0  # largest raw density of the start: a fog where surfaces may be, which a wrong guess costs little (docs/few_views.md)
+THICK = 0.0  # largest raw density of the start: a fog where surfaces may be, which a wrong guess costs little (docs/measured/few_views.md)
 RESOLUTION = 64  # level of the fit at which the networks' field comes in
 
 

@@ -124,6 +124,14 @@ class Mesh:
             legacy.compute_vertex_normals()
         return Mesh.from_open3d(legacy).cleaned()
 
+    def with_normals(self) -> Mesh:
+        """As it is if it has normals, else with those of the triangles around each vertex, by area."""
+        if self.normals is not None:
+            return self
+        legacy = self.to_open3d()
+        legacy.compute_vertex_normals()
+        return replace(self, normals=np.asarray(legacy.vertex_normals, dtype=np.float64))
+
     def to_open3d(self) -> o3d.geometry.TriangleMesh:
         """As Open3D's (legacy, float64) triangle mesh."""
         out = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(self.vertices), o3d.utility.Vector3iVector(self.triangles))
