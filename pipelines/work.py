@@ -10,6 +10,8 @@ from typing import Any
 
 from pipelines.console import make_progress, show_table
 
+PAGE = "exports/field.html"  # the field to walk through
+
 
 def work(
     target: Path,
@@ -40,4 +42,7 @@ def show(data: dict[str, Any], quiet: bool, as_json: bool, folder: Path) -> None
         show_table(data)
         for warning in data.get("warnings", []):
             sys.stdout.write(f"note: {warning}\n")
+        for export in data.get("exports", []):
+            if export["path"] == PAGE:
+                sys.stdout.write(f"{folder / PAGE}\n")
         sys.stdout.write(f"{folder / ('report.html' if data.get('evaluation') else 'exports/cameras')}\n")
