@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from toolkit.render.field import Field
 
 SEEN = 0.01  # see `fieldfuse bake --seen`
-FLIGHT = 90  # cameras along a page's flight
 
 
 def default_place(job: Job) -> Path:
@@ -53,23 +52,6 @@ def baked(job: Job, field: Field, views: Views, seen: float = SEEN) -> BakedFiel
         lenses = [views.intrinsics[i] for i in train]
         keep = seen_voxels(field, lenses, views.world_from_camera[train], seen, torch.get_num_threads(), job.progress)
     return quantise(field, keep)
-
-
-def put_page(job: Job, path: Path, field: Field, views: Views, scene: Scene) -> Path:
-    """The baked field as a page that any browser walks through, with all photos and an orbit.
-
-    Raises:
-        InputError: a decoder that cannot be baked, or is too wide for a page.
-        OutputError: the file cannot be written.
-    """
-    from pipelines.pictures import orbit_cameras
-    from toolkit.export.page import Tour, require_page, write_page
-
-    require_page(field)
-    _, _, around = orbit_cameras(views, scene, FLIGHT)
-    cameras = (views.names, views.intrinsics, views.world_from_camera, views.test)
-    write_page(path, baked(job, field.to("cpu"), views), Tour(*cameras, around, scene.median_depth), job.source.name)
-    return path
 
 
 def baked_of(job: Job, field: Field, views: Views, scene: Scene) -> BakedField:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.baking import put_page
 from pipelines.job import Job
+from pipelines.page import NAME, PAGE, put_page
 from pipelines.pictures import camera_of, orbit_cameras, pictures
 from pipelines.rendered import Pictures, to_picture
 from pipelines.room import SURFACE_BYTES, require_pictures
@@ -127,9 +127,9 @@ def export_field(
     if "cameras" in formats:
         put_cameras(folder / "cameras", poses, posed)
         written += [path for path in sorted((folder / "cameras").rglob("*")) if path.is_file()]
-    if "page" in formats:
+    if PAGE in formats:
         try:
-            written.append(put_page(job, folder / "field.html", field, views, scene))
+            written.append(put_page(job, folder / NAME, field, views, scene))
         except InputError as error:
             facts["notes"].append(f"the page to walk through was left out: {error}")
     if "video" in formats:

@@ -59,11 +59,12 @@ class Driven:
         assert found is not None
         return found
 
-    def drag(self, start: tuple[int, int], end: tuple[int, int], steps: int = 8) -> None:
+    def drag(self, start: tuple[int, int], end: tuple[int, int], steps: int = 8, shift: bool = False) -> None:
         """With the left button held from one place of the page to another."""
+        held = {"button": "left", "buttons": 1, "clickCount": 1, "modifiers": 8 if shift else 0}
         places = [tuple(np.add(start, np.subtract(end, start) * i / steps)) for i in range(steps + 1)]
         for kind, (x, y) in [("mousePressed", places[0]), *(("mouseMoved", place) for place in places), ("mouseReleased", places[-1])]:
-            self.ask("Input.dispatchMouseEvent", type=kind, x=float(x), y=float(y), button="left", buttons=1, clickCount=1)
+            self.ask("Input.dispatchMouseEvent", type=kind, x=float(x), y=float(y), **held)
             time.sleep(0.03)
 
 

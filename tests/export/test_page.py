@@ -168,8 +168,13 @@ def test_a_visitor_walks(tmp_path: Path) -> None:
         pivot = np.linalg.norm(np.array(start[:3]) + 3 * np.array(start[9:]) - np.array(dragged[:3]) - 3 * np.array(dragged[9:]))
         assert dragged != start and pivot < 1e-6  # about what is in the middle
         assert np.abs(rests() - first).mean() > 1
+        browser.drag((300, 160), (340, 160), shift=True)
+        turned = pose()
+        assert turned[:3] == dragged[:3] and turned[9:] != dragged[9:]  # on the spot
+        browser.drag((340, 160), (300, 160), shift=True)
+        assert pose() == pytest.approx(dragged, abs=1e-6)  # and back
         browser.ask("Input.dispatchMouseEvent", type="mouseWheel", x=300, y=160, deltaX=0, deltaY=-300)
-        until(lambda: pose() != dragged)
+        until(lambda: pose()[:3] != dragged[:3])
         near = np.linalg.norm(np.array(pose()[:3]) - np.array(dragged[:3]))
         assert 0.5 < near < 1.5
         browser.run("document.getElementById('after').click()")

@@ -103,7 +103,12 @@ class Field {
   // Where a picture of this size is drawn: three of words that the march leaves, and one of colours.
   target(width, height) {
     const key = `${width} ${height}`, gl = this.gl;
-    if (this.targets.has(key)) return this.targets.get(key);
+    const kept = this.targets.get(key);
+    if (kept) {
+      this.targets.delete(key);  // the last in the row is the one that was used last
+      this.targets.set(key, kept);
+      return kept;
+    }
     if (this.targets.size === MOST_TARGETS) {  // windows change their size, pictures in motion theirs
       const [name, old] = this.targets.entries().next().value;
       [...old.words, old.picture].forEach(one => gl.deleteTexture(one));

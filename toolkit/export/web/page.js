@@ -165,8 +165,8 @@ class Page {
     }, {passive: false});
     canvas.addEventListener('dblclick', event => this.lookAt(event.clientX, event.clientY));
     window.addEventListener('keydown', event => {
-      if (event.ctrlKey || event.metaKey || event.altKey || ['INPUT', 'SELECT'].includes(event.target.tagName)) return;
-      const key = event.key.toLowerCase();
+      const key = event.key.toLowerCase(), on = event.target.tagName;
+      if (event.ctrlKey || event.metaKey || event.altKey || on === 'SELECT' || (on === 'INPUT' && key.startsWith('arrow'))) return;
       if (['w', 'a', 's', 'd', 'q', 'e', 'shift', 'arrowleft', 'arrowright', 'arrowup', 'arrowdown'].includes(key)) {
         this.keys.add(key);
         if (key !== 'shift') this.fly(false), this.walker.journey = null;
@@ -210,7 +210,8 @@ class Page {
       this.walker.approach(Math.max(0.5, Math.min(2, apart(before) / Math.max(apart(now), 1))));
       this.walker.shift(-dx * per / 2, -dy * per / 2, 0);
     } else if (event.buttons & 6 || event.ctrlKey) this.walker.shift(-dx * per, -dy * per, 0);
-    else this.walker.turn(-dx / long * 4, dy / long * 4, !event.shiftKey);
+    else if (event.shiftKey) this.walker.turn(dx * per, -dy * per, false);  // what is seen follows the hand
+    else this.walker.turn(-dx / long * 4, dy / long * 4, true);
     this.fingers.set(event.pointerId, now);
     this.move();
   }

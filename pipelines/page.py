@@ -1,0 +1,35 @@
+"""The field of a run as a page that any browser walks through."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipelines.baking import baked
+from pipelines.pictures import orbit_cameras
+
+if TYPE_CHECKING:
+    from pipelines.job import Job
+    from toolkit.capture.types import Views
+    from toolkit.poses.scene import Scene
+    from toolkit.render.field import Field
+
+PAGE = "page"  # as `export.formats` has it
+NAME = "field.html"
+FLIGHT = 90  # cameras along the flight
+
+
+def put_page(job: Job, path: Path, field: Field, views: Views, scene: Scene) -> Path:
+    """The baked field as a page that any browser walks through, with all photos and an orbit.
+
+    Raises:
+        InputError: a decoder that cannot be baked, or is too wide for a page.
+        OutputError: the file cannot be written.
+    """
+    from toolkit.export.page import Tour, require_page, write_page
+
+    require_page(field)
+    _, _, around = orbit_cameras(views, scene, FLIGHT)
+    cameras = (views.names, views.intrinsics, views.world_from_camera, views.test)
+    write_page(path, baked(job, field.to("cpu"), views), Tour(*cameras, around, scene.median_depth), job.source.name)
+    return path
