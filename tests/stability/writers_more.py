@@ -28,6 +28,7 @@ from toolkit.evaluate.pictures import write_picture, write_strips
 from toolkit.evaluate.selftest.data import texture
 from toolkit.evaluate.selftest.edit import small_field
 from toolkit.evaluate.tradeoff_page import write_tradeoff
+from toolkit.export.page import Tour, write_page
 from toolkit.networks.weights import save_model
 from toolkit.render.bake import bake
 from toolkit.render.bake_file import write_baked
@@ -47,6 +48,7 @@ Write = Callable[[Path], object]
 def more_writers(place: Path) -> dict[str, Write]:
     """By name. `place` is for what they read."""
     baked, model = bake(small_field(1, 0.2)), make_model(tiny_settings())
+    tour = Tour(["a"], [Intrinsics(16, 12, 15.0, 15.0, 8.0, 6.0)], np.eye(4)[None], np.zeros(1, bool), np.eye(4)[None], 1.0)
     adam = torch.optim.Adam(model.parameters())
     shown, meshes = pictures()
     tradeoff = {
@@ -88,6 +90,7 @@ def more_writers(place: Path) -> dict[str, Write]:
 
     return {
         "write_baked": lambda folder: write_baked(folder / "baked.safetensors", baked),
+        "write_page": lambda folder: write_page(folder / "field.html", baked, tour, "page"),
         "save_model": lambda folder: save_model(folder / "weights.safetensors", model),
         "save_checkpoint": lambda folder: save_checkpoint(folder, 3, model, adam, {}, 2, Caution()),
         "Curve.write": curve,
