@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import psutil
 
+from pipelines.page import PAGE
+from pipelines.textured import TEXTURE, TSDF_TEXTURE
 from toolkit.evaluate import budget as model
 from toolkit.files import read_json, write_json
 
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
 FILE = "plan.json"
 LONGEST_START = 60.0  # seconds; a process that is older was not started for this command
-NOT_FITTED = ("capture", "frames", "poses", "effects", "scene", "views", "tsdf", "render", "export", "evaluate", "report")
+NOT_FITTED = ("capture", "frames", "poses", "effects", "scene", "views", "tsdf", TSDF_TEXTURE, "render", "export", "evaluate", "report")
 TOO_FEW = " The smallest choice needs about {:.0f} s on this machine as busy as it is; give more, or expect that."
 WORTH_LEARNING = 0.3  # seconds; shorter stages say little
 
@@ -113,8 +115,8 @@ class TotalBudget:
             rays = model.amounts(self.work, self.choice)["render"]
             spent = job.stages.records["render"].seconds
             after = sum(self.predicted.get(stage, 0.0) for stage in ("evaluate", "report")) * self._pace(job)
-            factor, amounts = self.speed.factors.get("export", 1.0), model.mesh_work(self.work, self.choice, model.extras(export.formats))
-            once, each = (factor * amount * self.speed.units["features"] for amount in amounts)
+            factor = self.speed.factors.get("export", 1.0)
+            once, each = (factor * amount * self.speed.units["features"] for amount in model.mesh_work(self.work, self.choice))
             a_ray = factor * model.EXPORT_RAY * (spent / rays if rays else self._predicted_ray())
             a_frame = a_ray * model.video_rays(self.work, replace(self.choice, video_frames=1))
             views, frames = model.exports_for(self.asked - self.elapsed() - after - once, each, a_frame)
@@ -191,10 +193,9 @@ class TotalBudget:
         assert self.speed is not None and self.work is not None and self.choice is not None
         export = job.settings.export
         video = export.video_frames if "video" in export.formats else 0
-        extra = model.extras(export.formats)
-        most = model.most_export_seconds(self.speed, self.work, self.choice, export.mesh_views, video, extra)
+        most = model.most_export_seconds(self.speed, self.work, self.choice, export.mesh_views, video)
         surface = bool({"points", "ply", "obj", "glb", "texture"} & set(export.formats))
-        least = min(most, model.least_export_seconds(self.speed, self.work, self.choice, extra)) if surface else 0.0
+        least = min(most, model.least_export_seconds(self.speed, self.work, self.choice)) if surface else 0.0
         return max(least, min(model.EXPORT_SHARE * max(0.0, left), most))
 
     def _learn_effects(self, job: Job, real: float | None) -> None:
@@ -271,6 +272,8 @@ def work_of(capture: Capture, settings: Any) -> model.Work:
         total=total,
         effects=effects,
         alpha=capture.alpha,
+        texture=TEXTURE in settings.export.formats,
+        page=PAGE in settings.export.formats,
         converted=len(to_convert(capture)),
     )
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from toolkit.config import load_settings
 from toolkit.evaluate import budget as model
-from toolkit.evaluate.budget import KINDS, Choice, Speed, Work, amounts, effects_work, most_export_seconds, sfm_work
+from toolkit.evaluate.budget import KINDS, Choice, Speed, Work, amounts, choose, effects_work, most_export_seconds, predict, sfm_work
 from toolkit.evaluate.budget_probe import self_test
 from toolkit.evaluate.budget_table import budget_table
 from toolkit.files import write_json
@@ -24,6 +24,16 @@ FOX = Work(50, 540, 960, 7, posed=True, depth=False, outlined=False)
 def test_more_seconds_give_larger_pictures() -> None:
     sizes = [model.choose(Speed(UNITS), FOX, seconds).image_size for seconds in (15, 30, 60, 120, 600)]
     assert sizes == sorted(sizes) and sizes[0] < sizes[-1] <= 960
+
+
+def test_what_has_to_be_done_anyway_does_not_make_pictures_small() -> None:
+    """105 frames with depth: effects and TSDF take what the fit should have, whatever the pictures' size."""
+    units = {"decode": 0.0076, "features": 0.18, "ray": 1.3e-6, "fit": 5e-6, "score": 0.94}
+    work = Work(105, 640, 480, 14, True, True, True, effects=True)
+    left = 90 * 0.75 - sum(predict(Speed(units), work, Choice(160)).values())
+    assert 0 < left < 0.35 * 90
+    assert 160 < choose(Speed(units), work, 90.0).image_size <= 320
+    assert choose(Speed(units), work, 60.0).image_size == 160  # there are not rays enough for more
 
 
 def test_a_slower_machine_gets_smaller_pictures() -> None:

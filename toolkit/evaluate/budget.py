@@ -21,14 +21,15 @@ RAYS_A_PIXEL = 0.6  # rays that a fit should have for each training pixel: with 
 VOXELS_A_RAY = 2.0  # as the schedule: a finer level is worth its voxels only when so few rays are left for each
 SURFACE = 3.0  # occupied voxels of a lattice of n a side, in n²
 FIT_SHARE = 0.35  # of the seconds, at least, that the fit should have when pictures are chosen
+NEARLY = 0.8  # of the seconds that the smallest pictures would leave, where they do not leave that share
 LEAST_FIT = 2.0  # seconds
 STEADY = 5.0  # seconds of stages that count as predicted well when it is told how busy the machine is: first imports are no sign of it
 EXPORT_SHARE = 0.25  # of the seconds, at most, that are planned for exports
 # Pictures' worth of features that a mesh takes: whatever it is of; a megapixel of one view, for its triangles; and a megapixel of all
 # views, to render, polish and fuse their depth and to carve with it. A mesh of 12 views of 400 pixels takes six times that of 160 pixels.
 MESH_FIXED, MESH_TRIANGLES, MESH_DEPTH = 3.0, 240.0, 35.0
-# Besides, for a texture: a coarser mesh, what each picture sees of it, large pictures read again; and for a page: what training rays see.
-EXTRAS = {"texture": 30.0, "page": 15.0}
+# For a texture besides: a coarser mesh, and of each training picture what it sees and its texels; for a page: what training rays see.
+TEXTURE_FIXED, TEXTURE_PICTURE, PAGE = 20.0, 0.3, 15.0
 OBJECT = 0.5  # of that where pictures have alpha: the object fills a part of them
 MESH_SIDE, VIDEO_SIDE = 400, 640  # long sides that are rendered at most
 EXPORT_RAY = 1.2  # of the time of a test view's ray: writing video frames comes on top
@@ -56,6 +57,7 @@ COST = {
     "scene": ("features", 1.0),
     "views": ("decode", 7.0),
     "tsdf": ("decode", 80.0),
+    "tsdf_texture": ("features", 1.0),
     "beside": ("features", 8.0),  # what a fit takes beside its own seconds: reading, the timeline, writing
     "render": ("ray", 1.5),
     "export": ("ray", 1.5),
@@ -63,7 +65,7 @@ COST = {
     "report": ("decode", 40.0),
 }
 KINDS = ("decode", "features", "ray", "fit", "score")
-COUNTED = 2  # raised when a stage's work is counted in another way: what was learnt before says nothing then
+COUNTED = 3  # raised when a stage's work is counted in another way: what was learnt before says nothing then
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,8 @@ class Work:
     total: int = 0
     effects: bool = False  # they are looked for
     alpha: bool = False  # pictures of an object alone
+    texture: bool = False  # meshes are to have one
+    page: bool = False  # the field is to be walked through in a browser
     converted: int = 0  # pictures that are HEIF, and are written as JPEG first
 
     @property
@@ -145,6 +149,7 @@ def amounts(work: Work, choice: Choice) -> dict[str, float]:
         "scene": 0.05 * frames * work.megapixels if work.outlined else float(min(frames, SIFT_FRAMES)),
         "views": frames * work.megapixels,
         "tsdf": (frames - test) * work.megapixels if work.depth else 0.0,
+        "tsdf_texture": texture_work(frames - test) if work.depth and work.texture else 0.0,
         "render": test * pixels,
         "evaluate": test * pixels / 1e6 * methods,
         "report": 1 + 0.2 * min(test, 12) * methods,
@@ -173,27 +178,29 @@ def video_rays(work: Work, choice: Choice) -> float:
     return (choice.video_frames or 0) * work.pixels(min(VIDEO_SIDE, choice.image_size))
 
 
-def extras(formats: list[str]) -> float:
-    """Pictures' worth of features that exports beside the mesh and the video take."""
-    return sum(EXTRAS.get(name, 0.0) for name in formats)
+def texture_work(pictures: float) -> float:
+    """Pictures' worth of features that a texture of so many training pictures takes."""
+    return TEXTURE_FIXED + TEXTURE_PICTURE * pictures
 
 
-def mesh_work(work: Work, choice: Choice, extra: float = 0.0) -> tuple[float, float]:
-    """Pictures' worth of features that a mesh (and what is `extra`) takes beside its views, and for each of them."""
+def mesh_work(work: Work, choice: Choice) -> tuple[float, float]:
+    """Pictures' worth of features that a mesh takes beside its views, its texture and the page among them, and for each view."""
     megapixels = work.pixels(min(MESH_SIDE, choice.image_size)) / 1e6 * (OBJECT if work.alpha else 1.0)
+    frames = min(work.frames, choice.max_frames or work.frames)
+    extra = (texture_work(frames * (1 - work.test / max(work.frames, 1))) if work.texture else 0.0) + (PAGE if work.page else 0.0)
     return MESH_FIXED + MESH_TRIANGLES * megapixels + extra, MESH_DEPTH * megapixels
 
 
-def most_export_seconds(speed: Speed, work: Work, choice: Choice, mesh_views: int, video_frames: int, extra: float = 0.0) -> float:
+def most_export_seconds(speed: Speed, work: Work, choice: Choice, mesh_views: int, video_frames: int) -> float:
     """What exports take when nothing of them is left out: more than that they cannot use."""
-    once, each = mesh_work(work, choice, extra)
+    once, each = mesh_work(work, choice)
     video = video_rays(work, replace(choice, video_frames=video_frames)) * EXPORT_RAY * speed.seconds("render", 1.0)
     return speed.factors.get("export", 1.0) * ((once + mesh_views * each) * speed.units["features"] + video)
 
 
-def least_export_seconds(speed: Speed, work: Work, choice: Choice, extra: float = 0.0) -> float:
+def least_export_seconds(speed: Speed, work: Work, choice: Choice) -> float:
     """What exports take at least: a mesh of the fewest views, and no video."""
-    return most_export_seconds(speed, work, choice, MESH_VIEWS[0], 0, extra)
+    return most_export_seconds(speed, work, choice, MESH_VIEWS[0], 0)
 
 
 def predict(speed: Speed, work: Work, choice: Choice) -> dict[str, float]:
@@ -205,24 +212,34 @@ def choose(speed: Speed, work: Work, total: float, most_frames: int = 150) -> Ch
     """Picture size and, for a video, how many frames, for a run of `total` seconds.
 
     The largest pictures whose fit still gets `FIT_SHARE` of the seconds and enough rays for its training pixels; of a video the most
-    frames for which there is such a size. The smallest of everything when there is none.
+    frames for which there is such a size. Where other things take so much that no size leaves that share, size has little to do with it:
+    then the largest that leaves nearly as much as any. The smallest of everything when there are never rays enough.
     """
     counts: list[int | None] = [None]
     if work.video:
         counts = [most_frames, *(count for count in FRAME_COUNTS if count < most_frames)]
     sizes = [size for size in SIZES if size == SIZES[0] or size <= 1.2 * max(work.width, work.height)]
     for count in counts:
-        fitting = [size for size in sizes if _fits(speed, work, Choice(size, count), total)]
+        left = {size: total * (1 - EXPORT_SHARE) - sum(predict(speed, work, Choice(size, count)).values()) for size in sizes}
+        most = max(left.values())
+        if most < FIT_SHARE * total and count != counts[-1]:
+            continue
+        least = min(FIT_SHARE * total, NEARLY * most)
+        fitting = [size for size in sizes if left[size] >= least and _rays(speed, left[size]) >= _wanted_rays(work, Choice(size, count))]
         if fitting:
             return Choice(max(fitting), count)
     return Choice(SIZES[0], counts[-1])
 
 
-def _fits(speed: Speed, work: Work, choice: Choice, total: float) -> bool:
-    """Whether enough is left for the fit."""
-    left = total * (1 - EXPORT_SHARE) - sum(predict(speed, work, choice).values())
+def _rays(speed: Speed, seconds: float) -> float:
+    """That a fit has in so many seconds."""
+    return seconds / speed.units["fit"]
+
+
+def _wanted_rays(work: Work, choice: Choice) -> float:
+    """That a fit should have."""
     training = (1 - work.test / max(work.frames, 1)) * min(work.frames, choice.max_frames or work.frames)
-    return left >= FIT_SHARE * total and left / speed.units["fit"] >= RAYS_A_PIXEL * training * work.pixels(choice.image_size)
+    return RAYS_A_PIXEL * training * work.pixels(choice.image_size)
 
 
 def fit_seconds(total: float, spent: float, rest: float) -> float:
