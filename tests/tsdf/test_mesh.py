@@ -84,6 +84,18 @@ def test_thinning_keeps_shape_and_colour() -> None:
     assert np.array_equal(thin.colours[far, 0] > 128, thin.vertices[far, 2] > 0)
     assert np.einsum("ij,ij->i", thin.normals, thin.vertices).min() > 0.9
     assert mesh.decimated(len(mesh.triangles)) is mesh
+    again = mesh.decimated(2000)
+    assert np.array_equal(again.vertices, thin.vertices) and np.array_equal(again.triangles, thin.triangles)
+
+
+def test_thinning_far_from_the_origin_is_thinning_at_it() -> None:
+    """Coordinates of a map: a million units away, of which float32 knows a sixteenth."""
+    away = np.array([1e6, -2e6, 5e5])
+    mesh = ball(1.0, subdivisions=4)
+    thin = Mesh.create(mesh.vertices + away, mesh.triangles, mesh.colours, mesh.normals).decimated(500)
+    assert 400 < len(thin.triangles) <= 525
+    assert np.abs(np.linalg.norm(thin.vertices - away, axis=1) - 1).max() < 0.05
+    assert np.einsum("ij,ij->i", thin.normals, thin.vertices - away).min() > 0.9
 
 
 def test_components_are_counted_as_open3d_and_trimesh_do() -> None:

@@ -9,7 +9,7 @@ import open3d as o3d
 import open3d.core as o3c
 
 from toolkit.camera import Array, Intrinsics, invert
-from toolkit.tsdf.mesh import Mesh
+from toolkit.tsdf.mesh import Mesh, ray_scene
 
 AT_ONCE = 1 << 19  # rays
 
@@ -44,14 +44,6 @@ def in_picture(points: Array, camera: Intrinsics, world_from_camera: Array) -> A
     with np.errstate(invalid="ignore"):
         u, v = local[:, 0] / z * camera.fx + camera.cx, local[:, 1] / z * camera.fy + camera.cy
         return np.asarray((u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height))
-
-
-def ray_scene(mesh: Mesh, origin: Array) -> o3d.t.geometry.RaycastingScene:
-    """The mesh, shifted by −`origin`, ready for rays and distances."""
-    scene = o3d.t.geometry.RaycastingScene()
-    vertices = np.ascontiguousarray(mesh.vertices - origin, dtype=np.float32)
-    scene.add_triangles(o3c.Tensor.from_numpy(vertices), o3c.Tensor.from_numpy(mesh.triangles.astype(np.uint32)))
-    return scene
 
 
 def _hidden(scene: o3d.t.geometry.RaycastingScene, points: Array, eye: Array, margin: float) -> Array:

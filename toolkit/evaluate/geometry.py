@@ -12,8 +12,8 @@ import trimesh
 
 from toolkit.camera import Array, Intrinsics
 from toolkit.errors import InputError
-from toolkit.evaluate.coverage import ray_scene, seen_points
-from toolkit.tsdf.mesh import Mesh
+from toolkit.evaluate.coverage import seen_points
+from toolkit.tsdf.mesh import Mesh, ray_scene
 
 SAMPLES = 200_000  # on each surface: F-scores of the same meshes then repeat within some thousandths
 VOXELS = (1, 2, 4)  # distances at which F-scores are given, in voxels
