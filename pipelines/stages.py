@@ -87,6 +87,7 @@ class Stages:
         in_place: bool = False,
         keeps: bool = False,
         rounded: bool = False,
+        adds: bool = False,
     ) -> T:
         """The stage's result: loaded when it is finished and nothing that went in has changed, else made and recorded.
 
@@ -98,6 +99,7 @@ class Stages:
             version: raised when the stage's code changes what it writes.
             in_place: `make` itself writes into the folder, so an older result is gone once it starts.
             keeps: `make` may return early when the user asks to stop; what it has is kept.
+            adds: files of the result before that are not written again stay, as long as the stages `after` are still the same.
             rounded: the files hold less precision than memory: the result is what they hold, so that a run that was killed later and
                 goes on has the same one.
 
@@ -119,7 +121,7 @@ class Stages:
                 self._note(record, cached=True)
                 return value
         self.progress.check()
-        value = self._make(name, key, before, make, save, in_place, keeps)
+        value = self._make(name, key, before, make, save, in_place, keeps, adds)
         return load() if rounded else value
 
     def _make(
@@ -131,6 +133,7 @@ class Stages:
         save: Callable[[T], Iterable[Path]],
         in_place: bool,
         keeps: bool,
+        adds: bool,
     ) -> T:
         old = self.record(name)
         if in_place:
@@ -145,6 +148,8 @@ class Stages:
         for path in paths:
             path.chmod(0o666 & ~_umask())  # some writers make files that only their owner may read
         outputs = {path.relative_to(self.folder.path).as_posix(): path.stat().st_size for path in paths}
+        if adds and old and old.after == before:
+            outputs = {path: size for path, size in old.outputs.items() if (self.folder / path).is_file()} | outputs
         record = Record(
             name, key, uuid.uuid4().hex[:16], round(time.monotonic() - start, 3), round(memory.megabytes, 1), outputs, before, stopped
         )

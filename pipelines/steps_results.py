@@ -179,15 +179,19 @@ def render_test_views(job: Job, field: Field, views: Views) -> Pictures:
 
 
 def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, scene: Scene, views: Views) -> dict[str, Any]:
-    """Points, meshes, cameras and video in the input's own frame; answers the mesh's facts."""
+    """Points, meshes, cameras, the page and video, in the input's own frame; answers the mesh's facts. Files of the same field that were
+    made before, in other formats, stay."""
     facts_path = job.folder / "exports" / "facts.json"
     made: list[Path] = []
 
     def make() -> dict[str, Any]:
         from pipelines.surface import export_field
 
+        before = read_kept(facts_path, EXPORT_FACTS) if job.stages.usable("export") else None
         facts, paths = export_field(job, job.folder / "exports", field, poses, posed, scene, views)
         made.extend(paths)
+        if before is not None and facts["mesh"] is None:
+            facts["mesh"] = before["mesh"]
         return facts
 
     def save(facts: dict[str, Any]) -> list[Path]:
@@ -200,6 +204,7 @@ def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, sc
         save=save,
         load=lambda: read_kept(facts_path, EXPORT_FACTS),
         uses=asdict(job.settings.export),
+        adds=True,
         after=["field", "poses", "scene", "views"],
     )
 

@@ -65,11 +65,14 @@ def test_tsdf_alone_then_the_rest_in_the_same_folder(tmp_path: Path, capsys: Cap
     assert stages(both)["tsdf"] and not stages(both)["field"]
     answer = call(capsys, "export", out, "--formats", "ply", "--quiet", "--json")
     assert answer.code == 0, answer.err
-    assert (
-        stages(json.loads(answer.out))["field"]
-        and (out / "exports" / "mesh.ply").is_file()
-        and not (out / "exports" / "points.ply").exists()
-    )
+    assert stages(json.loads(answer.out))["field"]
+    answer = call(capsys, "export", out, "--formats", "cameras", "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    # One format after the other: what was there of this field stays, in the report, too.
+    told = json.loads(answer.out)
+    for name in ("points.ply", "mesh.ply", "cameras/transforms.json"):
+        assert (out / "exports" / name).is_file() and f"exports/{name}" in [entry["path"] for entry in told["exports"]]
+    assert told["export_facts"]["mesh"]["triangles"] > 0
     page = tmp_path / "page.md"
     page.write_text("# Results\n")
     answer = call(capsys, "bench", "table", out / "report.json", "--into", page, "--data", tmp_path)
@@ -84,6 +87,10 @@ def test_a_changed_budget_redoes_the_field_and_what_follows(tmp_path: Path, caps
     assert answer.code == 0, answer.err
     cached = stages(json.loads(answer.out))
     assert {name for name, reused in cached.items() if not reused} == {"field", "render", "export", "evaluate"}
+    other = [*FAST, "--budget", 0.2, "--set", "export.formats=[cameras]"]
+    answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", *other, "--quiet")
+    assert answer.code == 0, answer.err
+    assert not (tmp_path / "out" / "exports" / "points.ply").exists()  # of another field
 
 
 def test_a_field_without_surface_is_exported_as_far_as_it_goes(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:

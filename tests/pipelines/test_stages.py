@@ -141,7 +141,9 @@ def test_a_stop_between_stages_ends_before_the_next(tmp_path: Path) -> None:
     assert chain.made == []
 
 
-def test_outputs_that_are_no_longer_made_are_removed(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("adds", "left"), [(False, ["0.txt"]), (True, ["0.txt", "1.txt", "2.txt"])])
+def test_outputs_that_are_no_longer_made_are_removed(tmp_path: Path, adds: bool, left: list[str]) -> None:
+    """Unless the stage adds to what is there."""
     with RunFolder(tmp_path / "run") as folder:
         for count in (3, 1):
             stages = Stages(folder, ConsoleProgress())
@@ -152,8 +154,8 @@ def test_outputs_that_are_no_longer_made_are_removed(tmp_path: Path) -> None:
                     path.write_text("here")
                 return paths
 
-            stages.run("only", lambda: count, save, lambda: 0, uses=count)  # noqa: B023
-        assert sorted(path.name for path in folder.path.glob("*.txt")) == ["0.txt"]
+            stages.run("only", lambda: count, save, lambda: 0, uses=count, adds=adds)  # noqa: B023
+        assert sorted(path.name for path in folder.path.glob("*.txt")) == left == sorted(stages.records["only"].outputs)
 
 
 def test_memory_of_children_counts(tmp_path: Path) -> None:
