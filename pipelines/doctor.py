@@ -20,6 +20,7 @@ PACKAGES = (
     "torch",
     "opencv-contrib-python-headless",
     "trimesh",
+    "fast-simplification",
     "typer",
     "rich",
     "omegaconf",

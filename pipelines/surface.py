@@ -121,7 +121,7 @@ def export_field(
     written: list[Path] = []
     if formats & {"points", *MESHES, TEXTURE}:
         try:
-            facts["mesh"], written = export_surface(job, folder, formats, field, posed, scene, views)
+            facts["mesh"], written = export_surface(job, folder, formats, field, posed, scene, views, facts["notes"])
         except InputError as error:
             facts["notes"].append(f"points and meshes were left out: {error}")
     if "cameras" in formats:
@@ -144,9 +144,12 @@ def export_field(
 
 
 def export_surface(
-    job: Job, folder: Path, formats: set[str], field: Field, posed: Capture, scene: Scene, views: Views
+    job: Job, folder: Path, formats: set[str], field: Field, posed: Capture, scene: Scene, views: Views, notes: list[str]
 ) -> tuple[dict[str, Any], list[Path]]:
     """The field's depth at the training cameras, polished by their pictures and fused: points and meshes of the region of interest.
+
+    Args:
+        notes: gets a sentence when the texture had to be left out.
 
     Raises:
         InputError: the field has no surface.
@@ -183,7 +186,10 @@ def export_surface(
         write_mesh(path, mesh)
         written.append(path)
     if TEXTURE in formats:
-        written.append(put_textured(job, folder / "textured.glb", whole, posed, scene, views))
+        try:
+            written.append(put_textured(job, folder / "textured.glb", whole, posed, scene, views))
+        except InputError as error:
+            notes.append(f"the texture was left out: {error}")
     return facts, written
 
 

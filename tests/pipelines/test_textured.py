@@ -17,6 +17,8 @@ from pipelines.textured import sharpest
 from tests.pipelines.made import CAMERA, call, make_room
 from tests.pipelines.short import ALONE
 from toolkit.effects.correct import Corrections, canonical
+from toolkit.errors import InputError
+from toolkit.files import read_json
 
 Capsys = pytest.CaptureFixture[str]
 FEW = ["--image-size", "48", "--budget", "2", *ALONE, "--set", "field.resolution=32", "--set", "export.mesh_views=6", "--quiet"]
@@ -78,3 +80,15 @@ def test_a_size_of_nothing_is_refused(tmp_path: Path, capsys: Capsys) -> None:
     make_room(tmp_path / "room", 4)
     answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", "--set", "export.texture_size=0")
     assert answer.code == 2 and "export.texture_size is 0; it must be a positive number" in answer.sentence()
+
+
+def test_a_mesh_stays_when_its_texture_cannot_be_made(run: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    def too_many(*_: object, **__: object) -> None:
+        raise InputError("80000 triangles do not fit into a texture")
+
+    monkeypatch.setattr("toolkit.export.texture.textured", too_many)
+    out = run / "untextured"
+    answer = call(capsys, "run", run / "room", "--out", out, *FEW, "--set", "export.formats=[ply,texture]", "--set", "tsdf.enabled=off")
+    assert answer.code == 0, answer.err
+    assert (out / "exports" / "mesh.ply").is_file() and not (out / "exports" / "textured.glb").exists()
+    assert "the texture was left out: 80000 triangles" in " ".join(read_json(out / "report.json")["warnings"])
