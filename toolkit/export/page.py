@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -72,7 +73,7 @@ def require_page(field: Field) -> None:
         )
 
 
-def write_page(path: Any, field: BakedField, tour: Tour, title: str) -> None:
+def write_page(path: Path | str, field: BakedField, tour: Tour, title: str) -> None:
     """Write the page, atomically. `field` was baked from one that passed `require_page`.
 
     Raises:
