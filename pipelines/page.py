@@ -20,7 +20,7 @@ FLIGHT = 90  # cameras along the flight
 
 
 def put_page(job: Job, path: Path, field: Field, views: Views, scene: Scene) -> Path:
-    """The baked field as a page that any browser walks through, with all photos and an orbit.
+    """The baked field as a page that any browser walks through, with the places of all pictures (not the pictures) and a flight.
 
     Raises:
         InputError: a decoder that cannot be baked, or is too wide for a page.

@@ -78,7 +78,8 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
     """
     start = time.monotonic()
     stages = job.stages
-    stages.trust({*RESULTS, *(() if "tsdf" in goals else (TSDF_TEXTURE,))} - goals)
+    stages.trust(set(RESULTS) - goals)
+    stages.trust(() if "tsdf" in goals else (TSDF_TEXTURE,))
     # What the networks left is what a fit begins with, whether the folder's field was fitted or not.
     stages.trust(FOR_FIELD if "field" not in goals or (go_on and not job.other_network) else ())
     capture, poses, posed, scene, views = stand(job)
