@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import os
 import signal
 import sys
@@ -15,6 +16,7 @@ from typing import IO, Any
 from toolkit.errors import FieldfuseError
 from toolkit.progress import Progress
 
+AGAIN = 0.02  # seconds until an interrupt that got lost is told again
 PLAIN_EVERY = 10.0  # seconds between two lines where there is no terminal
 STOPPING = "stopping: the current stage is brought to an end (Ctrl-C again to quit at once)"
 
@@ -80,6 +82,7 @@ class ConsoleProgress(Progress):
     def listening(self) -> Iterator[None]:
         """Turn the first SIGINT or SIGTERM into `stopping()`, the second into KeyboardInterrupt."""
         asked = 0
+        again: list[threading.Timer] = []
 
         def handler(number: int, frame: FrameType | None) -> None:
             nonlocal asked
@@ -89,10 +92,20 @@ class ConsoleProgress(Progress):
             self.request_stop()
             self.say(STOPPING)
 
+        def unraisable(lost: sys.UnraisableHookArgs) -> None:
+            # Python drops what is raised in `__del__` and in callbacks of C code; the wish to quit is told again a moment later.
+            if asked > 1 and issubclass(lost.exc_type, KeyboardInterrupt):
+                again.append(threading.Timer(AGAIN, _thread.interrupt_main))
+                again[-1].daemon = True
+                again[-1].start()
+            else:
+                hook(lost)
+
         if threading.current_thread() is not threading.main_thread():
             yield
             return
         before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+        hook, sys.unraisablehook = sys.unraisablehook, unraisable
         try:
             yield
         except FieldfuseError:
@@ -103,6 +116,9 @@ class ConsoleProgress(Progress):
                 raise KeyboardInterrupt from error
             raise
         finally:
+            sys.unraisablehook = hook
+            for timer in again:
+                timer.cancel()
             for number, old in before.items():
                 signal.signal(number, old)
             self.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import signal
+import sys
 import time
 
 import pytest
@@ -90,3 +91,37 @@ def test_a_library_that_hides_the_second_signal_does_not_make_it_an_error(signal
 
     with pytest.raises(expected), ConsoleProgress().listening():
         load()
+
+
+def test_a_second_signal_that_is_lost_in_del_still_ends(capsys: pytest.CaptureFixture[str]) -> None:
+    """Python reports what is raised in `__del__` and goes on: numba frees its compilers that way, while a fit begins."""
+
+    class Freed:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+            time.sleep(0)  # where the handler runs at the latest
+
+    hook = sys.unraisablehook
+    progress = PlainProgress(io.StringIO())
+    with pytest.raises(KeyboardInterrupt), progress.listening():
+        Freed()
+        for _ in range(500):
+            time.sleep(0.01)
+    assert progress.stopping() and sys.unraisablehook is hook
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_other_errors_in_del_are_told_as_ever() -> None:
+    class Freed:
+        def __del__(self) -> None:
+            raise ValueError("bad")
+
+    told: list[type[BaseException]] = []
+    hook, sys.unraisablehook = sys.unraisablehook, lambda lost: told.append(lost.exc_type)
+    try:
+        with ConsoleProgress().listening():
+            Freed()
+    finally:
+        sys.unraisablehook = hook
+    assert told == [ValueError]
