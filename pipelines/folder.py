@@ -38,6 +38,7 @@ FILES = (
     "timeline.json",
     "fit_notes.json",
     "fit_matched.json",
+    "left_out.safetensors",
     "mesh.ply",
     "evaluation.json",
     "report.json",

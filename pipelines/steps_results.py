@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from toolkit.poses.result import PoseResult
     from toolkit.poses.scene import Scene
     from toolkit.render.field import Field
+    from toolkit.stereo.left_out import LeftOut
     from toolkit.training.fit import FitResult
 
 
@@ -70,6 +71,7 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
 
 
 FIT_NOTES = "fit_notes.json"  # what a reader of the numbers has to know of the fit; there only when there is something
+LEFT_OUT = "left_out.safetensors"  # pixels that the fit did without, since they show what moves; there only when they were looked for
 FIT_MATCHED = "fit_matched.json"  # what the fit's quick matching found; there only when it was made
 Fitted = tuple["Field", list[dict[str, Any]]]
 
@@ -83,6 +85,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     from pipelines.steps_network import direct_result, make_network_field, uses_network
     from pipelines.steps_stereo import views_for_fit
     from toolkit.render.field import Field
+    from toolkit.stereo.left_out import save_left_out
     from toolkit.training.guided import fit_guided
     from toolkit.training.network_start import network_start
     from toolkit.volume.grid_host import GridHost
@@ -90,6 +93,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     settings = job.settings
     path, times = job.folder / "field.safetensors", job.folder / "timeline.json"
     told: dict[str, Any] = {}  # file → what it is to hold
+    found: list[LeftOut] = []
     made = make_network_field(job, views, scene) if uses_network(job, views) else None
     views, known = views_for_fit(job, scene, views)
     start = job.stages.record("field") if go_on and job.stages.usable("field") and not job.other_field else None
@@ -97,6 +101,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     def tell(result: FitResult) -> None:
         told.update({FIT_NOTES: result.notes} if result.notes else {})
         told.update({FIT_MATCHED: result.matched} if result.matched else {})
+        found.extend([] if result.left_out is None else [result.left_out])
 
     def load() -> Fitted:
         return Field.load(path).to(settings.device), read_kept(times, TIMELINE)
@@ -123,7 +128,9 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
         write_json(times, timeline)
         for name, content in told.items():
             write_json(job.folder / name, content)
-        return [path, times, *(job.folder / name for name in told)]
+        for left_out in found:
+            save_left_out(job.folder / LEFT_OUT, left_out)
+        return [path, times, *(job.folder / name for name in [*told, *([LEFT_OUT] if found else [])])]
 
     uses = [
         asdict(settings.field),
@@ -150,6 +157,14 @@ def fit_matched(job: Job) -> dict[str, Any] | None:
     """What this run's fit found by matching pictures before it began: pictures, long side, share of pixels with depth, seconds."""
     record = job.stages.records.get("field")
     return read_kept(job.folder / FIT_MATCHED, MATCHED) if record is not None and FIT_MATCHED in record.outputs else None
+
+
+def fit_left_out(job: Job) -> LeftOut | None:
+    """The pixels that this run's fit did without, since they show what moves; None: they were not looked for."""
+    from toolkit.stereo.left_out import load_left_out
+
+    record = job.stages.records.get("field")
+    return load_left_out(job.folder / LEFT_OUT) if record is not None and LEFT_OUT in record.outputs else None
 
 
 def render_test_views(job: Job, field: Field, views: Views) -> Pictures:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import time
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ from pipelines.folder import command_line
 from pipelines.job import Job
 from pipelines.rendered import Pictures
 from pipelines.steps_effects import effects_part, effects_warnings
-from pipelines.steps_results import fit_matched, fit_notes
+from pipelines.steps_results import fit_left_out, fit_matched, fit_notes
 from pipelines.textured import TSDF_TEXTURE
 from toolkit import __version__
 from toolkit.config import settings_dict
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from toolkit.poses.result import PoseResult
     from toolkit.poses.scene import Scene
     from toolkit.render.field import Field
+    from toolkit.stereo.left_out import LeftOut
 
 SEEN_BY_SFM = (
     "poses were computed from all pictures, the held-out ones included, so scores are a little kinder than with poses known beforehand"
@@ -34,6 +36,11 @@ MATCHED = (
     " knew a depth for {percent:.0f}% of their pixels{bare}."
 )
 BARE = " ({percent:.0f}% are bare and lie on planes that go on from beside them)"
+LEFT_OUT = (
+    "{percent:.1f}% of the training pictures' pixels were left out of the fit, in {pictures} of {looked_at} pictures, since they show"
+    " something else than several other pictures agree on ({seconds:.1f} s of its budget). Test views are scored on all of theirs."
+)
+NOTHING_LEFT_OUT = "Nothing that moves was found in the {looked_at} training pictures ({seconds:.1f} s of the fit's budget)."
 OPENED = {".html", ".ply", ".obj", ".glb", ".mp4", ".txt", ".json"}
 NO_TEST_VIEWS = "no picture was held out, so there are no scores; give --holdout 8 to keep every 8th picture for testing"
 
@@ -142,8 +149,17 @@ def describe_matching(matched: dict[str, Any]) -> str:
     return MATCHED.format(**{**matched, "percent": 100 * matched["share"], "bare": words})
 
 
-def describe_field(field: Field | None, matched: dict[str, Any] | None = None) -> dict[str, Any] | None:
-    """The report's part `field`; the voxel size is in working units. `matched` is what the fit's quick matching found."""
+def describe_left_out(left_out: LeftOut) -> str:
+    """A sentence about what moves."""
+    told = left_out.to_dict()
+    return (LEFT_OUT if left_out.masks else NOTHING_LEFT_OUT).format(**told, percent=100 * left_out.share)
+
+
+def describe_field(
+    field: Field | None, matched: dict[str, Any] | None = None, left_out: LeftOut | None = None
+) -> dict[str, Any] | None:
+    """The report's part `field`; the voxel size is in working units. `matched` is what the fit's quick matching found, `left_out` what
+    it did without."""
     if field is None:
         return None
     return {
@@ -153,6 +169,7 @@ def describe_field(field: Field | None, matched: dict[str, Any] | None = None) -
         "bytes": field.bytes,
         "resolution": field.resolution,
         **({"matched": matched} if matched is not None else {}),
+        **({"left_out": left_out.to_dict()} if left_out is not None else {}),
     }
 
 
@@ -184,12 +201,13 @@ def put_report(
     seconds: float,
 ) -> dict[str, Any]:
     """Write report.json and report.html; `seconds` is what this command took so far, reused stages count as they took."""
-    from toolkit.evaluate.pictures import method_pictures
+    from toolkit.evaluate.pictures import method_pictures, moving_pictures
     from toolkit.evaluate.report import report_data, write_report
 
     notes = export_facts["notes"] if export_facts else []
     began, told = time.monotonic(), None if job.plan is None else job.plan.told(job)
     matched = None if field is None else fit_matched(job)
+    left_out = None if field is None else fit_left_out(job)
     data = {
         **base_data(job, capture, poses),
         "warnings": warnings_of(job, capture, poses, scene, views) + notes,
@@ -201,8 +219,11 @@ def put_report(
             "width": views.intrinsics[0].width,
             "height": views.intrinsics[0].height,
         },
-        "field": describe_field(field, matched),
-        "notes": [] if matched is None else [describe_matching(matched)],
+        "field": describe_field(field, matched, left_out),
+        "notes": [
+            *([] if matched is None else [describe_matching(matched)]),
+            *([] if left_out is None else [describe_left_out(left_out)]),
+        ],
         "evaluation": {name: scores.get(name) for name in ("field", "tsdf", *(["network"] if "network" in scores else []))},
         "baseline": scores.get("nearest_image"),
         "timeline": timeline,
@@ -214,7 +235,7 @@ def put_report(
         data |= {"budget": told, "notes": [job.plan.note(told), *data["notes"]]}
     shown = {name: [*found.pictures] for name, found in pictures.items()}
     unit = "m" if scene.metric else "units"
-    tiles = method_pictures(views, np.flatnonzero(views.test), shown, unit)
+    tiles = replace(method_pictures(views, np.flatnonzero(views.test), shown, unit), moving=moving_pictures(views, left_out))
     write_report(job.folder.path, data, tiles)
     if job.plan is not None:
         data["budget"] = job.plan.finish(job, time.monotonic() - began)

@@ -14,6 +14,7 @@ from pipelines.page import NAME, PAGE, put_page
 from pipelines.pictures import camera_of, orbit_cameras, pictures
 from pipelines.rendered import Pictures, to_picture
 from pipelines.room import SURFACE_BYTES, require_pictures
+from pipelines.steps_results import fit_left_out
 from pipelines.summary import put_cameras
 from pipelines.textured import TEXTURE, put_textured
 from toolkit.camera import Intrinsics, Similarity
@@ -187,7 +188,9 @@ def export_surface(
         written.append(path)
     if TEXTURE in formats:
         try:
-            written.append(put_textured(job, folder / "textured.glb", whole, posed, scene, views))
+            left_out = fit_left_out(job)  # who passed belongs into a texture as little as into the field
+            shown = views if left_out is None else left_out.without(views)
+            written.append(put_textured(job, folder / "textured.glb", whole, posed, scene, shown))
         except InputError as error:
             notes.append(f"the texture was left out: {error}")
     return facts, written

@@ -88,6 +88,9 @@ class FitSettings:
     # Where depth comes from. auto: a sensor, or without one quick matching of the pictures in a share of the fit's seconds | any: a sensor,
     # or without one matching in full, which takes time of its own | sensor | off
     depth_from: str = "auto"
+    # Training pictures' pixels that show something else than several others agree on (people who pass, one's own shadow). auto: left out
+    # where depth is known and alpha cuts nothing out | off
+    moving: str = "auto"
     patience: bool = False  # end before the budget when the validation views stop improving
     passes: float | None = 50.0  # over the pixels, where there are too few views to keep some aside for validation; None: the whole budget
     prune_weight: float = 0.05  # voxels whose largest seen weight stays below are removed
@@ -163,6 +166,7 @@ CHOICES = {
     "network.depth_from": ("sensor", "off"),
     "network.precision": ("auto", "float32", "bfloat16"),
     "fit.depth_from": ("auto", "any", "sensor", "off"),
+    "fit.moving": ("auto", "off"),
     "field.background": ("auto", "on", "off"),
     "field.view": ("auto", "full", "low", "none"),
     "field.init": ("auto", "network", "classical"),

@@ -10,11 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.summary import describe_matching
+from pipelines.summary import describe_left_out, describe_matching
 from tests.pipelines.made import call, save_picture, write_transforms
 from tests.poses.textured import arc, render
 from toolkit.camera import Intrinsics, opengl_from_world
 from toolkit.files import read_json
+from toolkit.stereo.left_out import LeftOut, load_left_out
 
 Capsys = pytest.CaptureFixture[str]
 CAMERA = Intrinsics(128, 96, 120.0, 120.0, 64.0, 48.0)
@@ -73,6 +74,41 @@ def test_without_being_asked_pictures_are_matched_for_the_fit_alone(tmp_path: Pa
     data = read_json(out / "report.json")
     assert "matched" not in data["field"] and not any("matching" in note for note in data["notes"])
     assert not (out / "fit_matched.json").exists()
+
+
+def test_what_moves_is_left_out_and_told(tmp_path: Path, capsys: Capsys) -> None:
+    make_corner(tmp_path / "corner", 9)
+    for index in (2, 6):
+        path = tmp_path / "corner" / f"images/{index:03d}.png"
+        picture = cv2.imread(str(path))
+        assert picture is not None
+        picture[20:80, 10 * index + 10 : 10 * index + 45] = (30, 200, 60)
+        cv2.imwrite(str(path), picture)
+    out = tmp_path / "out"
+    options = ["--holdout", "4", "--quiet", "--set", "init=classical", "--set", "fit.budget=4", "--set", "field.resolution=32"]
+    options += ["--set", "export.formats=[texture]"]
+    assert call(capsys, "run", tmp_path / "corner", "--out", out, *options).code == 0
+    for _ in range(2):
+        data = read_json(out / "report.json")
+        told = data["field"]["left_out"]
+        assert told["looked_at"] == 6 and told["pictures"] == 2 and 0.02 < told["share"] < 0.12
+        assert any("in 2 of 6 pictures" in note for note in data["notes"])
+        page = (out / "report.html").read_text(encoding="utf-8")
+        assert "Left out of the fit" in page and page.count("what is left out tinted") == 2
+        assert load_left_out(out / "left_out.safetensors").to_dict() == told
+        assert call(capsys, "run", tmp_path / "corner", "--out", out, *options).code == 0  # what was made before is told again
+    texture = (out / "exports" / "textured.glb").read_bytes()
+    assert call(capsys, "run", tmp_path / "corner", "--out", out, *options, "--set", "fit.moving=off").code == 0
+    assert "left_out" not in read_json(out / "report.json")["field"] and not (out / "left_out.safetensors").exists()
+    assert "Left out of the fit" not in (out / "report.html").read_text(encoding="utf-8")
+    assert (out / "exports" / "textured.glb").read_bytes() != texture
+
+
+def test_the_report_tells_that_nothing_moves() -> None:
+    nothing = describe_left_out(LeftOut.of(["a"] * 7, [np.zeros((3, 4), bool)] * 7))
+    assert "Nothing that moves was found in the 7 training pictures" in nothing
+    some = describe_left_out(LeftOut.of(["a", "b"], [np.eye(4, dtype=bool), np.zeros((4, 4), bool)], 0.5))
+    assert "12.5% of" in some and "in 1 of 2 pictures" in some and "0.5 s" in some
 
 
 def test_the_report_tells_of_bare_surfaces() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.stereo.test_match import FAR, MEDIAN, NEAR, corner
+from tests.stereo.test_moving import PASSED, with_passer
 from toolkit.camera import Similarity
 from toolkit.capture.types import Views
 from toolkit.config import Settings, load_settings
@@ -18,8 +19,8 @@ from toolkit.poses.scene import Scene
 from toolkit.progress import Progress
 from toolkit.render.field import Field
 from toolkit.render.image import make_renderer, render_view
-from toolkit.stereo import quick
-from toolkit.training.guided import fit_guided, wants_matching
+from toolkit.stereo import moving, quick
+from toolkit.training.guided import find_moving, fit_guided, looks_for_moving, wants_matching
 
 SCENE = Scene(Similarity.identity(), np.array([0.0, 0.0, 0.0]), np.full(3, 1.5), MEDIAN, NEAR, FAR, 0.0, True, False)
 
@@ -69,6 +70,58 @@ def test_matching_is_a_part_of_the_budget(monkeypatch: pytest.MonkeyPatch) -> No
     assert len(took) == 1 and result.matched is not None and 1 <= result.matched["seconds"] < 1.1
     assert 3.9 < result.seconds < 4.2
     assert result.timeline[0]["seconds"] > 1 and result.timeline[-1]["seconds"] == pytest.approx(result.seconds, abs=0.05)
+
+
+def psnr(field: Field) -> float:
+    """Of the held-out view."""
+    made, _ = corner()
+    shown = render_view(field, made.intrinsics[3], made.world_from_camera[3], make_renderer(field)).rgb
+    return float(-10 * np.log10(np.mean(np.square(shown - made.images[3] / np.float32(255)))))
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_a_fit_does_without_what_moves(measured: bool) -> None:
+    made, depths, masks = with_passer()
+    given = replace(made, test=np.arange(len(made)) == 3, depths=list(depths) if measured else [])
+    without = fit_guided(given, SCENE, wanted(), ticks=steady())
+    everything = fit_guided(given, SCENE, wanted("fit.moving=off"), ticks=steady())
+    assert everything.left_out is None
+    assert without.left_out is not None and set(without.left_out.masks) == {made.names[index] for index in PASSED}
+    assert without.left_out.looked_at == 6 and without.left_out.share == pytest.approx(sum(mask.mean() for mask in masks) / 6, rel=0.35)
+    assert psnr(without.field) > psnr(everything.field) + 0.3
+
+
+def test_held_out_pictures_are_not_looked_at_for_what_moves() -> None:
+    made, _, _ = with_passer()
+    views = replace(made, test=np.arange(len(made)) == 4)
+    first = fit_guided(views, SCENE, wanted("budget=1"), ticks=steady()).left_out
+    other = replace(views, images=[np.zeros_like(image) if index == 4 else image for index, image in enumerate(made.images)])
+    second = fit_guided(other, SCENE, wanted("budget=1"), ticks=steady()).left_out
+    assert first is not None and second is not None and list(first.masks) == list(second.masks) == [made.names[1]]
+    assert np.array_equal(first.masks[made.names[1]], second.masks[made.names[1]])
+
+
+def test_looking_for_what_moves_is_a_part_of_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, whole = steady(), moving.moving
+
+    def slow(*given: object, **options: object) -> object:
+        assert [now() for _ in range(200)]  # a second
+        return whole(*given, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(moving, "moving", slow)
+    result = fit_guided(replace(views(), depths=corner()[1]), SCENE, wanted(), ticks=now)
+    assert result.matched is None and result.left_out is not None and 1 <= result.left_out.seconds < 1.1
+    assert 3.9 < result.seconds < 4.2
+
+
+def test_what_moves_is_looked_for_where_depth_is_known_and_nothing_is_cut_out() -> None:
+    known = replace(views(), depths=corner()[1])
+    assert looks_for_moving(known, wanted()) and not looks_for_moving(known, wanted("fit.moving=off"))
+    assert not looks_for_moving(replace(known, background=(1.0, 1.0, 1.0)), wanted())
+    assert find_moving(known, None, SCENE, 4) is not None and find_moving(known, None, SCENE, 0.2) is None
+    assert find_moving(views(), None, SCENE, 4) is None
+    only_held_out = [depth if test else None for depth, test in zip(corner()[1], known.test, strict=True)]
+    assert find_moving(replace(known, depths=only_held_out), None, SCENE, 4) is None
 
 
 def test_only_captures_without_depth_are_matched() -> None:

@@ -78,6 +78,7 @@ class Views:
     alpha: list[Array | None] = field(default_factory=list)  # (H, W) uint8, None: opaque
     depths: list[Array | None] = field(default_factory=list)  # (H, W) float32 along z, working units, 0 = missing; aligned to the picture
     background: tuple[float, float, float] | None = None  # colour behind everything for captures with alpha; None: unknown
+    matched: bool = False  # `depths` were found by matching pictures, not measured
     rough: bool = False  # `depths` were found by matching small pictures: less exact than a sensor's, or than those of matching in full
     weight: list[float] = field(default_factory=list)  # share of a view's pixels that a fit draws rays from; empty: all of all views
 
@@ -97,6 +98,7 @@ class Views:
             alpha=[self.alpha[i] for i in keep] if self.alpha else [],
             depths=[self.depths[i] for i in keep] if self.depths else [],
             background=self.background,
+            matched=self.matched,
             rough=self.rough,
             weight=[self.weight[i] for i in keep] if self.weight else [],
         )

@@ -192,6 +192,7 @@ def render_page(data: dict[str, Any], pictures: Pictures) -> str:
         open_views=OPEN_VIEWS,
         tile_height=TILE_HEIGHT,
         left_out=pictures.left_out,
+        moving=[{"caption": name, "uri": data_uri(tile)} for name, tile in pictures.moving],
         error_top=ERROR_TOP,
         error_bar=data_uri(colour_bar(128, 1, ERROR_COLOURS), lossless=True),
         depth_bar=data_uri(colour_bar(128, 1, DEPTH_COLOURS), lossless=True),

@@ -20,10 +20,12 @@ from toolkit.evaluate.depth import has_depth
 from toolkit.evaluate.pixels import as_float
 from toolkit.evaluate.score import RenderedView, entry, on_background
 from toolkit.files import atomic_path
+from toolkit.stereo.left_out import LeftOut
 
 ERROR_TOP = 0.2  # mean absolute difference of the three channels, in [0, 1], that gets the brightest colour
 ERROR_COLOURS = cv2.COLORMAP_INFERNO
 DEPTH_COLOURS = cv2.COLORMAP_TURBO
+TINT = (235, 40, 60)  # of what was left out
 MISSING = (128, 128, 128)  # neutral grey: no depth, or no truth to compare with
 
 PAPER = 255
@@ -61,6 +63,7 @@ class Pictures:
     depth_range: tuple[float, float] | None = None
     unit: str = "units"
     left_out: int = 0  # test views of which no pictures were made
+    moving: list[tuple[str, Array]] = field(default_factory=list)  # name, picture: training views, with what was left out of the fit tinted
 
 
 def coloured(values: Array, colours: int) -> Array:
@@ -111,6 +114,20 @@ def depth_error_picture(depth: Array, truth: Array, top: float) -> Array:
     picture = coloured(gap / max(top, 1e-12), ERROR_COLOURS)
     picture[~known] = MISSING
     return picture
+
+
+def moving_pictures(views: Views, left_out: LeftOut | None, most: int = 12) -> list[tuple[str, Array]]:
+    """Those training pictures of which most was left out of the fit, these pixels tinted, (H, W, 3) uint8, by name."""
+    masks = {} if left_out is None else left_out.masks
+    worst = sorted(masks, key=lambda name: -float(masks[name].mean()))[:most]
+    out = []
+    for name in (name for name in views.names if name in worst):
+        picture = views.images[views.names.index(name)]
+        shown = cv2.resize(masks[name].astype(np.uint8), (picture.shape[1], picture.shape[0]), interpolation=cv2.INTER_NEAREST) > 0
+        tinted = picture.copy()
+        tinted[shown] = np.round(picture[shown] * np.float32(0.4) + np.float32(0.6) * np.array(TINT, np.float32))
+        out.append((name, tinted))
+    return out
 
 
 def make_pictures(

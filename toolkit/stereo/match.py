@@ -142,10 +142,14 @@ def inverse_depths(view: GreyView, others: Sequence[GreyView], near: float, far:
 
 def _prepared(views: Views, index: int, long_side: int) -> _View:
     """Picture and mask of a view at the size of its depth map."""
-    camera = views.intrinsics[index].pinhole()
-    factor = min(1.0, long_side / max(camera.width, camera.height))
-    camera = camera.scaled(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+    camera = shrunk_camera(views.intrinsics[index], long_side)
     return _View(grey_view(views.images[index], camera, views.world_from_camera[index]), usable_pixels(views, index, camera))
+
+
+def shrunk_camera(camera: Intrinsics, long_side: int) -> Intrinsics:
+    """The pinhole camera whose picture is `long_side` pixels long at most."""
+    factor = min(1.0, long_side / max(camera.width, camera.height))
+    return camera.pinhole().scaled(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
 
 
 def usable_pixels(views: Views, index: int, camera: Intrinsics) -> Array | None:

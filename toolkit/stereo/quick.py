@@ -8,12 +8,14 @@ a slow machine, or a busy one.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from dataclasses import field as default
 
 import numpy as np
 
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture.types import Views
 from toolkit.progress import SILENT, Progress
+from toolkit.stereo import consensus
 from toolkit.stereo.bare import continued
 from toolkit.stereo.maps import depth_at
 from toolkit.stereo.match import LONG_SIDE, StereoDepth, stereo_depths
@@ -34,6 +36,7 @@ class Matched:
     pixels: int  # long side of their depth maps
     share: float  # of their pixels that have depth
     bare: float  # share of their pixels whose depth is that of a plane that goes on, not matched itself; part of `share`
+    depths: dict[int, StereoDepth] = default(default_factory=dict)  # as they were found, by the view's index
 
     def to_dict(self) -> dict[str, float]:
         return {"views": self.views, "pixels": self.pixels, "share": round(self.share, 4), "bare": round(self.bare, 4)}
@@ -84,7 +87,8 @@ def guided(
     out = replace(with_depths(views, matched, whole), rough=True)
     share = float(np.mean([np.mean(out.depths[index] > 0) for index in matched]))
     bare = float(np.mean([np.mean((one.depth <= 0) & (more.depth > 0)) for one, more in zip(found, whole, strict=True)]))
-    return out, Matched(len(matched), max(max(one.depth.shape) for one in found), share, bare)
+    depths = dict(zip(map(int, matched), whole, strict=True))
+    return out, Matched(len(matched), max(max(one.depth.shape) for one in found), share, bare, depths)
 
 
 def with_depths(views: Views, indices: Array, found: list[StereoDepth]) -> Views:
@@ -93,11 +97,12 @@ def with_depths(views: Views, indices: Array, found: list[StereoDepth]) -> Views
     for index, one in zip(indices, found, strict=True):
         camera = views.intrinsics[index]
         depths[index] = depth_at(one, camera.width, camera.height)
-    return replace(views, depths=depths)
+    return replace(views, depths=depths, matched=True)
 
 
 def warm_up() -> None:
-    """Have the kernels compiled, or loaded, by matching three small pictures, and letting a plane go on in them."""
+    """Have the kernels compiled, or loaded, by matching three small pictures, letting a plane go on in them, and having them agree."""
+    consensus.warm_up()
     noise = np.random.default_rng(0).integers(0, 256, (24, 48, 3)).astype(np.uint8)
     camera = Intrinsics(32, 24, 32.0, 32.0, 16.0, 12.0)
     poses = np.tile(np.eye(4), (3, 1, 1))

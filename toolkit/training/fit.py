@@ -23,6 +23,7 @@ from toolkit.networks.decoder import make_decoder
 from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
+from toolkit.stereo.left_out import LeftOut
 from toolkit.training import room
 from toolkit.training.behind import sky_behind
 from toolkit.training.depth import FINE, ROUGH
@@ -59,6 +60,7 @@ class FitResult:
     interrupted: bool = False
     notes: list[str] = default(default_factory=list)  # a sentence on each step that was not finite, and on what it had to do without
     matched: dict[str, float] | None = None  # what was matched before the fit: pictures, pixels, share with depth, seconds (`guided.py`)
+    left_out: LeftOut | None = None  # what the fit did without, since it moves (`guided.py`)
 
     def after(self, seconds: float) -> list[dict[str, float]]:
         """The timeline, with so many seconds before it."""

@@ -1,4 +1,7 @@
-"""A fit that knows depth: the capture's own, or, in the first share of its budget, what quick matching of the pictures finds."""
+"""A fit that knows depth, and what moves: both are found in the first share of its budget.
+
+Depth is the capture's own, or what quick matching of the pictures finds. With it, pictures can be held against each other.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +10,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypedDict, Unpack
 
+import numpy as np
+
 from toolkit.capture.types import Views
 from toolkit.config import Settings
 from toolkit.errors import InputError
 from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
-from toolkit.stereo import quick
+from toolkit.stereo import moving, quick
+from toolkit.stereo.left_out import LeftOut
 from toolkit.training.engine import warm_up
 from toolkit.training.fit import DEFAULT_BUDGET, FitResult, fit_field
 from toolkit.volume.host import Host
@@ -49,6 +55,11 @@ def wants_matching(views: Views, settings: Settings) -> bool:
     return settings.fit.depth_from == "auto" and settings.fit.depth > 0 and not known
 
 
+def looks_for_moving(views: Views, settings: Settings) -> bool:
+    """Whether pixels that show what moves are looked for: the settings do not forbid it, and alpha cuts nothing out."""
+    return settings.fit.moving == "auto" and views.background is None
+
+
 def fit_guided(
     views: Views,
     scene: Scene,
@@ -57,31 +68,58 @@ def fit_guided(
     ticks: Callable[[], float] = time.perf_counter,
     **begin: Unpack[Begin],
 ) -> FitResult:
-    """`fit_field`, with quick matching before it where that is wanted. Its seconds are a part of the budget, and of the timeline.
+    """`fit_field`, with quick matching before it where that is wanted, and without what moves. The seconds of both are a part of the
+    budget, and of the timeline.
 
     What cannot be matched is fitted to colours alone, and `notes` says why.
 
     Raises:
-        Interrupted: the user asked to stop while pictures were matched.
+        Interrupted: the user asked to stop while pictures were matched, or held against each other.
         InputError: as `fit_field`.
     """
-    if not wants_matching(views, settings):
+    matching = wants_matching(views, settings)
+    if not matching and not looks_for_moving(views, settings):
         return fit_field(views, scene, settings, progress, ticks=ticks, **begin)
     warm_up(settings, progress)
     quick.warm_up()
     budget, began = settings.fit.budget or DEFAULT_BUDGET, ticks()
     notes: list[str] = []
-    try:
-        part = Part(progress, 0.0, quick.SHARE * budget, budget)
-        known, matched = quick.guided(views, scene.near, scene.far, scene.median_depth, budget, part)
-    except InputError as error:
-        known, matched = views, None
-        notes.append(f"the field was fitted to colours alone: {error}")
+    known, matched, matched_for = views, None, 0.0
+    if matching:
+        try:
+            part = Part(progress, 0.0, quick.SHARE * budget, budget)
+            known, matched = quick.guided(views, scene.near, scene.far, scene.median_depth, budget, part)
+        except InputError as error:
+            notes.append(f"the field was fitted to colours alone: {error}")
+        matched_for = ticks() - began
+    left_out = find_moving(known, matched, scene, budget, progress) if looks_for_moving(views, settings) else None
     spent = ticks() - began
+    left_out = None if left_out is None else replace(left_out, seconds=spent - matched_for)
     rest = replace(settings, fit=replace(settings.fit, budget=max(budget - spent, 0.5 * budget)))
-    result = fit_field(known, scene, rest, Part(progress, spent, budget, budget), ticks=ticks, **begin)
+    shown = known if left_out is None else left_out.without(known)
+    result = fit_field(shown, scene, rest, Part(progress, spent, budget, budget), ticks=ticks, **begin)
     result.timeline = result.after(spent)
     result.seconds += spent
     result.notes = notes + result.notes
-    result.matched = None if matched is None else {**matched.to_dict(), "seconds": round(spent, 2)}
+    result.matched = None if matched is None else {**matched.to_dict(), "seconds": round(matched_for, 2)}
+    result.left_out = left_out
     return result
+
+
+def find_moving(
+    views: Views, matched: quick.Matched | None, scene: Scene, budget: float, progress: Progress = SILENT
+) -> LeftOut | None:
+    """What moves in the training pictures of `views`, by the depth that was `matched`, or by their own; None: no depth is known, or the
+    pictures are too many for a fit of `budget` seconds.
+
+    Raises:
+        Interrupted: the user asked to stop.
+    """
+    training = np.flatnonzero(~views.test)
+    some, side = views.subset(training), moving.plan(len(training), budget)
+    if side is None or not any(depth is not None for depth in some.depths):
+        return None
+    at = {int(index): place for place, index in enumerate(training)}
+    found = None if matched is None else {at[index]: one for index, one in matched.depths.items()}
+    depths, cameras = moving.depths_at(some, side, found)
+    return LeftOut.of(some.names, moving.moving(some, depths, cameras, scene.median_depth, not views.matched, progress))

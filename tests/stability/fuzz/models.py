@@ -19,6 +19,7 @@ from toolkit.render.bake import bake
 from toolkit.render.bake_file import read_baked, write_baked
 from toolkit.render.bake_image import BakedRenderer
 from toolkit.simulate.settings import read_scene_file
+from toolkit.stereo.left_out import LeftOut, load_left_out, save_left_out
 from toolkit.stereo.maps import load_stereo, save_stereo
 from toolkit.stereo.match import StereoDepth
 from toolkit.training.nerfusion.caution import Caution
@@ -77,6 +78,7 @@ def make_training(root: Path) -> None:
     )
     camera = Intrinsics(16, 12, 15.0, 15.0, 8.0, 6.0)
     save_stereo(root / "depths.safetensors", ["a", "b"], [StereoDepth(depths[0], depths[0], camera)] * 2)
+    save_left_out(root / "left_out.safetensors", LeftOut.of(["a", "b"], [rng.random((12, 16)) < 0.5] * 2, 0.5))
     speed = {"units": dict.fromkeys(budget.KINDS, 1.0), "factors": dict.fromkeys(budget.COST, 1.0)}
     (root / "fieldfuse").mkdir()
     write_json(root / "fieldfuse" / "speed.json", {"machine": speed})
@@ -90,6 +92,7 @@ def read_training(root: Path, number: int) -> None:
     scene = ShardScene(root / "shard.safetensors", 8)
     scene.pictures([0, 3])
     load_stereo(root / "depths.safetensors")
+    load_left_out(root / "left_out.safetensors")
     model = make_model(tiny_settings())
     path = root / "checkpoint-0000007.safetensors"
     load_checkpoint(path, model, torch.optim.Adam(model.parameters()))

@@ -260,7 +260,10 @@ def read_tensors(root: Path, number: int) -> None:
 
 
 RUN_FILES = ("run.json", "capture.json", "poses.json", "scene.json", "stages/views.json", "settings.yaml", "source/transforms.json")
-TRAINING_FILES = ("shard.safetensors", "checkpoint-0000007.safetensors", "train.yaml", "depths.safetensors", "fieldfuse/speed.json")
+TRAINING_FILES = (
+    "shard.safetensors", "checkpoint-0000007.safetensors", "train.yaml", "depths.safetensors", "left_out.safetensors",
+    "fieldfuse/speed.json",
+)  # fmt: skip
 TARGETS: tuple[Target, ...] = (
     *(Target(layout, files, LAYOUTS[layout][1], read_capture, 1.0) for layout, files in FILES.items()),
     Target("extras", ("transforms.json", "mask1.png", "depth2.npy", "points.ply"), make_extras, read_capture, 2.0),
