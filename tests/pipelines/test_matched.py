@@ -15,6 +15,7 @@ from tests.pipelines.made import call, save_picture, write_transforms
 from tests.poses.textured import arc, render
 from toolkit.camera import Intrinsics, opengl_from_world
 from toolkit.files import read_json
+from toolkit.stereo import moving
 from toolkit.stereo.left_out import LeftOut, load_left_out
 
 Capsys = pytest.CaptureFixture[str]
@@ -76,7 +77,8 @@ def test_without_being_asked_pictures_are_matched_for_the_fit_alone(tmp_path: Pa
     assert not (out / "fit_matched.json").exists()
 
 
-def test_what_moves_is_left_out_and_told(tmp_path: Path, capsys: Capsys) -> None:
+def test_what_moves_is_left_out_and_told(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(moving, "FEWEST", 6)
     make_corner(tmp_path / "corner", 9)
     for index in (2, 6):
         path = tmp_path / "corner" / f"images/{index:03d}.png"

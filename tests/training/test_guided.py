@@ -80,7 +80,8 @@ def psnr(field: Field) -> float:
 
 
 @pytest.mark.parametrize("measured", [False, True])
-def test_a_fit_does_without_what_moves(measured: bool) -> None:
+def test_a_fit_does_without_what_moves(measured: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(moving, "FEWEST", 6)
     made, depths, masks = with_passer()
     given = replace(made, test=np.arange(len(made)) == 3, depths=list(depths) if measured else [])
     without = fit_guided(given, SCENE, wanted(), ticks=steady())
@@ -91,7 +92,8 @@ def test_a_fit_does_without_what_moves(measured: bool) -> None:
     assert psnr(without.field) > psnr(everything.field) + 0.3
 
 
-def test_held_out_pictures_are_not_looked_at_for_what_moves() -> None:
+def test_held_out_pictures_are_not_looked_at_for_what_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(moving, "FEWEST", 6)
     made, _, _ = with_passer()
     views = replace(made, test=np.arange(len(made)) == 4)
     first = fit_guided(views, SCENE, wanted("budget=1"), ticks=steady()).left_out
@@ -119,6 +121,7 @@ def test_what_moves_is_looked_for_where_depth_is_known_and_nothing_is_cut_out() 
     assert looks_for_moving(known, wanted()) and not looks_for_moving(known, wanted("fit.moving=off"))
     assert not looks_for_moving(replace(known, background=(1.0, 1.0, 1.0)), wanted())
     assert find_moving(known, None, SCENE, 4) is not None and find_moving(known, None, SCENE, 0.2) is None
+    assert find_moving(replace(known, matched=True), None, SCENE, 4) is None  # they are too few
     assert find_moving(views(), None, SCENE, 4) is None
     only_held_out = [depth if test else None for depth, test in zip(corner()[1], known.test, strict=True)]
     assert find_moving(replace(known, depths=only_held_out), None, SCENE, 4) is None

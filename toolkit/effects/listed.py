@@ -20,6 +20,7 @@ from toolkit.effects import (
     exposure,
     highlights,
     motion_blur,
+    passers,
     rolling_shutter,
     sensor_noise,
     vignetting,
@@ -30,6 +31,7 @@ MODULES: dict[str, ModuleType] = {
     "distortion": distortion,
     "exposure": exposure,
     "vignetting": vignetting,
+    "passers": passers,
     "highlights": highlights,
     "background": background,
     "rolling_shutter": rolling_shutter,
@@ -45,6 +47,7 @@ STRENGTHS = ("weak", "medium", "strong")
 class Effects:
     """The effects of a capture, in the order in which light meets them; None: not there."""
 
+    passers: passers.Passers | None = None
     background: background.Background | None = None
     highlights: highlights.Highlights | None = None
     distortion: distortion.Distortion | None = None
@@ -147,6 +150,7 @@ def _like(default: Any, value: Any, where: str) -> Any:
 RANGES: dict[str, dict[str, tuple[float, float]]] = {  # where a formula needs more than a finite number
     "exposure": {"stops": (0, 4), "tint": (0, 2), "waves": (1, 64)},
     "vignetting": {"corner": (0.01, 1)},
+    "passers": {"share": (0, 1), "near": (0.05, 1), "far": (0.05, 1), "speed": (0.05, 20)},
     "highlights": {"strength": (0, 100), "coat": (0, 1)},
     "background": {"detail": (0, 1), "seed": (0, 2**31 - 1), "haze": (0, 10), "zenith": (0, 10), "earth": (0, 10)},
     "rolling_shutter": {"readout": (-1, 1)},

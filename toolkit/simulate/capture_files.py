@@ -62,6 +62,8 @@ class CaptureWriter:
         entry["transform_matrix"] = opengl_from_world(shot.world_from_camera).tolist()
         self.entries.append(entry)
         exact = {"depth": np.ascontiguousarray(shot.depth), "normals": shot.normals.astype(np.float16)}
+        if shot.passed is not None:
+            exact["passers"] = shot.passed.astype(np.uint8)
         (self.folder / truth).write_bytes(save(exact))
         picture = {"video_index": shot.index} if self.output == "video" else {"picture": entry["file_path"]}
         self.poses.append({**picture, "truth": truth, "seconds": shot.seconds, "world_from_camera": shot.world_from_camera.tolist()})

@@ -1,6 +1,6 @@
 """Filming: one frame of a scene after the other, through exactly the effects that are listed, with the truth behind each.
 
-Light takes this way: scene (background, highlights) → lens and rows (distortion, rolling shutter) → open shutter (motion blur) →
+Light takes this way: scene (passers, background, highlights) → lens and rows (distortion, rolling shutter) → open shutter (motion blur) →
 vignetting → exposure → sensor noise → clipping, sRGB and 8 bits → compression. An effect that is not listed is not called.
 """
 
@@ -20,6 +20,7 @@ from toolkit.effects import (
     distortion,
     exposure,
     motion_blur,
+    passers,
     rolling_shutter,
     sensor_noise,
     transfer,
@@ -28,9 +29,14 @@ from toolkit.effects import (
 from toolkit.effects.listed import Effects, generator
 from toolkit.simulate.curve import Motion
 from toolkit.simulate.eye import Eye, Picture, eye_of, measure, take
+from toolkit.simulate.people import peopled
+from toolkit.simulate.scene import Scene
 from toolkit.simulate.seen import Scenery
 
 Tensor = torch.Tensor
+
+FLOOR = 0.0  # metres: of procedural scenes
+PASSED = 1e-3  # metres before what stands still
 
 
 @dataclass(frozen=True)
@@ -45,6 +51,7 @@ class Shot:
     depth: Array  # (H, W) float32 metres along z: what a perfect camera at that pose sees; 0 = nothing
     normals: Array  # (H, W, 3) float32 unit, world axes; 0 = nothing
     sensor_depth: Array | None  # (H, W) float32 metres: what the depth sensor tells; None when the capture has no depth
+    passed: Array | None = None  # (H, W) bool: somebody stands before the scene here; None when passers are not listed
     facts: dict[str, Any] = field(default_factory=dict)  # parameters of the effects in this frame
 
 
@@ -80,6 +87,11 @@ class Film:
         self.intrinsics = intrinsics if effects.distortion is None else distortion.lens(effects.distortion, intrinsics)
         self.eye = eye_of(self.intrinsics, side, scene.device)
         self._radius = None if effects.vignetting is None else vignetting.radii(self.intrinsics).to(scene.device)
+        self._walks: list[passers.Walk] = []
+        if effects.passers is not None:
+            wide, floor = intrinsics.width / intrinsics.fx, FLOOR if isinstance(scene, Scene) else None
+            who = generator(seed, "passers")
+            self._walks = passers.draw(effects.passers, self.times, self.world_from_camera, scene.focus, wide, floor, who)
         self._gains = None if effects.exposure is None else exposure.draw(effects.exposure, len(self.times), generator(seed, "exposure"))
 
     def __len__(self) -> int:
@@ -90,10 +102,17 @@ class Film:
         effects, seconds, pose = self.effects, float(self.times[index]), self.world_from_camera[index]
         facts: dict[str, Any] = {}
         moving = effects.rolling_shutter is not None or effects.motion_blur is not None
-        picture = None if moving else take(self.scene, self.eye, pose[None])
+        there = self._there(seconds)
+        picture = None if moving else take(there, self.eye, pose[None])
         linear = self._gathered(seconds, facts) if picture is None else picture.linear
         rgb, jpeg = self._developed(linear, index, facts)
-        still, depth, normals = self._truth(picture, pose)
+        still, depth, normals = self._truth(picture if there is self.scene else None, pose)
+        passed, seen = (None if effects.passers is None else np.zeros(depth.shape, bool)), depth
+        if there is not self.scene:
+            still = take(there, plain(self.eye), pose[None])
+            seen = still.depth.cpu().numpy()
+            passed = (seen > 0) & ((depth == 0) | (seen < depth - PASSED))
+            facts["passers"] = {"share": float(passed.mean())}
         return Shot(
             index=index,
             seconds=seconds,
@@ -102,9 +121,14 @@ class Film:
             jpeg=jpeg,
             depth=depth,
             normals=normals,
-            sensor_depth=self._sensed(depth, still, index) if self.has_depth else None,
+            sensor_depth=self._sensed(seen, still, index) if self.has_depth else None,
+            passed=passed,
             facts=facts,
         )
+
+    def _there(self, seconds: float) -> Scenery:
+        """The scene, with whoever passes at that time."""
+        return peopled(self.scene, self._walks, seconds) if self._walks else self.scene
 
     def _gathered(self, seconds: float, facts: dict[str, Any]) -> Tensor:
         """(H, W, 3) linear light of a frame during which the camera moves."""
@@ -114,14 +138,16 @@ class Film:
             rows = rolling_shutter.forward(effects.rolling_shutter, seconds, self.intrinsics.height)
             facts["rolling_shutter"] = {"first_row_seconds": float(rows[0]), "last_row_seconds": float(rows[-1])}
         if effects.motion_blur is None:
-            return take(self.scene, self.eye, self.motion.poses(rows)).linear
+            return take(self._there(seconds), self.eye, self.motion.poses(rows)).linear
         offsets = motion_blur.instants(effects.motion_blur)
         half = effects.motion_blur.exposure / 2
         facts["motion_blur"] = {
             "exposure_seconds": effects.motion_blur.exposure,
             "path": self.motion.poses(seconds + np.array([-half, 0.0, half])).tolist(),  # world_from_camera at start, middle and end
         }
-        return motion_blur.forward([take(self.scene, self.eye, self.motion.poses(rows + offset)).linear for offset in offsets])
+        return motion_blur.forward(
+            [take(self._there(seconds + offset), self.eye, self.motion.poses(rows + offset)).linear for offset in offsets]
+        )
 
     def _developed(self, linear: Tensor, index: int, facts: dict[str, Any]) -> tuple[Array, bytes | None]:
         """Linear light on the lens → the stored picture."""

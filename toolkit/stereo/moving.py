@@ -27,6 +27,7 @@ from toolkit.stereo.match import MOST_WORKERS, StereoDepth, shrunk_camera, usabl
 SHARE, MOST_SHARE = 0.04, 0.1  # of a fit's seconds that looking is meant to take, and may take on the smallest pictures
 SIDES = (96, 200)  # pixels; of the pictures that are looked at
 VIEW_SECONDS = 0.025  # of a picture of the largest side, on one thread of a nominal machine
+FEWEST = 24  # pictures with depth by matching: with fewer, what has none before what has looks as if it moved
 ASKED = 12  # pictures that tell what stands at a place, at most
 LEAST_OFF = 20.0  # levels by which a colour must be off, besides what the others' colours scatter by …
 USUAL = 0.9  # … and what this share of the confirmed pixels of the capture is off by

@@ -109,15 +109,16 @@ def fit_guided(
 def find_moving(
     views: Views, matched: quick.Matched | None, scene: Scene, budget: float, progress: Progress = SILENT
 ) -> LeftOut | None:
-    """What moves in the training pictures of `views`, by the depth that was `matched`, or by their own; None: no depth is known, or the
-    pictures are too many for a fit of `budget` seconds.
+    """What moves in the training pictures of `views`, by the depth that was `matched`, or by their own; None: no depth is known, by
+    matching of too few pictures, or they are too many for a fit of `budget` seconds.
 
     Raises:
         Interrupted: the user asked to stop.
     """
     training = np.flatnonzero(~views.test)
     some, side = views.subset(training), moving.plan(len(training), budget)
-    if side is None or not any(depth is not None for depth in some.depths):
+    telling = sum(depth is not None for depth in some.depths)
+    if side is None or telling < (moving.FEWEST if views.matched else 1):
         return None
     at = {int(index): place for place, index in enumerate(training)}
     found = None if matched is None else {at[index]: one for index, one in matched.depths.items()}
