@@ -17,16 +17,19 @@ from toolkit.evaluate.pictures import (
     ERROR_TOP,
     LABEL,
     MISSING,
+    TINT,
     coloured,
     depth_picture,
     depth_range,
     error_picture,
     make_pictures,
+    moving_pictures,
     spread,
     strip,
     write_picture,
     write_strips,
 )
+from toolkit.stereo.left_out import LeftOut
 
 
 def test_error_scale_is_fixed() -> None:
@@ -93,6 +96,19 @@ def test_only_some_of_many_views() -> None:
     found = make_pictures(views, indices, [draw(views, i) for i in indices], most=4)
     assert len(found.views) == 4 and found.left_out == 11
     assert found.views[0].name == "0000.jpg" and found.views[-1].name == "0028.jpg"
+
+
+def test_what_was_left_out_is_tinted() -> None:
+    views = make_views()
+    small = [np.zeros((3, 4), bool) for _ in views.names]
+    small[3][:, 2:], small[1][0] = True, True
+    assert moving_pictures(views, None) == [] and moving_pictures(views, LeftOut.of(views.names, [one & False for one in small])) == []
+    shown = moving_pictures(views, LeftOut.of(views.names, small))
+    assert [name for name, _ in shown] == [views.names[1], views.names[3]]
+    picture, half = shown[1][1], views.images[3].shape[1] // 2
+    assert np.array_equal(picture[:, :half], views.images[3][:, :half]) and picture.dtype == np.uint8
+    assert (np.abs(picture[:, half:].astype(int) - np.array(TINT)) <= 0.4 * 255 + 1).all() and (picture != views.images[3])[:, half:].any()
+    assert [name for name, _ in moving_pictures(views, LeftOut.of(views.names, small), most=1)] == [views.names[3]]
 
 
 def test_no_rendering_at_all() -> None:

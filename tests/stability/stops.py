@@ -84,7 +84,7 @@ def fieldfuse(*arguments: object) -> Answer:
     out, err, looks = io.StringIO(), io.StringIO(), itertools.count(1)
     with (
         mock.patch.object(sys, "argv", ["fieldfuse", *map(str, arguments)]),
-        mock.patch.object(fit._Clock, "seconds", lambda _: next(looks) * TICK),
+        mock.patch.object(fit.Clock, "seconds", lambda _: next(looks) * TICK),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):

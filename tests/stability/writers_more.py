@@ -96,7 +96,7 @@ def more_writers(place: Path) -> dict[str, Write]:
         "save_checkpoint": lambda folder: save_checkpoint(folder, 3, model, adam, {}, 2, Caution()),
         "Curve.write": curve,
         "write_shard": shard,
-        "save_left_out": lambda folder: save_left_out(folder / "left_out.safetensors", LeftOut.of(["a"], [depth > 0])),
+        "save_left_out": lambda folder: save_left_out(folder / "left_out.safetensors", LeftOut.of(["a"], [np.ones((96, 128), bool)])),
         "save_stereo": lambda folder: save_stereo(folder / "depths.safetensors", ["a"], [StereoDepth(depth, depth, camera)]),
         "write_comparison": lambda folder: write_comparison(folder, made(), shown, meshes, 0.075),
         "write_tradeoff": lambda folder: write_tradeoff(folder, tradeoff),

@@ -66,7 +66,7 @@ def ticking(monkeypatch: pytest.MonkeyPatch, tick: float) -> dict[str, int]:
         looks["count"] += 1
         return looks["count"] * tick
 
-    monkeypatch.setattr("toolkit.training.fit._Clock.seconds", seconds)
+    monkeypatch.setattr("toolkit.training.fit.Clock.seconds", seconds)
     return looks
 
 

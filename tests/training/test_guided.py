@@ -103,6 +103,15 @@ def test_held_out_pictures_are_not_looked_at_for_what_moves(monkeypatch: pytest.
     assert np.array_equal(first.masks[made.names[1]], second.masks[made.names[1]])
 
 
+def test_a_stop_while_looking_for_what_moves_ends_the_fit() -> None:
+    class Stopping(Progress):
+        def stopping(self) -> bool:
+            return True
+
+    result = fit_guided(replace(views(), depths=corner()[1]), SCENE, wanted(), Stopping())
+    assert result.interrupted and result.left_out is None and result.steps == 0
+
+
 def test_looking_for_what_moves_is_a_part_of_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
     now, whole = steady(), moving.moving
 

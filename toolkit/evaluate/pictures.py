@@ -118,12 +118,14 @@ def depth_error_picture(depth: Array, truth: Array, top: float) -> Array:
 
 def moving_pictures(views: Views, left_out: LeftOut | None, most: int = 12) -> list[tuple[str, Array]]:
     """Those training pictures of which most was left out of the fit, these pixels tinted, (H, W, 3) uint8, by name."""
-    masks = {} if left_out is None else left_out.masks
-    worst = sorted(masks, key=lambda name: -float(masks[name].mean()))[:most]
+    if left_out is None:
+        return []
+    worst = sorted(left_out.masks, key=lambda name: -float(left_out.masks[name].mean()))[:most]
     out = []
-    for name in (name for name in views.names if name in worst):
-        picture = views.images[views.names.index(name)]
-        shown = cv2.resize(masks[name].astype(np.uint8), (picture.shape[1], picture.shape[0]), interpolation=cv2.INTER_NEAREST) > 0
+    for picture, name in zip(views.images, views.names, strict=True):
+        if name not in worst:
+            continue
+        shown = left_out.mask(name, picture.shape[1], picture.shape[0])
         tinted = picture.copy()
         tinted[shown] = np.round(picture[shown] * np.float32(0.4) + np.float32(0.6) * np.array(TINT, np.float32))
         out.append((name, tinted))

@@ -67,7 +67,7 @@ class FitResult:
         return [{**point, "seconds": round(seconds + point["seconds"], 3)} for point in self.timeline]
 
 
-class _Clock:
+class Clock:
     """Fitting seconds; stands still while something else is measured."""
 
     def __init__(self, ticks: Callable[[], float]) -> None:
@@ -146,7 +146,7 @@ def fit_field(
         raise InputError("every pixel of the training pictures is masked away; look at the capture's masks (black is left out)")
     budget = settings.fit.budget or DEFAULT_BUDGET
     warm_up(settings, progress)
-    clock = _Clock(ticks)
+    clock = Clock(ticks)
     if start is None:
         current, ladder = _first(views, train, scene, settings, device, host, generator)
     else:

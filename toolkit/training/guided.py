@@ -5,6 +5,7 @@ Depth is the capture's own, or what quick matching of the pictures finds. With i
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,14 +15,14 @@ import numpy as np
 
 from toolkit.capture.types import Views
 from toolkit.config import Settings
-from toolkit.errors import InputError
+from toolkit.errors import InputError, Interrupted
 from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
 from toolkit.stereo import moving, quick
 from toolkit.stereo.left_out import LeftOut
 from toolkit.training.engine import warm_up
-from toolkit.training.fit import DEFAULT_BUDGET, FitResult, fit_field
+from toolkit.training.fit import DEFAULT_BUDGET, Clock, FitResult, fit_field
 from toolkit.volume.host import Host
 
 
@@ -74,7 +75,7 @@ def fit_guided(
     What cannot be matched is fitted to colours alone, and `notes` says why.
 
     Raises:
-        Interrupted: the user asked to stop while pictures were matched, or held against each other.
+        Interrupted: the user asked to stop while pictures were matched.
         InputError: as `fit_field`.
     """
     matching = wants_matching(views, settings)
@@ -82,7 +83,7 @@ def fit_guided(
         return fit_field(views, scene, settings, progress, ticks=ticks, **begin)
     warm_up(settings, progress)
     quick.warm_up()
-    budget, began = settings.fit.budget or DEFAULT_BUDGET, ticks()
+    budget, clock = settings.fit.budget or DEFAULT_BUDGET, Clock(ticks)
     notes: list[str] = []
     known, matched, matched_for = views, None, 0.0
     if matching:
@@ -91,9 +92,12 @@ def fit_guided(
             known, matched = quick.guided(views, scene.near, scene.far, scene.median_depth, budget, part)
         except InputError as error:
             notes.append(f"the field was fitted to colours alone: {error}")
-        matched_for = ticks() - began
-    left_out = find_moving(known, matched, scene, budget, progress) if looks_for_moving(views, settings) else None
-    spent = ticks() - began
+        matched_for = clock.seconds()
+    left_out = None
+    if looks_for_moving(views, settings):
+        with contextlib.suppress(Interrupted):  # the fit ends at once as well then, and keeps what there is
+            left_out = find_moving(known, matched, scene, budget, progress)
+    spent = clock.seconds()
     left_out = None if left_out is None else replace(left_out, seconds=spent - matched_for)
     rest = replace(settings, fit=replace(settings.fit, budget=max(budget - spent, 0.5 * budget)))
     shown = known if left_out is None else left_out.without(known)
