@@ -39,7 +39,7 @@ LEAST_VOTES = 0.02
 SOLID = 0.03  # of the long side: what is thinner is an edge that was carried a little off
 LEAST_SHARE = 0.004  # of the picture: what is smaller may be a highlight
 OFF_SHARE = 0.25  # of a part's pixels that must be off themselves
-REACH, BLIND = 0.06, 0.02  # of the long side: how far a part goes on through what nothing confirms, and where nothing is known
+REACH = 0.08  # of the long side: how far a part goes on through what nothing confirms
 CLOSE = 0.03  # of the long side: gaps that are closed
 GAINS = (0.5, 2.0)  # by which a picture may be darker or brighter than the others
 FEW = 200  # pixels that tell a picture's gain
@@ -197,9 +197,8 @@ def _solid(one: _Difference, picture: Array, least_off: float, measured: bool) -
     out = kept[label]
     if not out.any():
         return np.asarray(out)
-    blind = round(BLIND * side)
-    for step in range(round(REACH * side)):
-        further = (cv2.dilate(out.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & (out | ~confirmed & (one.known | (step < blind)))
+    for _ in range(round(REACH * side)):
+        further = (cv2.dilate(out.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & (out | ~confirmed)
         if (further == out).all():
             break
         out = further
