@@ -7,9 +7,10 @@ planes go on through it afterwards (`bare.py`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -38,6 +39,9 @@ STEP = (
 PLANES = (32, 128)  # fewest and most planes
 MOST_WORKERS = 8
 COSTS_HELD = 3  # volumes of costs that a worker has room for: those of the sweep, those that are smoothed, and pictures
+
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -144,6 +148,15 @@ def _prepared(views: Views, index: int, long_side: int) -> _View:
     """Picture and mask of a view at the size of its depth map."""
     camera = shrunk_camera(views.intrinsics[index], long_side)
     return _View(grey_view(views.images[index], camera, views.world_from_camera[index]), usable_pixels(views, index, camera))
+
+
+def side_by_side(of: Callable[[int], T], count: int) -> list[T]:
+    """`of` of each number below `count`, several at once; it has to let other threads go on."""
+    with ThreadPoolExecutor(max(1, min(MOST_WORKERS, cv2.getNumThreads()))) as pool:
+        try:
+            return list(pool.map(of, range(count)))
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def shrunk_camera(camera: Intrinsics, long_side: int) -> Intrinsics:

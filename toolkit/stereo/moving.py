@@ -8,10 +8,8 @@ solid, counts as moving, with what nothing confirms right beside it. `left_out.p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -22,7 +20,7 @@ from toolkit.progress import SILENT, Progress
 from toolkit.stereo.bare import spread_along
 from toolkit.stereo.consensus import AGREED, SAME, Consensus, consensus
 from toolkit.stereo.cost import shrunk
-from toolkit.stereo.match import MOST_WORKERS, StereoDepth, shrunk_camera, usable_neighbours, usable_pixels
+from toolkit.stereo.match import StereoDepth, shrunk_camera, side_by_side, usable_neighbours, usable_pixels
 
 SHARE, MOST_SHARE = 0.04, 0.1  # of a fit's seconds that looking is meant to take, and may take on the smallest pictures
 SIDES = (96, 200)  # pixels; of the pictures that are looked at
@@ -43,8 +41,6 @@ REACH = 0.08  # of the long side: how far a part goes on through what nothing co
 CLOSE = 0.03  # of the long side: gaps that are closed
 GAINS = (0.5, 2.0)  # by which a picture may be darker or brighter than the others
 FEW = 200  # pixels that tell a picture's gain
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -99,7 +95,7 @@ def moving(
         agreed = consensus(cameras[index], poses[index], theirs, [small[o] for o in row], [cameras[o] for o in row], poses[row])
         return _difference(agreed, small[index], depths[index], usable_pixels(views, index, cameras[index]))
 
-    differences = _each(compared, len(views))
+    differences = side_by_side(compared, len(views))
     usual = [one.off[one.known & one.same] for one in differences]
     noise = float(np.quantile(np.concatenate(usual), USUAL)) if any(map(len, usual)) else 0.0
 
@@ -107,7 +103,7 @@ def moving(
         progress.check()
         return _solid(differences[index], small[index], LEAST_OFF + noise, measured)
 
-    return _each(solid, len(views))
+    return side_by_side(solid, len(views))
 
 
 def plan(views: int, budget: float) -> int | None:
@@ -142,14 +138,6 @@ def _nearest(depth: Array | None, camera: Intrinsics, usable: Array | None) -> A
         return None
     small = np.asarray(cv2.resize(depth, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST))
     return small if usable is None else np.where(usable, small, np.float32(0))
-
-
-def _each(of: Callable[[int], T], count: int) -> list[T]:
-    with ThreadPoolExecutor(max(1, min(MOST_WORKERS, cv2.getNumThreads()))) as pool:
-        try:
-            return list(pool.map(of, range(count)))
-        finally:
-            pool.shutdown(cancel_futures=True)
 
 
 def _difference(agreed: Consensus, picture: Array, depth: Array | None, usable: Array | None) -> _Difference:

@@ -7,11 +7,8 @@ plane and no view sees through the guess either.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from collections.abc import Sequence
 
-import cv2
 import numpy as np
 
 from toolkit.camera import Array, Intrinsics
@@ -20,13 +17,11 @@ from toolkit.progress import SILENT, Progress
 from toolkit.stereo.bare import CONFIRMED, points_of, proposal
 from toolkit.stereo.check import agreement, confirmed
 from toolkit.stereo.cost import shrunk
-from toolkit.stereo.match import CHECKED, MOST_WORKERS, StereoDepth, usable_neighbours, usable_pixels
+from toolkit.stereo.match import CHECKED, StereoDepth, side_by_side, usable_neighbours, usable_pixels
 from toolkit.stereo.planes import find_planes
 
 ON = 0.004  # share of its depth by which a point may miss a plane that it is counted to: a quarter of what matched depth needs
 REACH = 3.0  # pixels of parallax between a guess and the plane that takes its place, at most
-
-T = TypeVar("T")
 
 
 def settled(
@@ -66,7 +61,7 @@ def settled(
         # Its own depth, not the mean with theirs, which are looked up at the nearest pixel; fusing the maps averages better.
         return StereoDepth(np.where((depth > 0) & told[index], reliable[index], 0).astype(np.float32), confidence, lenses[index])
 
-    sure = _each(checked, len(views))
+    sure = side_by_side(checked, len(views))
     planes = find_planes(points_of(sure, poses), on=ON)
 
     def continued(index: int) -> Array:
@@ -77,18 +72,10 @@ def settled(
         near = _near(guesses[index], plan.depth, _parallax(index, others, lenses, poses))
         return np.where(plan.new & near, plan.depth, one.depth)
 
-    gone_on = _each(continued, len(views)) if len(planes) else [one.depth for one in sure]
+    gone_on = side_by_side(continued, len(views)) if len(planes) else [one.depth for one in sure]
     kept = _seen_through(gone_on, [one.depth > 0 for one in sure], others, lenses, poses, progress)
     filled = [np.where(depth > 0, depth, guess).astype(np.float32) for depth, guess in zip(kept, reliable, strict=True)]
     return _seen_through(filled, [depth > 0 for depth in kept], others, lenses, poses, progress)
-
-
-def _each(of: Callable[[int], T], count: int) -> list[T]:
-    with ThreadPoolExecutor(max(1, min(MOST_WORKERS, cv2.getNumThreads()))) as pool:
-        try:
-            return list(pool.map(of, range(count)))
-        finally:
-            pool.shutdown(cancel_futures=True)
 
 
 def _parallax(index: int, others: Sequence[Sequence[int]], lenses: Sequence[Intrinsics], poses: Array) -> float:
@@ -119,4 +106,4 @@ def _seen_through(
         through = agreement(index, others[index], depths, lenses, poses).through
         return np.where(sure[index] | (through == 0), depths[index], np.float32(0)).astype(np.float32)
 
-    return _each(kept, len(depths))
+    return side_by_side(kept, len(depths))
