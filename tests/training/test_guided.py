@@ -20,6 +20,7 @@ from toolkit.progress import Progress
 from toolkit.render.field import Field
 from toolkit.render.image import make_renderer, render_view
 from toolkit.stereo import moving, quick
+from toolkit.training import depth_start
 from toolkit.training.guided import find_moving, fit_guided, looks_for_moving, wants_matching
 
 SCENE = Scene(Similarity.identity(), np.array([0.0, 0.0, 0.0]), np.full(3, 1.5), MEDIAN, NEAR, FAR, 0.0, True, False)
@@ -177,3 +178,22 @@ def test_progress_goes_on_from_matching_to_fitting() -> None:
     assert matching and matching == sorted(matching) and max(matching) <= quick.SHARE + 1e-9
     fitting = [share for share, note in zip(told.shares, told.notes, strict=True) if "³" in note]
     assert fitting and fitting == sorted(fitting) and fitting[-1] > 0.9 and max(told.shares) < 1.05
+
+
+def test_a_fit_begins_with_what_is_known_of_depth_within_its_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, whole, begun = steady(), depth_start.depth_start, []
+
+    def slow(*given: object, **options: object) -> Field:
+        assert [now() for _ in range(200)]  # a second
+        begun.append(whole(*given, **options))  # type: ignore[arg-type]
+        return begun[-1]
+
+    monkeypatch.setattr(depth_start, "depth_start", slow)
+    measured = replace(views(), depths=corner()[1])
+    result = fit_guided(measured, SCENE, wanted("fit.moving=off"), ticks=now)
+    assert len(begun) == 1 and 3.9 < result.seconds < 4.2 and result.timeline[0]["seconds"] > 1
+    assert depth_error(result.field) < 0.02
+    fit_guided(measured, SCENE, wanted("budget=1"), start=result.field, ticks=now)
+    fit_guided(measured, SCENE, wanted("budget=1", "fit.depth=0"), ticks=now)
+    fit_guided(views(), SCENE, wanted("budget=1"), ticks=now)  # six pictures were matched: too few
+    assert len(begun) == 1

@@ -52,3 +52,8 @@ def test_a_fit_ends_with_its_seconds_or_its_rays_whichever_are_spent_first() -> 
     assert free.position(4.0, 10**9) == bound.position(4.0, 100) == 0.4
     assert bound.position(4.0, 700) == 0.7 and bound.position(4.0, 1000) == 1
     assert free.rays_left(4.0, 800) == pytest.approx(1200) and bound.rays_left(4.0, 800) == 200
+
+
+@pytest.mark.parametrize(("ladder", "rays"), [([32, 64], 256), ([64, 128], 512), ([480], 3840), ([1024], 4096), ([16], 256)])
+def test_rays_of_a_step_follow_from_the_lattice_wherever_a_fit_begins(ladder: list[int], rays: int) -> None:
+    assert Schedule(ladder, 10.0, FitSettings(), True).rays == rays

@@ -32,14 +32,13 @@ from toolkit.training.finite import NotFiniteError
 from toolkit.training.guard import Guard, refuse_broken
 from toolkit.training.levels import all_places, finer, first_field, looked_at, pruned, visible
 from toolkit.training.rays import PixelPool
-from toolkit.training.schedule import Schedule, most_rays
-from toolkit.training.start import NEAR, colour_behind, finest_resolution, levels, possible, space_of
+from toolkit.training.schedule import RUNGS, Schedule, most_rays
+from toolkit.training.start import NEAR, THIN, colour_behind, finest_resolution, levels, possible, space_of
 from toolkit.training.view import limit
 from toolkit.volume.host import Host, TorchHost
 from toolkit.volume.space import Space
 
 DEFAULT_BUDGET = 120.0
-START_RAW = -4.5  # of the first density: thin enough that every voxel along a ray is tried, thick enough that none is ignored
 TIMELINE_POINTS = 12
 TIMELINE_PIXELS = 8192
 VALIDATION_PIXELS = 2048
@@ -111,6 +110,7 @@ def fit_field(
     host: Host | None = None,
     start: Field | None = None,
     coarse: bool = False,
+    rungs: tuple[float, ...] = RUNGS,
     ticks: Callable[[], float] = time.perf_counter,
 ) -> FitResult:
     """Fit a field to the training views.
@@ -123,12 +123,13 @@ def fit_field(
         host: where rows live while they change (`GridHost` puts them into Open3D's hash map).
         start: a field to go on from, at its finest level.
         coarse: `start` is a first guess and no fitted field: climb from its level to the finest, as from the classical start.
+        rungs: share of the budget at which each level ends at the latest, from the first one on.
         ticks: the clock, in seconds, that the budget is counted on; a benchmark beside other work takes `time.process_time`.
 
     Raises:
         InputError: there is no training view or pixel, `start` is not finite, not one step was, or it does not fit into memory.
     """
-    device = torch.device(settings.device if settings.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu")
+    device = fit_device(settings)
     train = views.subset(np.flatnonzero(~views.test))
     if len(train) == 0:
         raise InputError("no training view is left; lower --holdout or give more pictures")
@@ -159,7 +160,7 @@ def fit_field(
     limit_rays = most_rays(len(pool), bool(aside.any()), settings.fit.passes)
     slow_within = settings.fit.slow_within * scene.median_depth
     trust = ROUGH if views.rough else FINE
-    plan = Schedule(ladder, budget, settings.fit, views.background is None, settings.fit.patience, limit_rays, slow_within, trust)
+    plan = Schedule(ladder, budget, settings.fit, views.background is None, settings.fit.patience, limit_rays, slow_within, trust, rungs)
     guard = Guard()
     result = FitResult(current, notes=guard.notes)
     marks = [budget * 0.02 * 50 ** (i / (TIMELINE_POINTS - 1)) for i in range(TIMELINE_POINTS - 1)]
@@ -214,6 +215,11 @@ def fit_field(
     return result
 
 
+def fit_device(settings: Settings) -> torch.device:
+    """Where a fit with these settings computes."""
+    return torch.device(settings.device if settings.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu")
+
+
 def _first(
     views: Views, train: Views, scene: Scene, settings: Settings, device: torch.device, host: Host, generator: torch.Generator
 ) -> tuple[Field, list[int]]:
@@ -225,7 +231,7 @@ def _first(
     behind = colour_behind(views).to(device)
     near = NEAR * scene.near
     fine = 4
-    return first_field(space, ladder[0], places, settings.field.channels, START_RAW, decoder, behind, near, fine, host, generator), ladder
+    return first_field(space, ladder[0], places, settings.field.channels, THIN, decoder, behind, near, fine, host, generator), ladder
 
 
 def _ladder(views: Views, train: Views, scene: Scene, settings: Settings) -> tuple[Space, list[int]]:

@@ -1,6 +1,7 @@
 """A fit that knows depth, and what moves: both are found in the first share of its budget.
 
-Depth is the capture's own, or what quick matching of the pictures finds. With it, pictures can be held against each other.
+Depth is the capture's own, or what quick matching of the pictures finds. With it, pictures can be held against each other, and the fit
+begins with what it tells.
 """
 
 from __future__ import annotations
@@ -21,8 +22,10 @@ from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
 from toolkit.stereo import moving, quick
 from toolkit.stereo.left_out import LeftOut
+from toolkit.training import depth_start
 from toolkit.training.engine import warm_up
-from toolkit.training.fit import DEFAULT_BUDGET, Clock, FitResult, fit_field
+from toolkit.training.fit import DEFAULT_BUDGET, Clock, FitResult, fit_device, fit_field
+from toolkit.training.schedule import PARTLY, RUNGS
 from toolkit.volume.host import Host
 
 
@@ -32,6 +35,7 @@ class Begin(TypedDict, total=False):
     host: Host | None
     start: Field | None
     coarse: bool
+    rungs: tuple[float, ...]
 
 
 class Part(Progress):
@@ -69,8 +73,8 @@ def fit_guided(
     ticks: Callable[[], float] = time.perf_counter,
     **begin: Unpack[Begin],
 ) -> FitResult:
-    """`fit_field`, with quick matching before it where that is wanted, and without what moves. The seconds of both are a part of the
-    budget, and of the timeline.
+    """`fit_field`, with quick matching before it where that is wanted, without what moves, and, unless `begin` has a start, from what is
+    known of depth. The seconds of all three are a part of the budget, and of the timeline.
 
     What cannot be matched is fitted to colours alone, and `notes` says why.
 
@@ -79,10 +83,11 @@ def fit_guided(
         InputError: as `fit_field`.
     """
     matching = wants_matching(views, settings)
-    if not matching and not looks_for_moving(views, settings):
+    if not (matching or looks_for_moving(views, settings) or depth_start.starts_by_depth(views, settings)):
         return fit_field(views, scene, settings, progress, ticks=ticks, **begin)
     warm_up(settings, progress)
     quick.warm_up()
+    depth_start.warm_up()
     budget, clock = settings.fit.budget or DEFAULT_BUDGET, Clock(ticks)
     notes: list[str] = []
     known, matched, matched_for = views, None, 0.0
@@ -99,8 +104,13 @@ def fit_guided(
             left_out = find_moving(known, matched, scene, budget, progress)
     spent = clock.seconds()
     left_out = None if left_out is None else replace(left_out, seconds=spent - matched_for)
-    rest = replace(settings, fit=replace(settings.fit, budget=max(budget - spent, 0.5 * budget)))
     shown = known if left_out is None else left_out.without(known)
+    if begin.get("start") is None and depth_start.starts_by_depth(shown, settings):
+        first = depth_start.depth_start(shown, scene, settings, fit_device(settings))
+        begin["start"], begin["coarse"] = first, True
+        begin["rungs"] = RUNGS if first.resolution == depth_start.RESOLUTION_KNOWN else PARTLY
+        spent = clock.seconds()
+    rest = replace(settings, fit=replace(settings.fit, budget=max(budget - spent, 0.5 * budget)))
     result = fit_field(shown, scene, rest, Part(progress, spent, budget, budget), ticks=ticks, **begin)
     result.timeline = result.after(spent)
     result.seconds += spent

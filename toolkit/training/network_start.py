@@ -17,11 +17,10 @@ from toolkit.networks.decoder import Deferred, PerSample, make_decoder
 from toolkit.poses.scene import Scene
 from toolkit.render.field import Field
 from toolkit.training.levels import FEATURE_NOISE, all_places, occupancy
-from toolkit.training.start import NEAR, finest_resolution, levels, possible
+from toolkit.training.start import NEAR, THIN, finest_resolution, levels, possible
 from toolkit.volume.edit import resample
 
 Tensor = torch.Tensor
-THIN = -4.5  # raw density of what is see-through or unknown, as in the classical start
 THICK = 0.0  # largest raw density of the start: a fog where surfaces may be, which a wrong guess costs little (docs/measured/few_views.md)
 RESOLUTION = 64  # level of the fit at which the networks' field comes in
 

@@ -12,15 +12,17 @@ from dataclasses import field as default
 
 from toolkit.config import FitSettings
 from toolkit.training.depth import FINE, Trust
+from toolkit.training.start import COARSEST
 from toolkit.training.step import Rates
 
-RUNGS = (0.1, 0.3, 0.6, 0.8, 0.9)  # share of the budget at which each level ends at the latest (32 … 512)
+RUNGS = (0.1, 0.3, 0.6, 0.8, 0.9)  # share of the budget at which each level ends at the latest, from the first one on …
+PARTLY = (0.2, 0.45, 0.7, 0.85, 0.9)  # … of a fit that begins with what is known of depth, and knows a part: what is not takes longer
 LEVEL_STEPS = 100  # a level is not left, nor pruned, before so many: what has not had time to grow is not empty
 PRUNE_EVERY = 150  # steps
 LAST_PRUNE = 0.8  # of the budget; from here on the field is only polished, on all views
 SLOWING = 1e7  # rays after which step sizes begin to fall
 LAST_RATE = 0.08  # of the step sizes, at the very end
-FIRST_BATCH = 256  # rays a step at the coarsest level, doubled at each level: early on the number of steps counts
+FIRST_BATCH = 256  # rays a step at the coarsest lattice, and as many times more as one is finer: early on the number of steps counts
 WORTH = 0.5  # rays that must be left for every voxel of a finer level: with fewer it ends blurred, and worse than the coarser one
 LOOK_STEPS = 60  # from one look at the validation views to the next …
 FINEST_LOOK_STEPS = 250  # … and at the finest level
@@ -50,6 +52,7 @@ class Schedule:
         most_rays: rays after which the fit ends, if the budget has not ended it before.
         slow_within: distance before a camera up to which things move slowly, working units (`near`).
         trust: how far the pictures' depth is believed.
+        rungs: share of the budget at which each level of the ladder ends at the latest.
     """
 
     ladder: list[int]
@@ -60,6 +63,7 @@ class Schedule:
     most_rays: float = math.inf
     slow_within: float = 0.0
     trust: Trust = FINE
+    rungs: tuple[float, ...] = RUNGS
     level: int = 0
     steps_here: int = 0
     slower: float = 1.0
@@ -82,7 +86,7 @@ class Schedule:
     @property
     def rays(self) -> int:
         """Rays of the next step."""
-        return min(FIRST_BATCH << self.level, self.settings.max_rays)
+        return min(FIRST_BATCH * max(self.resolution, COARSEST) // COARSEST, self.settings.max_rays)
 
     def position(self, seconds: float, rays: int = 0) -> float:
         """0 … 1: how far the fit is, by its seconds or its rays, whichever are spent first.
@@ -127,9 +131,9 @@ class Schedule:
 
     def wants_finer(self, done: float) -> bool:
         """Time for the next level: its share is spent, or the validation views gain nothing more here."""
-        if self.finest or self.steps_here < LEVEL_STEPS or done >= RUNGS[-1]:
+        if self.finest or self.steps_here < LEVEL_STEPS or done >= self.rungs[-1]:
             return False
-        return done > RUNGS[min(self.level, len(RUNGS) - 1)] or self.plateau()
+        return done > self.rungs[min(self.level, len(self.rungs) - 1)] or self.plateau()
 
     def worth(self, voxels: float, rays_left: float) -> bool:
         """Whether a finer level of so many voxels would see enough rays; if not, this level is the last."""

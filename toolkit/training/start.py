@@ -24,6 +24,7 @@ ROOM_MARGIN = 1.4  # the same where nothing exists outside and no alpha says whe
 LEAST_REACH = 0.9
 NEAR = 0.8  # of the scene's nearest depth: where a fit's rays begin
 COARSEST = 32
+THIN = -4.5  # raw density of what nobody knows: thin enough that every voxel along a ray is tried, thick enough that none is ignored
 FINEST = 512
 PIXELS = 2.0  # of the training views, a voxel in the middle of the scene
 OBJECT_PIXELS = 1.3  # the same where alpha cuts the object out: fewer voxels are in play, so they may be finer
@@ -101,19 +102,24 @@ def emptied_by_views(space: Space, resolution: int, places: Tensor, views: Views
     return torch.from_numpy(emptied > EMPTIED * count)
 
 
-def _judged(space: Space, resolution: int, places: Tensor, views: Views, reach: float = WHOLE) -> tuple[Array, Array, int]:
-    """(N, 3) voxels → (N,) how many training views see each, and how many say that it is empty; and how many there are."""
+def radii(space: Space, resolution: int, places: Tensor, reach: float) -> tuple[Array, Array]:
+    """(N, 3) voxels → (N, 3) their middles, and (N,) the length of `reach` voxels there, working units: contracted voxels are larger the
+    farther out they are."""
     voxel = 2 * space.extent / resolution
     centre = (places.double() + 0.5) * voxel - space.extent
-    points = space.to_working(centre).numpy()
-    # `reach` in working units; contracted voxels are larger the farther out they are.
     norm = np.maximum(centre.abs().amax(1).numpy(), 1.0)
-    stretch = 1.0 if space.shell == 0 else np.minimum((space.shell / np.maximum(space.extent - norm, voxel)) ** 2 / space.shell, 1e6)
+    stretch = np.ones(1) if space.shell == 0 else np.minimum((space.shell / np.maximum(space.extent - norm, voxel)) ** 2 / space.shell, 1e6)
     radius = reach * voxel * space.half * np.maximum(stretch, 1.0)
+    return space.to_working(centre).numpy(), np.broadcast_to(radius, len(centre))
+
+
+def _judged(space: Space, resolution: int, places: Tensor, views: Views, reach: float = WHOLE) -> tuple[Array, Array, int]:
+    """(N, 3) voxels → (N,) how many training views see each, and how many say that it is empty; and how many there are."""
+    points, radius = radii(space, resolution, places, reach)
     train = np.flatnonzero(~views.test)
     seen, emptied = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for index in train:
-        visible, empty = _look(views, int(index), points, np.broadcast_to(radius, len(points)))
+        visible, empty = _look(views, int(index), points, radius)
         seen += visible
         emptied += empty
     return seen, emptied, len(train)

@@ -1,0 +1,210 @@
+"""The start of a fit whose pictures' depth is known, measured or matched: which voxels can hold something, how thick, in which colour.
+
+The classical start (`start.py`) goes by depth only where next to no picture contradicts it, on the coarsest lattice. Here pictures vote,
+voxel by voxel: what more than a few of them saw past is empty, what they measured is thick and has its colour, and what nobody knows stays
+as thin and grey as in the classical start. So a fit begins on a finer lattice, and has more of its rays left for the finest.
+Not in the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import torch
+
+from toolkit.camera import Array, invert, unproject
+from toolkit.capture.types import Views
+from toolkit.config import Settings
+from toolkit.networks.decoder import make_decoder
+from toolkit.poses.scene import Scene
+from toolkit.render.field import Field
+from toolkit.training.levels import FEATURE_NOISE, all_places, occupancy
+from toolkit.training.start import (
+    COARSEST,
+    FEW_VIEWS,
+    NEAR,
+    THIN,
+    WHOLE,
+    colour_behind,
+    finest_resolution,
+    levels,
+    possible,
+    radii,
+    space_of,
+)
+from toolkit.training.view import limit
+from toolkit.volume.space import Space
+from toolkit.volume.topology import BLOCK, Topology
+
+Tensor = torch.Tensor
+RESOLUTION = 64  # voxels a side, where a part of the pictures' depth is known …
+KNOWN, RESOLUTION_KNOWN = 0.95, 128  # … and where that much of it is: what nobody knows is found on coarse lattices
+THICK = 1.5  # raw density of what was measured
+MOST_VIEWS = 80  # pictures that are asked, evenly spread: more say the same
+MOST_POINTS = 1_000_000  # that are put onto the lattice
+ENOUGH = 1.0  # points that a corner needs about it to count as measured
+PAST, PAST_SHARE = 1, 0.05  # pictures, and share of those that know, that may see past what is not empty
+SURFACE = 0.2  # pictures that measured a surface, for each one that saw past it, where it stays all the same
+
+
+@dataclass(frozen=True)
+class Votes:
+    """What pictures say of voxels; those that have a surface before a voxel say nothing of it."""
+
+    unknown: Array  # (N,) int32 pictures that look there, and know no depth
+    past: Array  # (N,) … that measured something farther away
+    here: Array  # (N,) … that measured a surface there
+
+    def stays(self, views: int) -> Array:
+        """(N,) bool: the voxels that can hold something, by the votes of so many pictures."""
+        least = 2 if views >= FEW_VIEWS else 1
+        surface = (self.here >= least) & (self.here > SURFACE * self.past)
+        told = self.unknown + self.past + self.here
+        empty = self.past > np.maximum(PAST, PAST_SHARE * told)
+        seen = self.unknown + self.here > 0
+        return np.asarray(surface | (seen & ~empty))
+
+
+def starts_by_depth(views: Views, settings: Settings) -> bool:
+    """Whether a fit of these views begins so: depth is known and believed, and alpha cuts nothing out. Depth that was matched has to be
+    that of `FEW_VIEWS` training pictures: what few agree on is too often wrong (gum with 12 pictures lost 1.1 dB by it)."""
+    told = sum(depth is not None and not test for depth, test in zip(views.depths, views.test, strict=False))
+    return told >= (FEW_VIEWS if views.matched else 1) and settings.fit.depth > 0 and views.background is None
+
+
+def depth_start(views: Views, scene: Scene, settings: Settings, device: torch.device | str = "cpu") -> Field:
+    """The first field of a fit, at `RESOLUTION` voxels a side, or at `RESOLUTION_KNOWN` where nearly all depth is known (at the fit's
+    finest, when that is less), from the training pictures and their depth. About a second.
+
+    Args:
+        views: all views, at least one training view with depth; held-out ones are not looked at.
+    """
+    torch.manual_seed(settings.seed)
+    train = views.subset(np.flatnonzero(~np.asarray(views.test)))
+    space = space_of(views, scene, settings.field.background)
+    resolution = _resolution(space, train, scene, settings)
+    places = _split(possible(space, COARSEST, all_places(space, COARSEST), train), resolution // COARSEST)
+    some = train.subset(np.arange(0, len(train), -(-len(train) // MOST_VIEWS)))
+    stays = votes(space, resolution, places, some).stays(len(some))
+    topology, occupied = occupancy(places[torch.from_numpy(stays)] if stays.any() else places)
+    count, colour = measured(space, resolution, topology, train)
+    known = count > ENOUGH
+    channels = settings.field.channels
+    feature = torch.randn(len(count), channels, generator=torch.Generator().manual_seed(settings.seed)) * FEATURE_NOISE
+    feature[known, :3] = torch.logit((colour[known] / count[known, None]).clamp(0.02, 0.98))
+    density = torch.where(known, THICK, THIN)
+    density[-1], feature[-1] = 0, 0
+    decoder = make_decoder(settings.field.decoder, channels, settings.field.hidden)
+    limit(decoder, settings.field.view)
+    return Field(space, resolution, topology, occupied, density, feature, decoder, colour_behind(views), NEAR * scene.near).to(device)
+
+
+def votes(space: Space, resolution: int, places: Tensor, views: Views) -> Votes:
+    """What the depth of `views` says of the voxels `places` (N, 3)."""
+    centres, radius = (np.ascontiguousarray(one) for one in radii(space, resolution, places, WHOLE))
+    worlds = np.stack([invert(pose) for pose in views.world_from_camera])
+    cameras = np.array([(c.fx, c.fy, c.cx, c.cy) for c in views.intrinsics])
+    out = np.zeros((3, len(places)), np.int32)
+    for index, depth in enumerate(views.depths):
+        camera = views.intrinsics[index]
+        known = np.zeros((camera.height, camera.width), np.float32) if depth is None else np.ascontiguousarray(depth, dtype=np.float32)
+        _vote(centres, radius, cameras[index], worlds[index], known, out)
+    return Votes(*out)
+
+
+def measured(space: Space, resolution: int, topology: Topology, views: Views) -> tuple[Tensor, Tensor]:
+    """How many points of the depth of `views` lie about each corner of the lattice, those farther away counting less, and the sum of their
+    colours, each channel 0 … 1: (M · 512 + 1,) and (M · 512 + 1, 3) float32, nothing in the zero row."""
+    side = BLOCK * (resolution // BLOCK + 1)
+    whole = np.zeros((side, side, side, 4), np.float32)
+    asked = [index for index, depth in enumerate(views.depths) if depth is not None]
+    pixels = sum(views.images[index][..., 0].size for index in asked)
+    step = max(1, int(np.ceil(np.sqrt(pixels / MOST_POINTS))))
+    for index in asked:
+        points, colours = _points(views, index, step)
+        at = (space.contract(space.normalise(torch.from_numpy(points))) + space.extent) * (resolution / (2 * space.extent))
+        _add(at.numpy().astype(np.float32), colours, whole)
+    blocks = whole.reshape(side // BLOCK, BLOCK, side // BLOCK, BLOCK, side // BLOCK, BLOCK, 4).transpose(0, 2, 4, 1, 3, 5, 6)
+    x, y, z = topology.keys.long().unbind(1)
+    rows = torch.from_numpy(blocks)[z, y, x].reshape(-1, 4)
+    rows = torch.cat([rows, rows.new_zeros(1, 4)])
+    return rows[:, 0], rows[:, 1:] / 255
+
+
+def warm_up() -> None:
+    """Have the kernels compiled, or loaded."""
+    out = np.zeros((3, 1), np.int32)
+    _vote(np.zeros((1, 3)), np.ones(1), np.ones(4), np.eye(4), np.zeros((1, 1), np.float32), out)
+    _add(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), np.zeros((2, 2, 2, 4), np.float32))
+
+
+def _resolution(space: Space, train: Views, scene: Scene, settings: Settings) -> int:
+    """Voxels a side: a doubling of the coarsest, among the fit's levels."""
+    shares = [0.0 if depth is None else float(np.mean(depth > 0)) for depth in train.depths]
+    wanted = RESOLUTION_KNOWN if np.mean(shares) >= KNOWN else RESOLUTION
+    rungs = levels(settings.field.resolution or finest_resolution(space, train, scene))
+    return max(rung for rung in rungs if rung <= wanted and rung & (rung - 1) == 0)
+
+
+def _split(places: Tensor, ratio: int) -> Tensor:
+    """(N, 3) voxels → (N · ratio³, 3) the finer ones in them."""
+    line = torch.arange(ratio)
+    inside = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
+    return (places[:, None] * ratio + inside).reshape(-1, 3)
+
+
+def _points(views: Views, index: int, step: int) -> tuple[Array, Array]:
+    """(P, 3) float64 points of every `step`th pixel that has depth and counts, and (P, 3) uint8 their colours."""
+    depth, valid = views.depths[index], views.valid[index] if views.valid else None
+    assert depth is not None
+    known = (depth > 0) if valid is None else (depth > 0) & valid
+    first = step // 2
+    row, column = np.nonzero(known[first::step, first::step])
+    row, column = row * step + first, column * step + first
+    pixels = np.stack([column, row], 1) + 0.5
+    points = unproject(views.intrinsics[index], views.world_from_camera[index], pixels, depth[row, column].astype(np.float64))
+    return points, views.images[index][row, column]
+
+
+@numba.njit(cache=True, nogil=True)
+def _vote(centres: Array, radius: Array, camera: Array, world: Array, depth: Array, out: Array) -> None:
+    """Add what one picture says of voxels to out (3, N): unknown, past, here."""
+    fx, fy, cx, cy = camera
+    height, width = depth.shape
+    for i in range(len(centres)):
+        x, y, z = centres[i]
+        far = world[2, 0] * x + world[2, 1] * y + world[2, 2] * z + world[2, 3]
+        reach = 2 * radius[i]
+        if far <= reach:
+            continue
+        u = (world[0, 0] * x + world[0, 1] * y + world[0, 2] * z + world[0, 3]) / far * fx + cx
+        v = (world[1, 0] * x + world[1, 1] * y + world[1, 2] * z + world[1, 3]) / far * fy + cy
+        if not (0 <= u < width and 0 <= v < height):
+            continue
+        there = depth[int(v), int(u)]
+        if not there > 0:
+            out[0, i] += 1
+        elif far < there - reach:
+            out[1, i] += 1
+        elif far <= there + reach:
+            out[2, i] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(places: Array, colours: Array, out: Array) -> None:
+    """Add points (P, 3), in voxels, to the corners about them, out (z, y, x, 4): weight, and colours by it."""
+    high, long, wide = out.shape[0] - 1, out.shape[1] - 1, out.shape[2] - 1
+    for i in range(len(places)):
+        x, y, z = places[i]
+        if not (0 <= x < wide and 0 <= y < long and 0 <= z < high):
+            continue
+        left, top, front = int(x), int(y), int(z)
+        for corner in range(8):
+            dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
+            weight = abs(1 - dx - (x - left)) * abs(1 - dy - (y - top)) * abs(1 - dz - (z - front))
+            node = out[front + dz, top + dy, left + dx]
+            node[0] += weight
+            for channel in range(3):
+                node[channel + 1] += weight * colours[i, channel]
