@@ -43,6 +43,7 @@ RESOLUTION = 64  # voxels a side, where a part of the pictures' depth is known â
 KNOWN, RESOLUTION_KNOWN = 0.95, 128  # â€¦ and where that much of it is: what nobody knows is found on coarse lattices
 THICK = 1.5  # raw density of what was measured
 MOST_VIEWS = 80  # pictures that are asked, evenly spread: more say the same
+PIECE = 4096  # voxels of the coarsest lattice whose parts are asked for at a time: memory is bounded
 MOST_POINTS = 1_000_000  # that are put onto the lattice
 ENOUGH = 1.0  # points that a corner needs about it to count as measured
 PAST, PAST_SHARE = 1, 0.05  # pictures, and share of those that know, that may see past what is not empty
@@ -85,10 +86,16 @@ def depth_start(views: Views, scene: Scene, settings: Settings, device: torch.de
     train = views.subset(np.flatnonzero(~np.asarray(views.test)))
     space = space_of(views, scene, settings.field.background)
     resolution = _resolution(space, train, scene, settings)
-    places = _split(possible(space, COARSEST, all_places(space, COARSEST), train), resolution // COARSEST)
     some = train.subset(np.arange(0, len(train), -(-len(train) // MOST_VIEWS)))
-    stays = votes(space, resolution, places, some).stays(len(some))
-    topology, occupied = occupancy(places[torch.from_numpy(stays)] if stays.any() else places)
+    coarse, ratio = possible(space, COARSEST, all_places(space, COARSEST), train), resolution // COARSEST
+    kept = []
+    for part in coarse.split(PIECE):
+        finer = _split(part, ratio)
+        kept.append(finer[torch.from_numpy(votes(space, resolution, finer, some).stays(len(some)))])
+    places = torch.cat(kept)
+    if len(places) == 0:  # depth that contradicts itself everywhere
+        places = _split(coarse, ratio)
+    topology, occupied = occupancy(places)
     count, colour = measured(space, resolution, topology, train)
     known = count > ENOUGH
     channels = settings.field.channels
