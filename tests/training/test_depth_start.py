@@ -23,6 +23,7 @@ from toolkit.training.depth_start import (
     RESOLUTION_KNOWN,
     THICK,
     Votes,
+    _asked,
     depth_start,
     measured,
     starts_by_depth,
@@ -172,6 +173,24 @@ def test_the_lattice_is_finer_where_nearly_everything_is_known() -> None:
     assert depth_start(full, SCENE, wanted("field.resolution=160"), "cpu").resolution == 64  # 160 is the level after 64
     missing = int(160 * (1 - KNOWN)) + 2
     assert depth_start(blind(full, slice(0, missing)), SCENE, wanted("field.resolution=256"), "cpu").resolution == RESOLUTION
+
+
+def test_depth_that_leaves_nothing_is_not_believed() -> None:
+    made = views()
+    far = replace(made, depths=[np.full((120, 160), 1e6, np.float32)] * 7)
+    odd = [np.full((120, 160), value, np.float32) for value in (np.nan, np.inf, -1.0, 1e-30, 1e30, 0.0, 3e38)]
+    for some in (far, replace(made, depths=odd)):
+        field = depth_start(some, SCENE, wanted("field.background=off", "field.resolution=64"), "cpu")
+        assert field.voxels > 1000 and torch.isfinite(field.density_rows).all() and torch.isfinite(field.feature_rows).all()
+
+
+def test_pictures_with_depth_are_asked_wherever_they_are() -> None:
+    made = views().subset(np.arange(200) % 7)
+    depths = [one if index % 2 else None for index, one in enumerate(made.depths)]
+    asked = _asked(replace(made, depths=depths))
+    assert len(asked) == len(set(asked)) == 100 and sum(index % 2 for index in asked) == 50
+    few = [one if index == 77 else None for index, one in enumerate(made.depths)]
+    assert 77 in _asked(replace(made, depths=few))
 
 
 def test_held_out_pictures_are_not_looked_at() -> None:

@@ -42,7 +42,7 @@ Tensor = torch.Tensor
 RESOLUTION = 64  # voxels a side, where a part of the pictures' depth is known …
 KNOWN, RESOLUTION_KNOWN = 0.95, 128  # … and where that much of it is: what nobody knows is found on coarse lattices
 THICK = 1.5  # raw density of what was measured
-MOST_VIEWS = 80  # pictures that are asked, evenly spread: more say the same
+MOST_VIEWS = 80  # pictures with depth that are asked, and as many without, evenly spread: more say the same
 PIECE = 4096  # voxels of the coarsest lattice whose parts are asked for at a time: memory is bounded
 MOST_POINTS = 1_000_000  # that are put onto the lattice
 ENOUGH = 1.0  # points that a corner needs about it to count as measured
@@ -86,7 +86,7 @@ def depth_start(views: Views, scene: Scene, settings: Settings, device: torch.de
     train = views.subset(np.flatnonzero(~np.asarray(views.test)))
     space = space_of(views, scene, settings.field.background)
     resolution = _resolution(space, train, scene, settings)
-    some = train.subset(np.arange(0, len(train), -(-len(train) // MOST_VIEWS)))
+    some = train.subset(_asked(train))
     coarse, ratio = possible(space, COARSEST, all_places(space, COARSEST), train), resolution // COARSEST
     kept = []
     for part in coarse.split(PIECE):
@@ -132,7 +132,7 @@ def measured(space: Space, resolution: int, topology: Topology, views: Views) ->
     for index in asked:
         points, colours = _points(views, index, step)
         at = (space.contract(space.normalise(torch.from_numpy(points))) + space.extent) * (resolution / (2 * space.extent))
-        _add(at.numpy().astype(np.float32), colours, whole)
+        _add(at.clamp(-1, side).numpy().astype(np.float32), colours, whole)
     blocks = whole.reshape(side // BLOCK, BLOCK, side // BLOCK, BLOCK, side // BLOCK, BLOCK, 4).transpose(0, 2, 4, 1, 3, 5, 6)
     x, y, z = topology.keys.long().unbind(1)
     rows = torch.from_numpy(blocks)[z, y, x].reshape(-1, 4)
@@ -155,6 +155,12 @@ def _resolution(space: Space, train: Views, scene: Scene, settings: Settings) ->
     return max(rung for rung in rungs if rung <= wanted and rung & (rung - 1) == 0)
 
 
+def _asked(train: Views) -> Array:
+    """Indices of the pictures that vote."""
+    told = np.array([depth is not None for depth in train.depths])
+    return np.concatenate([some[:: max(1, -(-len(some) // MOST_VIEWS))] for some in (np.flatnonzero(told), np.flatnonzero(~told))])
+
+
 def _split(places: Tensor, ratio: int) -> Tensor:
     """(N, 3) voxels → (N · ratio³, 3) the finer ones in them."""
     line = torch.arange(ratio)
@@ -166,7 +172,7 @@ def _points(views: Views, index: int, step: int) -> tuple[Array, Array]:
     """(P, 3) float64 points of every `step`th pixel that has depth and counts, and (P, 3) uint8 their colours."""
     depth, valid = views.depths[index], views.valid[index] if views.valid else None
     assert depth is not None
-    known = (depth > 0) if valid is None else (depth > 0) & valid
+    known = (depth > 0) & np.isfinite(depth) & (True if valid is None else valid)
     first = step // 2
     row, column = np.nonzero(known[first::step, first::step])
     row, column = row * step + first, column * step + first
