@@ -18,6 +18,7 @@ RENDER_BYTES = 260  # a pixel of the picture that is being rendered: rays, sampl
 SCORE_BYTES = 320  # a pixel of the picture that is being scored
 KEPT_BYTES = 8  # a pixel of a picture that is kept until all are there: colour, depth, mask
 SURFACE_BYTES = 40  # the same when depth maps are made to agree before they become a surface: 33 measured
+PICTURE_BYTES = 8  # of a picture that depth is polished by: its colours, and its grey levels with those beside them
 ROW_COPIES = 3  # of a field's values while it is baked: its own, sorted ones for the range, the bytes
 MESH_COPIES = 6  # of a mesh file's size in memory while meshes are compared: float64, a tree to search in, samples
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,11 +14,13 @@ from pipelines.job import Job
 from pipelines.page import NAME, PAGE, put_page
 from pipelines.pictures import camera_of, orbit_cameras, pictures
 from pipelines.rendered import Pictures, to_picture
-from pipelines.room import SURFACE_BYTES, require_pictures
+from pipelines.room import PICTURE_BYTES, SURFACE_BYTES, pixels, require_pictures
 from pipelines.steps_results import fit_left_out
 from pipelines.summary import put_cameras
+from pipelines.taken import as_taken
 from pipelines.textured import TEXTURE, put_textured
-from toolkit.camera import Intrinsics, Similarity
+from toolkit import memory
+from toolkit.camera import Array, Intrinsics, Similarity
 from toolkit.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,7 +35,7 @@ if TYPE_CHECKING:
 SMALL_PART = 0.002  # components of a mesh with less than this share of its area are specks
 MOST_TRIANGLES = 2_000_000
 MESHES = ("ply", "obj", "glb")
-MESH_SIDE = 400  # pixels; finer depth than this adds little to a mesh and much to the time
+RENDERED_SIDE = 400  # pixels; pictures tell what is finer (`export.mesh_size`), and rendering it takes long
 VIDEO_SIDE = 640
 FPS = 30
 
@@ -147,7 +150,8 @@ def export_field(
 def export_surface(
     job: Job, folder: Path, formats: set[str], field: Field, posed: Capture, scene: Scene, views: Views, notes: list[str]
 ) -> tuple[dict[str, Any], list[Path]]:
-    """The field's depth at the training cameras, polished by their pictures and fused: points and meshes of the region of interest.
+    """The field's depth at the training cameras, polished by their pictures as they were taken and fused: points and meshes of the region
+    of interest.
 
     Args:
         notes: gets a sentence when the texture had to be left out.
@@ -161,21 +165,25 @@ def export_surface(
     from toolkit.stereo.polish import Polisher
     from toolkit.stereo.settle import settled
 
-    shown = views.subset(np.flatnonzero(~views.test))  # held-out pictures are not looked at
-    cameras = [at_most(camera, MESH_SIDE) for camera in shown.intrinsics]
+    train = np.flatnonzero(~views.test)  # held-out pictures are not looked at
+    shown, cameras = finer_views(job, posed, views, train)
     chosen = spread(len(shown), job.settings.export.mesh_views)
     lenses = [cameras[index] for index in chosen]
-    require_pictures(lenses, kept=True, advice="lower export.mesh_views", each=SURFACE_BYTES)
+    require_pictures(lenses, kept=True, advice="lower export.mesh_views or export.mesh_size", each=SURFACE_BYTES)
     view = make_renderer(field, job.settings.engine)
     polisher = Polisher(shown, cameras, scene.near, scene.far, scene.median_depth)
     seen = shown.subset(np.array(chosen))
+    fit = job.settings.fit
+    measured = seen.depths if fit.depth > 0 and fit.depth_from != "off" else []
     volume = field_volume(
-        lambda lens, pose: render_view(field, lens, pose, view),
+        lambda lens, pose: render_view(field, at_most(lens, RENDERED_SIDE), pose, view),
         shown.world_from_camera[chosen],
         lenses,
         region=(scene.centre - scene.half_size, scene.centre + scene.half_size),
         polish=[partial(polisher.polished, index) for index in chosen],
-        settle=lambda reliable, opaque, told: settled(reliable, opaque, told, seen, lenses, scene.median_depth, job.progress),
+        settle=lambda reliable, opaque, told: settled(
+            reliable, opaque, told, seen, lenses, scene.median_depth, measured, progress=job.progress
+        ),
         progress=job.progress,
     )
     input_from_working = scene.working_from_input.inverse()
@@ -194,6 +202,20 @@ def export_surface(
         except InputError as error:
             notes.append(f"the texture was left out: {error}")
     return facts, written
+
+
+def finer_views(job: Job, posed: Capture, views: Views, train: Array) -> tuple[Views, list[Intrinsics]]:
+    """The views `train` with their pictures as they were taken, and the cameras of depth maps for them, `export.mesh_size` at most.
+
+    Where there is too little memory for that, pictures stay as large as the fit has them.
+    """
+    side, shown = job.settings.export.mesh_size, views.subset(train)
+    lenses, images = as_taken(job, posed, train, shown, side)
+    rendered = min(1.0, job.settings.export.mesh_views / max(len(lenses), 1))
+    wanted = int((PICTURE_BYTES + SURFACE_BYTES * rendered) * sum(map(pixels, lenses)))
+    if lenses != shown.intrinsics and memory.bounded(wanted) < wanted:
+        lenses, images = shown.intrinsics, shown.images
+    return replace(shown, images=list(images), intrinsics=lenses), [at_most(lens, side) for lens in lenses]
 
 
 def at_most(lens: Intrinsics, long_side: int) -> Intrinsics:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
+from pipelines.taken import as_taken
 
 if TYPE_CHECKING:
     from pipelines.job import Job
@@ -48,34 +47,8 @@ def put_textured(job: Job, path: Path, mesh: Mesh, posed: Capture, scene: Scene,
     thin = mesh.decimated(TRIANGLES)
     train = np.flatnonzero(~views.test)
     shown = views.subset(train)
-    lenses, images = sharpest(job, posed, train, shown)
+    lenses, images = as_taken(job, posed, train, shown, job.settings.export.texture_size)
     cameras = (lenses, shown.world_from_camera, shown.valid, shown.weight)
     atlas, texture = textured(thin, images, *cameras, largest=largest, progress=job.progress)
     write_textured(path, thin, atlas, texture, scene.working_from_input)
     return path
-
-
-def sharpest(job: Job, posed: Capture, indices: Array, shown: Views) -> tuple[list[Intrinsics], Iterable[Array]]:
-    """Cameras and pictures of the frames `indices`, which are the views `shown`: as large as they were taken, up to
-    `export.texture_size`, read one at a time; those of the fit where the originals are no larger."""
-    from toolkit.capture.prepare import pictures_at, target_size
-    from toolkit.effects.correct import canonical
-
-    side, found = job.settings.export.texture_size, job.corrections
-    lenses = []
-    for index, small in zip(indices, shown.intrinsics, strict=True):
-        taken = posed.frames[index].intrinsics
-        size = (small.width, small.height) if taken is None else target_size(taken.width, taken.height, side)
-        lenses.append(small.scaled(*size) if max(size) > max(small.width, small.height) else small)
-    if all(lens == small for lens, small in zip(lenses, shown.intrinsics, strict=True)):
-        return lenses, shown.images
-
-    def read() -> Iterator[Array]:
-        import cv2
-
-        for lens, name, (_, picture) in zip(lenses, shown.names, pictures_at(posed, indices, side), strict=True):
-            if picture.shape[:2] != (lens.height, lens.width):
-                picture = cv2.resize(picture, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-            yield picture if found is None else canonical(picture, lens, found.gain.get(name), found.corner)[0]
-
-    return lenses, read()

@@ -116,15 +116,21 @@ class TotalBudget:
             spent = job.stages.records["render"].seconds
             after = sum(self.predicted.get(stage, 0.0) for stage in ("evaluate", "report")) * self._pace(job)
             factor = self.speed.factors.get("export", 1.0)
-            once, each = (factor * amount * self.speed.units["features"] for amount in model.mesh_work(self.work, self.choice))
             a_ray = factor * model.EXPORT_RAY * (spent / rays if rays else self._predicted_ray())
             a_frame = a_ray * model.video_rays(self.work, replace(self.choice, video_frames=1))
-            views, frames = model.exports_for(self.asked - self.elapsed() - after - once, each, a_frame)
+            left = self.asked - self.elapsed() - after
+            for size in (export.mesh_size, None):  # finer depth where that costs no view
+                self.choice.mesh_size = size
+                once, each = (factor * amount * self.speed.units["features"] for amount in model.mesh_work(self.work, self.choice))
+                views, frames = model.exports_for(left - once, each, a_frame)
+                if views >= min(export.mesh_views, model.MESH_VIEWS[1]):
+                    break
             self.choice.mesh_views, self.choice.video_frames = min(views, export.mesh_views), min(frames, export.video_frames)
             self.export_planned = once + self.choice.mesh_views * each + self.choice.video_frames * a_frame
             self._keep(job)
         assert self.choice.mesh_views is not None and self.choice.video_frames is not None
         export.mesh_views = self.choice.mesh_views
+        export.mesh_size = self.choice.mesh_size or min(export.mesh_size, model.MESH_SIDE, self.choice.image_size)
         if self.choice.video_frames:
             export.video_frames = self.choice.video_frames
         else:
@@ -193,7 +199,8 @@ class TotalBudget:
         assert self.speed is not None and self.work is not None and self.choice is not None
         export = job.settings.export
         video = export.video_frames if "video" in export.formats else 0
-        most = model.most_export_seconds(self.speed, self.work, self.choice, export.mesh_views, video)
+        finest = replace(self.choice, mesh_size=export.mesh_size)
+        most = model.most_export_seconds(self.speed, self.work, finest, export.mesh_views, video)
         surface = bool({"points", "ply", "obj", "glb", "texture"} & set(export.formats))
         least = min(most, model.least_export_seconds(self.speed, self.work, self.choice)) if surface else 0.0
         return max(least, min(model.EXPORT_SHARE * max(0.0, left), most))

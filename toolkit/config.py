@@ -112,6 +112,7 @@ EXPORTS = ("points", "ply", "obj", "glb", "texture", "page", "cameras", "video")
 class ExportSettings:
     formats: list[str] = default(default_factory=lambda: list(EXPORTS))
     mesh_views: int = 60  # views whose rendered depth is fused into the mesh
+    mesh_size: int = 640  # long side in pixels, at most, of that depth, and of the pictures, as they were taken, that it is polished by
     texture_size: int = 1280  # long side in pixels, at most, of the pictures that a texture is made of
     video_frames: int = 90
 
@@ -305,6 +306,7 @@ def _check_ranges(settings: Settings) -> None:
         "tsdf.voxel_size": settings.tsdf.voxel_size,
         "views.limit": settings.views.limit,
         "export.texture_size": settings.export.texture_size,
+        "export.mesh_size": settings.export.mesh_size,
         "keyframes.every": settings.keyframes.every,
         "keyframes.most": settings.keyframes.most,
         "network.voxels": settings.network.voxels,

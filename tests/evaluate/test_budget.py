@@ -168,6 +168,12 @@ def test_exports_are_given_no_more_than_they_can_use() -> None:
     assert much == pytest.approx(1e-6 * (3 + (240 + 60 * 35) * megapixels) + 1.2 * 1.5e-11 * 90 * FOX.pixels(240))
 
 
+def test_finer_depth_of_a_mesh_takes_longer_and_less_than_rendering_it_would() -> None:
+    small, finer, rendered = (model.mesh_work(FOX, choice) for choice in (Choice(320), Choice(320, mesh_size=400), Choice(400)))
+    assert all(a < b < c for a, b, c in zip(small, finer, rendered, strict=True))
+    assert model.mesh_work(FOX, Choice(320, mesh_size=320)) == small
+
+
 def test_runs_of_a_budget_become_one_table() -> None:
     def run(source: str, asked: float, real: float, effects: bool) -> dict[str, object]:
         choice = {"image_size": 240, "fit_seconds": 12.5, "resolution": 256, "video_frames": 0, "effects": effects}

@@ -66,6 +66,19 @@ def test_sizes_are_chosen_and_one_camera_a_pose_is_fine() -> None:
     assert 1.2 < volume.depth_max < 1.7
 
 
+def test_what_is_rendered_may_be_smaller_than_its_depth_map() -> None:
+    """Half as wide; nobody polishes, so a voxel's error is that of a coarser picture, and colours are where they belong."""
+
+    def half(camera: Intrinsics, pose: Array) -> tuple[Array, Array, Array]:
+        return exact(camera.scaled(camera.width // 2, camera.height // 2), pose)
+
+    mesh = field_volume(half, POSES, CAMERA, 0.02).mesh().cleaned(min_area_share=2e-3)
+    offset = mesh.vertices - CENTRE
+    assert np.quantile(np.abs(np.linalg.norm(offset, axis=1) - RADIUS), 0.95) < 0.012
+    clear = np.abs(offset[:, 2]) > 0.04
+    assert np.median(np.abs(mesh.colours[clear].astype(int) - sphere_colour(mesh.vertices[clear], CENTRE))) <= 6
+
+
 def test_the_region_is_kept_and_the_rest_is_not() -> None:
     region = (CENTRE - 1.0, CENTRE + np.array([1, 1, 0]))  # the lower half
     mesh = field_volume(exact, POSES, CAMERA, 0.02, region=region).mesh()

@@ -13,7 +13,8 @@ from pipelines.console import make_progress
 from pipelines.job import open_job
 from pipelines.options import gather
 from pipelines.reconstruct import stand
-from pipelines.textured import sharpest
+from pipelines.surface import finer_views
+from pipelines.taken import as_taken
 from tests.pipelines.made import CAMERA, call, make_room
 from tests.pipelines.short import ALONE
 from toolkit.effects.correct import Corrections, canonical
@@ -44,13 +45,13 @@ def test_a_texture_has_texels_of_the_photos(run: Path, capsys: Capsys) -> None:
 
 @pytest.mark.parametrize(("side", "expected"), [(1280, 192), (96, 96), (48, None), (20, None)])
 def test_pictures_are_as_large_as_they_were_taken(run: Path, side: int, expected: int | None) -> None:
-    """Up to `export.texture_size`; where that is no more than the fit has, its own pictures."""
-    options = gather(None, None, [f"export.texture_size={side}"], image_size=48)
+    """Up to so many pixels; where that is no more than the fit has, its own pictures."""
+    options = gather(None, None, None, image_size=48)
     with open_job(run / "room", run / "other", options, make_progress(True)) as job:
         _, _, posed, _, views = stand(job)
         train = np.flatnonzero(~views.test)
         shown = views.subset(train)
-        lenses, pictures = sharpest(job, posed, train, shown)
+        lenses, pictures = as_taken(job, posed, train, shown, side)
         found = list(pictures)
     assert len(found) == len(lenses) == len(train)
     if expected is None:
@@ -69,17 +70,31 @@ def test_large_pictures_are_corrected_as_those_of_the_fit(run: Path) -> None:
     with open_job(run / "room", run / "other", gather(None, None, None, image_size=48), make_progress(True)) as job:
         _, _, posed, _, views = stand(job)
         shown = views.subset([1])
-        plain = next(iter(sharpest(job, posed, np.array([1]), shown)[1]))
+        plain = next(iter(as_taken(job, posed, np.array([1]), shown, 1280)[1]))
         job.corrections = Corrections({views.names[1]: (1.5, 1.0, 0.8)})
-        corrected = next(iter(sharpest(job, posed, np.array([1]), shown)[1]))
+        corrected = next(iter(as_taken(job, posed, np.array([1]), shown, 1280)[1]))
     assert np.array_equal(corrected, canonical(plain, TAKEN, (1.5, 1.0, 0.8), None)[0])
     assert (corrected[..., 0] < plain[..., 0]).mean() > 0.9 and np.array_equal(corrected[..., 1], plain[..., 1])
 
 
-def test_a_size_of_nothing_is_refused(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_mesh_is_made_of_pictures_as_they_were_taken_where_there_is_room(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open_job(run / "room", run / "other", gather(None, None, ["export.mesh_size=128"], image_size=48), make_progress(True)) as job:
+        _, _, posed, _, views = stand(job)
+        train = np.flatnonzero(~views.test)
+        shown, cameras = finer_views(job, posed, views, train)
+        assert {picture.shape for picture in shown.images} == {(96, 128, 3)}
+        assert {(camera.width, camera.height) for camera in cameras} == {(128, 96)}
+        assert shown.names == [views.names[index] for index in train]
+        monkeypatch.setattr("toolkit.memory.available", lambda: 130 * 2**20)
+        shown, cameras = finer_views(job, posed, views, train)
+        assert {picture.shape for picture in shown.images} == {(36, 48, 3)} and {camera.width for camera in cameras} == {48}
+
+
+@pytest.mark.parametrize("name", ["texture_size", "mesh_size"])
+def test_a_size_of_nothing_is_refused(tmp_path: Path, capsys: Capsys, name: str) -> None:
     make_room(tmp_path / "room", 4)
-    answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", "--set", "export.texture_size=0")
-    assert answer.code == 2 and "export.texture_size is 0; it must be a positive number" in answer.sentence()
+    answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", "--set", f"export.{name}=0")
+    assert answer.code == 2 and f"export.{name} is 0; it must be a positive number" in answer.sentence()
 
 
 def test_a_mesh_stays_when_its_texture_cannot_be_made(run: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:

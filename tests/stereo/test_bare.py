@@ -11,11 +11,12 @@ import pytest
 
 from tests.poses.textured import PLANES, arc, render, texture
 from tests.stereo.test_match import CAMERA, FAR, MEDIAN, NEAR, relative_errors, views_of
-from toolkit.camera import Array, pixel_grid, unproject
+from toolkit.camera import Array, Intrinsics, pixel_grid, unproject
 from toolkit.capture.types import Views
 from toolkit.stereo import bare
 from toolkit.stereo.bare import continued
 from toolkit.stereo.match import StereoDepth, stereo_depths
+from toolkit.stereo.plane_maps import depth_of, numbers_of
 from toolkit.stereo.planes import ON, Points, find_planes
 
 Made = tuple[Views, list[Array], list[StereoDepth]]
@@ -141,10 +142,8 @@ def test_a_picture_that_looks_elsewhere_is_left_as_it_was() -> None:
 
 def test_a_plane_aslant_tells_no_depth() -> None:
     planes = np.array([[0.0, 1.0, 0.0, 1.0]])  # a floor below the camera
-    camera = np.array([150.0, 150.0, 80.0, 60.0])
-    slant = float(np.cos(np.deg2rad(bare.SLANT)))
-    depth = np.zeros((120, 160), np.float32)
-    bare._go_on(camera, planes, slant, np.zeros((120, 160), np.int32), depth)
+    camera = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
+    depth = depth_of(np.zeros((120, 160), np.int32), camera, planes, bare.SLANT)
     rows = (np.arange(120) + 0.5 - 60) / 150
     expected = np.arctan(rows) > np.deg2rad(90 - bare.SLANT)  # of the middle column, whose rays do not lean to the side
     assert np.array_equal(depth[:, 80] > 0, expected) and np.allclose(depth[expected, 80], 1 / rows[expected], rtol=1e-5)
@@ -154,8 +153,7 @@ def test_who_votes_for_which_plane() -> None:
     """The first plane that is near enough; none is an answer, too, and what has no depth does not vote."""
     planes = np.array([[0.0, 0.0, 1.0, 2.0], [0.0, 0.0, -1.0, -2.1], [0.0, 1.0, 0.0, 1.0]])  # the last is seen from above its edge, aslant
     depth = np.array([[2.0, 2.05, 2.1, 2.3, 0.0]], np.float32)
-    voter = np.empty(depth.shape, np.int32)
-    bare._voters(depth, np.array([100.0, 100.0, 2.5, 0.5]), planes, bare.ON, 0.17, voter)
+    voter = numbers_of(depth, Intrinsics(5, 1, 100.0, 100.0, 2.5, 0.5), planes, bare.ON, 80.0)
     assert voter.tolist() == [[0, 0, 1, len(planes), -1]]
 
 

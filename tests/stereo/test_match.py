@@ -230,7 +230,7 @@ def test_cameras_out_of_this_world_are_not_read_at(far: float) -> None:
     assert (Matcher(first).cost(thin, between(first, thin), np.full((120, 160), 0.3, np.float32)) == -1).all()
 
 
-@pytest.mark.parametrize("count", [1, 3, 4, 5])
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6, 8])
 def test_the_better_half_counts(count: int) -> None:
     rng = np.random.default_rng(1)
     costs = rng.random((count, 6, 7)).astype(np.float32)

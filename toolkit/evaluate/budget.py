@@ -25,9 +25,9 @@ NEARLY = 0.8  # of the seconds that the smallest pictures would leave, where the
 LEAST_FIT = 2.0  # seconds
 STEADY = 5.0  # seconds of stages that count as predicted well when it is told how busy the machine is: first imports are no sign of it
 EXPORT_SHARE = 0.25  # of the seconds, at most, that are planned for exports
-# Pictures' worth of features that a mesh takes: whatever it is of; a megapixel of one view, for its triangles; and a megapixel of all
-# views, to render, polish and fuse their depth and to carve with it. A mesh of 12 views of 400 pixels takes six times that of 160 pixels.
-MESH_FIXED, MESH_TRIANGLES, MESH_DEPTH = 3.0, 240.0, 35.0
+# Pictures' worth of features that a mesh takes: whatever it is of; of a megapixel of one view, for its triangles, and of all views, to make
+# their depth agree, to polish, fuse and carve; each by the pixels that are rendered, and by those of the depth that is made of them.
+MESH_FIXED, MESH_TRIANGLES, MESH_DEPTH = 3.0, (180.0, 60.0), (28.0, 7.0)
 # For a texture besides: a coarser mesh, and of each training picture what it sees and its texels; for a page: what training rays see.
 TEXTURE_FIXED, TEXTURE_PICTURE, PAGE = 20.0, 0.3, 15.0
 OBJECT = 0.5  # of that where pictures have alpha: the object fills a part of them
@@ -110,6 +110,7 @@ class Choice:
     fit_seconds: float | None = None
     resolution: int | None = None
     mesh_views: int | None = None
+    mesh_size: int | None = None  # of a mesh's depth; None: as large as it is rendered
     video_frames: int | None = None  # 0: no video
     effects: bool | None = None  # whether they are looked for
 
@@ -185,10 +186,12 @@ def texture_work(pictures: float) -> float:
 
 def mesh_work(work: Work, choice: Choice) -> tuple[float, float]:
     """Pictures' worth of features that a mesh takes beside its views, its texture and the page among them, and for each view."""
-    megapixels = work.pixels(min(MESH_SIDE, choice.image_size)) / 1e6 * (OBJECT if work.alpha else 1.0)
+    rendered = min(MESH_SIDE, choice.image_size)
+    sizes = [work.pixels(side) / 1e6 * (OBJECT if work.alpha else 1.0) for side in (rendered, choice.mesh_size or rendered)]
     frames = min(work.frames, choice.max_frames or work.frames)
     extra = (texture_work(frames * (1 - work.test / max(work.frames, 1))) if work.texture else 0.0) + (PAGE if work.page else 0.0)
-    return MESH_FIXED + MESH_TRIANGLES * megapixels + extra, MESH_DEPTH * megapixels
+    triangles, depth = (sum(each * size for each, size in zip(of, sizes, strict=True)) for of in (MESH_TRIANGLES, MESH_DEPTH))
+    return MESH_FIXED + triangles + extra, depth
 
 
 def most_export_seconds(speed: Speed, work: Work, choice: Choice, mesh_views: int, video_frames: int) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 from toolkit.camera import Array, Intrinsics
 from toolkit.errors import InputError
 from toolkit.progress import SILENT, Progress
+from toolkit.stereo.maps import enlarged
 from toolkit.tsdf.frames import DepthFrame
 from toolkit.tsdf.held import fuse_held
 from toolkit.tsdf.mesh import as_bytes
@@ -44,14 +45,21 @@ def reliable_depth(depth: Array, opacity: Array, focal: float, min_opacity: floa
 def rendered_frame(
     render: Render, intrinsics: Intrinsics, world_from_camera: Array, min_opacity: float = 0.7, polish: Polish | None = None
 ) -> tuple[DepthFrame, Array, Array]:
-    """Render one view: a frame of its reliable depth, polished before; (H, W) all depth that is opaque enough; where pictures tell it."""
+    """Render one view: a frame of its reliable depth, polished before; (H, W) all depth that is opaque enough; where pictures tell it.
+
+    What is rendered may be smaller than the camera, whose pictures then tell what is finer.
+    """
     rendered = render(intrinsics, world_from_camera)
     rgb, depth, opacity = (rendered.rgb, rendered.depth, rendered.opacity) if hasattr(rendered, "rgb") else rendered
-    camera = intrinsics.pinhole()
+    camera, size = intrinsics.pinhole(), (intrinsics.width, intrinsics.height)
+    small = camera.scaled(np.shape(depth)[1], np.shape(depth)[0])
+    if small != camera:
+        depth = enlarged(np.asarray(depth), *size)
+        opacity = cv2.resize(np.asarray(opacity, dtype=np.float32), size, interpolation=cv2.INTER_LINEAR)
     depth, told = (np.asarray(depth), np.ones(np.shape(depth), bool)) if polish is None else polish(np.asarray(depth))
     opaque = np.where(np.isfinite(depth) & (np.asarray(opacity) >= min_opacity), depth, 0).astype(np.float32)
     depth = reliable_depth(depth, np.asarray(opacity), camera.fx, min_opacity)
-    return DepthFrame(depth, as_bytes(np.asarray(rgb)), camera, camera, np.asarray(world_from_camera, dtype=np.float64)), opaque, told
+    return DepthFrame(depth, as_bytes(np.asarray(rgb)), camera, small, np.asarray(world_from_camera, dtype=np.float64)), opaque, told
 
 
 def within(frame: DepthFrame, region: tuple[Array, Array]) -> DepthFrame:
@@ -115,6 +123,7 @@ def field_volume(
         # Planes and what is left beside them have edges of their own.
         depths = [reliable_depth(depth, np.ones_like(depth), frame.depth_intrinsics.fx) for frame, depth in zip(made, depths, strict=True)]
         made = [replace(frame, depth=depth) for frame, depth in zip(made, depths, strict=True)]
+    del opaque, told
     return fuse_held(
         made if region is None else [within(frame, region) for frame in made],
         len(poses),

@@ -19,9 +19,10 @@ import numpy as np
 from toolkit.camera import Array
 from toolkit.capture.types import Views
 from toolkit.progress import SILENT, Progress
-from toolkit.stereo.check import agreement, numbers
+from toolkit.stereo.check import agreement
 from toolkit.stereo.cost import shrunk
 from toolkit.stereo.match import CHECKED, MOST_WORKERS, StereoDepth, usable_neighbours, usable_pixels
+from toolkit.stereo.plane_maps import depth_of, in_camera, numbers_of
 from toolkit.stereo.planes import Points, find_planes
 
 POINTS = 60_000  # that planes are looked for in, of all pictures together
@@ -119,12 +120,8 @@ def proposal(one: StereoDepth, picture: Array, pose: Array, planes: Array, usabl
         planes: (K, 4) of `find_planes`.
         usable: (H, W) bool where there is something to see, None: everywhere.
     """
-    camera = numbers(one.intrinsics)
-    normals = planes[:, :3] @ pose[:3, :3]
-    local = np.column_stack([normals, planes[:, 3] - planes[:, :3] @ pose[:3, 3]])  # the planes in the camera's frame
-    voter = np.empty(one.depth.shape, np.int32)
-    slant = float(np.cos(np.deg2rad(SLANT)))
-    _voters(one.depth, camera, local, ON, slant, voter)
+    local = in_camera(planes, pose)
+    voter = numbers_of(one.depth, one.intrinsics, local, ON, SLANT)
     guide = cv2.GaussianBlur(picture, (0, 0), BLUR[0])
     present = [plane for plane in np.unique(voter) if plane >= 0]  # len(planes): those that lie on none
     if not present:
@@ -136,9 +133,8 @@ def proposal(one: StereoDepth, picture: Array, pose: Array, planes: Array, usabl
     open_ = (one.depth <= 0) & (total > LEAST_VOTES) & (votes.max(axis=2) > MAJORITY * total) & (winner < len(planes))
     if usable is not None:
         open_ &= usable
-    depth = one.depth.copy()
-    _go_on(camera, local, slant, np.where(open_, winner, np.int32(-1)), depth)
-    return Proposed(depth, open_ & (depth > 0))
+    there = depth_of(np.where(open_, winner, np.int32(-1)), one.intrinsics, local, SLANT)
+    return Proposed(np.where(there > 0, there, one.depth), there > 0)
 
 
 def spread_along(guide: Array, values: Array, away: float, edge: float) -> None:
@@ -169,46 +165,6 @@ def _pass_on(values: Array, keep: Array) -> None:
             share = keep[v, x]
             for k in range(values.shape[2]):
                 values[v, x, k] += share * (values[v, x + 1, k] - values[v, x, k])
-
-
-@numba.njit(cache=True, nogil=True)
-def _inverse_on(planes: Array, which: int, x: float, y: float, slant: float) -> float:
-    """Inverse depth of the plane `which` on the ray (x, y, 1), 0: behind the camera, or too much aslant."""
-    along = planes[which, 0] * x + planes[which, 1] * y + planes[which, 2]
-    offset = planes[which, 3]
-    if along * offset <= 0 or abs(along) <= slant * np.sqrt(x * x + y * y + 1):
-        return 0.0
-    return float(along / offset)
-
-
-@numba.njit(cache=True, nogil=True)
-def _voters(depth: Array, camera: Array, planes: Array, on: float, slant: float, voter: Array) -> None:
-    """The first of the planes (in the camera's frame) that each pixel lies on; len(planes): none, −1: no depth."""
-    fx, fy, cx, cy = camera
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            voter[v, u] = -1
-            z = depth[v, u]
-            if z <= 0:
-                continue
-            voter[v, u] = len(planes)
-            for plane in range(len(planes)):
-                inverse = _inverse_on(planes, plane, (u + 0.5 - cx) / fx, (v + 0.5 - cy) / fy, slant)
-                if inverse > 0 and abs(inverse * z - 1) < on:
-                    voter[v, u] = plane
-                    break
-
-
-@numba.njit(cache=True, nogil=True)
-def _go_on(camera: Array, planes: Array, slant: float, winner: Array, depth: Array) -> None:
-    """The depth of plane winner[v, u] where that is one, and stands before the camera."""
-    fx, fy, cx, cy = camera
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            if winner[v, u] >= 0:
-                inverse = _inverse_on(planes, winner[v, u], (u + 0.5 - cx) / fx, (v + 0.5 - cy) / fy, slant)
-                if inverse > 0:
-                    depth[v, u] = 1 / inverse
 
 
 def _middle(values: Array) -> Array:

@@ -216,34 +216,44 @@ def _best_of_four(costs: Array, out: Array) -> None:
             out[y, x] = value if first < never else F(UNKNOWN)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**OPTIONS)
+def _into_order(low: Array, high: Array) -> None:
+    """The smaller of each two values into `low`, the larger into `high`."""
+    for x in range(len(low)):
+        one, other = low[x], high[x]
+        low[x], high[x] = min(one, other), max(one, other)
+
+
+@numba.njit(**OPTIONS)
 def best_half(costs: Array, out: Array) -> None:
-    """(K, H, W) costs, −1 unknown → the mean of the better half of the known ones: the worse half may be hidden behind something."""
+    """(K, H, W) costs, −1 unknown → the mean of the better half of the known ones: the worse half may be hidden behind something.
+
+    Rows are sorted against each other, all their pixels at once: sorting pixel by pixel takes ten times as long.
+    """
     count, height, width = costs.shape
     if count == 4:
         _best_of_four(costs, out)
         return
-    values = np.empty(count, np.float32)
+    zero, never = F(0), F(1e3)
+    rows, known = np.empty((count, width), np.float32), np.empty(width, np.int32)
     for y in range(height):
+        known[:] = 0
+        for k in range(count):
+            row, given = rows[k], costs[k, y]
+            for x in range(width):
+                row[x] = given[x] if given[x] >= zero else never
+                known[x] += np.int32(given[x] >= zero)
+        for turn in range(count):  # odd-even transposition sort
+            for k in range(turn & 1, count - 1, 2):
+                _into_order(rows[k], rows[k + 1])
+        total = out[y]
+        total[:] = zero
+        for k in range((count + 1) // 2):
+            row = rows[k]
+            for x in range(width):
+                total[x] += row[x] if k < (known[x] + 1) // 2 else zero
         for x in range(width):
-            known = 0
-            for k in range(count):
-                value = costs[k, y, x]
-                if value >= 0:
-                    place = known
-                    while place > 0 and values[place - 1] > value:
-                        values[place] = values[place - 1]
-                        place -= 1
-                    values[place] = value
-                    known += 1
-            if known == 0:
-                out[y, x] = UNKNOWN
-                continue
-            half = (known + 1) // 2
-            total = np.float32(0)
-            for k in range(half):
-                total += values[k]
-            out[y, x] = total / half
+            total[x] = total[x] / F((known[x] + 1) // 2) if known[x] > 0 else F(UNKNOWN)
 
 
 @numba.njit(**OPTIONS)

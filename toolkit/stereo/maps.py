@@ -26,6 +26,18 @@ def depth_at(found: StereoDepth, width: int, height: int, least_confidence: floa
     depth = np.where(found.confidence >= least_confidence, found.depth, np.float32(0))
     if depth.shape == (height, width):
         return np.ascontiguousarray(depth, dtype=np.float32)
+    return _interpolated(depth, width, height)
+
+
+def enlarged(depth: Array, width: int, height: int) -> Array:
+    """(height, width) float32 a depth map on more pixels, 0 or not finite = unknown; beside an edge each has the nearest depth there is."""
+    known = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+    between = _interpolated(known, width, height)
+    return np.where(between > 0, between, cv2.resize(known, (width, height), interpolation=cv2.INTER_NEAREST))
+
+
+def _interpolated(depth: Array, width: int, height: int) -> Array:
+    """(height, width) float32, linear in inverse depth, 0 beside what is unknown and beside edges."""
     inverse: Array = np.where(depth > 0, 1 / np.maximum(depth, np.float32(1e-12)), 0).astype(np.float32)
     window = np.ones((3, 3), np.uint8)
     nearest, farthest = cv2.dilate(inverse, window), cv2.erode(inverse, window)

@@ -29,16 +29,16 @@ class Points:
     pixel: Array  # (N, 2) float64 x, y in shares of the picture's long side
 
 
-def find_planes(points: Points, seed: int = 0, on: float = ON) -> Array:
+def find_planes(points: Points, seed: int = 0, on: float = ON, least: float = LEAST, most: int = MOST) -> Array:
     """(K, 4) float64 planes, those with most points first: n · p = d with a unit normal n in the first three columns, d in the last.
 
-    What lies on a plane, within twice `on` (a share of its depth), is no longer asked for the next one.
+    What lies on a plane, within twice `on` (a share of its depth), is no longer asked for the next one. Each has `least` of the points.
     """
     generator = np.random.default_rng(seed)
     left = np.arange(len(points.depth))
-    least = max(3.0, LEAST * len(left))
+    needed = max(3.0, least * len(left))
     found: list[Array] = []
-    while len(found) < MOST and len(left) >= least:
+    while len(found) < most and len(left) >= needed:
         tried = _planes_through(points, _triples(points, left, generator))
         some = generator.permutation(left)[:SCORED]
         counts = (_misses(points, some, tried) < on).sum(axis=0)
@@ -46,7 +46,7 @@ def find_planes(points: Points, seed: int = 0, on: float = ON) -> Array:
         if not fitted:
             break
         number, plane = max(fitted, key=lambda one: one[0])
-        if number < least:
+        if number < needed:
             break
         found.append(plane)
         left = left[_misses(points, left, plane[None])[:, 0] >= 2 * on]
