@@ -103,6 +103,23 @@ def test_a_guess_far_from_the_plane_gives_way_where_pictures_show_the_plane() ->
     assert np.median(errors) < 0.002 and (errors < 0.01).mean() > 0.9
 
 
+def test_of_what_is_round_planes_go_no_farther_than_beside_what_is_sure(
+    corner: tuple[Views, list[Array]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pictures are asked which plane they show in a scene of planes, and there alone."""
+    views, truth = corner
+    asked: list[int] = []
+    monkeypatch.setattr(
+        "toolkit.stereo.settle.shown_planes", lambda index, maps, *_: asked.append(index) or np.full(maps[0].sure.shape, -1, np.int32)
+    )
+    v, u = np.mgrid[: truth[0].shape[0], : truth[0].shape[1]]
+    bent = [(depth * (1 + 0.05 * np.sin(u / 9) * np.cos(v / 9))).astype(np.float32) for depth in truth]
+    round_ = made(views, bent)
+    assert not asked and all((depth > 0).mean() > 0.5 for depth in round_)
+    made(views, truth)
+    assert sorted(asked) == list(range(len(views)))
+
+
 def test_what_a_sensor_measured_is_sure(corner: tuple[Views, list[Array]]) -> None:
     """Also where pictures tell nothing: a wall that all views hold, and the sensor with them, is no guess; without the sensor it is."""
     views, truth = corner

@@ -27,6 +27,7 @@ EDGE = 45.0  # … and the step of colour, in levels, that is as much in their w
 SEEN_THROUGH = 1.0  # is added to the cost of what neighbours see through: as much as nothing alike
 RECOGNISED = 0.4  # matching cost up to which pictures show that a plane is there …
 ELSEWHERE = 0.2  # … without which this is added to that of one that lies elsewhere than the guess, …
+HELD = 0.5  # … or this, shown or not, where other views hold the guess, such as a bare leg of a table before the floor, …
 NEARBY = 0.05  # … by more than this share of it
 MOST_COST = 0.6  # of a plane that is taken
 NEIGHBOURS = 8  # views that a picture is compared with
@@ -44,18 +45,19 @@ class Unsure:
     picture: Array  # (H, W, 3) uint8
     sure: Array  # (H, W) float32 along z, 0 = not sure
     guess: Array  # (H, W) float32, the same where it is no more than that; 0 = none
+    held: Array  # (H, W) bool guesses that other views hold, too
 
     @property
     def camera(self) -> Intrinsics:
         return self.grey.camera
 
 
-def shown_planes(index: int, views: Sequence[Unsure], planes: Array, rather: float) -> Array:
+def shown_planes(index: int, views: Sequence[Unsure], planes: Array, rather: Array) -> Array:
     """(H, W) int32 the plane that each pixel of the view `index` shows, −1: none, or what it shows is sure.
 
     Args:
         planes: (K, 4) of `planes.find_planes`.
-        rather: how much more than the guess a plane may cost, and is taken.
+        rather: (K,) how much more than the guess each plane may cost, and is taken.
     """
     view, pose = views[index], views[index].grey.world_from_camera
     local = in_camera(planes, pose)
@@ -68,15 +70,17 @@ def shown_planes(index: int, views: Sequence[Unsure], planes: Array, rather: flo
     poses = np.stack([one.grey.world_from_camera for one in views])
     for number, depth in enumerate(depths):
         said = agreement(index, compared, [*known[:index], depth, *known[index + 1 :]], cameras, poses)
-        elsewhere = (np.abs(depth - view.guess) > NEARBY * view.guess) & (costs[..., number] > RECOGNISED)
-        costs[..., number] += SEEN_THROUGH * ((said.through > 0) & (said.through >= said.agree)) + ELSEWHERE * elsewhere
+        elsewhere = np.abs(depth - view.guess) > NEARBY * view.guess
+        costs[..., number] += SEEN_THROUGH * ((said.through > 0) & (said.through >= said.agree))
+        costs[..., number] += elsewhere * np.where(view.held, HELD, ELSEWHERE * (costs[..., number] > RECOGNISED)).astype(np.float32)
     speaks_for = numbers_of(view.sure, view.camera, local, ON, SLANT)
     costs[~open_] = speaks_for[~open_][:, None] != np.arange(len(depths))
     spread_along(cv2.GaussianBlur(view.picture, (0, 0), BLUR[0]), costs, AWAY * max(open_.shape), EDGE)
-    best = costs[..., :-1].argmin(axis=2)
-    lowest = np.take_along_axis(costs, best[..., None], axis=2)[..., 0]
+    claims = costs[..., :-1] - rather.astype(np.float32)
+    best = claims.argmin(axis=2)
+    lowest, claim = (np.take_along_axis(of, best[..., None], axis=2)[..., 0] for of in (costs, claims))
     there = np.take_along_axis(np.stack(depths[:-1]), best[None], axis=0)[0] > 0
-    taken = open_ & there & (view.guess > 0) & (lowest < costs[..., -1] + rather) & (lowest < MOST_COST)
+    taken = open_ & there & (view.guess > 0) & (claim < costs[..., -1]) & (lowest < MOST_COST)
     return np.where(taken, best, -1).astype(np.int32)
 
 

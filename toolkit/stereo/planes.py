@@ -53,6 +53,13 @@ def find_planes(points: Points, seed: int = 0, on: float = ON, least: float = LE
     return np.array(found).reshape(-1, 4)
 
 
+def shares(points: Points, planes: Array, on: float = ON) -> Array:
+    """(K,) the share of all points that lies on each plane."""
+    if not len(points.depth):
+        return np.zeros(len(planes))
+    return np.asarray((_misses(points, np.arange(len(points.depth)), planes) < on).mean(axis=0))
+
+
 def _triples(points: Points, left: Array, generator: np.random.Generator) -> Array:
     """(T, 3) points of `left`, each three in one picture and `APART`."""
     first = generator.choice(left, TRIPLES)

@@ -1,13 +1,16 @@
 """Depth maps that are mostly right, such as a field's, made to agree with each other before a surface is made of them.
 
 What other views confirm and pictures tell stays. Elsewhere a field's depth is a guess: few views see the place, or nothing there could be
-recognised. Where a plane of what is sure explains the pictures as well as the guess does (`on_planes.py`), it goes on there; what is left
-of the guesses stays unless some other view sees through it.
+recognised. There planes of what is sure go on: where most of it lies on a few large ones, as in a room, wherever one explains the pictures
+as well as the guess does (`on_planes.py`); else, since small planes are found in what is round, too, only beside what is sure and near the
+guess (`bare.py`). What is left of the guesses stays unless some other view sees through it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -15,20 +18,75 @@ import numpy as np
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture.types import Views
 from toolkit.progress import SILENT, Progress
-from toolkit.stereo.bare import points_of
+from toolkit.stereo.bare import points_of, proposal
 from toolkit.stereo.check import agreement, confirmed
 from toolkit.stereo.cost import grey_view, shrunk
 from toolkit.stereo.match import CHECKED, StereoDepth, shrunk_camera, side_by_side, usable_neighbours, usable_pixels
 from toolkit.stereo.on_planes import SLANT, Unsure, shown_planes
 from toolkit.stereo.plane_maps import depth_of, in_camera
-from toolkit.stereo.planes import find_planes
+from toolkit.stereo.planes import find_planes, shares
 
+T = TypeVar("T")
+
+# Scenes of planes, where pictures are asked which plane they show
 CONFIRMED = 3  # views beside a view that must have the same point
 ON = 0.003  # share of its depth by which a point may miss a plane that it is counted to: a fifth of what matched depth needs
 LEAST, MOST = 0.003, 40  # share of the points that a plane has, and planes: twice as many as matched depth needs, since depth is better
+LARGE = 0.05  # share of the points that a large plane has
+PLANAR = 0.6  # share of the points on large planes from which a scene is one of planes: small ones are found in what is round, too
+RATHER = (0.1, -0.1)  # how much more a large plane may cost than a guess, and where a sensor's depth stands behind the guesses …
+SMALL = 0.0  # … and how much more a small one may at most
+ASKED_SIDE = 320  # pixels along the side, at most, of the pictures that are asked
+
+# Others, where planes go on beside what is sure
+CONFIRMED_BESIDE, ON_BESIDE = 2, 0.004
+REACH = 3.0  # pixels of parallax between a guess and the plane that takes its place, at most
+
 MEASURED = 0.03  # share of a sensor's depth by which a field's may differ and be the same place
-RATHER = (0.1, -0.1)  # how much more a plane may cost than a guess, and where a sensor's depth stands behind the guesses
-ASKED_SIDE = 320  # pixels along the side, at most, of the pictures that are asked which plane they show
+
+
+@dataclass(frozen=True)
+class _Maps:
+    """What is settled; lists have an entry a view, in one order."""
+
+    reliable: Sequence[Array]
+    guesses: Sequence[Array]
+    known: Sequence[Array]  # (H, W) bool where pictures or a sensor tell the depth
+    views: Views
+    lenses: list[Intrinsics]
+    poses: Array  # (N, 4, 4)
+    others: list[list[int]]  # views that a view's depth is checked against
+    progress: Progress
+
+    def each(self, of: Callable[[int], T]) -> list[T]:
+        """`of` each view, several at once."""
+
+        def asked(index: int) -> T:
+            self.progress.check()
+            return of(index)
+
+        return side_by_side(asked, len(self.lenses))
+
+    def sure(self, needed: int) -> list[StereoDepth]:
+        """What `needed` other views confirm, or all where there are fewer, and what is known."""
+
+        def checked(index: int) -> StereoDepth:
+            fewest = min(needed, max(1, len(self.others[index])))
+            depth, confidence = confirmed(index, self.others[index], self.reliable, self.lenses, self.poses, needed=fewest)
+            # Its own depth, not the mean with theirs, which are looked up at the nearest pixel; fusing the maps averages better.
+            kept = np.where((depth > 0) & self.known[index], self.reliable[index], 0).astype(np.float32)
+            return StereoDepth(kept, confidence, self.lenses[index])
+
+        return self.each(checked)
+
+    def not_seen_through(self, depths: Sequence[Array], sure: Sequence[Array]) -> list[Array]:
+        """`depths` without what is not `sure` and some other view sees through."""
+
+        def kept(index: int) -> Array:
+            through = agreement(index, self.others[index], depths, self.lenses, self.poses).through
+            return np.where(sure[index] | (through == 0), depths[index], np.float32(0)).astype(np.float32)
+
+        return self.each(kept)
 
 
 def settled(
@@ -64,40 +122,52 @@ def settled(
         return [np.asarray(depth, dtype=np.float32) for depth in reliable]
     others = [[other for other in row if beside[other]] for row in beside]
     backed = any(depth is not None for depth in measured)
+    known = [where | _same(depth, one) for where, depth, one in zip(told, reliable, measured, strict=True)] if backed else told
+    maps = _Maps(reliable, guesses, known, views, lenses, poses, others, progress)
+    sure = maps.sure(CONFIRMED)
+    points = points_of(sure, poses)
+    planes = find_planes(points, on=ON, least=LEAST, most=MOST)
+    share = shares(points, planes, ON)
+    if share[share >= LARGE].sum() >= PLANAR:
+        rather = np.where(share >= LARGE, RATHER[backed], min(SMALL, RATHER[backed]))
+        depths = _as_pictures_show(maps, sure, planes, rather)
+    else:
+        depths = _beside_what_is_sure(maps)
+    filled = [np.where(depth > 0, depth, guess).astype(np.float32) for depth, guess in zip(depths, reliable, strict=True)]
+    return maps.not_seen_through(filled, [depth > 0 for depth in depths])
 
-    def checked(index: int) -> StereoDepth:
-        progress.check()
-        depth, confidence = confirmed(index, others[index], reliable, lenses, poses, needed=min(CONFIRMED, max(1, len(others[index]))))
-        # Its own depth, not the mean with theirs, which are looked up at the nearest pixel; fusing the maps averages better.
-        known = told[index] | _same(reliable[index], measured[index]) if backed else told[index]
-        return StereoDepth(np.where((depth > 0) & known, reliable[index], 0).astype(np.float32), confidence, lenses[index])
 
-    found = side_by_side(checked, len(views))
-    sure = [one.depth for one in found]
-    planes = find_planes(points_of(found, poses), on=ON, least=LEAST, most=MOST)
-    if len(planes):
-        asked = [_asked(views, index, lenses[index], sure[index], guesses[index]) for index in range(len(views))]
+def _as_pictures_show(maps: _Maps, sure: Sequence[StereoDepth], planes: Array, rather: Array) -> list[Array]:
+    """What is sure, and planes wherever pictures show them (`on_planes.py`)."""
+    asked = [_asked(maps, index, one) for index, one in enumerate(sure)]
 
-        def continued(index: int) -> Array:
-            progress.check()
-            which = _resized(shown_planes(index, asked, planes, RATHER[backed]), lenses[index])
-            there = depth_of(which, lenses[index], in_camera(planes, poses[index]), SLANT)
-            open_, usable = (sure[index] <= 0) & (guesses[index] > 0), usable_pixels(views, index, lenses[index])
-            return np.where(open_ if usable is None else open_ & usable, there, sure[index])
+    def continued(index: int) -> Array:
+        lens, one, guess = maps.lenses[index], sure[index], maps.guesses[index]
+        which = _resized(shown_planes(index, asked, planes, rather), lens)
+        there = depth_of(which, lens, in_camera(planes, maps.poses[index]), SLANT)
+        open_, usable = (one.depth <= 0) & (guess > 0), usable_pixels(maps.views, index, lens)
+        return np.where(open_ if usable is None else open_ & usable, there, one.depth)
 
-        sure = side_by_side(continued, len(views))
+    return maps.each(continued)
 
-    def filled(index: int) -> Array:
-        return np.where(sure[index] > 0, sure[index], reliable[index]).astype(np.float32)
 
-    depths = [filled(index) for index in range(len(views))]
+def _beside_what_is_sure(maps: _Maps) -> list[Array]:
+    """What is sure, and planes that go on beside it in the picture (`bare.py`), near the guess and where no other view sees through."""
+    sure = maps.sure(CONFIRMED_BESIDE)
+    planes = find_planes(points_of(sure, maps.poses), on=ON_BESIDE)
+    if not len(planes):
+        return [one.depth for one in sure]
 
-    def kept(index: int) -> Array:
-        progress.check()
-        through = agreement(index, others[index], depths, lenses, poses).through
-        return np.where((sure[index] > 0) | (through == 0), depths[index], np.float32(0)).astype(np.float32)
+    def continued(index: int) -> Array:
+        one, lens, guess = sure[index], maps.lenses[index], maps.guesses[index]
+        picture, usable = shrunk(maps.views.images[index], lens), usable_pixels(maps.views, index, lens)
+        plan = proposal(one, picture, maps.poses[index], planes, usable)
+        apart = [float(np.linalg.norm(maps.poses[other][:3, 3] - maps.poses[index][:3, 3])) for other in maps.others[index]]
+        both = (guess > 0) & (plan.depth > 0)
+        shift = lens.fx * max(apart, default=0.0) * np.abs(1 / np.where(both, guess, 1) - 1 / np.where(both, plan.depth, 1))
+        return np.where(plan.new & both & (shift <= REACH), plan.depth, one.depth)
 
-    return side_by_side(kept, len(views))
+    return maps.not_seen_through(maps.each(continued), [one.depth > 0 for one in sure])
 
 
 def _same(depth: Array, measured: Array | None) -> Array:
@@ -108,12 +178,12 @@ def _same(depth: Array, measured: Array | None) -> Array:
     return np.asarray((theirs > 0) & (np.abs(theirs - depth) < MEASURED * theirs))
 
 
-def _asked(views: Views, index: int, lens: Intrinsics, sure: Array, guess: Array) -> Unsure:
+def _asked(maps: _Maps, index: int, sure: StereoDepth) -> Unsure:
     """A view at the size that it is asked at."""
-    camera = shrunk_camera(lens, ASKED_SIDE)
-    picture = views.images[index]
-    grey = grey_view(picture, camera, views.world_from_camera[index])
-    return Unsure(grey, shrunk(picture, camera), _resized(sure, camera), _resized(guess, camera))
+    camera, picture = shrunk_camera(maps.lenses[index], ASKED_SIDE), maps.views.images[index]
+    grey = grey_view(picture, camera, maps.poses[index])
+    held = _resized((sure.confidence > 0).astype(np.uint8), camera) > 0
+    return Unsure(grey, shrunk(picture, camera), _resized(sure.depth, camera), _resized(maps.guesses[index], camera), held)
 
 
 def _resized(values: Array, camera: Intrinsics) -> Array:
