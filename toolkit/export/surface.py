@@ -129,6 +129,8 @@ def field_volume(
         len(poses),
         voxel_size,
         depth_max,
+        # What pictures tell beyond what was rendered makes depth better, not voxels finer: those would keep its noise.
+        focal=min(frame.colour_intrinsics.fx for frame in made),
         carve=carve,
         nothing="no rendered view shows a surface (nothing is opaque) to make a mesh of; fit the field longer or check its poses",
         progress=progress,

@@ -54,13 +54,18 @@ def estimate_blocks(sample: Sequence[DepthFrame], volume: TsdfVolume, total: int
     return int(1.2 * (len(union) + unseen)) + largest
 
 
-def with_room(sample: Sequence[DepthFrame], voxel_size: float | None, depth_max: float, total: int) -> tuple[float, int]:
+def with_room(
+    sample: Sequence[DepthFrame], voxel_size: float | None, depth_max: float, total: int, focal: float | None = None
+) -> tuple[float, int]:
     """Voxel size and blocks for `total` frames; a size that was not asked for is made coarser until the blocks fit into memory.
+
+    Args:
+        focal: of the camera whose pixels that size goes by; None: the depth maps'.
 
     Raises:
         InputError: the size that was asked for is too fine for the memory, or for the pixels.
     """
-    focal = min(frame.depth_intrinsics.fx for frame in sample)
+    focal = focal or min(frame.depth_intrinsics.fx for frame in sample)
     size = voxel_size or automatic_voxel_size([frame.depth for frame in sample], focal)
     while True:
         try:

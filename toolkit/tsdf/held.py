@@ -21,6 +21,7 @@ def fuse_held(
     voxel_size: float | None = None,
     depth_max: float | None = None,
     *,
+    focal: float | None = None,
     carve: bool = True,
     nothing: str = "no view shows a surface",
     progress: Progress = SILENT,
@@ -30,6 +31,7 @@ def fuse_held(
 
     Args:
         voxel_size, depth_max: working units; None: from the frames' depth, the voxel size made coarser until it fits into memory.
+        focal: of the camera whose pixels a voxel size that is not asked for goes by; None: the depth maps'.
         carve: take no frame's word alone: each empties what others put in front of its surface, and what a single one shows is left out.
         nothing: the refusal when no frame shows depth.
 
@@ -48,7 +50,7 @@ def fuse_held(
     shown = [frame for frame in held if (frame.depth > 0).any()]
     if not shown:
         raise InputError(nothing)
-    volume = _with_room(shown, voxel_size, depth_max)
+    volume = _with_room(shown, voxel_size, depth_max, focal)
     if carve:
         volume.min_weight = CONFIRMED if len(shown) >= MANY_VIEWS else None
         for frame in shown:
@@ -62,8 +64,8 @@ def fuse_held(
     return volume
 
 
-def _with_room(frames: Sequence[DepthFrame], voxel_size: float | None, depth_max: float | None) -> TsdfVolume:
+def _with_room(frames: Sequence[DepthFrame], voxel_size: float | None, depth_max: float | None, focal: float | None) -> TsdfVolume:
     """An empty volume that the frames fit into."""
     depth_max = depth_max or automatic_depth_max([frame.depth for frame in frames])
-    size, expected = with_room(frames, voxel_size, depth_max, len(frames))
+    size, expected = with_room(frames, voxel_size, depth_max, len(frames), focal)
     return TsdfVolume(size, depth_max, expected_blocks=2 * expected)
