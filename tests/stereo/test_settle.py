@@ -49,13 +49,15 @@ def guessed(views: Views, truth: list[Array]) -> tuple[list[Array], list[Array]]
     return depths, [grey & (depth > 0) & (share != 0) for depth, share, grey in zip(truth, shares, bare, strict=True)]
 
 
-def test_exact_depth_stays(corner: tuple[Views, list[Array]]) -> None:
+@pytest.mark.parametrize(("planar", "share"), [(2.0, 0.98), (0.6, 0.97)])
+def test_exact_depth_stays(corner: tuple[Views, list[Array]], monkeypatch: pytest.MonkeyPatch, planar: float, share: float) -> None:
+    """Where pictures are asked, a plane may be taken at their borders for what stands before it: few others see what they show."""
+    monkeypatch.setattr("toolkit.stereo.settle.PLANAR", planar)
     views, truth = corner
     for depth, true in zip(made(views, truth), truth, strict=True):
         assert (depth > 0)[true > 0].mean() > 0.97 and depth.dtype == np.float32
         assert not depth[true <= 0].any()
-        # At the pictures' borders, where nothing else sees what they show, a plane may be taken for what stands before it.
-        assert np.quantile(off(depth, true, true > 0), 0.97) < 0.005
+        assert np.quantile(off(depth, true, true > 0), share) < 0.005
 
 
 def test_a_guess_becomes_the_plane_that_goes_on_there(corner: tuple[Views, list[Array]]) -> None:
@@ -87,6 +89,18 @@ def test_no_plane_goes_where_nothing_was(corner: tuple[Views, list[Array]]) -> N
     hole[FLOOR_OR_WALL] = True
     missing = [np.where(hole, 0, depth).astype(np.float32) for depth in truth]
     assert not any(depth[hole].any() for depth in made(views, missing))
+
+
+def test_beside_what_is_sure_no_plane_goes_far_from_what_was(corner: tuple[Views, list[Array]], monkeypatch: pytest.MonkeyPatch) -> None:
+    """In scenes that are not of planes, where pictures are not asked."""
+    monkeypatch.setattr("toolkit.stereo.settle.PLANAR", 2.0)
+    views, truth = corner
+    hole = np.zeros(truth[0].shape, bool)
+    hole[FLOOR_OR_WALL] = True
+    missing = [np.where(hole, 0, depth).astype(np.float32) for depth in truth]
+    near = [np.where(hole, 0.4 * depth, 0).astype(np.float32) for depth in truth]  # many pixels of parallax before the wall
+    for depth, true in zip(made(views, missing, [a + b for a, b in zip(missing, near, strict=True)]), truth, strict=True):
+        assert not depth[hole & (true > 0)].any()
 
 
 def test_a_guess_far_from_the_plane_gives_way_where_pictures_show_the_plane() -> None:
