@@ -14,7 +14,7 @@ from toolkit.errors import InputError, Interrupted
 from toolkit.poses.overlap import parallax, spread_parallax
 from toolkit.progress import Progress
 from toolkit.stereo.cost import NOISE, UNKNOWN, GreyView, Matcher, best_half, between, grey_view, plane_homography, sweep
-from toolkit.stereo.match import StereoDepth, inverse_depths, stereo_depths, usable_neighbours
+from toolkit.stereo.match import FEW, MANY, USUAL, StereoDepth, demands, inverse_depths, stereo_depths, usable_neighbours
 from toolkit.stereo.polish import Polisher
 from toolkit.stereo.smooth import PATHS, SOFT_EDGE, smoothed_planes
 
@@ -329,3 +329,23 @@ def test_depth_that_is_nearly_right_is_polished() -> None:
     got, told = alone.polished(0, truth[0])
     np.testing.assert_array_equal(got, np.where(truth[0] > 0, truth[0], 0).astype(np.float32))
     assert not told.any()
+
+
+def test_few_pictures_are_matched_from_farther_apart() -> None:
+    """With few pictures neighbours stand 50° apart, and one of them confirms a depth; with many that is too far, and two must."""
+    few, many = arc(3, 100.0), np.concatenate([arc(3, 100.0), np.tile(arc(1, 0.0), (MANY - 3, 1, 1))])
+    wide = usable_neighbours(few, [CAMERA] * 3, MEDIAN, 2)
+    assert 1 in wide[0] and 0 in wide[1] and 1 in wide[2]
+    assert not {1, 2} & set(usable_neighbours(many, [CAMERA] * len(many), MEDIAN, 8)[0])
+    assert demands(MANY - 1) == FEW and demands(MANY) == USUAL and FEW.confirm < USUAL.confirm
+
+
+def test_two_pictures_confirm_each_other_and_more_find_no_less() -> None:
+    """What few pictures find is nearly all right, though one other alone confirms it."""
+    views, truth = corner()
+    for count in (2, 3):
+        some = views.subset(list(range(count)))
+        for one, true in zip(stereo_depths(some, NEAR, FAR, MEDIAN), truth[:count], strict=True):
+            found = one.depth > 0
+            assert found.mean() > 0.3
+            assert np.mean(np.abs(one.depth[found] / true[found] - 1) < 0.02) > 0.9

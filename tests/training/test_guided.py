@@ -197,3 +197,21 @@ def test_a_fit_begins_with_what_is_known_of_depth_within_its_budget(monkeypatch:
     fit_guided(measured, SCENE, wanted("budget=1", "fit.depth=0"), ticks=now)
     fit_guided(views(), SCENE, wanted("budget=1"), ticks=now)  # six pictures were matched: too few
     assert len(begun) == 1
+
+
+def test_a_guess_leaves_the_coarsest_lattice_sooner() -> None:
+    class Levels(Progress):
+        def __init__(self) -> None:
+            self.seen: list[str] = []
+
+        def update(self, done: float, total: float, note: str = "") -> None:
+            self.seen += [note.split(",")[0]] if "³" in note else []
+
+    rough = fit_guided(views(), SCENE, wanted("budget=1", "field.resolution=32"), ticks=steady()).field
+    shares = []
+    for begin in ({}, {"start": rough, "coarse": True}):
+        told = Levels()
+        fit_guided(views(), SCENE, wanted("fit.depth_from=sensor", "fit.moving=off"), told, ticks=steady(0.002), **begin)  # type: ignore[arg-type]
+        assert set(told.seen) == {"32³", "64³"}
+        shares.append(told.seen.count("32³") / len(told.seen))
+    assert shares[1] < 0.7 * shares[0]

@@ -90,7 +90,7 @@ def test_a_wider_decoder_is_the_same_function(hidden: int) -> None:
 def test_the_start_holds_what_the_networks_say_and_is_thin_where_they_say_nothing() -> None:
     field, views = made(), wall_views()
     start = network_start(field, views, scene(), settings())
-    assert start.resolution == 64 and start.space == field.space == space_of(views, scene())
+    assert start.resolution == 32 and start.space == field.space == space_of(views, scene())
     assert isinstance(start.decoder, Deferred) and start.decoder.hidden == 16
     assert float(start.density_rows[:-1].min()) >= THIN and float(start.density_rows.max()) <= THICK
     assert not start.density_rows[-1] and not start.feature_rows[-1].any()

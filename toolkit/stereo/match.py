@@ -30,8 +30,7 @@ LONG_SIDE = 400  # pixels; cost grows with the third power of it
 MATCHED = 4  # neighbours that a picture is matched with
 CHECKED = 8  # neighbours that its depth is checked against
 SWEET = 8.0  # degrees of parallax that are looked for
-PARALLAX = (1.0, 45.0)  # degrees outside which a neighbour tells nothing, or looks too different
-LEAST_OVERLAP = 0.25
+MANY = 24  # pictures; fewer have no choice of neighbours (`FEW`)
 MOST_COST = 0.4  # matching cost beyond which nothing was recognised: bare walls have 0.5 everywhere
 STEP = (
     1.5  # pixels that the picture of the neighbour that moves most moves by from one plane to the next; refinement finds what lies between
@@ -42,6 +41,25 @@ COSTS_HELD = 3  # volumes of costs that a worker has room for: those of the swee
 
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Demands:
+    """What is asked of neighbours.
+
+    Attributes:
+        parallax: degrees outside which a neighbour tells nothing, or looks too different.
+        overlap: least share of a picture that the other shows, too.
+        confirm: neighbours that must have the same depth. The first may be a picture that was used for matching: it alone proves little …
+    """
+
+    parallax: tuple[float, float]
+    overlap: float
+    confirm: int
+
+
+USUAL = Demands((1.0, 45.0), 0.25, 2)
+FEW = Demands((1.0, 60.0), 0.15, 1)  # … but is all that there is where pictures are few (docs/measured/few_views.md#matching-few-pictures)
 
 
 @dataclass(frozen=True)
@@ -102,8 +120,8 @@ def stereo_depths(
     def checked(index: int) -> StereoDepth:
         progress.check()
         known = [other for other in neighbours[index] if neighbours[other]]
-        # The first confirmation may come from a picture that was used for matching, so it alone proves little.
-        depth, confidence = confirmed(index, known, maps, cameras, poses, needed=min(2, max(1, len(known))))
+        needed = min(demands(len(views)).confirm, max(1, len(known)))
+        depth, confidence = confirmed(index, known, maps, cameras, poses, needed=needed)
         return StereoDepth(depth, confidence, cameras[index])
 
     each = COSTS_HELD * PLANES[1] * 4 * max(camera.width * camera.height for camera in cameras)
@@ -122,12 +140,18 @@ def stereo_depths(
     return out
 
 
+def demands(pictures: int) -> Demands:
+    """What is asked of the neighbours of so many pictures."""
+    return USUAL if pictures >= MANY else FEW
+
+
 def usable_neighbours(world_from_camera: Array, cameras: Sequence[Intrinsics], median_depth: float, count: int) -> list[list[int]]:
     """For each view the neighbours that suit matching, best first; views that see too little in common or from one place are left out."""
     shares = overlap(world_from_camera, cameras, median_depth)
     angles = np.maximum(parallax(world_from_camera, median_depth), spread_parallax(world_from_camera, cameras, median_depth))
     best = best_neighbours(world_from_camera, shares, angles, count, SWEET)
-    fits = (np.minimum(shares, shares.T) >= LEAST_OVERLAP) & (angles >= PARALLAX[0]) & (angles <= PARALLAX[1])
+    asked = demands(len(cameras))
+    fits = (np.minimum(shares, shares.T) >= asked.overlap) & (angles >= asked.parallax[0]) & (angles <= asked.parallax[1])
     return [[int(other) for other in row if fits[index, other]] for index, row in enumerate(best)]
 
 

@@ -25,7 +25,7 @@ from toolkit.stereo.left_out import LeftOut
 from toolkit.training import depth_start
 from toolkit.training.engine import warm_up
 from toolkit.training.fit import DEFAULT_BUDGET, Clock, FitResult, fit_device, fit_field
-from toolkit.training.schedule import PARTLY, RUNGS
+from toolkit.training.schedule import GUESSED, PARTLY, RUNGS
 from toolkit.volume.host import Host
 
 
@@ -74,7 +74,8 @@ def fit_guided(
     **begin: Unpack[Begin],
 ) -> FitResult:
     """`fit_field`, with quick matching before it where that is wanted, without what moves, and, unless `begin` has a start, from what is
-    known of depth. The seconds of all three are a part of the budget, and of the timeline.
+    known of depth. The seconds of all three are a part of the budget, and of the timeline. A start that is a guess (`coarse`) is gone on
+    from in steps of its own, unless `begin` has others.
 
     What cannot be matched is fitted to colours alone, and `notes` says why.
 
@@ -82,6 +83,8 @@ def fit_guided(
         Interrupted: the user asked to stop while pictures were matched.
         InputError: as `fit_field`.
     """
+    if begin.get("coarse"):
+        begin.setdefault("rungs", GUESSED)
     matching = wants_matching(views, settings)
     if not (matching or looks_for_moving(views, settings) or depth_start.starts_by_depth(views, settings)):
         return fit_field(views, scene, settings, progress, ticks=ticks, **begin)

@@ -21,8 +21,9 @@ from toolkit.training.start import NEAR, THIN, finest_resolution, levels, possib
 from toolkit.volume.edit import resample
 
 Tensor = torch.Tensor
-THICK = 0.0  # largest raw density of the start: a fog where surfaces may be, which a wrong guess costs little (docs/measured/few_views.md)
-RESOLUTION = 64  # level of the fit at which the networks' field comes in
+# Largest raw density of the start: a fog where surfaces may be, which a wrong guess costs little (docs/measured/few_views.md).
+THICK = 0.0
+RESOLUTION = 32  # level of the fit at which the networks' field comes in: the coarsest, where what few pictures tell is smooth first
 
 
 def widened(decoder: Deferred, hidden: int, generator: torch.Generator) -> Deferred:

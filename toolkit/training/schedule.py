@@ -17,6 +17,7 @@ from toolkit.training.step import Rates
 
 RUNGS = (0.1, 0.3, 0.6, 0.8, 0.9)  # share of the budget at which each level ends at the latest, from the first one on …
 PARTLY = (0.2, 0.45, 0.7, 0.85, 0.9)  # … of a fit that begins with what is known of depth, and knows a part: what is not takes longer
+GUESSED = (0.01, 0.06, 0.25, 0.55, 0.9)  # … of one that begins with a guess, on the coarsest lattice: a hundred steps there make it smooth
 LEVEL_STEPS = 100  # a level is not left, nor pruned, before so many: what has not had time to grow is not empty
 PRUNE_EVERY = 150  # steps
 LAST_PRUNE = 0.8  # of the budget; from here on the field is only polished, on all views
