@@ -14,7 +14,7 @@ from toolkit.errors import InputError, Interrupted
 from toolkit.poses.overlap import parallax, spread_parallax
 from toolkit.progress import Progress
 from toolkit.stereo.cost import NOISE, UNKNOWN, GreyView, Matcher, best_half, between, grey_view, plane_homography, sweep
-from toolkit.stereo.match import FEW, MANY, USUAL, StereoDepth, demands, inverse_depths, stereo_depths, usable_neighbours
+from toolkit.stereo.match import LENIENT, MANY, STRICT, StereoDepth, demands, inverse_depths, stereo_depths, usable_neighbours
 from toolkit.stereo.polish import Polisher
 from toolkit.stereo.smooth import PATHS, SOFT_EDGE, smoothed_planes
 
@@ -337,7 +337,9 @@ def test_few_pictures_are_matched_from_farther_apart() -> None:
     wide = usable_neighbours(few, [CAMERA] * 3, MEDIAN, 2)
     assert 1 in wide[0] and 0 in wide[1] and 1 in wide[2]
     assert not {1, 2} & set(usable_neighbours(many, [CAMERA] * len(many), MEDIAN, 8)[0])
-    assert demands(MANY - 1) == FEW and demands(MANY) == USUAL and FEW.confirm < USUAL.confirm
+    assert demands(MANY - 1) == LENIENT and demands(MANY) == STRICT and LENIENT.confirm < STRICT.confirm
+    asked_so = usable_neighbours(many, [CAMERA] * len(many), MEDIAN, 8, LENIENT)
+    assert {1} <= set(asked_so[0])
 
 
 def test_two_pictures_confirm_each_other_and_more_find_no_less() -> None:

@@ -21,7 +21,7 @@ from toolkit.capture.types import Views
 from toolkit.progress import SILENT, Progress
 from toolkit.stereo.check import agreement
 from toolkit.stereo.cost import shrunk
-from toolkit.stereo.match import CHECKED, MOST_WORKERS, StereoDepth, usable_neighbours, usable_pixels
+from toolkit.stereo.match import CHECKED, MOST_WORKERS, Demands, StereoDepth, usable_neighbours, usable_pixels
 from toolkit.stereo.plane_maps import depth_of, in_camera, numbers_of
 from toolkit.stereo.planes import Points, find_planes
 
@@ -46,12 +46,15 @@ class Proposed:
     new: Array  # (H, W) bool where a plane goes on
 
 
-def continued(found: Sequence[StereoDepth], views: Views, median_depth: float, progress: Progress = SILENT) -> list[StereoDepth]:
+def continued(
+    found: Sequence[StereoDepth], views: Views, median_depth: float, progress: Progress = SILENT, asked: Demands | None = None
+) -> list[StereoDepth]:
     """What matching `found` of `views`, and depth beside it where a plane goes on.
 
     Args:
         found: `match.stereo_depths` of the views, in their order.
         median_depth: what parallax and overlap of pictures are judged at.
+        asked: of the neighbours that confirm a plane; None: as `match.demands` has it.
 
     Returns:
         depths as matched where there were any; others confident as what `check.confirmed` keeps.
@@ -62,7 +65,7 @@ def continued(found: Sequence[StereoDepth], views: Views, median_depth: float, p
     poses = np.asarray(views.world_from_camera, dtype=np.float64)
     cameras = [one.intrinsics for one in found]
     planes = find_planes(points_of(found, poses))
-    neighbours = usable_neighbours(poses, cameras, median_depth, CHECKED) if len(found) > 1 else [[]]
+    neighbours = usable_neighbours(poses, cameras, median_depth, CHECKED, asked) if len(found) > 1 else [[]]
     if not len(planes) or not any(neighbours):
         return list(found)
     others = [[other for other in row if neighbours[other]] for row in neighbours]

@@ -30,7 +30,7 @@ LONG_SIDE = 400  # pixels; cost grows with the third power of it
 MATCHED = 4  # neighbours that a picture is matched with
 CHECKED = 8  # neighbours that its depth is checked against
 SWEET = 8.0  # degrees of parallax that are looked for
-MANY = 24  # pictures; fewer have no choice of neighbours (`FEW`)
+MANY = 24  # pictures; fewer have no choice of neighbours (`LENIENT`)
 MOST_COST = 0.4  # matching cost beyond which nothing was recognised: bare walls have 0.5 everywhere
 STEP = (
     1.5  # pixels that the picture of the neighbour that moves most moves by from one plane to the next; refinement finds what lies between
@@ -58,8 +58,9 @@ class Demands:
     confirm: int
 
 
-USUAL = Demands((1.0, 45.0), 0.25, 2)
-FEW = Demands((1.0, 60.0), 0.15, 1)  # … but is all that there is where pictures are few (docs/measured/few_views.md#matching-few-pictures)
+STRICT = Demands((1.0, 45.0), 0.25, 2)
+# … but is all that there is where pictures are few, and enough where a fit has the last word (docs/measured/few_views.md).
+LENIENT = Demands((1.0, 60.0), 0.15, 1)
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,7 @@ def stereo_depths(
     *,
     long_side: int = LONG_SIDE,
     matched: int = MATCHED,
+    asked: Demands | None = None,
     progress: Progress = SILENT,
 ) -> list[StereoDepth]:
     """One depth map for each of `views`, all of which are matched with each other (leave held-out views out before).
@@ -94,6 +96,7 @@ def stereo_depths(
         median_depth: what parallax and overlap of pictures are judged at.
         long_side: size of the depth maps; larger pictures are shrunk for matching.
         matched: neighbours that each picture is matched with.
+        asked: of neighbours; None: as `demands` has it.
 
     Raises:
         InputError: fewer than two views, no two of them that see the same from different places, a range that is none, or too little
@@ -107,7 +110,8 @@ def stereo_depths(
     ready = [_prepared(views, index, long_side) for index in range(len(views))]
     poses = np.asarray(views.world_from_camera, dtype=np.float64)
     cameras = [view.grey.camera for view in ready]
-    neighbours = usable_neighbours(poses, cameras, median_depth, max(matched, CHECKED))
+    asked = asked or demands(len(views))
+    neighbours = usable_neighbours(poses, cameras, median_depth, max(matched, CHECKED), asked)
     if not any(neighbours):
         raise InputError(
             "no two pictures see the same things from places far enough apart to match them for depth; the camera has to move sideways"
@@ -120,8 +124,7 @@ def stereo_depths(
     def checked(index: int) -> StereoDepth:
         progress.check()
         known = [other for other in neighbours[index] if neighbours[other]]
-        needed = min(demands(len(views)).confirm, max(1, len(known)))
-        depth, confidence = confirmed(index, known, maps, cameras, poses, needed=needed)
+        depth, confidence = confirmed(index, known, maps, cameras, poses, needed=min(asked.confirm, max(1, len(known))))
         return StereoDepth(depth, confidence, cameras[index])
 
     each = COSTS_HELD * PLANES[1] * 4 * max(camera.width * camera.height for camera in cameras)
@@ -142,15 +145,17 @@ def stereo_depths(
 
 def demands(pictures: int) -> Demands:
     """What is asked of the neighbours of so many pictures."""
-    return USUAL if pictures >= MANY else FEW
+    return STRICT if pictures >= MANY else LENIENT
 
 
-def usable_neighbours(world_from_camera: Array, cameras: Sequence[Intrinsics], median_depth: float, count: int) -> list[list[int]]:
+def usable_neighbours(
+    world_from_camera: Array, cameras: Sequence[Intrinsics], median_depth: float, count: int, asked: Demands | None = None
+) -> list[list[int]]:
     """For each view the neighbours that suit matching, best first; views that see too little in common or from one place are left out."""
     shares = overlap(world_from_camera, cameras, median_depth)
     angles = np.maximum(parallax(world_from_camera, median_depth), spread_parallax(world_from_camera, cameras, median_depth))
     best = best_neighbours(world_from_camera, shares, angles, count, SWEET)
-    asked = demands(len(cameras))
+    asked = asked or demands(len(cameras))
     fits = (np.minimum(shares, shares.T) >= asked.overlap) & (angles >= asked.parallax[0]) & (angles <= asked.parallax[1])
     return [[int(other) for other in row if fits[index, other]] for index, row in enumerate(best)]
 

@@ -18,7 +18,7 @@ from toolkit.progress import SILENT, Progress
 from toolkit.stereo import consensus
 from toolkit.stereo.bare import continued
 from toolkit.stereo.maps import depth_at
-from toolkit.stereo.match import LONG_SIDE, StereoDepth, stereo_depths
+from toolkit.stereo.match import LENIENT, LONG_SIDE, StereoDepth, stereo_depths
 
 SHARE = 0.15  # of the fit's seconds that matching is meant to take …
 MOST_SHARE = 0.25  # … and may take with the smallest pictures before some of them are left out
@@ -82,8 +82,8 @@ def guided(
     side, every = chosen
     matched = training[::every]
     some = views.subset(matched)
-    found = stereo_depths(some, near, far, median_depth, long_side=side, progress=progress)
-    whole = continued(found, some, median_depth, progress)
+    found = stereo_depths(some, near, far, median_depth, long_side=side, asked=LENIENT, progress=progress)
+    whole = continued(found, some, median_depth, progress, LENIENT)
     out = replace(with_depths(views, matched, whole), rough=True)
     share = float(np.mean([np.mean(out.depths[index] > 0) for index in matched]))
     bare = float(np.mean([np.mean((one.depth <= 0) & (more.depth > 0)) for one, more in zip(found, whole, strict=True)]))
