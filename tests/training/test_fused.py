@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -14,9 +15,11 @@ from tests.render.made import random_field, random_rays
 from tests.training.gradients import exact_gradients, some_weights, torch_gradients, weighed
 from toolkit.camera import Intrinsics
 from toolkit.capture.types import Views
+from toolkit.networks.decoder import Deferred
+from toolkit.networks.encoding import spherical_harmonics
 from toolkit.render.compiled import CompiledRenderer
 from toolkit.render.rays import render_rays
-from toolkit.training import fused_kernels, fused_order
+from toolkit.training import fused_decoder, fused_order
 from toolkit.training.depth import ROUGH
 from toolkit.training.fused import FusedOptimiser
 from toolkit.training.rays import PixelPool
@@ -82,9 +85,11 @@ def gradients(engine: FusedOptimiser, picks: torch.Tensor, rates: Rates = RATES)
         rows = torch.from_numpy(engine.touched[thread, :used].astype(np.int64))
         dense[0].index_add_(0, rows, torch.from_numpy(engine.density_sums[thread, :used]))
         dense[1].index_add_(0, rows, torch.from_numpy(engine.feature_sums[thread, :used]))
-    given, h1, h2, g1, g2, g_logit = engine.tape
-    weights = [(g1.T @ given)[:, : 8 + 9], g1.sum(0), g2.T @ h1, g2.sum(0), g_logit.T @ h2, g_logit.sum(0)]
-    return [*dense, *(torch.from_numpy(weight) for weight in weights)]
+    totals = [fused_decoder.in_order(tape.total) for tape in engine.tapes]
+    for number, layer in enumerate(field.decoder.layers):
+        weight, bias = (torch.from_numpy(sum(total[number][part] for total in totals)) for part in (0, 1))
+        dense += [weight[: layer.out_features, : layer.in_features], bias[: layer.out_features]]
+    return dense
 
 
 @pytest.mark.parametrize(("seed", "threads", "rates"), [(0, 1, RATES), (1, 3, RATES), (2, 1, SLOW)])
@@ -104,16 +109,39 @@ def test_gradients_agree(shell: float, seed: int, threads: int, rates: Rates) ->
             assert float((one.double() - other.double()).abs().max()) <= 1e-4 * scale
 
 
-@pytest.mark.parametrize("rays", [0, 1, 3, 4, 257])
-def test_products_of_a_layer(rays: int) -> None:
-    """Sums over rays of inputs times gradients, against NumPy in float64; half of the inputs are zero, as behind a ReLU."""
-    generator = np.random.default_rng(rays)
-    inputs, gradients = (generator.normal(size=(rays, width)).astype(np.float32) for width in (24, 32))
-    inputs[generator.random(inputs.shape) < 0.5] = 0
-    weight, bias = np.full((24, 32), np.nan, np.float32), np.full(32, np.nan, np.float32)
-    fused_kernels.add_products((0,) * 32, inputs, gradients, weight, bias)
-    np.testing.assert_allclose(weight, inputs.T.astype(float) @ gradients, atol=1e-4)
-    np.testing.assert_allclose(bias, gradients.astype(float).sum(0), atol=1e-4)
+@pytest.mark.parametrize("rays", [0, 1, 3, 4, 31, fused_decoder.RAYS])
+@pytest.mark.parametrize(("channels", "hidden"), [(16, 64), (8, 32), (5, 20)])
+def test_a_few_rays_are_decoded_as_by_torch(channels: int, hidden: int, rays: int) -> None:
+    """Colours and all gradients of a block of rays, twice in a row, against autograd in float64; widths that are no whole number of lanes
+    are padded with zeros, which stay zero; rows beyond the block's rays, here not a number, do not matter."""
+    generator = torch.Generator().manual_seed(rays)
+    decoder = Deferred(channels, hidden)
+    layers = fused_decoder.layers_of(decoder)
+    tape = fused_decoder.make_tape(layers)
+    exact = copy.deepcopy(decoder).double()
+    features = torch.randn(2, rays, channels, generator=generator)
+    directions = torch.nn.functional.normalize(torch.randn(2, rays, 3, generator=generator), dim=-1)
+    g_colour = torch.randn(2, rays, 3, generator=generator)
+    fused_decoder.forget_gradients(tape.total)
+    for block in range(2):
+        given = features[block].double().requires_grad_(True)
+        colour = exact(given, directions[block].double())
+        colour.backward(g_colour[block].double())
+        tape.given[:rays, :channels] = features[block].numpy()
+        tape.given[:rays, channels : channels + 9] = spherical_harmonics(directions[block]).numpy()
+        tape.given[rays:] = np.nan
+        fused_decoder.forward(layers, tape, rays)
+        np.testing.assert_allclose(tape.colour[:rays], colour.detach(), atol=1e-5)
+        tape.g_logit[:rays] = (g_colour[block].double() * colour * (1 - colour)).detach()
+        fused_decoder.backward(layers, tape, rays)
+        np.testing.assert_allclose(tape.g_given[:rays, :channels], given.grad, atol=1e-5)
+    for layer, (weight, bias) in zip(exact.layers, fused_decoder.in_order(tape.total), strict=True):
+        for got, wanted in ((weight, layer.weight), (bias, layer.bias)):
+            own = tuple(slice(0, size) for size in wanted.shape)
+            np.testing.assert_allclose(got[own], 0 if wanted.grad is None else wanted.grad, atol=1e-4)
+            rest = got.copy()
+            rest[own] = 0
+            assert not rest.any()
 
 
 def test_a_step_moves_rows_as_the_reference_does() -> None:

@@ -13,9 +13,10 @@ import torch
 
 from tests.training.test_fit import scene, sphere_views, ticking, wanted
 from toolkit.errors import InputError
+from toolkit.progress import SILENT
 from toolkit.training import guard, step
 from toolkit.training.adam import LazyAdam
-from toolkit.training.engine import Engine, TorchEngine, make_engine
+from toolkit.training.engine import Engine, TorchEngine, make_engine, warm_up
 from toolkit.training.finite import NotFiniteError, check
 from toolkit.training.fit import _first, fit_field
 from toolkit.training.fused import FusedOptimiser
@@ -148,9 +149,11 @@ def test_a_fit_goes_on_from_the_last_good_step_with_smaller_ones(name: str, monk
 
 @pytest.mark.parametrize("name", ["torch", "numba"])
 def test_a_fit_that_breaks_again_and_again_ends_with_what_it_has(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen = wanted(f"engine={name}", "budget=3", "field.resolution=32")
+    warm_up(chosen, SILENT)  # its steps are not counted
     ticking(monkeypatch, 0.05)
     spoiling(monkeypatch, name, math.inf, (number >= 30 for number in count()))
-    result = fit_field(sphere_views(), scene(), wanted(f"engine={name}", "budget=3", "field.resolution=32"))
+    result = fit_field(sphere_views(), scene(), chosen)
     assert result.steps == 30 and len(result.notes) == guard.MOST + 1
     assert "the fit ended with the field of the step before" in result.notes[-1]
     assert bool(torch.isfinite(result.field.density_rows).all())

@@ -73,6 +73,7 @@ def march_ray(
     stop: Any,
     threshold: Any,
     marks: Any,
+    first: Any,
     cells: Any,
     all_rows: Any,
     values: Any,
@@ -85,12 +86,13 @@ def march_ray(
         stop: the march ends once the transmittance is below.
         marks: (M · 512,) uint16 for `mark`, or of length 0. Of a ray that ends somewhere the strongest sample counts as seen fully: on a
             fine lattice a surface is several voxels thick and none of them may hold much weight.
+        first: place of the ray's first sample among these:
         cells: (S,) int32, all_rows: (S, 8) int32 corners, values: (S, VALUES) float32: the kept samples.
         result: (4,) float32 distance at which half of the light is stopped (0: never), transmittance left, samples looked up, coarse steps
             whose fine ones were tried.
 
     Returns:
-        number of kept samples.
+        the place after the last kept sample.
     """
     half, extent, shell = space.half, space.extent, space.shell
     ox, oy, oz = (ox - space.cx) / half, (oy - space.cy) / half, (oz - space.cz) / half
@@ -118,7 +120,7 @@ def march_ray(
         rise = ONE / math.sqrt(shell * shell + extent * extent * (px * px + py * py + pz * pz))
     far = shell / space.voxel
     marking = marks.shape[0] > 0
-    kept, looked, walked = 0, 0, 0
+    kept, looked, walked = first, 0, 0
     depth, median = ZERO, ZERO  # optical depth so far
     transmittance = ONE
     step_index = 0

@@ -44,7 +44,7 @@ def project_back_pass(
     for ray in range(len(origins)):
         ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
         dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-        kept = march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, threshold, marks, cells, rows, values, result)
+        kept = march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, threshold, marks, 0, cells, rows, values, result)
         opacity = K.ZERO
         for i in range(kept):
             opacity += values[i, K.WEIGHT]

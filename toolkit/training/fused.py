@@ -14,6 +14,7 @@ from toolkit.render import kernels as K
 from toolkit.render.compiled import decoder_arrays, make_space, make_volume, render_pass
 from toolkit.render.composite import STOP, THRESHOLD
 from toolkit.render.field import Field
+from toolkit.training import fused_decoder
 from toolkit.training import fused_kernels as kernels
 from toolkit.training import fused_moves as moves
 from toolkit.training.finite import broken, refuse
@@ -96,11 +97,7 @@ class FusedOptimiser:
     def sync(self) -> Field:
         """The field with the decoder's weights written back."""
         assert isinstance(self.field.decoder, Deferred)
-        d = self.decoder
-        with torch.no_grad():
-            for layer, weight, bias in zip(self.field.decoder.layers, (d.w1_out, d.w2_out, d.w3), (d.b1, d.b2, d.b3), strict=True):
-                layer.weight.copy_(torch.from_numpy(weight[:, : layer.in_features]))
-                layer.bias.copy_(torch.from_numpy(bias))
+        fused_decoder.write_layers(self.layers, self.field.decoder)
         return self.field
 
     def step(self, rays: int, rates: Rates) -> tuple[float, int]:
@@ -137,13 +134,12 @@ class FusedOptimiser:
         weights = (rates.distortion, rates.opacity, rates.depth, rates.depth_noise, rates.colour_threshold, STOP, rates.slow_within)
         losses = kernels.Losses(*(np.float32(weight) for weight in weights))
         shares, met = batch.weights / np.float32(rays), np.empty((rays, 3), np.float32)
-        self._make_room(rays)
 
         def gradients(thread: int) -> tuple[int, float, int, tuple[Array, ...], str | None]:
             part = batch.part(thread)
             moves.forget(self.index, thread, self.touched[thread, : self.used[thread]])
             self.used[thread], error, looked = self._gradients(thread, part, picks, jitter, shares, losses, met)
-            weights = self._weight_gradients(thread, part)
+            weights = self._weight_gradients(thread)
             if following is not None:
                 following.look(thread, self.space, self.pixels, self.met)
             return self.used[thread], error, looked, weights, self._broken(thread, error, weights)
@@ -171,7 +167,8 @@ class FusedOptimiser:
         """(B, 3) colours that the field has now."""
         out = np.empty((len(origins), 5), np.float32)
         limits = (np.float32(STOP), np.float32(THRESHOLD))
-        render_pass(self.space, self.volume, self.decoder, self.background, origins.numpy(), directions.numpy(), *limits, out)
+        decoder = decoder_arrays(self.sync().decoder)
+        render_pass(self.space, self.volume, decoder, self.background, origins.numpy(), directions.numpy(), *limits, out)
         return torch.from_numpy(out[:, :3])
 
     def _broken(self, thread: int, error: float, weights: tuple[Array, ...]) -> str | None:
@@ -194,49 +191,34 @@ class FusedOptimiser:
     def _take_decoder(self, field: Field) -> None:
         """Copy the decoder's weights."""
         assert isinstance(field.decoder, Deferred)
-        self.decoder = decoder_arrays(field.decoder)
-        self.tape: tuple[Array, ...] = ()
+        self.layers = fused_decoder.layers_of(field.decoder)
+        self.tapes = [fused_decoder.make_tape(self.layers) for _ in range(self.threads)]
 
     def _weights(self) -> tuple[Array, ...]:
         """What Adam moves of the decoder."""
-        d = self.decoder
-        return d.w1, d.b1, d.w2, d.b2, d.w3, d.b3
+        return fused_decoder.moved(self.layers)
 
     def _of_direction(self) -> Array:
         """(9, hidden) weights that take the direction of view."""
-        return self.decoder.w1[self.field.decoder.channels :][:9]
-
-    def _make_room(self, rays: int) -> None:
-        """For a batch of so many rays."""
-        if not self.tape or len(self.tape[0]) != rays:
-            hidden = self.decoder.b1.shape[0]
-            widths = (self.decoder.w1.shape[0], hidden, hidden, hidden, hidden, 3)
-            self.tape = tuple(np.zeros((rays, width), np.float32) for width in widths)
+        return self.layers.w1[self.field.decoder.channels :][:9]
 
     def _gradients(
         self, thread: int, part: slice, picks: Array, jitter: Array, shares: Array, losses: kernels.Losses, met: Array
     ) -> tuple[int, float, int]:
         """The part of a batch that is `thread`'s → rows touched, its part of the mean squared error, samples looked up."""
         rows = (self.touched[thread], self.density_sums[thread], self.feature_sums[thread])
-        own = kernels.Gradients(*rows, *(array[part] for array in self.tape))
-        arguments = (self.pixels, picks[part], jitter[part], shares[part], losses, self.marks[thread], self.index, thread, own, met[part])
-        out: tuple[int, float, int] = kernels.gradient_pass(self.space, self.volume, self.decoder, self.background, *arguments)
+        arguments = (self.pixels, picks[part], jitter[part], shares[part], losses, self.marks[thread], self.index, thread)
+        given = (self.space, self.volume, self.layers, self.background)
+        out: tuple[int, float, int] = kernels.gradient_pass(*given, *arguments, kernels.Gradients(*rows), self.tapes[thread], met[part])
         return out
 
-    def _weight_gradients(self, thread: int, part: slice) -> tuple[Array, ...]:
-        """In the order of `_weights`. ∂L/∂W is a product of the layer's inputs with the gradients behind it, over the rays of a part."""
-        given, h1, h2, g1, g2, g_logit = (array[part] for array in self.tape)
-        w1, b1, w2, b2, w3, b3 = (np.empty_like(weight) for weight in self._weights())
-        w3 = np.empty((len(b2), len(b3)), np.float32)
-        kernels.add_products(self.space.hidden, given, g1, w1, b1)
-        kernels.add_products(self.space.hidden, h1, g2, w2, b2)
-        kernels.add_products((0, 0, 0), h2, g_logit, w3, b3)
-        return w1, b1, w2, b2, w3.T, b3
+    def _weight_gradients(self, thread: int) -> tuple[Array, ...]:
+        """In the order of `_weights`, of the part of the last batch that was `thread`'s."""
+        return fused_decoder.moved(self.tapes[thread].total)
 
     def _turn_decoder(self) -> None:
         """Renew what is kept of the weights a second time."""
-        d = self.decoder
-        d.w1_out[:], d.w2_out[:] = d.w1.T, d.w2.T
+        fused_decoder.turn(self.layers)
 
     def _move_decoder(self, rate: float, parts: list[tuple[Array, ...]]) -> None:
         """Adam on the decoder, with the sum of the threads' gradients."""

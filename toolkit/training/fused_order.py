@@ -40,7 +40,7 @@ def hit_codes(space: Any, pixels: Any, picks: Any, memory: Any, grid: Any, codes
         memory, grid: of `Tiles`.
         codes: (B,) uint32 and tiles: (B,) int32, a pixel's place in `memory`: filled here.
     """
-    ray = np.empty(6, np.float32)
+    ray = np.empty((1, 6), np.float32)
     top = F(1023)
     high, wide = np.int32(grid[0]), np.int32(grid[1])
     for index in range(len(picks)):
@@ -50,13 +50,13 @@ def hit_codes(space: Any, pixels: Any, picks: Any, memory: Any, grid: Any, codes
             K.prefetch(pixels.source, later)
             K.prefetch(pixels.colour, later)
         pick = picks[index]
-        pixel_ray(pixels, pick, ray)
+        pixel_ray(pixels, pick, ray, 0)
         tile = fused_draw.tile_of(pixels, pick, high, wide)
         tiles[index] = tile
         t = memory[tile, 0] / space.half
-        x = (ray[0] - space.cx) / space.half + t * ray[3]
-        y = (ray[1] - space.cy) / space.half + t * ray[4]
-        z = (ray[2] - space.cz) / space.half + t * ray[5]
+        x = (ray[0, 0] - space.cx) / space.half + t * ray[0, 3]
+        y = (ray[0, 1] - space.cy) / space.half + t * ray[0, 4]
+        z = (ray[0, 2] - space.cz) / space.half + t * ray[0, 5]
         n = max(max(abs(x), abs(y)), max(abs(z), ONE))
         q = (space.extent - space.shell / n) / n * (top / (TWO * space.extent))
         centre = top * K.HALF

@@ -35,7 +35,7 @@ class FusedPerSampleOptimiser(FusedOptimiser):
     def _weights(self) -> tuple[Array, ...]:
         return _moved(self.net)
 
-    def _weight_gradients(self, thread: int, part: slice) -> tuple[Array, ...]:
+    def _weight_gradients(self, thread: int) -> tuple[Array, ...]:
         return _moved(self.scratch[thread].total)
 
     def _of_direction(self) -> Array:
@@ -43,9 +43,6 @@ class FusedPerSampleOptimiser(FusedOptimiser):
 
     def _turn_decoder(self) -> None:
         turn(self.net)
-
-    def _make_room(self, rays: int) -> None:
-        """What a thread needs does not depend on the size of a batch."""
 
     def _gradients(
         self, thread: int, part: slice, picks: Array, jitter: Array, shares: Array, losses: Losses, met: Array

@@ -240,13 +240,14 @@ def gradient_pass(
     for array in (total.b1, total.b2, total.b3, total.b4, total.density, total.density_bias):
         array[:] = ZERO
     zero_row = volume.density.shape[0] - 1
-    ray, light, starts = np.empty(6, np.float32), np.empty(5, np.float32), np.empty(RAYS + 1, np.int64)
+    rays_of, light, starts = np.empty((1, 6), np.float32), np.empty(5, np.float32), np.empty(RAYS + 1, np.int64)
+    ray = rays_of.reshape(-1)
     used, looked, number = 0, 0, 0
     error = 0.0
     while number < len(picks):
         begun, samples, rays = number, 0, 0
         while number < len(picks) and rays < RAYS and samples < BATCH:
-            pixel_ray(pixels, picks[number], ray)
+            pixel_ray(pixels, picks[number], rays_of, 0)
             starts[rays] = samples
             kept = march_ray(space, volume, net, tape, samples, ray, jitter[number], losses.stop, losses.threshold, marks, light)
             for i in range(samples, samples + kept):

@@ -22,6 +22,7 @@ from toolkit.render.field import Field
 from toolkit.render.march import BRICK
 from toolkit.render.paths import look_at
 from toolkit.training.fused import BETAS, FusedOptimiser
+from toolkit.training.fused_decoder import MOVED, write_layers
 from toolkit.training.fused_per_sample import FusedPerSampleOptimiser
 from toolkit.training.rays import Batch, PixelPool
 from toolkit.training.step import Rates
@@ -66,11 +67,7 @@ def compiled_gradients(field: Field, pool: PixelPool, picks: Tensor) -> dict[str
         write_back(engine.net._replace(**dict(zip(NAMES, moments, strict=True))), net)
     else:
         assert isinstance(net, Deferred)
-        w1, b1, w2, b2, w3, b3 = (torch.from_numpy(moment) for moment in moments)
-        with torch.no_grad():
-            for layer, weight, bias in zip(net.layers, (w1.T, w2.T, w3), (b1, b2, b3), strict=True):
-                layer.weight.copy_(weight[:, : layer.in_features])
-                layer.bias.copy_(bias)
+        write_layers(engine.layers._replace(**dict(zip(MOVED, moments, strict=True))), net)
     return {"densities": density, "features": features, **{name: value.detach() for name, value in net.named_parameters()}}
 
 
