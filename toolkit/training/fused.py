@@ -55,6 +55,7 @@ class FusedOptimiser:
         self.field = field
         rows, channels = len(field.density_rows), field.feature_rows.shape[1]
         self.index = np.full((rows, self.threads + 1), -1, np.int32)
+        self.bases = np.zeros(self.threads, np.int64)
         # Sized for the worst case; the system gives memory only to the part that is written.
         self.density_records = K.aligned((rows * self.threads, 3), np.float32, zeroed=True)
         self.feature_records = K.aligned((rows * self.threads, 2 * channels), np.float32, zeroed=True)
@@ -137,7 +138,7 @@ class FusedOptimiser:
 
         def gradients(thread: int) -> tuple[int, float, int, tuple[Array, ...], str | None]:
             part = batch.part(thread)
-            moves.forget(self.index, thread, self.touched[thread, : self.used[thread]])
+            self._forget(thread)
             self.used[thread], error, looked = self._gradients(thread, part, picks, jitter, shares, losses, met)
             weights = self._weight_gradients(thread)
             if following is not None:
@@ -149,7 +150,7 @@ class FusedOptimiser:
         step_sizes = np.array([rates.density, rates.feature], np.float32)
 
         def move(thread: int) -> None:
-            state = (self.space.width, self.volume, self.index, self.density_records, self.feature_records)
+            state = (self.space.width, self.volume, self.index, self.bases, self.density_records, self.feature_records)
             sums = (self.touched, self.density_sums, self.feature_sums)
             state_of_thread = (thread, self.used[thread], self.records[thread])
             self.records[thread] = moves.adam_pass(*state, *sums, *state_of_thread, self.scales, step_sizes, *_CONSTANTS)
@@ -162,6 +163,13 @@ class FusedOptimiser:
 
         self._each(move)
         return sum(result[1] for result in results), sum(result[2] for result in results)
+
+    def _forget(self, thread: int) -> None:
+        """What `thread` touched in the batch before is touched no more."""
+        self.bases[thread] += self.used[thread]
+        if self.bases[thread] > np.iinfo(np.int32).max - len(self.index):  # the next batch might not fit into 32 bits
+            self.index[:, thread + 1] = -1
+            self.bases[thread] = 0
 
     def colours(self, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
         """(B, 3) colours that the field has now."""
@@ -207,7 +215,7 @@ class FusedOptimiser:
     ) -> tuple[int, float, int]:
         """The part of a batch that is `thread`'s → rows touched, its part of the mean squared error, samples looked up."""
         rows = (self.touched[thread], self.density_sums[thread], self.feature_sums[thread])
-        arguments = (self.pixels, picks[part], jitter[part], shares[part], losses, self.marks[thread], self.index, thread)
+        arguments = (self.pixels, picks[part], jitter[part], shares[part], losses, self.marks[thread], self.index, self.bases, thread)
         given = (self.space, self.volume, self.layers, self.background)
         out: tuple[int, float, int] = kernels.gradient_pass(*given, *arguments, kernels.Gradients(*rows), self.tapes[thread], met[part])
         return out

@@ -20,6 +20,7 @@ from toolkit.training.fused_decoder import RAYS, backward, forget_gradients, for
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
 REACH = F(REACH_)
 MOST = 1024  # samples of one ray that are kept, see `kernels_march`
+AHEAD = 8  # pixels for which memory is asked before they are needed
 ROOM = 2 * MOST  # samples of all rays of a block: one with fewer than `RAYS` rays where they are many
 WALK_WORK = F(0.7)  # what a coarse step costs whose fine ones are tried, in samples that are looked up
 
@@ -100,6 +101,7 @@ def gradient_pass(
     losses: Any,
     marks: Any,
     index: Any,
+    bases: Any,
     thread: Any,
     gradients: Any,
     tape: Any,
@@ -111,8 +113,9 @@ def gradient_pass(
     Args:
         shares: (len(picks),) float32 what each ray counts in the means over the whole batch, of which these may be a part.
         marks: (M · 512,) uint16, this thread's own, or of length 0.
-        index: (M · 512 + 1, threads + 1) int32; column 1 + `thread` is where a row's sums are in `gradients`, −1: not touched, as all are
-            on entry.
+        index: (M · 512 + 1, threads + 1) int32; column 1 + `thread`, less bases[thread], is where a row's sums are in `gradients`;
+            negative: not touched, as all are on entry.
+        bases: (threads,) int64, which a batch moves past what the ones before wrote, so that nothing has to be wiped.
         tape: this thread's own; its `total` has the sums of the gradients of the decoder's weights afterwards.
         met: (len(picks), 3) distance where half of the light was stopped, work in samples, and squared colour error, for those that ask;
             or of length 0.
@@ -131,11 +134,12 @@ def gradient_pass(
     starts, opacities, g_opacities = np.zeros(RAYS + 1, np.int64), np.empty(RAYS, np.float32), np.empty(RAYS, np.float32)
     # A row of an array is never taken as an array of its own inside the loops, nor an array out of its tuple: each is counted, by an atomic
     # operation.
-    feature, truth, distances = volume.feature, pixels.colour, pixels.distance
+    feature, truth, distances, places, sources = volume.feature, pixels.colour, pixels.distance, pixels.place, pixels.source
+    knows = distances.shape[0] > 0
     touched, density_sums, feature_sums = gradients.touched, gradients.density, gradients.feature
     given, flat, colour, g_logit, g_mean = tape.given, tape.given.reshape(-1), tape.colour, tape.g_logit, tape.g_given
     inputs = given.shape[1]
-    column = thread + 1
+    column, base = thread + 1, bases[thread]
     zero_row = volume.density.shape[0] - 1
     spread = F(4) / (F(space.fine) * F(space.resolution))
     used, looked = 0, 0
@@ -147,6 +151,13 @@ def gradient_pass(
         count, filled = 0, 0
         while count < RAYS and number + count < len(picks) and filled + MOST <= ROOM:
             at = number + count
+            if at + AHEAD < len(picks):
+                later = picks[at + AHEAD]
+                K.prefetch(places, later)
+                K.prefetch(sources, later)
+                K.prefetch(truth, later)
+                if knows:
+                    K.prefetch(distances, later)
             pixel_ray(pixels, picks[at], ray, count)
             starts[count] = filled
             filled = march_ray(
@@ -226,7 +237,7 @@ def gradient_pass(
                 total_place += values[i, K.WEIGHT] * values[i, K.PLACE]
             share = shares[number + one]
             distortion, depth_loss = losses.distortion * share, losses.depth * share
-            distance = distances[picks[number + one]] if distances.shape[0] > 0 else ZERO
+            distance = distances[picks[number + one]] if knows else ZERO
             before, before_place = ZERO, ZERO
             for i in range(first, last):
                 g = constant + depth_loss * depth_pull(values[i, K.ALONG], distance, losses.depth_noise)
@@ -254,10 +265,10 @@ def gradient_pass(
                     row = rows[i, corner]
                     if row == zero_row:
                         continue
-                    at = index[row, column]
+                    at = np.int64(index[row, column]) - base
                     if at < 0:
                         at = used
-                        index[row, column] = at
+                        index[row, column] = base + at
                         touched[at] = row
                         density_sums[at] = ZERO
                         for c in range(channels):

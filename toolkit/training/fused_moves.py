@@ -19,6 +19,7 @@ def adam_pass(
     width: Any,
     volume: Any,
     index: Any,
+    bases: Any,
     density_records: Any,
     feature_records: Any,
     touched: Any,
@@ -37,7 +38,8 @@ def adam_pass(
     order, so that the result depends on the number of threads alone.
 
     Args:
-        index: (M · 512 + 1, threads + 1) int32; column 0 is a row's Adam record, −1: it has none yet.
+        index: (M · 512 + 1, threads + 1) int32; column 0 is a row's Adam record, −1: it has none yet; the others, with
+            bases (threads,), are of `fused_kernels.gradient_pass`.
         density_records: (K, 3) float32; feature_records: (K, 2 C) float32, first moments, then second.
         touched, density_sums, feature_sums: (threads, …) of all `Gradients`.
         records: how many this thread has given to rows so far; threads take turns in the order of records, so that none asks another.
@@ -52,6 +54,8 @@ def adam_pass(
     c1, c2 = ONE - b1, ONE - b2
     threads = index.shape[1] - 1
     for at in range(used):
+        if at + 2 * AHEAD < used:
+            K.prefetch(index, np.int64(touched[thread, at + 2 * AHEAD]))
         if at + AHEAD < used:
             later = np.int64(touched[thread, at + AHEAD])
             record = np.int64(index[later, 0])
@@ -59,12 +63,13 @@ def adam_pass(
             K.prefetch_half(feature_records, record)
             K.prefetch(density_records, record)
             K.prefetch(feature, later)
+            K.prefetch(density, later)
         row = touched[thread, at]
         mine = True
         for other in range(threads):
             if other == thread:
                 continue
-            twin = index[row, other + 1]
+            twin = np.int64(index[row, other + 1]) - bases[other]
             if twin >= 0:
                 if other < thread:
                     mine = False
@@ -104,13 +109,6 @@ def adam_dense(values: Any, gradient: Any, first: Any, second: Any, rate: Any, b
         first[i] = b1 * first[i] + (ONE - b1) * g
         second[i] = b2 * second[i] + (ONE - b2) * g * g
         values[i] -= rate * first[i] / (np.sqrt(second[i]) + epsilon)
-
-
-@njit(**K.OPTIONS)
-def forget(index: Any, thread: Any, touched: Any) -> None:
-    """Make `index` good for the next batch."""
-    for at in range(len(touched)):
-        index[touched[at], thread + 1] = -1
 
 
 @njit(**K.OPTIONS)

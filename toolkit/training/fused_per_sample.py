@@ -49,7 +49,7 @@ class FusedPerSampleOptimiser(FusedOptimiser):
     ) -> tuple[int, float, int]:
         rows = (self.touched[thread], self.density_sums[thread], self.feature_sums[thread])
         losses = losses._replace(threshold=np.float32(NEGLIGIBLE))
-        arguments = (self.pixels, picks[part], jitter[part], shares[part], losses, self.marks[thread], self.index, thread, rows)
+        arguments = (self.pixels, picks[part], jitter[part], shares[part], losses, self.marks[thread], self.index, self.bases, thread, rows)
         given = (self.space, self.volume, self.net, self.background)
         out: tuple[int, float, int] = kernels.gradient_pass(*given, *arguments, self.scratch[thread], met[part])
         return out

@@ -180,7 +180,7 @@ def ray_backward(
 
 @njit(**K.OPTIONS)
 def _scatter(
-    tape: Tape, count: Any, scratch: Scratch, index: Any, column: Any, zero_row: Any, gradients: Any, channels: Any, used: Any
+    tape: Tape, count: Any, scratch: Scratch, index: Any, base: Any, column: Any, zero_row: Any, gradients: Any, channels: Any, used: Any
 ) -> Any:
     """Add gradients of samples to the sums of the lattice corners that they were looked up from → rows touched so far."""
     touched, density_sums, feature_sums = gradients
@@ -190,10 +190,10 @@ def _scatter(
             row = tape.rows[i, corner]
             if row == zero_row:
                 continue
-            at = index[row, column]
+            at = np.int64(index[row, column]) - base
             if at < 0:
                 at = used
-                index[row, column] = at
+                index[row, column] = base + at
                 touched[at] = row
                 density_sums[at] = ZERO
                 for c in range(len(channels)):
@@ -219,6 +219,7 @@ def gradient_pass(
     losses: Any,
     marks: Any,
     index: Any,
+    bases: Any,
     thread: Any,
     gradients: Any,
     scratch: Scratch,
@@ -270,5 +271,5 @@ def gradient_pass(
             if met.shape[0] > 0:
                 met[begun + r, 2] = own_error
         decoder_backward(space.width, net, scratch, samples)
-        used = _scatter(tape, samples, scratch, index, thread + 1, zero_row, gradients, space.width, used)
+        used = _scatter(tape, samples, scratch, index, bases[thread], thread + 1, zero_row, gradients, space.width, used)
     return used, error, looked
