@@ -72,6 +72,30 @@ def prefetch_half(context: Any, array: Any, index: Any) -> Any:
     return _prefetch(context, array, index, True)
 
 
+@cast(Any, intrinsic)
+def to_half(context: Any, value: Any) -> Any:
+    """float32 → uint16: the nearest bfloat16, the even one of two that are as near."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        whole = ir.IntType(32)
+        bits = builder.bitcast(arguments[0], whole)
+        even = builder.and_(builder.lshr(bits, whole(16)), whole(1))
+        return builder.trunc(builder.lshr(builder.add(bits, builder.add(even, whole(0x7FFF))), whole(16)), ir.IntType(16))
+
+    return types.uint16(types.float32), generate
+
+
+@cast(Any, intrinsic)
+def of_half(context: Any, value: Any) -> Any:
+    """uint16, a bfloat16 → float32, the same number."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        whole = ir.IntType(32)
+        return builder.bitcast(builder.shl(builder.zext(arguments[0], whole), whole(16)), ir.FloatType())
+
+    return types.float32(types.uint16), generate
+
+
 def aligned(shape: tuple[int, ...], dtype: Any, zeroed: bool = False) -> np.ndarray[Any, Any]:
     """An array that starts at a cache line, so that a row of 16 floats is one line and not parts of two."""
     count = math.prod(shape) * np.dtype(dtype).itemsize

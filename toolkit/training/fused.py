@@ -58,7 +58,7 @@ class FusedOptimiser:
         self.bases = np.zeros(self.threads, np.int64)
         # Sized for the worst case; the system gives memory only to the part that is written.
         self.density_records = K.aligned((rows * self.threads, 3), np.float32, zeroed=True)
-        self.feature_records = K.aligned((rows * self.threads, 2 * channels), np.float32, zeroed=True)
+        self.feature_records = K.aligned((rows * self.threads, 2 * channels), np.uint16, zeroed=True)
         self.records, self.used = [0] * self.threads, [0] * self.threads
         self.touched = np.empty((self.threads, rows), np.int32)
         self.density_sums = np.empty((self.threads, rows), np.float32)
@@ -69,7 +69,8 @@ class FusedOptimiser:
     def let_go(self) -> None:
         """Free what belongs to the rows, before finer ones are made beside them; `renew_rows` must follow."""
         self.index = self.touched = np.empty((0, 0), np.int32)
-        self.density_records = self.feature_records = self.density_sums = np.empty((0, 0), np.float32)
+        self.density_records = self.density_sums = np.empty((0, 0), np.float32)
+        self.feature_records = np.empty((0, 0), np.uint16)
         self.feature_sums = np.empty((0, 0, 0), np.float32)
         self.marks = np.empty((0, 0), np.uint16)
 

@@ -40,7 +40,8 @@ def adam_pass(
     Args:
         index: (M · 512 + 1, threads + 1) int32; column 0 is a row's Adam record, −1: it has none yet; the others, with
             bases (threads,), are of `fused_kernels.gradient_pass`.
-        density_records: (K, 3) float32; feature_records: (K, 2 C) float32, first moments, then second.
+        density_records: (K, 3) float32; feature_records: (K, 2 C) uint16, first moments, then second, as bfloat16: of 16 channels one
+            cache line.
         touched, density_sums, feature_sums: (threads, …) of all `Gradients`.
         records: how many this thread has given to rows so far; threads take turns in the order of records, so that none asks another.
         scales: (S,) float32 bias correction sqrt(1 - b2^n) / (1 - b1^n) for n steps; the last one beyond.
@@ -60,7 +61,6 @@ def adam_pass(
             later = np.int64(touched[thread, at + AHEAD])
             record = np.int64(index[later, 0])
             K.prefetch(feature_records, record)
-            K.prefetch_half(feature_records, record)
             K.prefetch(density_records, record)
             K.prefetch(feature, later)
             K.prefetch(density, later)
@@ -94,9 +94,9 @@ def adam_pass(
         step = rates[1] * scale
         for c in range(channels):
             g = feature_sums[thread, at, c]
-            m = b1 * feature_records[place, c] + c1 * g
-            v = b2 * feature_records[place, channels + c] + c2 * g * g
-            feature_records[place, c], feature_records[place, channels + c] = m, v
+            m = b1 * K.of_half(feature_records[place, c]) + c1 * g
+            v = b2 * K.of_half(feature_records[place, channels + c]) + c2 * g * g
+            feature_records[place, c], feature_records[place, channels + c] = K.to_half(m), K.to_half(v)
             feature[row, c] -= step * m / (np.sqrt(v) + epsilon)
     return records
 
