@@ -30,6 +30,8 @@ OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": MATHS, "err
 # in tuples, is counted by an atomic operation when they begin and when they end: a tenth of a profile of the training step.
 LEAF: dict[str, Any] = {**OPTIONS, **({"_nrt": False} if hasattr(DefaultOptions, "_nrt") else {})}
 
+INLINE: dict[str, Any] = {**LEAF, "forceinline": True}
+
 ZERO, HALF, ONE, TWO = F(0), F(0.5), F(1), F(2)
 SOLID, RAW_MAX, UNITS = F(composite.SOLID), F(composite.RAW_MAX), F(composite.UNITS)
 STRETCH = F(MAX_STRETCH)

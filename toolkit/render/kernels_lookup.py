@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from toolkit.render.kernels import LEAF, ONE, X, Y, Z
+from toolkit.render.kernels import INLINE, LEAF, ONE, X, Y, Z
 
 X_ROW, Y_ROW, Z_ROW = np.uintp(1), np.uintp(8), np.uintp(64)  # rows from a corner of a block to the next one along each axis
 
@@ -28,7 +28,7 @@ def corner_rows(upper: Any, cell: Any, rows: Any) -> None:
         rows[corner] = min(block * 512 + ((w & 7) * 8 + (v & 7)) * 8 + (u & 7), zero_row)
 
 
-@njit(**LEAF)
+@njit(**INLINE)
 def corner_rows_of(upper: Any, cell: Any, rows: Any, index: Any) -> None:
     """`corner_rows` into rows[index, 0 … 7]."""
     slot, local = cell >> 9, cell & 511
@@ -52,7 +52,7 @@ def corner_weights(x: Any, y: Any, z: Any, weights: Any) -> None:
     weights[4], weights[5], weights[6], weights[7] = a * b * z, x * b * z, a * y * z, x * y * z
 
 
-@njit(**LEAF)
+@njit(**INLINE)
 def raw_density(density: Any, upper: Any, cell: Any, x: Any, y: Any, z: Any) -> Any:
     """Trilinear raw density in voxel `cell`."""
     slot, local = cell >> 9, cell & 511
