@@ -17,7 +17,8 @@ from toolkit.camera import Intrinsics
 from toolkit.capture.types import Views
 from toolkit.networks.decoder import Deferred
 from toolkit.networks.encoding import spherical_harmonics
-from toolkit.render.compiled import CompiledRenderer
+from toolkit.render.compiled import CompiledRenderer, decoder_arrays
+from toolkit.render.kernels_decode import RAYS, decode, layers_of
 from toolkit.render.rays import render_rays
 from toolkit.training import fused_decoder, fused_order
 from toolkit.training.depth import ROUGH
@@ -73,7 +74,7 @@ def gradients(engine: FusedOptimiser, picks: torch.Tensor, rates: Rates = RATES)
     field, counts = engine.field, {}
 
     def keep_sums(width: object, volume: object, index: np.ndarray, *rest: object) -> None:
-        thread, used = rest[5:7]
+        thread, used = rest[6:8]
         counts[thread] = used
 
     with pytest.MonkeyPatch.context() as patch:
@@ -109,15 +110,15 @@ def test_gradients_agree(shell: float, seed: int, threads: int, rates: Rates) ->
             assert float((one.double() - other.double()).abs().max()) <= 1e-4 * scale
 
 
-@pytest.mark.parametrize("rays", [0, 1, 3, 4, 31, fused_decoder.RAYS])
+@pytest.mark.parametrize("rays", [0, 1, 3, 4, 31, RAYS])
 @pytest.mark.parametrize(("channels", "hidden"), [(16, 64), (8, 32), (5, 20)])
 def test_a_few_rays_are_decoded_as_by_torch(channels: int, hidden: int, rays: int) -> None:
     """Colours and all gradients of a block of rays, twice in a row, against autograd in float64; widths that are no whole number of lanes
     are padded with zeros, which stay zero; rows beyond the block's rays, here not a number, do not matter."""
     generator = torch.Generator().manual_seed(rays)
     decoder = Deferred(channels, hidden)
-    layers = fused_decoder.layers_of(decoder)
-    tape = fused_decoder.make_tape(layers)
+    layers = layers_of(decoder_arrays(decoder))
+    turned, tape = fused_decoder.turned(layers, channels), fused_decoder.make_tape(layers, channels)
     exact = copy.deepcopy(decoder).double()
     features = torch.randn(2, rays, channels, generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(2, rays, 3, generator=generator), dim=-1)
@@ -130,10 +131,10 @@ def test_a_few_rays_are_decoded_as_by_torch(channels: int, hidden: int, rays: in
         tape.given[:rays, :channels] = features[block].numpy()
         tape.given[:rays, channels : channels + 9] = spherical_harmonics(directions[block]).numpy()
         tape.given[rays:] = np.nan
-        fused_decoder.forward(layers, tape, rays)
+        decode(layers, tape, rays)
         np.testing.assert_allclose(tape.colour[:rays], colour.detach(), atol=1e-5)
         tape.g_logit[:rays] = (g_colour[block].double() * colour * (1 - colour)).detach()
-        fused_decoder.backward(layers, tape, rays)
+        fused_decoder.decode_backward(layers, turned, tape, rays)
         np.testing.assert_allclose(tape.g_given[:rays, :channels], given.grad, atol=1e-5)
     for layer, (weight, bias) in zip(exact.layers, fused_decoder.in_order(tape.total), strict=True):
         for got, wanted in ((weight, layer.weight), (bias, layer.bias)):
@@ -224,6 +225,23 @@ def test_a_batch_is_drawn_anew_when_what_is_asked_for_changes(threads: int) -> N
         assert len(batches[-1]) == rays and batches[-1].max() < limit
         assert sorted(i for part, _ in got for i in range(part.start, part.stop)) == list(range(rays))
     assert len({tuple(batch) for batch in batches}) == len(batches)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_numbers_of_rows_begin_again_before_they_are_too_large(threads: int) -> None:
+    """What a batch notes of its rows is never wiped but outgrown; before 32 bits are full all begins anew, and nothing else changes."""
+    pool, fields = PixelPool(made_views(), depth=True), []
+    for late in (False, True):
+        engine = FusedOptimiser(random_field(1.0, 32, keep=0.5, raw=-2.5), pool, seed=4, threads=threads)
+        first = np.iinfo(np.int32).max - len(engine.index) if late else 0
+        engine.bases[:], bases = first, [first]
+        for _ in range(4):
+            engine.step(256, replace(RATES, density=0.1, feature=0.05, decoder=1e-3))
+            bases.append(int(engine.bases[0]))
+        assert bases[1] == first and (0 in bases[2:]) == late  # the first batch fits, the second might not
+        fields.append(engine.sync())
+    assert torch.equal(fields[0].density_rows, fields[1].density_rows)
+    assert torch.equal(fields[0].feature_rows, fields[1].feature_rows)
 
 
 def test_pruned_voxels_are_left_alone() -> None:

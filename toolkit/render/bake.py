@@ -65,7 +65,7 @@ class BakedField:
         """The scalars as the kernels take them."""
         f = np.float32
         extent = self.space.extent
-        channels, hidden = self.arrays.feature.shape[1], len(self.decoder.b1)
+        channels = self.arrays.feature.shape[1]
         centre, box = (tuple(f(v) for v in values) for values in (self.space.centre, self.space.box))
         scalars = (
             *centre,
@@ -79,8 +79,6 @@ class BakedField:
             self.resolution,
             *self.table_origin,
             (0,) * channels,
-            (0,) * hidden,
-            (0,) * (channels + K.PADDED),
         )
         return K.Space._make(scalars)
 

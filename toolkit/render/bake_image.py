@@ -13,6 +13,7 @@ from toolkit.errors import InputError
 from toolkit.render.bake import BakedField
 from toolkit.render.bake_tiles import TILE, render_tiles
 from toolkit.render.image import SOLID, Rendered
+from toolkit.render.kernels_decode import layers_of, rays_of
 from toolkit.render.sky import on_sky
 from toolkit.threads import share
 
@@ -38,6 +39,7 @@ class BakedRenderer:
         self.field, self.space = field, field.kernel_space()
         self.threads = threads or torch.get_num_threads()
         self.limits = np.float32(stop), np.float32(threshold)
+        self.layers = layers_of(field.decoder)
 
     def render(self, intrinsics: Intrinsics, world_from_camera: Array) -> Rendered:
         """The field as a pinhole camera at `world_from_camera` (4, 4), working frame, sees it."""
@@ -58,10 +60,10 @@ class BakedRenderer:
         tiles = -(-width // TILE) * -(-height // TILE)
         pieces = min(PIECES * self.threads, tiles) if self.threads > 1 else 1
         cuts = [tiles * i // pieces for i in range(pieces + 1)]
-        fixed = (self.space, self.field.arrays, self.field.decoder, self.field.background, camera, pose, (width, height))
+        fixed = (self.space, self.field.arrays, self.layers, self.field.background, camera, pose, (width, height))
 
         def part(piece: int) -> Any:
-            return render_tiles(*fixed, (cuts[piece], cuts[piece + 1]), self.limits, out)
+            return render_tiles(*fixed, rays_of(self.layers), (cuts[piece], cuts[piece + 1]), self.limits, out)
 
         counts = share(part, range(pieces), self.threads)
         looked, coloured, walked = (sum(count[i] for count in counts) for i in range(3))

@@ -10,7 +10,7 @@ from numba import njit
 
 from toolkit.render import kernels as K
 from toolkit.render.bake_kernels import VW, VX, VY, VZ, baked_march
-from toolkit.render.kernels_decode import decode, encode_direction
+from toolkit.render.kernels_decode import RAYS, decode, encode_direction
 
 F, ZERO, HALF, ONE = K.F, K.ZERO, K.HALF, K.ONE
 MOST_KEPT = 512  # samples of one ray that are coloured
@@ -34,13 +34,26 @@ def add_feature(width: Any, feature: Any, starts: Any, kept_at: Any, i: Any, tot
 
 
 @njit(**K.OPTIONS)
+def _put(layers: Any, tape: Any, background: Any, pixels: Any, count: Any, out: Any) -> None:
+    """Decode `count` rays, and put their colours where their pixels are."""
+    decode(layers, tape, count)
+    colour = tape.colour
+    for one in range(count):
+        pixel = pixels[one]
+        opacity = out[pixel, 4]
+        for k in range(3):
+            out[pixel, k] = min(max(colour[one, k] * opacity + (ONE - opacity) * background[k], ZERO), ONE)
+
+
+@njit(**K.OPTIONS)
 def render_tiles(
-    space: Any, baked: Any, decoder: Any, background: Any, camera: Any, pose: Any, size: Any, tiles: Any, limits: Any, out: Any
+    space: Any, baked: Any, layers: Any, background: Any, camera: Any, pose: Any, size: Any, tape: Any, tiles: Any, limits: Any, out: Any
 ) -> Any:
     """Pixels of some tiles of a pinhole picture.
 
     Args:
         camera: (4,) float32 fx, fy, cx, cy; pose: (3, 4) float32 world_from_camera; size: (width, height), ints.
+        tape: this thread's own `kernels_decode.Rays`.
         tiles: range of tiles, row by row, as (first, last + 1).
         limits: float32 stop, threshold: see `baked_march`.
         out: (H · W, 5) float32 colour, depth along z, opacity.
@@ -48,10 +61,11 @@ def render_tiles(
     Returns:
         samples looked up, samples coloured, fine steps.
     """
-    channels, hidden = len(space.width), len(space.hidden)
+    channels = len(space.width)
     starts, kept_at = np.empty((MOST_KEPT, 4), np.int32), np.empty((MOST_KEPT, 4), np.float32)
-    given = np.zeros(channels + K.PADDED, np.float32)
-    h1, h2, colour, result = np.empty(hidden, np.float32), np.empty(hidden, np.float32), np.empty(3, np.float32), np.empty(4, np.float32)
+    sums, result, pixels = np.zeros(channels, np.float32), np.empty(4, np.float32), np.empty(RAYS, np.int64)
+    given, flat = tape.given, tape.given.reshape(-1)
+    inputs, waiting = given.shape[1], 0
     width, height = size
     stop, threshold = limits
     across = (width + TILE - 1) // TILE
@@ -81,16 +95,19 @@ def render_tiles(
                         out[pixel, k] = background[k]
                     continue
                 for k in range(channels):
-                    given[k] = ZERO
+                    sums[k] = ZERO
                 total = ZERO
                 for sample in range(kept):
-                    add_feature(space.width, baked.feature, starts, kept_at, sample, given)
+                    add_feature(space.width, baked.feature, starts, kept_at, sample, sums)
                     total += kept_at[sample, VW]
                 share = ONE / total
                 for k in range(channels):
-                    given[k] = baked.low[k] + baked.scale[k] * (given[k] * share)
-                encode_direction(dx, dy, dz, given, channels)
-                decode(space, decoder, given, h1, h2, colour)
-                for k in range(3):
-                    out[pixel, k] = min(max(colour[k] * opacity + (ONE - opacity) * background[k], ZERO), ONE)
+                    given[waiting, k] = baked.low[k] + baked.scale[k] * (sums[k] * share)
+                encode_direction(dx, dy, dz, flat, waiting * inputs + channels)
+                pixels[waiting] = pixel
+                waiting += 1
+                if waiting == RAYS:
+                    _put(layers, tape, background, pixels, waiting, out)
+                    waiting = 0
+    _put(layers, tape, background, pixels, waiting, out)
     return looked, coloured, walked

@@ -12,7 +12,7 @@ from toolkit.networks.decoder import Deferred
 from toolkit.render import kernels as K
 from toolkit.render.composite import STOP, THRESHOLD
 from toolkit.render.field import Field
-from toolkit.render.kernels_decode import decode, encode_direction
+from toolkit.render.kernels_decode import RAYS, decode, encode_direction, layers_of, rays_of
 from toolkit.render.kernels_lookup import gather_row
 from toolkit.render.kernels_march import march_ray
 from toolkit.threads import share
@@ -76,8 +76,6 @@ def make_space(field: Field) -> K.Space:
         oy=oy,
         oz=oz,
         width=(0,) * channels,
-        hidden=(0,) * field.decoder.hidden,
-        inputs=(0,) * (channels + K.PADDED),
     )
 
 
@@ -97,39 +95,41 @@ def make_volume(field: Field) -> K.Volume:
 
 @njit(**K.OPTIONS)
 def render_pass(
-    space: Any, volume: Any, decoder: Any, background: Any, origins: Any, directions: Any, stop: Any, threshold: Any, out: Any
+    space: Any, volume: Any, layers: Any, tape: Any, background: Any, origins: Any, directions: Any, stop: Any, threshold: Any, out: Any
 ) -> None:
-    """Deferred rendering: origins, directions (B, 3) → out (B, 5) colour, distance, opacity."""
-    channels, hidden = len(space.width), len(space.hidden)
+    """Deferred rendering: origins, directions (B, 3) → out (B, 5) colour, distance, opacity. `tape` is this thread's own."""
+    channels = len(space.width)
     cells, values = np.empty(MOST_KEPT, np.int32), np.empty((MOST_KEPT, K.VALUES), np.float32)
     rows, weights = np.empty((MOST_KEPT, 8), np.int32), np.empty((MOST_KEPT, 8), np.float32)
-    features, given = np.empty((MOST_KEPT, channels), np.float32), np.zeros(channels + K.PADDED, np.float32)
-    h1, h2, colour, result = np.empty(hidden, np.float32), np.empty(hidden, np.float32), np.empty(3, np.float32), np.empty(4, np.float32)
-    marks, feature = np.empty(0, np.uint16), volume.feature
-    for ray in range(len(origins)):
-        ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
-        dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-        kept = march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, threshold, marks, 0, cells, rows, values, result)
-        for c in range(channels):
-            given[c] = K.ZERO
-        opacity = K.ZERO
-        for i in range(kept):
-            gather_row(space.width, feature, rows, values, weights, features, i)
-            weight = values[i, K.WEIGHT]
-            opacity += weight
+    features, mean, result = np.empty((MOST_KEPT, channels), np.float32), np.empty(channels, np.float32), np.empty(4, np.float32)
+    marks, feature, given, flat, colour = np.empty(0, np.uint16), volume.feature, tape.given, tape.given.reshape(-1), tape.colour
+    inputs = given.shape[1]
+    for begin in range(0, len(origins), RAYS):
+        count = min(RAYS, len(origins) - begin)
+        for one in range(count):
+            ray = begin + one
+            ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
+            dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+            kept = march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, threshold, marks, 0, cells, rows, values, result)
             for c in range(channels):
-                given[c] += weight * features[i, c]
-        out[ray, 3], out[ray, 4] = result[0], opacity
-        if kept == 0:
+                mean[c] = K.ZERO
+            opacity = K.ZERO
+            for i in range(kept):
+                gather_row(space.width, feature, rows, values, weights, features, i)
+                weight = values[i, K.WEIGHT]
+                opacity += weight
+                for c in range(channels):
+                    mean[c] += weight * features[i, c]
+            share = K.ONE / max(opacity, K.F(1e-6))
+            for c in range(channels):
+                given[one, c] = mean[c] * share
+            encode_direction(dx, dy, dz, flat, one * inputs + channels)
+            out[ray, 3], out[ray, 4] = result[0], opacity
+        decode(layers, tape, count)
+        for one in range(count):
+            opacity = out[begin + one, 4]
             for k in range(3):
-                out[ray, k] = background[k]
-            continue
-        for c in range(channels):
-            given[c] /= max(opacity, K.F(1e-6))
-        encode_direction(dx, dy, dz, given, channels)
-        decode(space, decoder, given, h1, h2, colour)
-        for k in range(3):
-            out[ray, k] = min(max(colour[k] * opacity + (K.ONE - opacity) * background[k], K.ZERO), K.ONE)
+                out[begin + one, k] = min(max(colour[one, k] * opacity + (K.ONE - opacity) * background[k], K.ZERO), K.ONE)
 
 
 class CompiledRenderer:
@@ -137,7 +137,7 @@ class CompiledRenderer:
 
     def __init__(self, field: Field, threads: int | None = None) -> None:
         assert isinstance(field.decoder, Deferred)
-        self.space, self.volume, self.decoder = make_space(field), make_volume(field), decoder_arrays(field.decoder)
+        self.space, self.volume, self.layers = make_space(field), make_volume(field), layers_of(decoder_arrays(field.decoder))
         self.background = field.background.numpy().astype(np.float32)
         self.threads = threads or torch.get_num_threads()
 
@@ -148,7 +148,7 @@ class CompiledRenderer:
 
         def part(piece: slice) -> None:
             arguments = (given[0][piece], given[1][piece], np.float32(STOP), np.float32(threshold), out[piece])
-            render_pass(self.space, self.volume, self.decoder, self.background, *arguments)
+            render_pass(self.space, self.volume, self.layers, rays_of(self.layers), self.background, *arguments)
 
         size = max(min(PIECE, len(out) // self.threads), 1)
         pieces = [slice(start, start + size) for start in range(0, len(out), size)]

@@ -44,14 +44,15 @@ PADDED = 16  # inputs of the decoder beside the features: nine harmonics, and ze
 X, Y, Z, RAW, TAU, WEIGHT, AFTER, PLACE, ALONG = range(VALUES)
 
 
-def _prefetch(context: Any, array: Any, index: Any, half: bool) -> Any:
+@cast(Any, intrinsic)
+def prefetch(context: Any, array: Any, index: Any) -> Any:
+    """Ask for the cache line of array[index] or array[index, 0] without waiting for it: memory latency is most of what a ray costs."""
+
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kind = signature.args[0]
         view = context.make_array(kind)(context, builder, arguments[0])
         width = cgutils.unpack_tuple(builder, view.shape, kind.ndim)[-1] if kind.ndim == 2 else ir.Constant(ir.IntType(64), 1)
         offset = builder.mul(arguments[1], width)
-        if half:
-            offset = builder.add(offset, builder.lshr(width, ir.Constant(ir.IntType(64), 1)))
         pointer = builder.bitcast(builder.gep(view.data, [offset]), ir.IntType(8).as_pointer())
         number = ir.IntType(32)
         shape = ir.FunctionType(ir.VoidType(), [pointer.type, number, number, number])
@@ -60,18 +61,6 @@ def _prefetch(context: Any, array: Any, index: Any, half: bool) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.int64), generate
-
-
-@cast(Any, intrinsic)
-def prefetch(context: Any, array: Any, index: Any) -> Any:
-    """Ask for the cache line of array[index] or array[index, 0] without waiting for it: memory latency is most of what a ray costs."""
-    return _prefetch(context, array, index, False)
-
-
-@cast(Any, intrinsic)
-def prefetch_half(context: Any, array: Any, index: Any) -> Any:
-    """The same for the middle of row `index`: a row of 2 C floats is two lines long."""
-    return _prefetch(context, array, index, True)
 
 
 @cast(Any, intrinsic)
@@ -126,8 +115,6 @@ class Space(NamedTuple):
     oy: Any
     oz: Any
     width: Any  # tuple with an entry a channel: its length is known to the compiler, which then unrolls
-    hidden: Any  # the same for the decoder's hidden width
-    inputs: Any  # and for its inputs
 
 
 class Volume(NamedTuple):

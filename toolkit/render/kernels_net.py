@@ -10,7 +10,7 @@ from numba import njit
 
 from toolkit.networks.decoder import FREQUENCIES
 from toolkit.render import kernels as K
-from toolkit.render.kernels_decode import sigmoid
+from toolkit.render.kernels_decode import rectify, sigmoid
 from toolkit.render.kernels_lookup import gather_feature
 from toolkit.render.kernels_matrix import TILE, product
 
@@ -86,15 +86,6 @@ def encode(width: Any, out: Any) -> None:
             sine, cosine = out[c_count * k + c], out[first_cosine + c_count * (k - 1) + c]
             out[c_count * (k + 1) + c] = TWO * sine * cosine
             out[first_cosine + c_count * k + c] = ONE - TWO * sine * sine
-
-
-@njit(**K.LEAF)
-def rectify(values: Any, first: Any, count: Any, bias: Any) -> None:
-    """values[first : first + count, :H] = max(values + bias, 0)."""
-    for row in range(first, first + count):
-        own = values[row]
-        for j in range(len(bias)):
-            own[j] = max(own[j] + bias[j], ZERO)
 
 
 @njit(**K.OPTIONS)

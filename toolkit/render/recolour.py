@@ -153,14 +153,16 @@ class _Compiled:
 
     def __init__(self, field: Field) -> None:
         from toolkit.render.compiled import decoder_arrays, make_space, make_volume
+        from toolkit.render.kernels_decode import layers_of
 
         assert isinstance(field.decoder, Deferred)
         self.threads = torch.get_num_threads()
-        self.space, self.volume, self.decoder = make_space(field), make_volume(field), decoder_arrays(field.decoder)
+        self.space, self.volume, self.layers = make_space(field), make_volume(field), layers_of(decoder_arrays(field.decoder))
         self.total = np.zeros((self.threads, len(field.density_rows), COLOURS + 1), np.float32)
         self.marks = np.zeros((self.threads, len(field.occupied)), np.uint16)
 
     def add(self, origins: Tensor, directions: Tensor, colours: Tensor) -> None:
+        from toolkit.render.kernels_decode import rays_of
         from toolkit.render.kernels_recolour import project_back_pass
 
         given = [values.float().contiguous().numpy() for values in (origins, directions, colours)]
@@ -169,7 +171,8 @@ class _Compiled:
 
         def part(thread: int) -> None:
             own = [values[edges[thread] : edges[thread + 1]] for values in given]
-            project_back_pass(self.space, self.volume, self.decoder, *own, *limits, self.marks[thread], self.total[thread])
+            field = (self.space, self.volume, self.layers, rays_of(self.layers))
+            project_back_pass(*field, *own, *limits, self.marks[thread], self.total[thread])
 
         share(part, range(self.threads), self.threads)
 

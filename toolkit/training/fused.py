@@ -14,6 +14,7 @@ from toolkit.render import kernels as K
 from toolkit.render.compiled import decoder_arrays, make_space, make_volume, render_pass
 from toolkit.render.composite import STOP, THRESHOLD
 from toolkit.render.field import Field
+from toolkit.render.kernels_decode import layers_of, rays_of
 from toolkit.training import fused_decoder
 from toolkit.training import fused_kernels as kernels
 from toolkit.training import fused_moves as moves
@@ -176,8 +177,8 @@ class FusedOptimiser:
         """(B, 3) colours that the field has now."""
         out = np.empty((len(origins), 5), np.float32)
         limits = (np.float32(STOP), np.float32(THRESHOLD))
-        decoder = decoder_arrays(self.sync().decoder)
-        render_pass(self.space, self.volume, decoder, self.background, origins.numpy(), directions.numpy(), *limits, out)
+        given = (self.space, self.volume, self.layers, rays_of(self.layers), self.background)
+        render_pass(*given, origins.numpy(), directions.numpy(), *limits, out)
         return torch.from_numpy(out[:, :3])
 
     def _broken(self, thread: int, error: float, weights: tuple[Array, ...]) -> str | None:
@@ -200,12 +201,13 @@ class FusedOptimiser:
     def _take_decoder(self, field: Field) -> None:
         """Copy the decoder's weights."""
         assert isinstance(field.decoder, Deferred)
-        self.layers = fused_decoder.layers_of(field.decoder)
-        self.tapes = [fused_decoder.make_tape(self.layers) for _ in range(self.threads)]
+        self.layers, channels = layers_of(decoder_arrays(field.decoder)), field.decoder.channels
+        self.turned = fused_decoder.turned(self.layers, channels)
+        self.tapes = [fused_decoder.make_tape(self.layers, channels) for _ in range(self.threads)]
 
     def _weights(self) -> tuple[Array, ...]:
         """What Adam moves of the decoder."""
-        return fused_decoder.moved(self.layers)
+        return tuple(self.layers)
 
     def _of_direction(self) -> Array:
         """(9, hidden) weights that take the direction of view."""
@@ -217,17 +219,17 @@ class FusedOptimiser:
         """The part of a batch that is `thread`'s → rows touched, its part of the mean squared error, samples looked up."""
         rows = (self.touched[thread], self.density_sums[thread], self.feature_sums[thread])
         arguments = (self.pixels, picks[part], jitter[part], shares[part], losses, self.marks[thread], self.index, self.bases, thread)
-        given = (self.space, self.volume, self.layers, self.background)
+        given = (self.space, self.volume, self.layers, self.turned, self.background)
         out: tuple[int, float, int] = kernels.gradient_pass(*given, *arguments, kernels.Gradients(*rows), self.tapes[thread], met[part])
         return out
 
     def _weight_gradients(self, thread: int) -> tuple[Array, ...]:
         """In the order of `_weights`, of the part of the last batch that was `thread`'s."""
-        return fused_decoder.moved(self.tapes[thread].total)
+        return tuple(self.tapes[thread].total)
 
     def _turn_decoder(self) -> None:
         """Renew what is kept of the weights a second time."""
-        fused_decoder.turn(self.layers)
+        fused_decoder.turn(self.layers, self.turned)
 
     def _move_decoder(self, rate: float, parts: list[tuple[Array, ...]]) -> None:
         """Adam on the decoder, with the sum of the threads' gradients."""

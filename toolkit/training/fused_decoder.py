@@ -1,8 +1,4 @@
-"""The deferred decoder of a training step, compiled: a few rays at a time, forward and backward, as products of small matrices.
-
-One ray at a time a layer is a product of a matrix with a vector, which reads every weight for 64 multiplications of its own; several rays
-share what is read. `networks/decoder.py` is the reference.
-"""
+"""The deferred decoder of a training step, compiled: the gradients of a few rays at a time. `render/kernels_decode.py` goes forward."""
 
 from __future__ import annotations
 
@@ -14,65 +10,58 @@ from numba import njit
 
 from toolkit.networks.decoder import Deferred
 from toolkit.render import kernels as K
-from toolkit.render.compiled import decoder_arrays
-from toolkit.render.kernels_decode import sigmoid
-from toolkit.render.kernels_matrix import LANES, TILE, add_outer, product
-from toolkit.render.kernels_net import rectify
+from toolkit.render.kernels_decode import RAYS, Layers, rays_of, whole_lanes
+from toolkit.render.kernels_matrix import add_outer, product
 
 Array = np.ndarray[Any, Any]
-F, ZERO, ONE = K.F, K.ZERO, K.ONE
-MOVED = ("w1", "b1", "w2", "b2", "w3", "b3")
-RAYS = 32  # rays at a time: what they need fits into the second cache, and the weights are read once for all of them
+ZERO = K.ZERO
 
 
-class Layers(NamedTuple):
-    """The decoder's weights, (inputs, outputs), and `…_back` transposed. All widths are padded with zeros to whole LANES, which stay zero."""
+class Turned(NamedTuple):
+    """Weights a second time, transposed: for what goes back."""
 
-    w1: Any  # (I, H), I ≥ C + 9
-    w1_back: Any  # (H, C'), of the features alone
-    b1: Any
+    w1: Any  # (H, C), of the features alone, C rounded up to whole LANES
     w2: Any  # (H, H)
-    w2_back: Any
-    b2: Any
-    w3: Any  # (3, H)
-    b3: Any
 
 
 class Tape(NamedTuple):
     """What is known of `RAYS` rays, a row a ray; and sums over a batch of the gradients of the weights, `total`."""
 
-    given: Any  # (R, I) mean features, encoded direction, zeros
-    h1: Any  # (R, H)
+    given: Any  # as in `kernels_decode.Rays`
+    h1: Any
     h2: Any
-    colour: Any  # (R, 3)
+    colour: Any
     g_logit: Any  # (R, 3)
     g1: Any  # (R, H)
     g2: Any
-    g_given: Any  # (R, C')
-    total: Layers  # the transposed ones are not used
+    g_given: Any  # (R, C), of the features
+    total: Layers
 
 
-def whole_lanes(width: int) -> int:
-    """The next multiple of LANES."""
-    return -(-width // LANES) * LANES
+def turned(layers: Layers, channels: int) -> Turned:
+    """Room for the transposed weights, and they in it."""
+    hidden = len(layers.b1)
+    out = Turned(K.aligned((hidden, whole_lanes(channels)), np.float32), K.aligned((hidden, hidden), np.float32))
+    turn(layers, out)
+    return out
 
 
-def layers_of(decoder: Deferred) -> Layers:
-    """Copies of the weights."""
-    d = decoder_arrays(decoder)
-    inputs, hidden, channels = whole_lanes(d.w1.shape[0]), whole_lanes(d.w1.shape[1]), whole_lanes(decoder.channels)
-    layers = Layers(*(K.aligned(shape, np.float32, zeroed=True) for shape in _shapes(inputs, hidden, channels)))
-    for padded, weight in ((layers.w1, d.w1), (layers.w2, d.w2), (layers.w3, d.w3)):
-        padded[: weight.shape[0], : weight.shape[1]] = weight
-    for padded, bias in ((layers.b1, d.b1), (layers.b2, d.b2), (layers.b3, d.b3)):
-        padded[: len(bias)] = bias
-    turn(layers)
-    return layers
+def turn(layers: Layers, out: Turned) -> None:
+    """Renew them."""
+    out.w1[:], out.w2[:] = layers.w1[: out.w1.shape[1]].T, layers.w2.T
 
 
-def moved(layers: Layers) -> tuple[Array, ...]:
-    """What Adam moves, in the order of MOVED."""
-    return tuple(getattr(layers, name) for name in MOVED)
+def make_tape(layers: Layers, channels: int) -> Tape:
+    """Room for one thread."""
+    hidden = len(layers.b1)
+    rows = [K.aligned((RAYS, width), np.float32, zeroed=True) for width in (3, hidden, hidden, whole_lanes(channels))]
+    total = Layers(*(K.aligned(weight.shape, np.float32, zeroed=True) for weight in layers))
+    return Tape._make([*rays_of(layers), *rows, total])
+
+
+def in_order(layers: Layers) -> list[tuple[Array, Array]]:
+    """Weight (out, in) and bias of each layer, as torch has them, with their padding."""
+    return [(layers.w1.T, layers.b1), (layers.w2.T, layers.b2), (layers.w3, layers.b3)]
 
 
 def write_layers(layers: Layers, decoder: Deferred) -> None:
@@ -83,29 +72,6 @@ def write_layers(layers: Layers, decoder: Deferred) -> None:
             layer.bias.copy_(torch.from_numpy(bias[: layer.out_features]))
 
 
-def turn(layers: Layers) -> None:
-    """Renew what is kept of the weights a second time."""
-    layers.w1_back[:], layers.w2_back[:] = layers.w1[: layers.w1_back.shape[1]].T, layers.w2.T
-
-
-def in_order(layers: Layers) -> list[tuple[Array, Array]]:
-    """Weight (out, in) and bias of each layer, as torch has them, with their padding."""
-    return [(layers.w1.T, layers.b1), (layers.w2.T, layers.b2), (layers.w3, layers.b3)]
-
-
-def make_tape(layers: Layers) -> Tape:
-    """Room for one thread."""
-    (inputs, hidden), channels = layers.w1.shape, layers.w1_back.shape[1]
-    widths = (inputs, hidden, hidden, 3, 3, hidden, hidden, channels)
-    rows = [K.aligned((RAYS, width), np.float32, zeroed=True) for width in widths]
-    return Tape(*rows, Layers(*(K.aligned(weight.shape, np.float32, zeroed=True) for weight in layers)))
-
-
-def _shapes(inputs: int, hidden: int, channels: int) -> list[tuple[int, ...]]:
-    assert RAYS % TILE == 0
-    return [(inputs, hidden), (hidden, channels), (hidden,), (hidden, hidden), (hidden, hidden), (hidden,), (3, hidden), (3,)]
-
-
 @njit(**K.OPTIONS)
 def forget_gradients(total: Layers) -> None:
     """Begin a batch."""
@@ -113,35 +79,12 @@ def forget_gradients(total: Layers) -> None:
 
 
 @njit(**K.OPTIONS)
-def forward(layers: Layers, tape: Tape, rays: Any) -> None:
-    """`Deferred.forward` of the first `rays` rows: tape.given → tape.h1, tape.h2, tape.colour."""
-    product(tape.given, 0, rays, layers.w1, tape.h1)
-    rectify(tape.h1, 0, rays, layers.b1)
-    product(tape.h1, 0, rays, layers.w2, tape.h2)
-    rectify(tape.h2, 0, rays, layers.b2)
-    _colours(layers, tape.given, tape.h2, rays, tape.colour)
-
-
-@njit(**K.LEAF)
-def _colours(layers: Any, given: Any, hidden: Any, rays: Any, colour: Any) -> None:
-    w3, b3 = layers.w3, layers.b3
-    for ray in range(rays):
-        a, b, c = b3[0] + given[ray, 0], b3[1] + given[ray, 1], b3[2] + given[ray, 2]
-        for j in range(w3.shape[1]):
-            value = hidden[ray, j]
-            a += value * w3[0, j]
-            b += value * w3[1, j]
-            c += value * w3[2, j]
-        colour[ray, 0], colour[ray, 1], colour[ray, 2] = sigmoid(a), sigmoid(b), sigmoid(c)
-
-
-@njit(**K.OPTIONS)
-def backward(layers: Layers, tape: Tape, rays: Any) -> None:
-    """From tape.g_logit of the first `rays` rows to tape.g_given, and the sums of the weights' gradients in tape.total."""
+def decode_backward(layers: Layers, back: Turned, tape: Tape, rays: Any) -> None:
+    """From tape.g_logit of the first `rays` rows to tape.g_given; gradients of the weights are added to tape.total."""
     _last_backward(layers, tape.h2, tape.g_logit, rays, tape.g2)
-    product(tape.g2, 0, rays, layers.w2_back, tape.g1)
+    product(tape.g2, 0, rays, back.w2, tape.g1)
     _stop(tape.h1, rays, tape.g1)
-    product(tape.g1, 0, rays, layers.w1_back, tape.g_given)
+    product(tape.g1, 0, rays, back.w1, tape.g_given)
     add_outer(tape.given, tape.g1, rays, tape.total.w1)
     add_outer(tape.h1, tape.g2, rays, tape.total.w2)
     _add_sums(tape, tape.total, rays)

@@ -11,11 +11,11 @@ import numpy as np
 from numba import njit
 
 from toolkit.render import kernels as K
-from toolkit.render.kernels_decode import encode_direction
+from toolkit.render.kernels_decode import RAYS, decode, encode_direction
 from toolkit.render.kernels_lookup import gather_row
 from toolkit.render.kernels_march import march_ray
 from toolkit.training.depth import REACH as REACH_
-from toolkit.training.fused_decoder import RAYS, backward, forget_gradients, forward
+from toolkit.training.fused_decoder import decode_backward, forget_gradients
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
 REACH = F(REACH_)
@@ -93,6 +93,7 @@ def gradient_pass(
     space: Any,
     volume: Any,
     layers: Any,
+    back_layers: Any,
     background: Any,
     pixels: Any,
     picks: Any,
@@ -107,7 +108,7 @@ def gradient_pass(
     tape: Any,
     met: Any,
 ) -> Any:
-    """Forward and backward over the rays of pixels `picks`, a few rays at a time: they are marched, decoded together, and their gradients go
+    """Forward and backward over the rays of pixels `picks`, a few at a time: they are marched, decoded together, and their gradients go
     back to the lattice while all that is known of their samples is still in the cache.
 
     Args:
@@ -202,7 +203,7 @@ def gradient_pass(
             for c in range(channels):
                 given[one, c] = mean[c] * scale
             encode_direction(ray[one, 3], ray[one, 4], ray[one, 5], flat, one * inputs + channels)
-        forward(layers, tape, count)
+        decode(layers, tape, count)
         # loss: mean over rays and channels of the squared error
         for one in range(count):
             pick, share, opacity = picks[number + one], shares[number + one], opacities[one]
@@ -219,7 +220,7 @@ def gradient_pass(
             error += own_error * share
             if met.shape[0] > 0:
                 met[number + one, 2] = own_error
-        backward(layers, tape, count)
+        decode_backward(layers, back_layers, tape, count)
         for one in range(count):
             first, last = starts[one], starts[one + 1]
             if first == last:

@@ -24,7 +24,7 @@ def row_bytes(settings: Settings, device: torch.device) -> int:
     values = 4 * (1 + channels)
     if chosen_engine(settings, device) == "torch":
         return values + 4 * (2 * channels + 4) + 8
-    return values + 4 + threads * (4 + 10 + 4 * channels + 4 * (3 + 2 * channels))
+    return values + 4 + threads * (4 + 10 + 4 * channels + 4 * (3 + channels))  # moments of features have two bytes
 
 
 def require_start(views: Views, start: Field | None, settings: Settings, device: torch.device) -> None:

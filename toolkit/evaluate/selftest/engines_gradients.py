@@ -19,10 +19,11 @@ from toolkit.networks.decoder import Deferred, PerSample
 from toolkit.render.compiled_per_sample import write_back
 from toolkit.render.differentiable import render_with_gradients
 from toolkit.render.field import Field
+from toolkit.render.kernels_decode import Layers
 from toolkit.render.march import BRICK
 from toolkit.render.paths import look_at
 from toolkit.training.fused import BETAS, FusedOptimiser
-from toolkit.training.fused_decoder import MOVED, write_layers
+from toolkit.training.fused_decoder import write_layers
 from toolkit.training.fused_per_sample import FusedPerSampleOptimiser
 from toolkit.training.rays import Batch, PixelPool
 from toolkit.training.step import Rates
@@ -67,7 +68,7 @@ def compiled_gradients(field: Field, pool: PixelPool, picks: Tensor) -> dict[str
         write_back(engine.net._replace(**dict(zip(NAMES, moments, strict=True))), net)
     else:
         assert isinstance(net, Deferred)
-        write_layers(engine.layers._replace(**dict(zip(MOVED, moments, strict=True))), net)
+        write_layers(Layers(*moments), net)
     return {"densities": density, "features": features, **{name: value.detach() for name, value in net.named_parameters()}}
 
 
