@@ -140,6 +140,7 @@ def gradient_pass(
     touched, density_sums, feature_sums = gradients.touched, gradients.density, gradients.feature
     given, flat, colour, g_logit, g_mean = tape.given, tape.given.reshape(-1), tape.colour, tape.g_logit, tape.g_given
     inputs = given.shape[1]
+    stop = max(losses.stop, losses.threshold)  # no sample behind weighs more than the light that is left
     column, base = thread + 1, bases[thread]
     zero_row = volume.density.shape[0] - 1
     spread = F(4) / (F(space.fine) * F(space.resolution))
@@ -171,7 +172,7 @@ def gradient_pass(
                 ray[count, 4],
                 ray[count, 5],
                 jitter[at],
-                losses.stop,
+                stop,
                 losses.threshold,
                 marks,
                 filled,
