@@ -93,7 +93,9 @@ def test_erase_empty_blocks_keeps_values_and_corner_blocks() -> None:
     values[-1] = 0
     small, kept, (one, two) = erase_empty_blocks(empty, padded, [values, values[:, None].expand(-1, 3)])
     assert torch.equal(small.keys, topology.keys) and torch.equal(kept, occupied)
-    assert torch.equal(one[:-1], values[VOXELS : -1 - VOXELS]) and float(one[-1]) == 0 and torch.equal(two, one[:, None].expand(-1, 3))
+    used = corner_nodes(topology, occupied)
+    assert torch.equal(one[:-1], torch.where(used, values[VOXELS : -1 - VOXELS], 0)) and float(one[-1]) == 0
+    assert torch.equal(two, one[:, None].expand(-1, 3))
 
 
 # ------------------------------------------------------------------------------------------------ prune

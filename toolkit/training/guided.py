@@ -14,6 +14,7 @@ from typing import TypedDict, Unpack
 
 import numpy as np
 
+from toolkit import memory
 from toolkit.capture.types import Views
 from toolkit.config import Settings
 from toolkit.errors import InputError, Interrupted
@@ -105,14 +106,14 @@ def fit_guided(
     if looks_for_moving(views, settings):
         with contextlib.suppress(Interrupted):  # the fit ends at once as well then, and keeps what there is
             left_out = find_moving(known, matched, scene, budget, progress)
-    spent = clock.seconds()
-    left_out = None if left_out is None else replace(left_out, seconds=spent - matched_for)
+    left_out = None if left_out is None else replace(left_out, seconds=clock.seconds() - matched_for)
     shown = known if left_out is None else left_out.without(known)
     if begin.get("start") is None and depth_start.starts_by_depth(shown, settings):
         first = depth_start.depth_start(shown, scene, settings, fit_device(settings))
         begin["start"], begin["coarse"] = first, True
         begin["rungs"] = RUNGS if first.resolution == depth_start.RESOLUTION_KNOWN else PARTLY
-        spent = clock.seconds()
+    memory.give_back()  # what pictures, costs and votes took
+    spent = clock.seconds()
     rest = replace(settings, fit=replace(settings.fit, budget=max(budget - spent, 0.5 * budget)))
     result = fit_field(shown, scene, rest, Part(progress, spent, budget, budget), ticks=ticks, **begin)
     result.timeline = result.after(spent)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,32 +33,32 @@ class PixelPool:
 
     def __init__(self, views: Views, device: torch.device | str = "cpu", depth: bool = False) -> None:
         """With `depth` the distances of known surfaces are kept, too, if any view has depth."""
-        colours, places, which, distances = [], [], [], []
+        pixels = [self._kept(views, index) for index in range(len(views))]
+        count = sum(len(flat) for flat in pixels)
+        colour, place, which = np.empty((count, 3), np.uint8), np.empty(count, np.int32), np.empty(count, np.int32)
         depths = views.depths if depth and any(one is not None for one in views.depths) else None
-        for index in range(len(views)):
-            image = views.images[index]
-            valid = views.valid[index] if views.valid else None
-            flat = np.arange(image.shape[0] * image.shape[1]) if valid is None else np.flatnonzero(valid)
-            if views.weight and views.weight[index] < 1:
-                flat = flat[np.random.default_rng(zlib.crc32(views.names[index].encode())).random(len(flat)) < views.weight[index]]
-            colours.append(torch.from_numpy(np.ascontiguousarray(image.reshape(-1, 3)[flat])))
-            places.append(torch.from_numpy(flat.astype(np.int32)))
-            which.append(torch.full((len(flat),), index, dtype=torch.int32))
-            if depths is not None:
-                known = depths[index]
-                along = (
-                    np.zeros(len(flat), np.float32) if known is None else ray_distances(known, views.intrinsics[index]).reshape(-1)[flat]
-                )
-                distances.append(torch.from_numpy(along))
-        self.colour = torch.cat(colours).to(device)
-        self.place = torch.cat(places).to(device)
-        self.view = torch.cat(which).to(device)
-        self.distance = torch.cat(distances).to(device) if distances else torch.zeros(0, device=device)
+        distance = np.zeros(0 if depths is None else count, np.float32)
+        first = 0
+        for index, flat in enumerate(pixels):
+            own = slice(first, first := first + len(flat))
+            colour[own], place[own], which[own] = views.images[index].reshape(-1, 3)[flat], flat, index
+            if depths is not None and (known := depths[index]) is not None:
+                distance[own] = ray_distances(known, views.intrinsics[index]).reshape(-1)[flat]
+        self.colour, self.place, self.view, self.distance = (torch.from_numpy(of).to(device) for of in (colour, place, which, distance))
         self.height = max((c.height for c in views.intrinsics), default=0)
         k = [(c.fx, c.fy, c.cx, c.cy, c.width) for c in views.intrinsics]
         self.camera = torch.tensor(k, dtype=torch.float32, device=device)
         self.limit = len(self.colour)  # batches are drawn from the pixels before this one
         self.pose = torch.from_numpy(views.world_from_camera.astype(np.float32)).to(device)
+
+    @staticmethod
+    def _kept(views: Views, index: int) -> np.ndarray[Any, Any]:
+        """(P,) int32 places of a view's pixels that take part."""
+        valid, image = views.valid[index] if views.valid else None, views.images[index]
+        flat = np.arange(image.shape[0] * image.shape[1], dtype=np.int32) if valid is None else np.flatnonzero(valid).astype(np.int32)
+        if views.weight and views.weight[index] < 1:
+            flat = flat[np.random.default_rng(zlib.crc32(views.names[index].encode())).random(len(flat)) < views.weight[index]]
+        return flat
 
     def __len__(self) -> int:
         return len(self.colour)

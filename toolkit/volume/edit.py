@@ -10,13 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from toolkit.volume.lookup import corners, gather
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
 
-CHUNK = 1024  # blocks at a time
+CHUNK = 1024  # blocks at a time …
+COPIED = 128  # … and of those that are copied at the end of a fit
 MODES = ("trilinear", "nearest")
 _ELEMENTS = 2**19  # values gathered at a time by `resample`: about what fits into a core's cache
 
@@ -80,18 +82,26 @@ def _extended(topology: Topology, occupied: Tensor) -> tuple[Topology, Tensor]:
 
 
 def erase_empty_blocks(topology: Topology, occupied: Tensor, rows: Sequence[Tensor]) -> tuple[Topology, Tensor, list[Tensor]]:
-    """Without the blocks that hold neither an occupied voxel nor a corner of one; the others keep their order."""
-    kept = corner_nodes(topology, occupied).view(-1, VOXELS).any(1).nonzero().view(-1)
-    return Topology(topology.keys[kept]), occupied.view(-1, VOXELS)[kept].view(-1), [_of_blocks(values, kept) for values in rows]
+    """Without the blocks that hold neither an occupied voxel nor a corner of one; the others keep their order. Of their rows those that no
+    occupied voxel uses are zero."""
+    nodes = corner_nodes(topology, occupied).view(-1, VOXELS)
+    kept = nodes.any(1).nonzero().view(-1)
+    values = [_of_blocks(of, kept, nodes) for of in rows]
+    return Topology(topology.keys[kept]), occupied.view(-1, VOXELS)[kept].view(-1), values
 
 
-def _of_blocks(values: Tensor, kept: Tensor) -> Tensor:
-    """(M · 512 + 1, …) rows → those of the blocks `kept`, and the last one. Whole blocks are copied, once: the end of a fit is when it
-    takes most memory."""
-    out = values.new_empty((len(kept) * VOXELS + 1, *values.shape[1:]))
-    width = VOXELS * values[0].numel()
+def _of_blocks(values: Tensor, kept: Tensor, nodes: Tensor) -> Tensor:
+    """(M · 512 + 1, …) rows → those of the blocks `kept`, as far as they are `nodes` (M, 512), and the last one. The end of a fit is when
+    it takes most memory, so what is not used stays unwritten, and a few blocks are copied at a time."""
+    shape = (len(kept) * VOXELS + 1, *values.shape[1:])
+    # NumPy's zeros take no memory before they are written; torch's do.
+    lazy = values.device.type == "cpu" and values.dtype == torch.float32
+    out = torch.from_numpy(np.zeros(shape, np.float32)) if lazy else values.new_zeros(shape)
     with torch.no_grad():
-        torch.index_select(values[:-1].reshape(-1 if len(values) > 1 else 0, width), 0, kept, out=out[:-1].view(len(kept), width))
+        blocks, new = (of[:-1].reshape(-1, VOXELS, *of.shape[1:]) for of in (values, out))
+        for first in range(0, len(kept), COPIED):
+            some = slice(first, first + COPIED)
+            new[some][nodes[kept[some]]] = blocks[kept[some]][nodes[kept[some]]]
         out[-1] = values[-1]
     return out
 

@@ -138,7 +138,11 @@ class BlockGrid:
             self._map.activate(inserted[index : index + 1])
         fresh = self.find(missing)
         for name, channels in self.attributes.items():
-            self.rows(name).detach().view(-1, VOXELS * channels).index_fill_(0, fresh, 0.0)
+            rows = self.rows(name).detach().view(-1, VOXELS * channels)
+            dirty = fresh
+            if 2 * len(fresh) > self.capacity:  # memory that is new is zero, and takes nothing as long as it is only looked at
+                dirty = fresh[rows.any(1)[fresh]]
+            rows.index_fill_(0, dirty, 0.0)
         return self.find(keys)
 
     def find(self, keys: Tensor) -> Tensor:

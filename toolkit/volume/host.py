@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
 
 from toolkit.volume.topology import Topology
@@ -36,6 +37,11 @@ class Host(Protocol):
         ...
 
 
+def _zeros(shape: tuple[int, ...], device: torch.device) -> Tensor:
+    """float32. NumPy's zeros take no memory before they are written, torch's do."""
+    return torch.from_numpy(np.zeros(shape, np.float32)) if device.type == "cpu" else torch.zeros(shape, device=device)
+
+
 class TorchHost:
     """Rows as ordinary tensors on a device."""
 
@@ -45,7 +51,7 @@ class TorchHost:
     def allocate(self, keys: Tensor, channels: int, voxel_size: float) -> Hosted:
         topology = Topology(keys.to(self.device))
         size = topology.zero_row + 1
-        return Hosted(topology, torch.zeros(size, device=self.device), torch.zeros(size, channels, device=self.device))
+        return Hosted(topology, _zeros((size,), self.device), _zeros((size, channels), self.device))
 
     def close(self) -> None:
         """Nothing to do: torch frees what nobody holds."""
