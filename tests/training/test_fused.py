@@ -86,7 +86,7 @@ def gradients(engine: FusedOptimiser, picks: torch.Tensor, rates: Rates = RATES)
         rows = torch.from_numpy(engine.touched[thread, :used].astype(np.int64))
         dense[0].index_add_(0, rows, torch.from_numpy(engine.density_sums[thread, :used]))
         dense[1].index_add_(0, rows, torch.from_numpy(engine.feature_sums[thread, :used]))
-    totals = [fused_decoder.in_order(tape.total) for tape in engine.tapes]
+    totals = [fused_decoder.in_order(block.tape.total) for block in engine.blocks]
     for number, layer in enumerate(field.decoder.layers):
         weight, bias = (torch.from_numpy(sum(total[number][part] for total in totals)) for part in (0, 1))
         dense += [weight[: layer.out_features, : layer.in_features], bias[: layer.out_features]]

@@ -64,8 +64,7 @@ def render_tiles(
     channels = len(space.width)
     starts, kept_at = np.empty((MOST_KEPT, 4), np.int32), np.empty((MOST_KEPT, 4), np.float32)
     sums, result, pixels = np.zeros(channels, np.float32), np.empty(4, np.float32), np.empty(RAYS, np.int64)
-    given, flat = tape.given, tape.given.reshape(-1)
-    inputs, waiting = given.shape[1], 0
+    given, waiting = tape.given, 0
     width, height = size
     stop, threshold = limits
     across = (width + TILE - 1) // TILE
@@ -103,7 +102,7 @@ def render_tiles(
                 share = ONE / total
                 for k in range(channels):
                     given[waiting, k] = baked.low[k] + baked.scale[k] * (sums[k] * share)
-                encode_direction(dx, dy, dz, flat, waiting * inputs + channels)
+                encode_direction(dx, dy, dz, given, waiting, channels)
                 pixels[waiting] = pixel
                 waiting += 1
                 if waiting == RAYS:

@@ -102,8 +102,7 @@ def render_pass(
     cells, values = np.empty(MOST_KEPT, np.int32), np.empty((MOST_KEPT, K.VALUES), np.float32)
     rows, weights = np.empty((MOST_KEPT, 8), np.int32), np.empty((MOST_KEPT, 8), np.float32)
     features, mean, result = np.empty((MOST_KEPT, channels), np.float32), np.empty(channels, np.float32), np.empty(4, np.float32)
-    marks, feature, given, flat, colour = np.empty(0, np.uint16), volume.feature, tape.given, tape.given.reshape(-1), tape.colour
-    inputs = given.shape[1]
+    marks, feature, given, colour = np.empty(0, np.uint16), volume.feature, tape.given, tape.colour
     for begin in range(0, len(origins), RAYS):
         count = min(RAYS, len(origins) - begin)
         for one in range(count):
@@ -123,7 +122,7 @@ def render_pass(
             share = K.ONE / max(opacity, K.F(1e-6))
             for c in range(channels):
                 given[one, c] = mean[c] * share
-            encode_direction(dx, dy, dz, flat, one * inputs + channels)
+            encode_direction(dx, dy, dz, given, one, channels)
             out[ray, 3], out[ray, 4] = result[0], opacity
         decode(layers, tape, count)
         for one in range(count):

@@ -42,11 +42,11 @@ class Rays(NamedTuple):
 
 
 @njit(**LEAF)
-def encode_direction(x: Any, y: Any, z: Any, out: Any, at: Any) -> None:
-    """Spherical harmonics up to degree 2 into out[at … at + 8]; see `networks.encoding.spherical_harmonics`."""
-    out[at], out[at + 1], out[at + 2], out[at + 3] = _C0, -_C1 * y, _C1 * z, -_C1 * x
-    out[at + 4], out[at + 5], out[at + 6] = _C2 * x * y, -_C2 * y * z, _C3 * (F(3) * z * z - ONE)
-    out[at + 7], out[at + 8] = -_C2 * x * z, _C4 * (x * x - y * y)
+def encode_direction(x: Any, y: Any, z: Any, out: Any, row: Any, at: Any) -> None:
+    """Spherical harmonics up to degree 2 into out[row, at … at + 8]; see `networks.encoding.spherical_harmonics`."""
+    out[row, at], out[row, at + 1], out[row, at + 2], out[row, at + 3] = _C0, -_C1 * y, _C1 * z, -_C1 * x
+    out[row, at + 4], out[row, at + 5], out[row, at + 6] = _C2 * x * y, -_C2 * y * z, _C3 * (F(3) * z * z - ONE)
+    out[row, at + 7], out[row, at + 8] = -_C2 * x * z, _C4 * (x * x - y * y)
 
 
 @njit(**LEAF)

@@ -229,10 +229,7 @@ def march_ray(
         strongest_cell = cell if cell >= 0 else strongest_cell
     if marks.shape[0] > 0 and light[1] < K.SOLID:
         mark_surface(marks, strongest_cell)
-    directions = np.empty(9, np.float32)
-    encode_direction(dx, dy, dz, directions, 0)
     hidden = len(net.density)
     for i in range(first, first + kept):
-        for j in range(9):
-            tape.h2[i, hidden + j] = directions[j]
+        encode_direction(dx, dy, dz, tape.h2, i, hidden)
     return kept

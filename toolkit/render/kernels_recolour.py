@@ -45,8 +45,7 @@ def project_back_pass(
     features, mean = np.empty((ROOM, channels), np.float32), np.empty(channels, np.float32)
     result, asked, starts = np.empty(4, np.float32), np.empty(3, np.float32), np.zeros(RAYS + 1, np.int64)
     of_block = np.empty(RAYS, np.int64)
-    feature, given, flat, colour = volume.feature, tape.given, tape.given.reshape(-1), tape.colour
-    inputs, ray = given.shape[1], 0
+    feature, given, colour, ray = volume.feature, tape.given, tape.colour, 0
     while ray < len(origins):
         count = 0
         while ray < len(origins) and count < RAYS and starts[count] + MOST_KEPT <= ROOM:
@@ -72,7 +71,7 @@ def project_back_pass(
                     K.prefetch(sums, np.int64(rows[i, corner]))
             for c in range(channels):
                 given[count, c] = mean[c] / opacity
-            encode_direction(dx, dy, dz, flat, count * inputs + channels)
+            encode_direction(dx, dy, dz, given, count, channels)
             count += 1
             starts[count] = last
         decode(layers, tape, count)

@@ -15,7 +15,7 @@ from toolkit.render.compiled import decoder_arrays, make_space, make_volume, ren
 from toolkit.render.composite import STOP, THRESHOLD
 from toolkit.render.field import Field
 from toolkit.render.kernels_decode import layers_of, rays_of
-from toolkit.training import fused_decoder
+from toolkit.training import fused_block, fused_decoder
 from toolkit.training import fused_kernels as kernels
 from toolkit.training import fused_moves as moves
 from toolkit.training.finite import broken, refuse
@@ -203,7 +203,8 @@ class FusedOptimiser:
         assert isinstance(field.decoder, Deferred)
         self.layers, channels = layers_of(decoder_arrays(field.decoder)), field.decoder.channels
         self.turned = fused_decoder.turned(self.layers, channels)
-        self.tapes = [fused_decoder.make_tape(self.layers, channels) for _ in range(self.threads)]
+        tapes = [fused_decoder.make_tape(self.layers, channels) for _ in range(self.threads)]
+        self.blocks = [fused_block.make_block(tape, field.feature_rows.shape[1]) for tape in tapes]
 
     def _weights(self) -> tuple[Array, ...]:
         """What Adam moves of the decoder."""
@@ -217,15 +218,15 @@ class FusedOptimiser:
         self, thread: int, part: slice, picks: Array, jitter: Array, shares: Array, losses: kernels.Losses, met: Array
     ) -> tuple[int, float, int]:
         """The part of a batch that is `thread`'s → rows touched, its part of the mean squared error, samples looked up."""
-        rows = (self.touched[thread], self.density_sums[thread], self.feature_sums[thread])
+        sums = kernels.Gradients(self.touched[thread], self.density_sums[thread], self.feature_sums[thread])
         arguments = (self.pixels, picks[part], jitter[part], shares[part], losses, self.marks[thread], self.index, self.bases, thread)
         given = (self.space, self.volume, self.layers, self.turned, self.background)
-        out: tuple[int, float, int] = kernels.gradient_pass(*given, *arguments, kernels.Gradients(*rows), self.tapes[thread], met[part])
+        out: tuple[int, float, int] = fused_block.gradient_pass(*given, *arguments, sums, self.blocks[thread], met[part])
         return out
 
     def _weight_gradients(self, thread: int) -> tuple[Array, ...]:
         """In the order of `_weights`, of the part of the last batch that was `thread`'s."""
-        return tuple(self.tapes[thread].total)
+        return tuple(self.blocks[thread].tape.total)
 
     def _turn_decoder(self) -> None:
         """Renew what is kept of the weights a second time."""
