@@ -244,6 +244,27 @@ def test_numbers_of_rows_begin_again_before_they_are_too_large(threads: int) -> 
     assert torch.equal(fields[0].feature_rows, fields[1].feature_rows)
 
 
+@pytest.mark.parametrize("failing", [0, 1, 2])
+def test_a_thread_that_fails_is_heard_and_stops_the_others(failing: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They wait for each other within a step; none waits for one that does not come, and the next step is as good as any."""
+    engine = FusedOptimiser(random_field(1.0, 32, keep=0.5, raw=-2.5), PixelPool(made_views(), depth=True), threads=3)
+    original = engine._gradients
+
+    def spoilt(thread: int, *rest: object) -> tuple[int, float, int]:
+        if thread == failing:
+            raise OSError(f"thread {thread} has had enough")
+        return original(thread, *rest)  # type: ignore[arg-type]
+
+    before = engine.field.density_rows.clone()
+    with monkeypatch.context() as patch:
+        patch.setattr(engine, "_gradients", spoilt)
+        with pytest.raises(OSError, match=f"thread {failing} has had enough"):
+            engine.step(256, replace(RATES, density=0.1))
+    assert torch.equal(before, engine.field.density_rows)
+    error, looked = engine.step(256, replace(RATES, density=0.1))
+    assert np.isfinite(error) and looked > 0 and not torch.equal(before, engine.field.density_rows)
+
+
 def test_pruned_voxels_are_left_alone() -> None:
     """After pruning rows stay where they are, so the optimiser state stays good and erased voxels get no gradient."""
     pool = PixelPool(made_views(), depth=True)

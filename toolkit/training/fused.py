@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -49,6 +51,7 @@ class FusedOptimiser:
         steps = np.arange(1, 2049)
         self.scales = np.concatenate([[1], np.sqrt(1 - BETAS[1] ** steps) / (1 - BETAS[0] ** steps)]).astype(np.float32)
         self.executor = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
+        self.barrier = threading.Barrier(self.threads)
         self.renew_rows(field)
 
     def renew_rows(self, field: Field) -> None:
@@ -147,8 +150,7 @@ class FusedOptimiser:
                 following.look(thread, self.space, self.pixels, self.met)
             return self.used[thread], error, looked, weights, self._broken(thread, error, weights)
 
-        results = self._each(gradients)
-        refuse(result[4] for result in results)
+        results: list[Any] = [None] * self.threads
         step_sizes = np.array([rates.density, rates.feature], np.float32)
 
         def move(thread: int) -> None:
@@ -163,7 +165,14 @@ class FusedOptimiser:
                 if following is not None:
                     following.sort(self.met)
 
-        self._each(move)
+        def work(thread: int) -> None:
+            results[thread] = gradients(thread)
+            self._wait()
+            if not any(result[4] for result in results):
+                move(thread)
+
+        self._each(work)
+        refuse(result[4] for result in results)
         return sum(result[1] for result in results), sum(result[2] for result in results)
 
     def _forget(self, thread: int) -> None:
@@ -191,12 +200,34 @@ class FusedOptimiser:
             return None
         return broken(error, [("the gradient of the densities", density), ("the gradient of the features", feature), *small])
 
-    def _each(self, work: Any) -> list[Any]:
-        """`work(thread)` of all threads, the first of them here."""
+    def _each(self, work: Callable[[int], None]) -> None:
+        """`work(thread)` of all threads, the first of them here; they may `_wait` for each other."""
         if self.executor is None:
-            return [work(0)]
-        others = [self.executor.submit(work, thread) for thread in range(1, self.threads)]
-        return [work(0), *(other.result() for other in others)]
+            work(0)
+            return
+
+        def safe(thread: int) -> None:
+            try:
+                work(thread)
+            except BaseException:
+                self.barrier.abort()  # else the others would wait for ever
+                raise
+
+        self.barrier.reset()
+        others = [self.executor.submit(safe, thread) for thread in range(1, self.threads)]
+        failed: list[BaseException] = []
+        try:
+            safe(0)
+        except BaseException as error:
+            failed.append(error)
+        failed += [error for other in others if (error := other.exception()) is not None]  # all are done now
+        for error in sorted(failed, key=lambda error: isinstance(error, threading.BrokenBarrierError)):  # the cause first
+            raise error
+
+    def _wait(self) -> None:
+        """Until all threads are here."""
+        if self.executor is not None:
+            self.barrier.wait()
 
     def _take_decoder(self, field: Field) -> None:
         """Copy the decoder's weights."""
