@@ -218,11 +218,11 @@ class FusedOptimiser:
         failed: list[BaseException] = []
         try:
             safe(0)
-        except BaseException as error:
-            failed.append(error)
-        failed += [error for other in others if (error := other.exception()) is not None]  # all are done now
-        for error in sorted(failed, key=lambda error: isinstance(error, threading.BrokenBarrierError)):  # the cause first
-            raise error
+        except BaseException as own:
+            failed.append(own)
+        failed += [told for other in others if (told := other.exception()) is not None]  # all are done now
+        for cause in sorted(failed, key=lambda one: isinstance(one, threading.BrokenBarrierError)):
+            raise cause
 
     def _wait(self) -> None:
         """Until all threads are here."""
