@@ -19,9 +19,9 @@ from pipelines.console import ConsoleProgress
 from pipelines.folder import STAGES, RunFolder
 from pipelines.memory import PeakMemory
 from toolkit import __version__
-from toolkit import memory as memory_of_process
 from toolkit.errors import FieldfuseError, InputError
 from toolkit.files import fingerprint, read_json, remove, write_json
+from toolkit.memory import give_back
 
 T = TypeVar("T")
 
@@ -146,7 +146,7 @@ class Stages:
             stopped = keeps and self.progress.stopping()
             remove(self._path(name))
             paths = [Path(path) for path in save(value)]
-        memory_of_process.give_back()
+        give_back()
         for path in paths:
             path.chmod(0o666 & ~_umask())  # some writers make files that only their owner may read
         outputs = {path.relative_to(self.folder.path).as_posix(): path.stat().st_size for path in paths}

@@ -34,7 +34,7 @@ _CONSTANTS = (np.float32(BETAS[0]), np.float32(BETAS[1]), np.float32(EPSILON))
 class FusedOptimiser:
     """A field, its pixels, and the optimiser state of the rows that rays have come to.
 
-    Memory beside the field: a lattice corner costs 4 bytes and 6 more a thread, and 4 (2 C + 4) bytes once a gradient has come to it.
+    Memory beside the field: a lattice corner costs 4 bytes and 6 more a thread, and 4 (C + 3) bytes once a gradient has come to it.
     """
 
     def __init__(self, field: Field, pool: PixelPool, seed: int = 0, threads: int | None = None) -> None:

@@ -39,7 +39,7 @@ def adam_pass(
 
     Args:
         index: (M · 512 + 1, threads + 1) int32; column 0 is a row's Adam record, −1: it has none yet; the others, with
-            bases (threads,), are of `fused_kernels.gradient_pass`.
+            bases (threads,), are of `fused_block.gradient_pass`.
         density_records: (K, 3) float32; feature_records: (K, 2 C) uint16, first moments, then second, as bfloat16: of 16 channels one
             cache line.
         touched, density_sums, feature_sums: (threads, …) of all `Gradients`.

@@ -14,10 +14,10 @@ from typing import TypedDict, Unpack
 
 import numpy as np
 
-from toolkit import memory
 from toolkit.capture.types import Views
 from toolkit.config import Settings
 from toolkit.errors import InputError, Interrupted
+from toolkit.memory import give_back
 from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.field import Field
@@ -112,7 +112,7 @@ def fit_guided(
         first = depth_start.depth_start(shown, scene, settings, fit_device(settings))
         begin["start"], begin["coarse"] = first, True
         begin["rungs"] = RUNGS if first.resolution == depth_start.RESOLUTION_KNOWN else PARTLY
-    memory.give_back()  # what pictures, costs and votes took
+    give_back()  # what pictures, costs and votes took
     spent = clock.seconds()
     rest = replace(settings, fit=replace(settings.fit, budget=max(budget - spent, 0.5 * budget)))
     result = fit_field(shown, scene, rest, Part(progress, spent, budget, budget), ticks=ticks, **begin)
