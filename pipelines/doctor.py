@@ -68,7 +68,7 @@ class Check:
 def collect() -> list[Check]:
     """Look at everything (a few seconds). Never raises: what goes wrong in a check is its finding."""
     checks = [_python(), *_packages()]
-    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _video, _lpips, _viewer, _heic, _cores, _memory, _disk)
+    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _video, _lpips, _viewer, _heic, _h264, _cores, _memory, _disk)
     for look in looks:
         try:
             checks.append(look())
@@ -195,6 +195,10 @@ def _viewer() -> Check:
 
 def _heic() -> Check:
     return _package("heic", "pillow-heif", "photos of phones in HEIC (.heic) are not read", "pip install 'pillow-heif>=1'")
+
+
+def _h264() -> Check:
+    return _package("h264", "av", "videos are written as VP9, slowly, which not all players know", "pip install 'av>=14'")
 
 
 def _package(name: str, package: str, without: str, ask: str) -> Check:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from toolkit.stereo.match import StereoDepth
     from toolkit.tsdf.fuse import Points
     from toolkit.tsdf.mesh import Mesh
+    from toolkit.tsdf.volume import TsdfVolume
 
 SMALL_PART = 0.002  # components of a mesh with less than this share of its area are specks
 MOST_TRIANGLES = 2_000_000
@@ -160,6 +161,31 @@ def export_surface(
         InputError: the field has no surface.
     """
     from toolkit.export.mesh import mesh_facts, write_mesh
+
+    volume = _volume_of(job, field, posed, scene, views)
+    memory.give_back()  # what pictures and depth maps took
+    input_from_working = scene.working_from_input.inverse()
+    written = [put_points(folder / "points.ply", volume.points(), input_from_working)] if "points" in formats else []
+    whole = volume.mesh().cleaned(min_area_share=SMALL_PART)
+    del volume
+    mesh = whole.decimated(MOST_TRIANGLES).transformed(input_from_working)
+    facts = mesh_facts(mesh)
+    for path in [job.folder / "mesh.ply", *(folder / f"mesh.{suffix}" for suffix in MESHES if suffix in formats)]:
+        write_mesh(path, mesh)
+        written.append(path)
+    if TEXTURE in formats:
+        memory.give_back()
+        try:
+            left_out = fit_left_out(job)  # who passed belongs into a texture as little as into the field
+            shown = views if left_out is None else left_out.without(views)
+            written.append(put_textured(job, folder / "textured.glb", whole, posed, scene, shown))
+        except InputError as error:
+            notes.append(f"the texture was left out: {error}")
+    return facts, written
+
+
+def _volume_of(job: Job, field: Field, posed: Capture, scene: Scene, views: Views) -> TsdfVolume:
+    """The field's depth at the training cameras, polished, made to agree, and fused."""
     from toolkit.export.surface import field_volume
     from toolkit.render.image import make_renderer, render_view
     from toolkit.stereo.polish import Polisher
@@ -175,7 +201,7 @@ def export_surface(
     seen = shown.subset(np.array(chosen))
     fit = job.settings.fit
     measured = seen.depths if fit.depth > 0 and fit.depth_from != "off" else []
-    volume = field_volume(
+    return field_volume(
         lambda lens, pose: render_view(field, at_most(lens, RENDERED_SIDE), pose, view),
         shown.world_from_camera[chosen],
         lenses,
@@ -186,22 +212,6 @@ def export_surface(
         ),
         progress=job.progress,
     )
-    input_from_working = scene.working_from_input.inverse()
-    written = [put_points(folder / "points.ply", volume.points(), input_from_working)] if "points" in formats else []
-    whole = volume.mesh().cleaned(min_area_share=SMALL_PART)
-    mesh = whole.decimated(MOST_TRIANGLES).transformed(input_from_working)
-    facts = mesh_facts(mesh)
-    for path in [job.folder / "mesh.ply", *(folder / f"mesh.{suffix}" for suffix in MESHES if suffix in formats)]:
-        write_mesh(path, mesh)
-        written.append(path)
-    if TEXTURE in formats:
-        try:
-            left_out = fit_left_out(job)  # who passed belongs into a texture as little as into the field
-            shown = views if left_out is None else left_out.without(views)
-            written.append(put_textured(job, folder / "textured.glb", whole, posed, scene, shown))
-        except InputError as error:
-            notes.append(f"the texture was left out: {error}")
-    return facts, written
 
 
 def finer_views(job: Job, posed: Capture, views: Views, train: Array) -> tuple[Views, list[Intrinsics]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -40,20 +41,22 @@ def boxes(data: bytes, start: int = 0, end: int | None = None) -> Iterator[tuple
         start += size
 
 
-@pytest.mark.parametrize("codec", ["vp09", "mp4v"])
+@pytest.mark.parametrize("codec", ["avc1", "vp09", "mp4v"])
 def test_header_and_frames(tmp_path: Path, codec: str) -> None:
+    if codec == "avc1":
+        pytest.importorskip("av", reason="PyAV is not installed; make test brings it")
     path = tmp_path / "orbit.mp4"
     assert write_video(path, fading(15), fps=12.5, codec=codec) == codec
     assert [item.name for item in tmp_path.iterdir()] == ["orbit.mp4"]
     # The header by hand: brand, codec, picture size, number of frames, duration.
     data = path.read_bytes()
     found = {kind: (start, end) for kind, start, end in boxes(data)}
-    assert {"ftyp", "moov", "mdat", "stsd", "stsz", "mdhd"} <= set(found)
+    assert {"ftyp", "moov", "mdat", "stsd", "stsz", "mvhd"} <= set(found)
     entry = found["stsd"][0] + 8
     assert data[entry + 4 : entry + 8].decode() == codec
     assert struct.unpack_from(">HH", data, entry + 8 + 24) == (128, 96)
     assert struct.unpack_from(">I", data, found["stsz"][0] + 8)[0] == 15
-    scale, duration = struct.unpack_from(">II", data, found["mdhd"][0] + 12)
+    scale, duration = struct.unpack_from(">II", data, found["mvhd"][0] + 12)
     assert duration / scale == pytest.approx(15 / 12.5, rel=0.01)
     # The frames, in order and in RGB.
     reader = cv2.VideoCapture(str(path))
@@ -65,13 +68,38 @@ def test_header_and_frames(tmp_path: Path, codec: str) -> None:
     reader.release()
 
 
-def test_the_preferred_codec_is_one_that_browsers_play(tmp_path: Path) -> None:
+def test_h264_is_preferred_and_what_must_be_known_first_comes_first(tmp_path: Path) -> None:
+    pytest.importorskip("av", reason="PyAV is not installed; make test brings it")
+    path = tmp_path / "a.mp4"
+    assert write_video(path, fading(3)) == "avc1"
+    kinds = [kind for kind, _, _ in boxes(path.read_bytes())]
+    assert kinds.index("moov") < kinds.index("mdat")
+
+
+def test_without_pyav_it_is_one_that_opencv_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
     assert write_video(tmp_path / "a.mp4", fading(3)) in ("vp09", "mp4v")
 
 
-def test_odd_sizes_and_floating_point_pictures(tmp_path: Path) -> None:
+def test_colours_are_what_players_take_them_for(tmp_path: Path) -> None:
+    """Pure colours come back from a reader that goes by the file's own words on its colours."""
+    av = pytest.importorskip("av", reason="PyAV is not installed; make test brings it")
+    colours = [(200, 30, 30), (30, 200, 30), (30, 30, 200), (230, 230, 230), (10, 10, 10)]
+    path = tmp_path / "a.mp4"
+    write_video(path, [np.full((64, 96, 3), colour, np.uint8) for colour in colours])
+    with av.open(str(path)) as file:
+        stream = file.streams.video[0]
+        assert (stream.codec_context.colorspace, stream.codec_context.color_range) == (6, 1)
+        read = [frame.to_ndarray(format="rgb24") for frame in file.decode(stream)]
+    assert len(read) == len(colours)
+    for picture, colour in zip(read, colours, strict=True):
+        assert np.abs(picture.reshape(-1, 3).mean(0) - colour).max() < 5  # 8 bits twice; another matrix would be off by 10 to 30
+
+
+@pytest.mark.parametrize("codec", ["auto", "mp4v"])
+def test_odd_sizes_and_floating_point_pictures(tmp_path: Path, codec: str) -> None:
     path = tmp_path / "odd.mp4"
-    write_video(path, (picture / np.float32(255) for picture in fading(4, 95, 127)), codec="mp4v")
+    write_video(path, (picture / np.float32(255) for picture in fading(4, 95, 127)), codec=codec)
     reader = cv2.VideoCapture(str(path))
     frames = [reader.read()[1] for _ in range(4)]
     reader.release()

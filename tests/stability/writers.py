@@ -66,6 +66,7 @@ def writers() -> dict[str, Write]:
             folder, list("abcd"), [camera] * 4, poses(4), mesh.vertices, None, Similarity.identity()
         ),
         "write_video": lambda folder: write_video(folder / "a.mp4", [texture(i, 48, 64) for i in range(6)]),
+        "write_video vp09": lambda folder: write_video(folder / "c.mp4", [texture(i, 48, 64) for i in range(6)], codec="vp09"),
         "write_video mp4v": lambda folder: write_video(folder / "b.mp4", [texture(i, 48, 64) for i in range(6)], codec="mp4v"),
         "write_report": lambda folder: write_report(
             folder, {"command": "fieldfuse run", "timeline": [{"seconds": 1.0, "psnr": 20.0}] * 20}

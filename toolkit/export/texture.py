@@ -81,7 +81,7 @@ def bake_texture(
     means = np.zeros((len(corners), 3), np.float32)
     finish(corners, mesh.colours[mesh.triangles].astype(np.float32), *layout, texture, total, means)
     shift(_level(mesh, means)[mesh.triangles], *layout, texture)
-    return np.round(np.clip(texture, 0, 255)).astype(np.uint8)
+    return np.rint(np.clip(texture, 0, 255, out=texture), out=texture).astype(np.uint8)  # a large one takes 200 MB: not once more
 
 
 def _level(mesh: Mesh, means: Array) -> Array:
