@@ -139,6 +139,18 @@ def test_a_sweep_of_a_room_from_inside() -> None:
     closed_and_smooth(orbit(shuffled, None, 120))
 
 
+def test_who_turns_in_a_room_is_not_sent_round_its_middle() -> None:
+    """Such cameras look past the middle by 38° in the median; from where they stood, looking at it shows what hardly anybody filmed."""
+    angle = np.deg2rad(np.linspace(-75, 75, 80))
+    at = np.stack([0.4 * np.sin(3 * angle), np.linspace(-0.6, 0.6, 80), np.full(80, 1.5)], axis=1)
+    cameras = look_at(at, at + np.stack([np.cos(angle), np.sin(angle), np.full(80, -0.1)], axis=1), UP)
+    path = orbit(cameras, np.array([2.5, 0.0, 1.0]), 90)
+    assert rigid(path)
+    apart = np.linalg.norm(path[:, None, :3, 3] - cameras[None, :, :3, 3], axis=2)
+    turned = np.arccos(np.clip(path[:, :3, 2] @ cameras[:, :3, 2].T, -1, 1))
+    assert (apart + turned).min(axis=1).max() < 0.2
+
+
 def test_interpolation_goes_through_the_keys_at_an_even_pace() -> None:
     keys = ring(9, 2.0, 0.3, 0, 1.5 * np.pi)
     path = interpolate(keys, 8 * 20 + 1)

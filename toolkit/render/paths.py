@@ -9,7 +9,7 @@ from toolkit.errors import InputError
 
 UP = (0.0, 0.0, 1.0)  # in the working frame
 FACING = 0.9  # length of the mean viewing direction above which all cameras look the same way (spread of about 25°)
-LOOKING_IN = 0.7  # median cosine between viewing direction and direction to the centre above which the cameras surround it
+LOOKING_IN = 0.85  # median cosine between viewing direction and direction to the centre above which the cameras surround it
 FULL_CIRCLE = np.deg2rad(50)  # the largest gap in azimuth that a closed circle may cross
 ARC_ENDS = 0.04  # share of the cameras beyond either end of an arc: where hardly anybody stood, fog stands in the way
 KEY_CAMERAS = 12
