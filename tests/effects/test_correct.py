@@ -70,12 +70,12 @@ def test_weights_are_shares_of_the_valid_pixels_that_rays_are_drawn_from() -> No
     whole = views()
     whole.valid = [None, None, np.arange(64)[None].repeat(48, 0) < 32]
     pool = PixelPool(Corrections(weight={"b": 0.3, "c": 0.5}).on_views(whole))
-    drawn = np.bincount(pool.view.numpy())
+    drawn = np.diff(pool.starts.numpy())
     assert drawn[0] == 48 * 64
     assert abs(drawn[1] / (48 * 64) - 0.3) < 0.03 and abs(drawn[2] / (48 * 32) - 0.5) < 0.05
-    assert bool((pool.place[pool.view == 2] % 64 < 32).all())
+    assert bool((pool.places[pool.starts[2] :] % 64 < 32).all())
     alone = PixelPool(Corrections(weight={"b": 0.3}).on_views(views()).subset([1]))
-    torch.testing.assert_close(alone.place, pool.place[pool.view == 1])
+    torch.testing.assert_close(alone.places, pool.places[pool.starts[1] : pool.starts[2]])
 
 
 def test_a_lens_is_added_to_what_is_given() -> None:

@@ -31,7 +31,7 @@ def masked_pool() -> PixelPool:
     views = made_views(5, 24)
     valid = [np.random.default_rng(index).random((24, 24)) < 0.67 for index in range(5)]
     pool = PixelPool(replace(views, valid=valid))
-    pool.limit = int((pool.view < 4).sum())
+    pool.limit = int(pool.starts[4])
     return pool
 
 

@@ -142,7 +142,7 @@ def fit_field(
     room.require_start(train, start, settings, device)
     # Views that are kept aside come last, so that joining them is a matter of a limit.
     pool = PixelPool(train.subset(np.argsort(aside, kind="stable")), device, depth=settings.fit.depth > 0)
-    pool.limit = int((pool.view < np.count_nonzero(~aside)).sum())
+    pool.limit = int(pool.starts[np.count_nonzero(~aside)])
     if pool.limit == 0:
         raise InputError("every pixel of the training pictures is masked away; look at the capture's masks (black is left out)")
     budget = settings.fit.budget or DEFAULT_BUDGET

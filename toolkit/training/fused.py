@@ -40,8 +40,7 @@ class FusedOptimiser:
     def __init__(self, field: Field, pool: PixelPool, seed: int = 0, threads: int | None = None) -> None:
         self.pool, self.threads = pool, threads or torch.get_num_threads()
         self.generator = np.random.default_rng(seed)
-        given = (pool.colour, pool.place, pool.view, pool.camera, pool.pose, pool.distance)
-        self.pixels = kernels.Pixels(*(tensor.numpy() for tensor in given))
+        self.pixels = kernels.pixels_of(pool)
         self.met = Tiles(pool)
         self.next: Batch | None = None
         self._take_decoder(field)

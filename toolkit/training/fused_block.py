@@ -15,7 +15,7 @@ from toolkit.render.kernels_decode import RAYS, decode, encode_direction
 from toolkit.render.kernels_lookup import gather_row
 from toolkit.render.kernels_march import march_ray
 from toolkit.training.fused_decoder import Tape, decode_backward, forget_gradients
-from toolkit.training.fused_kernels import depth_pull, pixel_ray, slow_near
+from toolkit.training.fused_kernels import ask_for, depth_pull, pixel_ray, slow_near
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
 MOST = 1024  # samples of one ray that are kept, see `kernels_march`
@@ -108,18 +108,12 @@ def _march(
 ) -> Any:
     """Samples of as many rays from picks[number] on as there is room for → their number, and that of samples looked up."""
     ray, starts, result = block.ray, block.starts, block.result
-    knows = pixels.distance.shape[0] > 0
     stop = max(losses.stop, losses.threshold)  # no sample behind weighs more than the light that is left
     count, filled, looked = 0, 0, 0
     while count < RAYS and number + count < len(picks) and filled + MOST <= ROOM:
         at = number + count
         if at + AHEAD < len(picks):
-            later = picks[at + AHEAD]
-            K.prefetch(pixels.place, later)
-            K.prefetch(pixels.source, later)
-            K.prefetch(pixels.colour, later)
-            if knows:
-                K.prefetch(pixels.distance, later)
+            ask_for(pixels, picks[at + AHEAD])
         pixel_ray(pixels, picks[at], ray, count)
         ox, oy, oz = ray[count, 0], ray[count, 1], ray[count, 2]
         dx, dy, dz = ray[count, 3], ray[count, 4], ray[count, 5]

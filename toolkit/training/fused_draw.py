@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from toolkit.render import kernels as K
+from toolkit.training.fused_kernels import seen_at
 from toolkit.training.importance import MOST as MOST_
 from toolkit.training.importance import SHARE as SHARE_
 from toolkit.training.importance import TILE as TILE_
@@ -23,10 +24,8 @@ LOW = np.uint64(0xFFFFFFFF)
 @njit(**K.LEAF)
 def tile_of(pixels: Any, pick: Any, high: Any, wide: Any) -> Any:
     """The tile of pixel `pick`."""
-    view, place = pixels.source[pick], pixels.place[pick]
-    width = np.int32(pixels.camera[view, 4])
-    row = place // width
-    return (view * high + row // CELL) * wide + (place - row * width) // CELL
+    view, row, column = seen_at(pixels, pick)
+    return (view * high + row // CELL) * wide + column // CELL
 
 
 @njit(**K.OPTIONS)
@@ -70,8 +69,8 @@ def draw(pixels: Any, limit: Any, seed: Any, density: Any, high: Any, wide: Any,
         bits = _mixed(state)
         candidates[at] = np.int64(((bits >> np.uint64(32)) * np.uint64(limit)) >> np.uint64(32))
         luck[at] = F((bits & LOW) >> np.uint64(8)) * F(1 / 16777216)
-        K.prefetch(pixels.place, candidates[at])
-        K.prefetch(pixels.source, candidates[at])
+        if pixels.places.shape[0] > 0:
+            K.prefetch(pixels.places, candidates[at])
         half = (number + AHEAD // 2) % AHEAD
         if number >= AHEAD // 2:
             tiles[half] = tile_of(pixels, candidates[half], high, wide)

@@ -9,7 +9,7 @@ from numba import njit
 
 from toolkit.render import kernels as K
 from toolkit.training import fused_draw
-from toolkit.training.fused_kernels import pixel_ray
+from toolkit.training.fused_kernels import ask_for, pixel_ray
 from toolkit.training.importance import KEEP as KEEP_
 from toolkit.training.importance import RENEW, tile_grid
 from toolkit.training.rays import PixelPool
@@ -45,10 +45,7 @@ def hit_codes(space: Any, pixels: Any, picks: Any, memory: Any, grid: Any, codes
     high, wide = np.int32(grid[0]), np.int32(grid[1])
     for index in range(len(picks)):
         if index + AHEAD < len(picks):
-            later = picks[index + AHEAD]
-            K.prefetch(pixels.place, later)
-            K.prefetch(pixels.source, later)
-            K.prefetch(pixels.colour, later)
+            ask_for(pixels, picks[index + AHEAD])
         pick = picks[index]
         pixel_ray(pixels, pick, ray, 0)
         tile = fused_draw.tile_of(pixels, pick, high, wide)
@@ -113,8 +110,8 @@ class Tiles:
 
     def draw(self, pixels: Any, limit: int, seed: int, picks: Array, weights: Array) -> None:
         """Fill `picks` (B,) int64 with pixels before `limit`, and `weights` (B,) float32 with what each of them counts."""
-        if not 0 < limit <= len(pixels.place):  # compiled code looks where it is told to
-            raise ValueError(f"pixels are to be drawn from the first {limit} of {len(pixels.place)}")
+        if not 0 < limit <= len(pixels.colour):  # compiled code looks where it is told to
+            raise ValueError(f"pixels are to be drawn from the first {limit} of {len(pixels.colour)}")
         fused_draw.draw(pixels, limit, seed, self.density, *self.grid, picks, weights)
 
     def renew(self) -> None:

@@ -45,10 +45,8 @@ class Errors:
 
     def tiles(self, picks: Tensor) -> Tensor:
         """(B,) pixels → (B,) tiles."""
-        view, place = self.pool.view[picks].long(), self.pool.place[picks].long()
-        width = self.pool.camera[view, 4].long()
-        row = place.div(width, rounding_mode="floor")
-        return (view * self.high + row // TILE) * self.wide + (place - row * width) // TILE
+        view, row, column = self.pool.seen_at(picks)
+        return (view * self.high + row // TILE) * self.wide + column // TILE
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """(count,) pixels before the pool's limit, with replacement, and (count,) what each of them counts."""

@@ -26,25 +26,30 @@ class Batch:
 
 
 class PixelPool:
-    """The valid pixels of some views, as uint8 on the device, with what is needed to make their rays.
+    """The valid pixels of some views, as uint8 on the device, view after view, with what is needed to make their rays.
 
-    Of a view that counts for less, so many are drawn by lot (always the same ones) as its weight says: rays come evenly from what is kept.
+    A view's pixels are starts[v] … starts[v + 1], in the order of its picture; which place each has in it is kept only where pixels are
+    left out. Of a view that counts for less, so many are drawn by lot (always the same ones) as its weight says: rays come evenly from what is kept.
     """
 
     def __init__(self, views: Views, device: torch.device | str = "cpu", depth: bool = False) -> None:
         """With `depth` the distances of known surfaces are kept, too, if any view has depth."""
         pixels = [self._kept(views, index) for index in range(len(views))]
-        count = sum(len(flat) for flat in pixels)
-        colour, place, which = np.empty((count, 3), np.uint8), np.empty(count, np.int32), np.empty(count, np.int32)
+        sizes = [lens.width * lens.height if flat is None else len(flat) for flat, lens in zip(pixels, views.intrinsics, strict=True)]
+        starts = np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)]).astype(np.int64)
+        count = int(starts[-1])
+        colour, some = np.empty((count, 3), np.uint8), any(flat is not None for flat in pixels)
+        places = np.empty(count if some else 0, np.int32)
         depths = views.depths if depth and any(one is not None for one in views.depths) else None
         distance = np.zeros(0 if depths is None else count, np.float32)
-        first = 0
         for index, flat in enumerate(pixels):
-            own = slice(first, first := first + len(flat))
-            colour[own], place[own], which[own] = views.images[index].reshape(-1, 3)[flat], flat, index
+            own, of_picture = slice(starts[index], starts[index + 1]), slice(None) if flat is None else flat
+            colour[own] = views.images[index].reshape(-1, 3)[of_picture]
+            if some:
+                places[own] = np.arange(sizes[index]) if flat is None else flat
             if depths is not None and (known := depths[index]) is not None:
-                distance[own] = ray_distances(known, views.intrinsics[index]).reshape(-1)[flat]
-        self.colour, self.place, self.view, self.distance = (torch.from_numpy(of).to(device) for of in (colour, place, which, distance))
+                distance[own] = ray_distances(known, views.intrinsics[index]).reshape(-1)[of_picture]
+        self.colour, self.places, self.starts, self.distance = (torch.from_numpy(of).to(device) for of in (colour, places, starts, distance))
         self.height = max((c.height for c in views.intrinsics), default=0)
         k = [(c.fx, c.fy, c.cx, c.cy, c.width) for c in views.intrinsics]
         self.camera = torch.tensor(k, dtype=torch.float32, device=device)
@@ -52,24 +57,31 @@ class PixelPool:
         self.pose = torch.from_numpy(views.world_from_camera.astype(np.float32)).to(device)
 
     @staticmethod
-    def _kept(views: Views, index: int) -> np.ndarray[Any, Any]:
-        """(P,) int32 places of a view's pixels that take part."""
+    def _kept(views: Views, index: int) -> np.ndarray[Any, Any] | None:
+        """(P,) int32 places of a view's pixels that take part, ascending; None: all."""
         valid, image = views.valid[index] if views.valid else None, views.images[index]
-        flat = np.arange(image.shape[0] * image.shape[1], dtype=np.int32) if valid is None else np.flatnonzero(valid).astype(np.int32)
+        flat = None if valid is None or valid.all() else np.flatnonzero(valid).astype(np.int32)
         if views.weight and views.weight[index] < 1:
+            flat = np.arange(image.shape[0] * image.shape[1], dtype=np.int32) if flat is None else flat
             flat = flat[np.random.default_rng(zlib.crc32(views.names[index].encode())).random(len(flat)) < views.weight[index]]
         return flat
 
     def __len__(self) -> int:
         return len(self.colour)
 
+    def seen_at(self, pick: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(B,) pixels → (B,) int64 views, rows and columns."""
+        view = torch.searchsorted(self.starts[1:], pick, right=True)
+        place = self.places[pick].long() if len(self.places) else pick - self.starts[view]
+        width = self.camera[view, 4].long()
+        row = place.div(width, rounding_mode="floor")
+        return view, row, place - row * width
+
     def take(self, pick: Tensor) -> Batch:
         """The rays of the pixels `pick` (B,)."""
-        view = self.view[pick].long()
-        fx, fy, cx, cy, width = self.camera[view].unbind(1)
-        place = self.place[pick]
-        row = place.div(width.int(), rounding_mode="floor")
-        u, v = (place - row * width.int()).float() + 0.5, row.float() + 0.5
+        view, row, column = self.seen_at(pick)
+        fx, fy, cx, cy, _ = self.camera[view].unbind(1)
+        u, v = column.float() + 0.5, row.float() + 0.5
         camera = torch.stack([(u - cx) / fx, (v - cy) / fy, torch.ones_like(u)], 1)
         pose = self.pose[view]
         directions = torch.nn.functional.normalize((pose[:, :3, :3] @ camera[:, :, None]).squeeze(2), dim=1)
