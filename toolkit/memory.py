@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import mmap
 import resource
 from contextlib import suppress
 from pathlib import Path
@@ -58,6 +59,18 @@ def workers(wanted: int, each: int, what: str, advice: str) -> int:
     require(each, what, advice)
     there = available()
     return wanted if there is None else max(1, min(wanted, (there - SPARE) // max(1, each)))
+
+
+def pages(size: int) -> mmap.mmap | bytearray:
+    """`size` bytes, all zero, for what will be written here and there: where nothing is written they take no memory, page by page. (What
+    NumPy gives begins so, too, but on systems with huge pages a byte that is written takes 2 MB.)"""
+    if size == 0 or not hasattr(mmap, "MAP_PRIVATE"):
+        return bytearray(size)
+    out = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    if hasattr(mmap, "MADV_NOHUGEPAGE"):
+        with suppress(OSError):  # a kernel without huge pages
+            out.madvise(mmap.MADV_NOHUGEPAGE)
+    return out
 
 
 def give_back() -> None:

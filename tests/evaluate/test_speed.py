@@ -52,7 +52,7 @@ def test_memory_a_voxel() -> None:
     engine = FusedOptimiser(field, sphere_pixels(16), threads=1)
     rows = len(field.density_rows)
     assert engine.index.nbytes == rows * 8 and engine.marks.nbytes == len(field.occupied) * 2
-    assert engine.feature_records.shape == (rows, 2 * CHANNELS) and engine.density_records.shape == (rows, 3)
+    assert engine.records.shape == (rows, CHANNELS + 2) and engine.records.itemsize == 2
 
 
 def test_ratios_are_of_the_clock_that_is_asked_for() -> None:

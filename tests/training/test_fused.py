@@ -74,7 +74,7 @@ def gradients(engine: FusedOptimiser, picks: torch.Tensor, rates: Rates = RATES)
     field, counts = engine.field, {}
 
     def keep_sums(width: object, volume: object, index: np.ndarray, *rest: object) -> None:
-        thread, used = rest[6:8]
+        thread, used = rest[5:7]
         counts[thread] = used
 
     with pytest.MonkeyPatch.context() as patch:

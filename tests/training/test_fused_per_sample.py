@@ -101,7 +101,7 @@ def gradients(
     field, counts = engine.field, {}
 
     def keep_sums(width: object, volume: object, index: np.ndarray, *rest: object) -> None:
-        thread, used = rest[6:8]
+        thread, used = rest[5:7]
         counts[thread] = used
 
     with monkeypatch.context() as patch:

@@ -50,7 +50,7 @@ def everything(engine: Any) -> list[np.ndarray]:
         out += [engine.density.state, engine.feature.state]
         out += [value for state in engine.decoder.state.values() for value in state.values()]
     else:
-        out += [engine.density_records, engine.feature_records, *(value for pair in engine.moments for value in pair)]
+        out += [engine.records, *(value for pair in engine.moments for value in pair)]
     return [np.array(value.detach() if isinstance(value, torch.Tensor) else value) for value in out]
 
 

@@ -42,7 +42,7 @@ def test_bytes_of_a_row_are_those_of_the_compiled_engine(decoder: str, monkeypat
     engine = make_engine(settings, field, PixelPool(sphere_views()))
     torch.set_num_threads(before)
     engine.step(64, Rates(0.1, 0.1, 1e-3, 0.01))
-    names = ("index", "density_records", "feature_records", "touched", "density_sums", "feature_sums", "marks")
+    names = ("index", "records", "touched", "density_sums", "feature_sums", "marks")
     held = sum(getattr(engine, name).nbytes for name in names) + field.density_rows.nbytes + field.feature_rows.nbytes
     assert room.row_bytes(settings, field.device) == pytest.approx(held / len(field.density_rows), rel=0.05)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from toolkit.networks.decoder import Deferred, PerSample, make_decoder
 from toolkit.render.composite import RAW_MAX, UNITS
 from toolkit.render.march import MarchGrid
 from toolkit.render.sky import checked_sky
-from toolkit.volume.edit import corner_nodes, erase_empty_blocks
+from toolkit.volume.edit import corner_nodes
 from toolkit.volume.space import Space
 from toolkit.volume.store import FieldFile, compact, expand, read_field, write_field
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
@@ -97,10 +98,20 @@ class Field:
 
     def settled(self) -> Field:
         """A copy in memory of its own, without the blocks that hold nothing."""
-        topology, occupied, (density_rows, feature_rows) = erase_empty_blocks(
-            self.topology, self.occupied, [self.density_rows, self.feature_rows]
-        )
-        return replace(self, topology=topology, occupied=occupied, density_rows=density_rows, feature_rows=feature_rows)
+        return self.packed()()
+
+    def packed(self) -> Callable[[], Field]:
+        """What makes the copy that `settled` is; it holds the corners that voxels use and nothing else, so that the memory of this field's
+        rows can be let go of before the copy's is taken: the end of a fit is when most is needed."""
+        corners = corner_nodes(self.topology, self.occupied).view(-1, VOXELS)
+        kept = corners.any(1).nonzero().view(-1)
+        source = corners.view(-1).nonzero().view(-1)
+        density, feature = self.density_rows.detach()[source], self.feature_rows.detach()[source]
+        index, blocks = corners[kept].view(-1).nonzero().view(-1), len(kept)
+        occupied = self.occupied.view(-1, VOXELS)[kept].view(-1)
+        topology, none = Topology(self.topology.keys[kept]), (density[:0], feature[:0])
+        rest = replace(self, topology=topology, occupied=occupied, density_rows=none[0], feature_rows=none[1])
+        return lambda: replace(rest, density_rows=expand(density, index, blocks), feature_rows=expand(feature, index, blocks))
 
     def save(self, path: Path | str, working_from_input: Similarity | None = None, meta: dict[str, Any] | None = None) -> None:
         """Write `field.safetensors`, atomically; corners that no occupied voxel uses are left out.

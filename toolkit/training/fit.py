@@ -19,6 +19,7 @@ from toolkit.camera import Array
 from toolkit.capture.types import Views
 from toolkit.config import Settings
 from toolkit.errors import InputError
+from toolkit.memory import give_back
 from toolkit.networks.decoder import make_decoder
 from toolkit.poses.scene import Scene
 from toolkit.progress import SILENT, Progress
@@ -177,6 +178,7 @@ def fit_field(
             if plan.worth(voxels, plan.rays_left(now, result.rays)) and room.fits(current, keep, plan, settings, guard.notes):
                 plan.climb()
                 engine.let_go()
+                give_back()
                 current = finer(current, keep, plan.resolution, host)
                 engine.renew_rows(current)
         elif plan.wants_pruning(done):
@@ -210,8 +212,11 @@ def fit_field(
     _measure(result, held_out, engine, result.seconds)
     current = engine.sync()
     engine.let_go()
-    result.field = replace(current.settled(), sky=sky_behind(views))
+    packed = current.packed()
+    del engine, current  # their rows are the host's
     host.close()
+    give_back()
+    result.field = replace(packed(), sky=sky_behind(views))
     return result
 
 

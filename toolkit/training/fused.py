@@ -27,14 +27,14 @@ from toolkit.training.step import Rates
 from toolkit.training.view import blind
 
 Array = np.ndarray[Any, Any]
-BETAS, EPSILON = (0.9, 0.99), 1e-10
+BETAS, EPSILON = (0.9, 0.99), 1e-10  # of the decoder; rows have no first moment
 _CONSTANTS = (np.float32(BETAS[0]), np.float32(BETAS[1]), np.float32(EPSILON))
 
 
 class FusedOptimiser:
     """A field, its pixels, and the optimiser state of the rows that rays have come to.
 
-    Memory beside the field: a lattice corner costs 4 bytes and 6 more a thread, and 4 (C + 3) bytes once a gradient has come to it.
+    Memory beside the field: a lattice corner costs 4 bytes and 6 more a thread, and 2 (C + 2) bytes once a gradient has come to it.
     """
 
     def __init__(self, field: Field, pool: PixelPool, seed: int = 0, threads: int | None = None) -> None:
@@ -48,7 +48,7 @@ class FusedOptimiser:
         self.moments = [(np.zeros_like(weight), np.zeros_like(weight)) for weight in self._weights()]
         self.decoder_steps = 0
         steps = np.arange(1, 2049)
-        self.scales = np.concatenate([[1], np.sqrt(1 - BETAS[1] ** steps) / (1 - BETAS[0] ** steps)]).astype(np.float32)
+        self.scales = np.concatenate([[1], np.sqrt(1 - BETAS[1] ** steps)]).astype(np.float32)
         self.executor = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
         self.barrier = threading.Barrier(self.threads)
         self.renew_rows(field)
@@ -60,9 +60,8 @@ class FusedOptimiser:
         self.index = np.full((rows, self.threads + 1), -1, np.int32)
         self.bases = np.zeros(self.threads, np.int64)
         # Sized for the worst case; the system gives memory only to the part that is written.
-        self.density_records = K.aligned((rows * self.threads, 3), np.float32, zeroed=True)
-        self.feature_records = K.aligned((rows * self.threads, 2 * channels), np.uint16, zeroed=True)
-        self.records, self.used = [0] * self.threads, [0] * self.threads
+        self.records = K.aligned((rows * self.threads, moves.FEATURE + channels), np.uint16, zeroed=True)
+        self.given, self.used = [0] * self.threads, [0] * self.threads
         self.touched = np.empty((self.threads, rows), np.int32)
         self.density_sums = np.empty((self.threads, rows), np.float32)
         self.feature_sums = K.aligned((self.threads, rows, channels), np.float32)
@@ -72,8 +71,8 @@ class FusedOptimiser:
     def let_go(self) -> None:
         """Free what belongs to the rows, before finer ones are made beside them; `renew_rows` must follow."""
         self.index = self.touched = np.empty((0, 0), np.int32)
-        self.density_records = self.density_sums = np.empty((0, 0), np.float32)
-        self.feature_records = np.empty((0, 0), np.uint16)
+        self.density_sums = np.empty((0, 0), np.float32)
+        self.records = np.empty((0, 0), np.uint16)
         self.feature_sums = np.empty((0, 0, 0), np.float32)
         self.marks = np.empty((0, 0), np.uint16)
 
@@ -97,7 +96,7 @@ class FusedOptimiser:
     @property
     def next_record(self) -> int:
         """Rows that a gradient has come to so far."""
-        return sum(self.records)
+        return sum(self.given)
 
     def sync(self) -> Field:
         """The field with the decoder's weights written back."""
@@ -153,10 +152,10 @@ class FusedOptimiser:
         step_sizes = np.array([rates.density, rates.feature], np.float32)
 
         def move(thread: int) -> None:
-            state = (self.space.width, self.volume, self.index, self.bases, self.density_records, self.feature_records)
+            state = (self.space.width, self.volume, self.index, self.bases, self.records)
             sums = (self.touched, self.density_sums, self.feature_sums)
-            state_of_thread = (thread, self.used[thread], self.records[thread])
-            self.records[thread] = moves.adam_pass(*state, *sums, *state_of_thread, self.scales, step_sizes, *_CONSTANTS)
+            state_of_thread = (thread, self.used[thread], self.given[thread])
+            self.given[thread] = moves.adam_pass(*state, *sums, *state_of_thread, self.scales, step_sizes, *_CONSTANTS[1:])
             if thread == self.threads - 1:
                 self._move_decoder(rates.decoder, [result[3] for result in results])
             if thread == 0:

@@ -10,7 +10,8 @@ from numba import njit
 from toolkit.render import kernels as K
 
 ZERO, ONE = K.ZERO, K.ONE
-COUNT, FIRST, SECOND = 0, 1, 2  # columns of a row's density record: steps, both moments
+COUNT, DENSITY, FEATURE = 0, 1, 2  # columns of a row's record: steps, and from where on the second moments are
+MOST_STEPS = 65535  # that are counted
 AHEAD = 8  # rows for which memory is asked before they are needed
 
 
@@ -20,39 +21,37 @@ def adam_pass(
     volume: Any,
     index: Any,
     bases: Any,
-    density_records: Any,
-    feature_records: Any,
+    records: Any,
     touched: Any,
     density_sums: Any,
     feature_sums: Any,
     thread: Any,
     used: Any,
-    records: Any,
+    given: Any,
     scales: Any,
     rates: Any,
-    b1: Any,
     b2: Any,
     epsilon: Any,
 ) -> Any:
-    """Lazy Adam on rows that thread `thread` touched. A row that several touched is moved by the first of them, with the sum in their
-    order, so that the result depends on the number of threads alone.
+    """Lazy Adam (`adam.LazyAdam`) on rows that thread `thread` touched. A row that several touched is moved by the first of them, with the
+    sum in their order, so that the result depends on the number of threads alone.
 
     Args:
         index: (M · 512 + 1, threads + 1) int32; column 0 is a row's Adam record, −1: it has none yet; the others, with
             bases (threads,), are of `fused_block.gradient_pass`.
-        density_records: (K, 3) float32; feature_records: (K, 2 C) uint16, first moments, then second, as bfloat16: of 16 channels one
-            cache line.
+        records: (K, C + 2) uint16, of a row its steps, and the second moments of its density and features as bfloat16.
         touched, density_sums, feature_sums: (threads, …) of all `Gradients`.
-        records: how many this thread has given to rows so far; threads take turns in the order of records, so that none asks another.
-        scales: (S,) float32 bias correction sqrt(1 - b2^n) / (1 - b1^n) for n steps; the last one beyond.
+        given: how many records this thread has given to rows so far; threads take turns in the order of records, so that none asks
+            another.
+        scales: (S,) float32 bias correction sqrt(1 - b2^n) for n steps; the last one beyond.
         rates: (2,) float32 of density and features.
 
     Returns:
-        `records` after this pass.
+        `given` after this pass.
     """
     channels = len(width)
     density, feature = volume.density, volume.feature
-    c1, c2 = ONE - b1, ONE - b2
+    c2 = ONE - b2
     threads = index.shape[1] - 1
     for at in range(used):
         if at + 2 * AHEAD < used:
@@ -60,8 +59,8 @@ def adam_pass(
         if at + AHEAD < used:
             later = np.int64(touched[thread, at + AHEAD])
             record = np.int64(index[later, 0])
-            K.prefetch(feature_records, record)
-            K.prefetch(density_records, record)
+            K.prefetch(records, record)
+            K.prefetch(records, record + 1)  # it may begin in one cache line and end in the next
             K.prefetch(feature, later)
             K.prefetch(density, later)
         row = touched[thread, at]
@@ -81,24 +80,22 @@ def adam_pass(
             continue
         place = np.int64(index[row, 0])
         if place < 0:
-            place = records * threads + thread
+            place = given * threads + thread
             index[row, 0] = place
-            records += 1
-        steps = density_records[place, COUNT] + ONE
-        scale = scales[min(int(steps), len(scales) - 1)]
+            given += 1
+        steps = min(int(records[place, COUNT]) + 1, MOST_STEPS)
+        scale = scales[min(steps, len(scales) - 1)]
         g = density_sums[thread, at]
-        m = b1 * density_records[place, FIRST] + c1 * g
-        v = b2 * density_records[place, SECOND] + c2 * g * g
-        density_records[place, COUNT], density_records[place, FIRST], density_records[place, SECOND] = steps, m, v
-        density[row] -= rates[0] * scale * m / (np.sqrt(v) + epsilon)
+        v = b2 * K.of_half(records[place, DENSITY]) + c2 * g * g
+        records[place, COUNT], records[place, DENSITY] = np.uint16(steps), K.to_half(v)
+        density[row] -= rates[0] * scale * g / (np.sqrt(v) + epsilon)
         step = rates[1] * scale
         for c in range(channels):
             g = feature_sums[thread, at, c]
-            m = b1 * K.of_half(feature_records[place, c]) + c1 * g
-            v = b2 * K.of_half(feature_records[place, channels + c]) + c2 * g * g
-            feature_records[place, c], feature_records[place, channels + c] = K.to_half(m), K.to_half(v)
-            feature[row, c] -= step * m / (np.sqrt(v) + epsilon)
-    return records
+            v = b2 * K.of_half(records[place, FEATURE + c]) + c2 * g * g
+            records[place, FEATURE + c] = K.to_half(v)
+            feature[row, c] -= step * g / (np.sqrt(v) + epsilon)
+    return given
 
 
 @njit(**K.OPTIONS)

@@ -29,7 +29,8 @@ class PixelPool:
     """The valid pixels of some views, as uint8 on the device, view after view, with what is needed to make their rays.
 
     A view's pixels are starts[v] … starts[v + 1], in the order of its picture; which place each has in it is kept only where pixels are
-    left out. Of a view that counts for less, so many are drawn by lot (always the same ones) as its weight says: rays come evenly from what is kept.
+    left out. Of a view that counts for less, so many are drawn by lot (always the same ones) as its weight says: rays come evenly from
+    what is kept.
     """
 
     def __init__(self, views: Views, device: torch.device | str = "cpu", depth: bool = False) -> None:
@@ -49,7 +50,8 @@ class PixelPool:
                 places[own] = np.arange(sizes[index]) if flat is None else flat
             if depths is not None and (known := depths[index]) is not None:
                 distance[own] = ray_distances(known, views.intrinsics[index]).reshape(-1)[of_picture]
-        self.colour, self.places, self.starts, self.distance = (torch.from_numpy(of).to(device) for of in (colour, places, starts, distance))
+        self.colour, self.places = torch.from_numpy(colour).to(device), torch.from_numpy(places).to(device)
+        self.starts, self.distance = torch.from_numpy(starts).to(device), torch.from_numpy(distance).to(device)
         self.height = max((c.height for c in views.intrinsics), default=0)
         k = [(c.fx, c.fy, c.cx, c.cy, c.width) for c in views.intrinsics]
         self.camera = torch.tensor(k, dtype=torch.float32, device=device)

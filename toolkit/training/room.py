@@ -13,7 +13,7 @@ from toolkit.training.engine import chosen_engine
 from toolkit.training.schedule import Schedule
 from toolkit.volume.topology import BLOCK, VOXELS
 
-POOL_BYTES = 2 * 15  # a pixel: colour, place, view, distance, and one copy of them while they are put together
+POOL_BYTES = 15  # a pixel: colour, distance, and where some are left out its place, that twice while they are put together
 HALF = BLOCK // 2
 BESIDE = 1.5  # blocks at a finer level, by those that hold voxels: some hold nothing but corners of their neighbours' voxels
 
@@ -23,8 +23,8 @@ def row_bytes(settings: Settings, device: torch.device) -> int:
     channels, threads = settings.field.channels, settings.threads or torch.get_num_threads()
     values = 4 * (1 + channels)
     if chosen_engine(settings, device) == "torch":
-        return values + 4 * (2 * channels + 4) + 8
-    return values + 4 + threads * (4 + 10 + 4 * channels + 4 * (3 + channels))  # moments of features have two bytes
+        return values + 4 * (channels + 3) + 8
+    return values + 4 + threads * (4 + 10 + 4 * channels + 2 * (2 + channels))  # moments have two bytes
 
 
 def require_start(views: Views, start: Field | None, settings: Settings, device: torch.device) -> None:

@@ -10,15 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from toolkit.volume.lookup import corners, gather
+from toolkit.volume.rows import zero_rows
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
 
 CHUNK = 1024  # blocks at a time …
-COPIED = 128  # … and of those that are copied at the end of a fit
+COPIED = 128  # … and of those that are copied
 MODES = ("trilinear", "nearest")
 _ELEMENTS = 2**19  # values gathered at a time by `resample`: about what fits into a core's cache
 
@@ -91,12 +91,9 @@ def erase_empty_blocks(topology: Topology, occupied: Tensor, rows: Sequence[Tens
 
 
 def _of_blocks(values: Tensor, kept: Tensor, nodes: Tensor) -> Tensor:
-    """(M · 512 + 1, …) rows → those of the blocks `kept`, as far as they are `nodes` (M, 512), and the last one. The end of a fit is when
-    it takes most memory, so what is not used stays unwritten, and a few blocks are copied at a time."""
-    shape = (len(kept) * VOXELS + 1, *values.shape[1:])
-    # NumPy's zeros take no memory before they are written; torch's do.
-    lazy = values.device.type == "cpu" and values.dtype == torch.float32
-    out = torch.from_numpy(np.zeros(shape, np.float32)) if lazy else values.new_zeros(shape)
+    """(M · 512 + 1, …) rows → those of the blocks `kept`, as far as they are `nodes` (M, 512), and the last one; a few blocks at a time,
+    and what is not used stays unwritten."""
+    out = zero_rows((len(kept) * VOXELS + 1, *values.shape[1:]), values.device, values.dtype)
     with torch.no_grad():
         blocks, new = (of[:-1].reshape(-1, VOXELS, *of.shape[1:]) for of in (values, out))
         for first in range(0, len(kept), COPIED):

@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
 import torch
 
+from toolkit.volume.rows import zero_rows
 from toolkit.volume.topology import Topology
 
 Tensor = torch.Tensor
@@ -37,11 +37,6 @@ class Host(Protocol):
         ...
 
 
-def _zeros(shape: tuple[int, ...], device: torch.device) -> Tensor:
-    """float32. NumPy's zeros take no memory before they are written, torch's do."""
-    return torch.from_numpy(np.zeros(shape, np.float32)) if device.type == "cpu" else torch.zeros(shape, device=device)
-
-
 class TorchHost:
     """Rows as ordinary tensors on a device."""
 
@@ -51,7 +46,7 @@ class TorchHost:
     def allocate(self, keys: Tensor, channels: int, voxel_size: float) -> Hosted:
         topology = Topology(keys.to(self.device))
         size = topology.zero_row + 1
-        return Hosted(topology, _zeros((size,), self.device), _zeros((size, channels), self.device))
+        return Hosted(topology, zero_rows((size,), self.device), zero_rows((size, channels), self.device))
 
     def close(self) -> None:
         """Nothing to do: torch frees what nobody holds."""

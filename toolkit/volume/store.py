@@ -23,6 +23,7 @@ from toolkit import memory
 from toolkit.camera import Similarity
 from toolkit.errors import FieldfuseError, InputError, OutputError
 from toolkit.files import atomic_path
+from toolkit.volume.rows import zero_rows
 from toolkit.volume.topology import MAX_TABLE_CELLS, VOXELS
 
 VERSION = 1
@@ -80,7 +81,7 @@ def compact(rows: Tensor, node_index: Tensor) -> Tensor:
 
 def expand(values: Tensor, node_index: Tensor, blocks: int) -> Tensor:
     """(R, …) stored values → (blocks · 512 + 1, …) block rows; what is not stored, and the zero row at the end, is zero."""
-    rows = values.new_zeros((blocks * VOXELS + 1, *values.shape[1:]))
+    rows = zero_rows((blocks * VOXELS + 1, *values.shape[1:]), values.device, values.dtype)
     return rows.index_copy_(0, node_index.long(), values)
 
 
