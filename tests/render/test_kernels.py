@@ -7,8 +7,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
+from scipy.ndimage import distance_transform_cdt
 
 from toolkit.render import kernels as K
+from toolkit.render.compiled import FARTHEST, chessboard_distance
 
 
 @njit
@@ -34,3 +36,13 @@ def test_numbers_of_two_bytes_are_those_of_torch(values: list[float]) -> None:
     expected = torch.from_numpy(given).bfloat16()
     np.testing.assert_array_equal(got.view(np.int16), expected.view(torch.int16).numpy())
     np.testing.assert_array_equal(back, expected.float().numpy())
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.tuples(*[st.integers(1, 12)] * 3), st.sampled_from([0.0, 0.01, 0.2, 1.0]), st.integers(0, 1000))
+def test_distances_of_bricks_are_those_of_the_chessboard(shape: tuple[int, int, int], share: float, seed: int) -> None:
+    filled = np.random.default_rng(seed).random(shape) < share
+    bricks = np.where(filled, np.uint8(0), np.uint8(FARTHEST))
+    chessboard_distance(bricks, FARTHEST)
+    exact = distance_transform_cdt(~filled, metric="chessboard") if filled.any() else np.full(shape, FARTHEST)
+    np.testing.assert_array_equal(bricks, np.minimum(exact, FARTHEST))
