@@ -60,17 +60,25 @@ class NetworkSettings:
     precision: str = "auto"  # of the networks' arithmetic: auto (bfloat16 where the processor multiplies it) | float32 | bfloat16
 
 
+WIDTHS = {"deferred": 96, "per_sample": 64}  # a ray is decoded once, or at every sample
+
+
 @dataclass
 class FieldSettings:
     channels: int = 16  # features a voxel
     decoder: str = "deferred"  # deferred | per_sample (the paper's)
-    hidden: int = 64  # width of the decoder
+    hidden: int | None = None  # width of the decoder; None: 96, of the paper's 64
     view: str = (
         "auto"  # auto (by the evidence of the effects stage) | full | low (first order) | none: of the direction, what the decoder sees
     )
     background: str = "auto"  # auto | on | off: contract what lies outside the region of interest
     resolution: int | None = None  # voxels along the longest side of the volume; None: by preset and picture size
     init: str = "auto"  # auto (network: few training views) | network | classical
+
+    @property
+    def width(self) -> int:
+        """Hidden units of a layer of the decoder."""
+        return self.hidden or WIDTHS[self.decoder]
 
 
 @dataclass

@@ -20,7 +20,7 @@ from toolkit.camera import Array
 from toolkit.errors import InputError
 from toolkit.evaluate.speed_state import around, lens
 from toolkit.export.page import Tour, corner_densities, decoder_blocks, page, require_page, write_page
-from toolkit.networks.decoder import make_decoder
+from toolkit.networks.decoder import Deferred, make_decoder
 from toolkit.render.bake import BakedField, bake
 from toolkit.render.bake_image import BakedRenderer
 
@@ -62,12 +62,13 @@ def test_decoder_blocks_are_the_decoder() -> None:
     small, large = decoder_blocks(baked)
     given = np.random.default_rng(0).normal(size=28).astype(np.float32)
     given[8:16], given[25:] = 0, 0  # this field has eight features
-    first = small[: 16 * 7 * 16].reshape(16, 7, 4, 4)
+    width = 24  # of 16 hidden units: a multiple of twelve
+    first = small[: width // 4 * 7 * 16].reshape(-1, 7, 4, 4)
     hidden = np.einsum("jicr,ic->jr", first, given.reshape(7, 4)).reshape(-1)
     d = baked.decoder
     expected = d.w1_out[:, :8] @ given[:8] + d.w1_out[:, 8:17] @ given[16:25]
     assert np.allclose(hidden[:16], expected, atol=1e-5) and not hidden[16:].any()
-    second = np.einsum("jicr,ic->jr", large.reshape(16, 16, 4, 4), hidden.reshape(16, 4)).reshape(-1)
+    second = np.einsum("jicr,ic->jr", large.reshape(width // 4, width // 4, 4, 4), hidden.reshape(-1, 4)).reshape(-1)
     assert np.allclose(second[:16], d.w2_out @ hidden[:16], atol=1e-4)
 
 
@@ -98,10 +99,10 @@ def test_text_of_others_stays_text() -> None:
     assert text.count("</title>") == 1
 
 
-@pytest.mark.parametrize(("channels", "hidden"), [(17, 16), (8, 65)])
+@pytest.mark.parametrize(("channels", "hidden"), [(17, 16), (8, 97)])
 def test_what_does_not_fit_is_told(channels: int, hidden: int) -> None:
     field = replace(random_field(), decoder=make_decoder("deferred", channels, hidden))
-    with pytest.raises(InputError, match=f"up to 16 features and 64 hidden units, and this field has {channels} and {hidden}; leave page"):
+    with pytest.raises(InputError, match=f"up to 16 features and 96 hidden units, and this field has {channels} and {hidden}; leave page"):
         require_page(field)
 
 
@@ -123,10 +124,20 @@ def seen(browser: Driven, pose: Array) -> Array:
     return np.frombuffer(base64.b64decode(browser.run(script)), np.uint8).reshape(HEIGHT, WIDTH, 4)[..., :3]
 
 
+def wide_decoder() -> Deferred:
+    torch.manual_seed(3)
+    decoder = Deferred(8, 96)
+    with torch.no_grad():
+        for layer in decoder.layers:
+            layer.weight.normal_(0, 1.5 / layer.in_features**0.5)
+    return decoder
+
+
 FIELDS = {
     "a box": coloured_field(),
     "a shell and a sky": replace(coloured_field(1.0), sky=SKY),
     "few features, holes": random_field(1.0, 32, keep=0.4),
+    "as wide as may be": replace(random_field(1.0, 32, keep=0.4), decoder=wide_decoder()),
 }
 
 

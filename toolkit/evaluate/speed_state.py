@@ -20,7 +20,7 @@ from toolkit.volume.space import Space
 
 RADIUS = 0.7  # of the sphere, in half sizes of the region
 THICK = 4  # voxels of the sphere's wall, on either side
-CHANNELS, HIDDEN = 16, 64  # the defaults of a fit
+CHANNELS, HIDDEN = 16, 96  # the defaults of a fit
 
 
 def sphere_field(resolution: int, seed: int = 0) -> Field:

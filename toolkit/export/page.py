@@ -32,7 +32,8 @@ from toolkit.render.field import Field
 from toolkit.render.march import MAX_STRETCH
 from toolkit.volume.topology import VOXELS
 
-CHANNELS, HIDDEN = 16, 64  # at most: what lies in one word of four, and in a uniform block of 16 kB
+CHANNELS, HIDDEN = 16, 96  # at most: what lies in one word of four, and, in thirds, in uniform blocks of 16 kB
+WHOLE = 12  # hidden units are a multiple of it: three parts of rows, four units a vector
 INPUTS = CHANNELS + 12  # of the decoder: features, nine harmonics and zeros up to a multiple of four
 CHUNK = 512  # blocks at a time
 NEAREST_DEPTH, FARTHEST_DEPTH = 0.6, 2.5  # of the median depth: the range of depth's colours
@@ -153,17 +154,22 @@ def corner_densities(field: BakedField) -> Array:
     return out
 
 
+def _width(field: BakedField) -> int:
+    """Hidden units of a page's decoder."""
+    return -(-len(field.decoder.b1) // WHOLE) * WHOLE
+
+
 def decoder_blocks(field: BakedField) -> tuple[Array, Array]:
     """The decoder as the shader's uniform blocks: matrices of four by four, column by column, (first layer, biases, last layer) and
-    (second layer). Hidden units that are missing up to `HIDDEN` are zeros."""
-    d, channels = field.decoder, field.arrays.feature.shape[1]
-    w1 = np.zeros((HIDDEN, INPUTS), np.float32)
+    (second layer, whose rows are used in thirds). Hidden units that are missing up to `_width` are zeros."""
+    d, channels, width = field.decoder, field.arrays.feature.shape[1], _width(field)
+    w1 = np.zeros((width, INPUTS), np.float32)
     hidden = len(d.b1)
     w1[:hidden, :channels] = d.w1_out[:, :channels]
     w1[:hidden, CHANNELS : CHANNELS + 9] = d.w1_out[:, channels : channels + 9]
-    w2 = _padded(_padded(d.w2_out, HIDDEN, 1), HIDDEN, 0)
-    last = _padded(d.w3, HIDDEN, 1)
-    small = [_by_four(w1), _padded(d.b1, HIDDEN, 0), _padded(d.b2, HIDDEN, 0), last.reshape(-1), _padded(d.b3, 4, 0)]
+    w2 = _padded(_padded(d.w2_out, width, 1), width, 0)
+    last = _padded(d.w3, width, 1)
+    small = [_by_four(w1), _padded(d.b1, width, 0), _padded(d.b2, width, 0), last.reshape(-1), _padded(d.b3, 4, 0)]
     return np.concatenate([part.reshape(-1) for part in small]), _by_four(w2).reshape(-1)
 
 
@@ -186,7 +192,7 @@ def _about(field: BakedField, tour: Tour) -> dict[str, Any]:
         "low": low.tolist(),
         "scale": scale.tolist(),
     }
-    define: dict[str, Any] = {"FINE": field.fine, "FINER": FINER, "RESOLUTION": resolution, "HIDDEN": HIDDEN}
+    define: dict[str, Any] = {"FINE": field.fine, "FINER": FINER, "RESOLUTION": resolution, "HIDDEN": _width(field)}
     define |= {"MAX_STRETCH": f"{MAX_STRETCH:e}", "LONGEST": int(14 * space.extent / (4 * voxel)) + 32}
     define |= {f"C{number}": repr(value) for number, value in enumerate(SH)}
     return {

@@ -103,7 +103,7 @@ def depth_start(views: Views, scene: Scene, settings: Settings, device: torch.de
     feature[known, :3] = torch.logit((colour[known] / count[known, None]).clamp(0.02, 0.98))
     density = torch.where(known, THICK, THIN)
     density[-1], feature[-1] = 0, 0
-    decoder = make_decoder(settings.field.decoder, channels, settings.field.hidden)
+    decoder = make_decoder(settings.field.decoder, channels, settings.field.width)
     limit(decoder, settings.field.view)
     return Field(space, resolution, topology, occupied, density, feature, decoder, colour_behind(views), NEAR * scene.near).to(device)
 

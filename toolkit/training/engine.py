@@ -116,7 +116,7 @@ def warm_up(settings: Settings, progress: Progress) -> None:
         return
     from toolkit.training import warm
 
-    kind = (settings.field.decoder, settings.field.channels, settings.field.hidden)
+    kind = (settings.field.decoder, settings.field.channels, settings.field.width)
     if not warm.ready(*kind):
         progress.update(0, 1, "compiling the fast engine, once on this machine, about a minute")
         warm.run(*kind)

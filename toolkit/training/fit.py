@@ -231,7 +231,7 @@ def _first(
     """The classical start at the coarsest level, and the resolutions to climb."""
     space, ladder = _ladder(views, train, scene, settings)
     places = possible(space, ladder[0], all_places(space, ladder[0]), views)
-    decoder = make_decoder(settings.field.decoder, settings.field.channels, settings.field.hidden).to(device)
+    decoder = make_decoder(settings.field.decoder, settings.field.channels, settings.field.width).to(device)
     limit(decoder, settings.field.view)
     behind = colour_behind(views).to(device)
     near = NEAR * scene.near

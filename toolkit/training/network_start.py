@@ -66,7 +66,7 @@ def network_start(made: Field, views: Views, scene: Scene, settings: Settings) -
     density = torch.where(mark > 0, raw.clamp(THIN, THICK), torch.full_like(raw, THIN))
     density[-1] = 0
     taken = _takes_features(made, settings)
-    channels, hidden = settings.field.channels, settings.field.hidden
+    channels, hidden = settings.field.channels, settings.field.width
     noise = (torch.randn(len(density), channels, generator=generator) * FEATURE_NOISE).to(device)
     decoder: Deferred | PerSample
     if taken and isinstance(made.decoder, Deferred):
@@ -91,4 +91,4 @@ def network_start(made: Field, views: Views, scene: Scene, settings: Settings) -
 def _takes_features(made: Field, settings: Settings) -> bool:
     """Whether the fit's decoder can take over the networks' features."""
     same = isinstance(made.decoder, Deferred) and settings.field.decoder == "deferred"
-    return same and made.feature_rows.shape[1] == settings.field.channels and made.decoder.hidden <= settings.field.hidden
+    return same and made.feature_rows.shape[1] == settings.field.channels and made.decoder.hidden <= settings.field.width

@@ -8,9 +8,12 @@ uniform vec2 size, range;  // of inverse depth, from far to near
 uniform vec3 sky[9];       // of one colour: the others are 0
 uniform int show;          // 0 colours, 1 depth, 2 opacity
 
-const int INPUTS = 7, WIDE = HIDDEN / 4;
+const int INPUTS = 7, WIDE = HIDDEN / 4, THIRD = WIDE / 3;
 layout(std140) uniform Small { mat4 w1[WIDE * INPUTS]; vec4 b1[WIDE], b2[WIDE], w3[3 * WIDE], b3; };
-layout(std140) uniform Large { mat4 w2[WIDE * WIDE]; };
+// A block holds 16 kB everywhere; the second layer takes more.
+layout(std140) uniform Large0 { mat4 w2_0[THIRD * WIDE]; };
+layout(std140) uniform Large1 { mat4 w2_1[THIRD * WIDE]; };
+layout(std140) uniform Large2 { mat4 w2_2[THIRD * WIDE]; };
 
 out vec4 shown;
 
@@ -27,12 +30,15 @@ vec3 decoded(vec4 given[INPUTS]) {
     h[j] = max(sum, 0.0);
   }
   vec3 out_ = given[0].xyz + b3.xyz;
-  for (int j = 0; j < WIDE; j++) {
-    vec4 sum = b2[j];
-    for (int i = 0; i < WIDE; i++) sum += w2[j * WIDE + i] * h[i];
-    sum = max(sum, 0.0);
-    out_ += vec3(dot(w3[j], sum), dot(w3[WIDE + j], sum), dot(w3[2 * WIDE + j], sum));
+#define ADD(W2, FIRST) for (int j = 0; j < THIRD; j++) { \
+    vec4 sum = b2[FIRST + j]; \
+    for (int i = 0; i < WIDE; i++) sum += W2[j * WIDE + i] * h[i]; \
+    sum = max(sum, 0.0); \
+    out_ += vec3(dot(w3[FIRST + j], sum), dot(w3[WIDE + FIRST + j], sum), dot(w3[2 * WIDE + FIRST + j], sum)); \
   }
+  ADD(w2_0, 0)
+  ADD(w2_1, THIRD)
+  ADD(w2_2, 2 * THIRD)
   return 1.0 / (1.0 + exp(-clamp(out_, -80.0, 80.0)));
 }
 

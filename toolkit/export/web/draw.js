@@ -30,7 +30,8 @@ class Field {
     this.palette = this.texture(gl.TEXTURE_2D, gl.LINEAR);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 256, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, field.palette);
     this.block(this.decode, 'Small', field.small, 0);
-    this.block(this.decode, 'Large', field.large, 1);
+    const third = field.large.length / 3;
+    for (let part = 0; part < 3; part++) this.block(this.decode, `Large${part}`, field.large.subarray(part * third, (part + 1) * third), 1 + part);
     gl.useProgram(this.march.program);
     for (const [name, value] of Object.entries(about.march)) this.set(this.march, name, value);
     gl.useProgram(this.decode.program);
