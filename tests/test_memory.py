@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import psutil
 import pytest
 
 from toolkit import memory
@@ -67,3 +69,15 @@ def test_work_that_makes_do_takes_less(monkeypatch: pytest.MonkeyPatch) -> None:
     assert memory.bounded(memory.GIB) == 0
     monkeypatch.setattr(memory, "available", lambda: None)
     assert memory.bounded(8 * memory.GIB) == 8 * memory.GIB and memory.workers(9, memory.GIB, "x", "y") == 9
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_pages_that_nobody_writes_take_no_memory() -> None:
+    size = 2**28
+    before = psutil.Process().memory_info().rss
+    buffer = memory.pages(size)
+    values = np.frombuffer(buffer, np.uint8)
+    assert len(values) == size
+    values[:: 2**20] = 1  # one page of 256
+    assert psutil.Process().memory_info().rss - before < size // 8
+    assert not values[1 : 2**20].any() and len(memory.pages(0)) == 0
