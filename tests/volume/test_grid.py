@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from toolkit.errors import InputError
 from toolkit.volume.grid import BlockGrid
+from toolkit.volume.grid_host import GridHost
 from toolkit.volume.topology import VOXELS, Topology
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -280,3 +281,21 @@ def test_estimate_is_close_to_what_the_buffers_take() -> None:
 def test_missing_cuda_is_said_in_one_sentence() -> None:
     with pytest.raises(InputError, match="CUDA"):
         BlockGrid(0.1, device="cuda")
+
+
+@pytest.mark.parametrize("channels", [1, 5, 16])
+def test_a_fits_rows_are_open3ds_memory_from_a_cache_line_on(channels: int) -> None:
+    keys = torch.cartesian_prod(*[torch.arange(4)] * 3).int()
+    host = GridHost()
+    for _ in range(2):  # the second one may get memory that was used before
+        hosted = host.allocate(keys, channels, 0.1)
+        assert hosted.feature.shape == (len(keys) * 512 + 1, channels) and hosted.density.shape == (len(keys) * 512 + 1,)
+        assert hosted.feature.data_ptr() % 64 == 0 and hosted.density.data_ptr() % 64 == 0
+        assert not hosted.feature.any() and not hosted.density.any()
+        assert torch.equal(hosted.topology.keys[torch.sort(hosted.topology.find(keys)).values], hosted.topology.keys)
+        hosted.feature[:], hosted.density[:] = 2.0, 3.0
+        assert host.grid is not None
+        for name, value in (("feature", 2.0), ("density", 3.0)):
+            buffer = host.grid.rows(name)
+            assert int((buffer == value).sum()) == (len(keys) * 512 + 1) * buffer.shape[1]
+    host.close()
