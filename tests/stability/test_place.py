@@ -27,8 +27,8 @@ from toolkit.training.fit import fit_field
 
 FAR = np.array([6.0e6, -1.0e6, 3.0e5])  # metres in an earth-centred frame
 NOWHERE, AS_IT_IS = np.zeros(3), np.eye(3)
-# dB that the fit's PSNR may be from that of the capture as it is. Measured with three seeds: 0 when turned; in another unit or place 2e-8 to
-# 1e-6 where no last digit puts anything on the other side of something, else up to 3e-3.
+# dB that the fit's PSNR may be from that of the capture as it is. Measured with three seeds: 0 when turned; in another unit or place 2e-8
+# to 1e-6 where no last digit puts anything on the other side of something, else up to 3e-3.
 BOUND = 1e-2
 PLACES: dict[str, tuple[float, Array, Array]] = {  # scale, shift, turn
     "a thousandth": (1e-3, NOWHERE, AS_IT_IS),
