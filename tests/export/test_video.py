@@ -51,13 +51,15 @@ def test_header_and_frames(tmp_path: Path, codec: str) -> None:
     # The header by hand: brand, codec, picture size, number of frames, duration.
     data = path.read_bytes()
     found = {kind: (start, end) for kind, start, end in boxes(data)}
-    assert {"ftyp", "moov", "mdat", "stsd", "stsz", "mvhd"} <= set(found)
+    assert {"ftyp", "moov", "mdat", "stsd", "stsz", "mdhd", "mvhd"} <= set(found)
     entry = found["stsd"][0] + 8
     assert data[entry + 4 : entry + 8].decode() == codec
     assert struct.unpack_from(">HH", data, entry + 8 + 24) == (128, 96)
     assert struct.unpack_from(">I", data, found["stsz"][0] + 8)[0] == 15
-    scale, duration = struct.unpack_from(">II", data, found["mvhd"][0] + 12)
-    assert duration / scale == pytest.approx(15 / 12.5, rel=0.01)
+    # Of H.264 the track is longer by what its pictures wait for later ones; the movie's own list of edits takes that off again.
+    for box in ("mvhd",) if codec == "avc1" else ("mvhd", "mdhd"):
+        scale, duration = struct.unpack_from(">II", data, found[box][0] + 12)
+        assert duration / scale == pytest.approx(15 / 12.5, rel=0.01), box
     # The frames, in order and in RGB.
     reader = cv2.VideoCapture(str(path))
     for picture in fading(15):

@@ -29,7 +29,8 @@ class GridHost:
             previous.close()
         if int(slots.max()) != blocks - 1:  # a fresh table hands out its first slots; otherwise its order is not ours to use
             topology = self.grid.topology()
-            return Hosted(topology, zero_rows((topology.zero_row + 1,)), zero_rows((topology.zero_row + 1, channels)))
+            size = topology.zero_row + 1
+            return Hosted(topology, zero_rows((size,), self.device), zero_rows((size, channels), self.device))
         ordered = torch.empty_like(keys)
         ordered[slots] = keys
         feature, density = (_aligned(self.grid.rows(name), blocks * VOXELS) for name in ("feature", "density"))
