@@ -10,9 +10,8 @@ from pathlib import Path
 import cv2
 
 from toolkit.capture.checks import check_capture
-from toolkit.capture.headers import read_bytes
-from toolkit.capture.heif import decode, file_is_heif
-from toolkit.capture.images import to_rgba
+from toolkit.capture.heif import file_is_heif
+from toolkit.capture.images import read_picture
 from toolkit.capture.listing import counted, picture_header, unique_names
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError, OutputError, first_line
@@ -20,7 +19,7 @@ from toolkit.files import atomic_path, fingerprint, read_json, write_json
 from toolkit.progress import SILENT, Progress
 from toolkit.threads import share
 
-VERSION = 1
+VERSION = 2  # of what is written
 QUALITY = 97  # of the JPEG files, as of a video's frames
 MOST_AT_ONCE, PIXELS_AT_ONCE = 8, 200e6  # pictures, and their pixels, on their way at a time: a pixel takes about ten bytes
 CONVERTED = "converted"  # in `Capture.extra`: how many pictures were
@@ -38,7 +37,7 @@ def all_converted(capture: Capture) -> bool:
 
 
 def convert_pictures(capture: Capture, out: Path, threads: int, progress: Progress = SILENT) -> Capture:
-    """The capture with every HEIF picture replaced by a JPEG (with alpha: PNG) of the same name and size in `out/frames`.
+    """The capture with every HEIF picture replaced by a JPEG (with alpha: PNG) of the same name and size in `out/frames`, in sRGB.
 
     What is there and is of the same file is not written again, so a killed run goes on where it stopped.
 
@@ -78,7 +77,7 @@ def write_picture(source: Path, target: Path) -> Path:
         InputError: it cannot be decoded.
         OutputError: it cannot be written.
     """
-    picture = to_rgba(decode(read_bytes(source), source))
+    picture = read_picture(source)[0]
     alpha = picture.shape[2] == 4
     path = target.with_name(f"{target.name}.{'png' if alpha else 'jpg'}")
     order = cv2.COLOR_RGBA2BGRA if alpha else cv2.COLOR_RGB2BGR

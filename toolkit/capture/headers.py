@@ -20,12 +20,14 @@ _pillow_limit = threading.Lock()
 
 @dataclass(frozen=True)
 class Header:
-    """Stored size (before any EXIF turn; of HEIF as it is seen), file format in Pillow's name for it, EXIF orientation (1: as stored)."""
+    """Stored size (before any EXIF turn; of HEIF as it is seen), file format in Pillow's name for it, EXIF orientation (1: as stored), and
+    the ICC profile of its colours, if it has one."""
 
     width: int
     height: int
     format: str
     orientation: int
+    profile: bytes | None = None
 
 
 def read_bytes(path: Path) -> bytes:
@@ -63,6 +65,7 @@ def read_header(data: bytes, path: Path) -> Header:
                     width, height = picture.size
                     kind = picture.format or ""
                     orientation = _orientation(picture)
+                    profile = picture.info.get("icc_profile")
             finally:
                 Image.MAX_IMAGE_PIXELS = limit
     except UnidentifiedImageError as error:
@@ -77,7 +80,7 @@ def read_header(data: bytes, path: Path) -> Header:
         raise InputError(f"the picture {path} has no pixels ({width}×{height}); remove it")
     if not _complete(data, kind):
         raise _cut_short(path)
-    return Header(width, height, kind, orientation)
+    return Header(width, height, kind, orientation, profile if isinstance(profile, bytes) and profile else None)
 
 
 def _cut_short(path: Path) -> InputError:

@@ -9,7 +9,8 @@ import numpy as np
 
 from toolkit.camera import Array
 from toolkit.capture import heif
-from toolkit.capture.headers import MAX_PIXELS, read_bytes, read_header
+from toolkit.capture.colours import to_srgb
+from toolkit.capture.headers import MAX_PIXELS, Header, read_bytes, read_header
 from toolkit.capture.types import Capture, Frame
 from toolkit.capture.video import iterate_video
 from toolkit.errors import InputError
@@ -26,8 +27,8 @@ def turns_by_exif(capture: Capture) -> bool:
 def load_image(frame: Frame, *, exif: bool = False) -> Array:
     """The frame's picture, (H, W, 3) or with alpha (H, W, 4), uint8 RGB(A), alpha not premultiplied.
 
-    Grey pictures become RGB; 16-bit ones are rounded to 8 bits; floating-point ones are taken as 0 to 1. With `exif` the EXIF
-    orientation is applied (see `turns_by_exif`), without it the pixels stay as stored.
+    Grey pictures become RGB; 16-bit ones are rounded to 8 bits; floating-point ones are taken as 0 to 1. Colours are sRGB's, whatever
+    profile the file has. With `exif` the EXIF orientation is applied (see `turns_by_exif`), without it the pixels stay as stored.
 
     Raises:
         InputError: naming the file, when it is missing, no picture, cut short or too large.
@@ -36,8 +37,18 @@ def load_image(frame: Frame, *, exif: bool = False) -> Array:
         for _, picture in iterate_video(frame.image, {frame.video_index}):
             return picture
         raise InputError(f"frame {frame.video_index} of the video {frame.image} cannot be decoded; the file may be damaged")
-    picture, orientation = _decode(frame.image)
-    return upright(to_rgba(picture), orientation if exif else 1)
+    picture, orientation = read_picture(frame.image)
+    return upright(picture, orientation if exif else 1)
+
+
+def read_picture(path: Path) -> tuple[Array, int]:
+    """The picture in the file `path` as `load_image` has it, pixels as stored, and the EXIF orientation.
+
+    Raises:
+        InputError: naming the file.
+    """
+    picture, header = _decode(path)
+    return to_srgb(to_rgba(picture), header.profile), 1 if header.format == heif.FORMAT else header.orientation
 
 
 def load_depth(frame: Frame, capture: Capture) -> Array:
@@ -82,7 +93,7 @@ def load_mask(frame: Frame) -> Array | None:
     """
     if frame.mask is None:
         return None
-    mask, _ = _decode(frame.mask)
+    mask = _decode(frame.mask)[0]
     if mask.ndim == 3:
         mask = mask[:, :, : min(mask.shape[2], 3)].max(axis=2)
     return np.asarray(mask > 0)
@@ -113,12 +124,12 @@ def upright(picture: Array, orientation: int) -> Array:
     return np.ascontiguousarray(picture)
 
 
-def _decode(path: Path) -> tuple[Array, int]:
-    """The pixels as stored (OpenCV's channel order and depth), and the EXIF orientation."""
+def _decode(path: Path) -> tuple[Array, Header]:
+    """The pixels as stored (OpenCV's channel order and depth; of HEIF as they are seen), and the file's header."""
     data = read_bytes(path)
     header = read_header(data, path)
     if header.format == heif.FORMAT:
-        return heif.decode(data, path), 1
+        return heif.decode(data, path), header
     try:
         # UNCHANGED keeps alpha and 16 bits, and leaves the orientation to us.
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -128,7 +139,7 @@ def _decode(path: Path) -> tuple[Array, int]:
         raise InputError(
             f"the picture {path} ({header.format}) is damaged or of a kind that cannot be decoded; copy it again or convert it to PNG"
         )
-    return np.asarray(picture), header.orientation
+    return np.asarray(picture), header
 
 
 def _load_npy(path: Path) -> Array:
