@@ -66,8 +66,8 @@ def profile(primaries: tuple[tuple[float, float], ...], gamma: float | None = No
         data += b"\0" * (-len(data) % 4)
         table += name + struct.pack(">II", at + len(body), len(data))
         body += data
-    head = struct.pack(">I", at + len(body)) + b"lcms" + bytes.fromhex("04300000") + b"mntrRGB XYZ " + struct.pack(">6H", 2026, 1, 1, 0, 0, 0)
-    head += b"acsp" + b"\0" * 28 + b"".join(fixed(v) for v in xyz(D50))
+    head = struct.pack(">I", at + len(body)) + b"lcms" + bytes.fromhex("04300000") + b"mntrRGB XYZ "
+    head += struct.pack(">6H", 2026, 1, 1, 0, 0, 0) + b"acsp" + b"\0" * 28 + b"".join(fixed(v) for v in xyz(D50))
     return head.ljust(128, b"\0") + table + body
 
 
