@@ -68,9 +68,8 @@ class FieldSettings:
     channels: int = 16  # features a voxel
     decoder: str = "deferred"  # deferred | per_sample (the paper's)
     hidden: int | None = None  # width of the decoder; None: 96, of the paper's 64
-    view: str = (
-        "auto"  # auto (by the evidence of the effects stage) | full | low (first order) | none: of the direction, what the decoder sees
-    )
+    # Of the direction, what the decoder sees: auto (by the evidence of the effects stage) | full (third order) | low (first order) | none
+    view: str = "auto"
     background: str = "auto"  # auto | on | off: contract what lies outside the region of interest
     resolution: int | None = None  # voxels along the longest side of the volume; None: by preset and picture size
     init: str = "auto"  # auto (network: few training views) | network | classical

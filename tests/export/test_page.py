@@ -60,13 +60,13 @@ def test_decoder_blocks_are_the_decoder() -> None:
     """Matrices of four by four, column by column, multiplied as the shader does."""
     baked = bake(random_field())
     small, large = decoder_blocks(baked)
-    given = np.random.default_rng(0).normal(size=28).astype(np.float32)
-    given[8:16], given[25:] = 0, 0  # this field has eight features
+    given = np.random.default_rng(0).normal(size=32).astype(np.float32)
+    given[8:16] = 0  # this field has eight features
     width = 24  # of 16 hidden units: a multiple of twelve
-    first = small[: width // 4 * 7 * 16].reshape(-1, 7, 4, 4)
-    hidden = np.einsum("jicr,ic->jr", first, given.reshape(7, 4)).reshape(-1)
+    first = small[: width // 4 * 8 * 16].reshape(-1, 8, 4, 4)
+    hidden = np.einsum("jicr,ic->jr", first, given.reshape(8, 4)).reshape(-1)
     d = baked.decoder
-    expected = d.w1_out[:, :8] @ given[:8] + d.w1_out[:, 8:17] @ given[16:25]
+    expected = d.w1_out[:, :8] @ given[:8] + d.w1_out[:, 8:] @ given[16:]
     assert np.allclose(hidden[:16], expected, atol=1e-5) and not hidden[16:].any()
     second = np.einsum("jicr,ic->jr", large.reshape(width // 4, width // 4, 4, 4), hidden.reshape(-1, 4)).reshape(-1)
     assert np.allclose(second[:16], d.w2_out @ hidden[:16], atol=1e-4)

@@ -129,7 +129,7 @@ def test_a_few_rays_are_decoded_as_by_torch(channels: int, hidden: int, rays: in
         colour = exact(given, directions[block].double())
         colour.backward(g_colour[block].double())
         tape.given[:rays, :channels] = features[block].numpy()
-        tape.given[:rays, channels : channels + 9] = spherical_harmonics(directions[block]).numpy()
+        tape.given[:rays, channels : channels + 16] = spherical_harmonics(directions[block]).numpy()
         tape.given[rays:] = np.nan
         decode(layers, tape, rays)
         np.testing.assert_allclose(tape.colour[:rays], colour.detach(), atol=1e-5)

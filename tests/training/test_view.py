@@ -18,11 +18,11 @@ from toolkit.training.view import HARMONICS, blind, limit, of_direction
 
 def test_limits_take_the_harmonics_of_the_order() -> None:
     for kind in ("deferred", "per_sample"):
-        for view, seen in (("none", 0), ("low", 4), ("full", 9)):
+        for view, seen in (("none", 0), ("low", 4), ("full", 16)):
             decoder = make_decoder(kind, 8, 16)
             before = of_direction(decoder).clone()
             limit(decoder, view)
-            assert blind(decoder).tolist() == [False] * seen + [True] * (9 - seen)
+            assert blind(decoder).tolist() == [False] * seen + [True] * (16 - seen)
             torch.testing.assert_close(of_direction(decoder)[:, :seen], before[:, :seen], rtol=0, atol=0)
             assert HARMONICS[view] == seen
 
@@ -43,7 +43,7 @@ def test_a_fit_does_not_learn_what_it_may_not_see(engine: str, kind: str) -> Non
         fitted = fit_field(views, scene(), settings, ticks=lambda: 0.02 * next(looks))
         decoder = fitted.field.decoder
         assert fitted.steps > 5
-        assert int(blind(decoder).sum()) == 9 - HARMONICS[view]
+        assert int(blind(decoder).sum()) == 16 - HARMONICS[view]
         spread = colours(decoder, around).std(0).max()
         assert (spread < 1e-6) == (view == "none"), spread
         there, opposite = colours(decoder, around), colours(decoder, -around)

@@ -25,7 +25,7 @@ from toolkit.camera import Array, Intrinsics
 from toolkit.errors import InputError
 from toolkit.files import atomic_path
 from toolkit.networks.decoder import Deferred
-from toolkit.networks.encoding import SH
+from toolkit.networks.encoding import BEHIND, DIRECTION, SH
 from toolkit.render.bake import BakedField
 from toolkit.render.bake_kernels import CORNERS, FINER
 from toolkit.render.field import Field
@@ -34,7 +34,7 @@ from toolkit.volume.topology import VOXELS
 
 CHANNELS, HIDDEN = 16, 96  # at most: what lies in one word of four, and, in thirds, in uniform blocks of 16 kB
 WHOLE = 12  # hidden units are a multiple of it: three parts of rows, four units a vector
-INPUTS = CHANNELS + 12  # of the decoder: features, nine harmonics and zeros up to a multiple of four
+INPUTS = CHANNELS + DIRECTION  # of the decoder: features and harmonics
 CHUNK = 512  # blocks at a time
 NEAREST_DEPTH, FARTHEST_DEPTH = 0.6, 2.5  # of the median depth: the range of depth's colours
 SCRIPTS = ("unpack.js", "draw.js", "walk.js", "page.js")
@@ -166,7 +166,7 @@ def decoder_blocks(field: BakedField) -> tuple[Array, Array]:
     w1 = np.zeros((width, INPUTS), np.float32)
     hidden = len(d.b1)
     w1[:hidden, :channels] = d.w1_out[:, :channels]
-    w1[:hidden, CHANNELS : CHANNELS + 9] = d.w1_out[:, channels : channels + 9]
+    w1[:hidden, CHANNELS:] = d.w1_out[:, channels : channels + DIRECTION]
     w2 = _padded(_padded(d.w2_out, width, 1), width, 0)
     last = _padded(d.w3, width, 1)
     small = [_by_four(w1), _padded(d.b1, width, 0), _padded(d.b2, width, 0), last.reshape(-1), _padded(d.b3, 4, 0)]
@@ -178,7 +178,7 @@ def _about(field: BakedField, tour: Tour) -> dict[str, Any]:
     space, resolution = field.space, field.resolution
     voxel = 2 * space.extent / resolution
     low, scale = (_padded(values, CHANNELS, 0) for values in (field.arrays.low, field.arrays.scale))
-    sky = np.zeros((9, 3))
+    sky = np.zeros((BEHIND, 3))
     sky[0] = field.background / SH[0]
     march = {
         "centre": list(space.centre),

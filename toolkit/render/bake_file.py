@@ -19,6 +19,7 @@ from safetensors.numpy import save
 from toolkit.camera import Similarity
 from toolkit.errors import InputError, OutputError
 from toolkit.files import atomic_path
+from toolkit.networks.encoding import DIRECTION
 from toolkit.render import kernels as K
 from toolkit.render.bake import BakedField
 from toolkit.render.bake_kernels import CORNERS, FINER, LEVELS, Baked
@@ -126,7 +127,7 @@ def _checked(arrays: dict[str, Array], about: dict[str, Any]) -> BakedField:
     channels = arrays["feature"].shape[1]
     hidden = len(arrays["decoder.b1"])
     _require(1 <= hidden <= MOST_HIDDEN, "its decoder is too wide")
-    inputs = channels + K.PADDED
+    inputs = channels + DIRECTION
     shapes = {"w1": (inputs, hidden), "w1_out": (hidden, inputs), "b1": (hidden,), "w2": (hidden, hidden), "w2_out": (hidden, hidden)}
     shapes |= {"b2": (hidden,), "w3": (3, hidden), "b3": (3,)}
     for name, shape in shapes.items():

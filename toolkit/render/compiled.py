@@ -29,7 +29,6 @@ def decoder_arrays(decoder: Deferred) -> K.Decoder:
     first, second, last = decoder.layers
     w1, w2, w3 = (np.array(layer.weight.detach().cpu().numpy(), dtype=np.float32) for layer in (first, second, last))
     b1, b2, b3 = (np.array(layer.bias.detach().cpu().numpy(), dtype=np.float32) for layer in (first, second, last))
-    w1 = np.pad(w1, ((0, 0), (0, decoder.channels + K.PADDED - w1.shape[1])))
     return K.Decoder(np.ascontiguousarray(w1.T), w1, b1, np.ascontiguousarray(w2.T), w2, b2, w3, b3)
 
 

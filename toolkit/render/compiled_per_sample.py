@@ -9,6 +9,7 @@ import torch
 from numba import njit
 
 from toolkit.networks.decoder import FREQUENCIES, PerSample
+from toolkit.networks.encoding import DIRECTION
 from toolkit.render import kernels as K
 from toolkit.render.compiled import PIECE, make_space, make_volume
 from toolkit.render.composite import STOP
@@ -42,8 +43,8 @@ def net_arrays(decoder: PerSample) -> Net:
     w1, w2, wd, w3, w4 = (state[f"{name}.weight"] for name in LAYERS)
     b1, b2, bd, b3, b4 = (state[f"{name}.bias"][None] for name in LAYERS)
     hidden, inputs = whole(decoder.hidden), whole(decoder.channels * (1 + 2 * FREQUENCIES))
-    third = _padded(w3[:, : decoder.hidden].T, hidden + K.PADDED, hidden)
-    third[hidden : hidden + 9, : decoder.hidden] = w3[:, decoder.hidden :].T
+    third = _padded(w3[:, : decoder.hidden].T, hidden + DIRECTION, hidden)
+    third[hidden : hidden + DIRECTION, : decoder.hidden] = w3[:, decoder.hidden :].T
     net = Net(
         w1=_padded(w1.T, inputs, hidden),
         w1_back=K.aligned((hidden, inputs), np.float32),
@@ -71,7 +72,7 @@ def turn(net: Net) -> None:
 def write_back(net: Net, decoder: PerSample) -> None:
     """The weights into the decoder."""
     h = decoder.hidden
-    third = np.concatenate([net.w3[:h], net.w3[len(net.b3) : len(net.b3) + 9]])
+    third = np.concatenate([net.w3[:h], net.w3[len(net.b3) : len(net.b3) + DIRECTION]])
     values = {
         "body.0.weight": net.w1[: decoder.channels * (1 + 2 * FREQUENCIES), :h].T,
         "body.0.bias": net.b1[:h],

@@ -39,7 +39,6 @@ THIN = F(0.01)  # below this optical thickness 1 - exp(-τ) is taken from its se
 THIRD = F(1 / 3)
 LINE = 64  # bytes of a cache line
 VALUES = 9  # columns of a sample's floats
-PADDED = 16  # inputs of the decoder beside the features: nine harmonics, and zeros that make a round number
 # AFTER: transmittance behind the sample; ALONG: distance from the camera, working units
 X, Y, Z, RAW, TAU, WEIGHT, AFTER, PLACE, ALONG = range(VALUES)
 
@@ -131,7 +130,7 @@ class Volume(NamedTuple):
 class Decoder(NamedTuple):
     """The deferred decoder's weights, as sums over whichever index the compiler is to vectorise need them.
 
-    Inputs are C mean features, nine harmonics and seven zeros: I = C + 16.
+    Inputs are C mean features and sixteen harmonics: I = C + 16.
     """
 
     w1: Any  # (I, H)

@@ -16,7 +16,7 @@ from toolkit.networks.encoding import SH
 from toolkit.render.kernels import LEAF, ONE, OPTIONS, ZERO, Decoder, F, aligned
 from toolkit.render.kernels_matrix import LANES, product
 
-_C0, _C1, _C2, _C3, _C4 = (F(value) for value in SH)
+_C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9 = (F(value) for value in SH)
 
 RAYS = 32  # at a time: what they need fits into the second cache, and the weights are read once for all of them
 
@@ -24,7 +24,7 @@ RAYS = 32  # at a time: what they need fits into the second cache, and the weigh
 class Layers(NamedTuple):
     """The deferred decoder's weights, (inputs, outputs) but for the last. All widths are padded to whole LANES with zeros."""
 
-    w1: Any  # (I, H), I ≥ C + 9
+    w1: Any  # (I, H), I ≥ C + 16
     b1: Any
     w2: Any  # (H, H)
     b2: Any
@@ -43,10 +43,14 @@ class Rays(NamedTuple):
 
 @njit(**LEAF)
 def encode_direction(x: Any, y: Any, z: Any, out: Any, row: Any, at: Any) -> None:
-    """Spherical harmonics up to degree 2 into out[row, at … at + 8]; see `networks.encoding.spherical_harmonics`."""
+    """Spherical harmonics up to degree 3 into out[row, at … at + 15]; see `networks.encoding.spherical_harmonics`."""
+    xx, yy, zz = x * x, y * y, F(5) * z * z
     out[row, at], out[row, at + 1], out[row, at + 2], out[row, at + 3] = _C0, -_C1 * y, _C1 * z, -_C1 * x
     out[row, at + 4], out[row, at + 5], out[row, at + 6] = _C2 * x * y, -_C2 * y * z, _C3 * (F(3) * z * z - ONE)
-    out[row, at + 7], out[row, at + 8] = -_C2 * x * z, _C4 * (x * x - y * y)
+    out[row, at + 7], out[row, at + 8] = -_C2 * x * z, _C4 * (xx - yy)
+    out[row, at + 9], out[row, at + 10] = -_C5 * y * (F(3) * xx - yy), _C6 * x * y * z
+    out[row, at + 11], out[row, at + 12] = -_C7 * y * (zz - ONE), _C8 * z * (zz - F(3))
+    out[row, at + 13], out[row, at + 14], out[row, at + 15] = -_C7 * x * (zz - ONE), _C9 * z * (xx - yy), -_C5 * x * (xx - F(3) * yy)
 
 
 @njit(**LEAF)

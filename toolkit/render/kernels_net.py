@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from toolkit.networks.decoder import FREQUENCIES
+from toolkit.networks.encoding import DIRECTION
 from toolkit.render import kernels as K
 from toolkit.render.kernels_decode import rectify, sigmoid
 from toolkit.render.kernels_lookup import gather_feature
@@ -32,7 +33,7 @@ class Net(NamedTuple):
     b2: Any
     density: Any  # (H,)
     density_bias: Any  # (1,)
-    w3: Any  # (H + PADDED, H): the hidden layer, nine harmonics, zeros
+    w3: Any  # (H + DIRECTION, H): the hidden layer, harmonics
     w3_back: Any  # (H, H), of the hidden layer alone
     b3: Any
     w4: Any  # (3, H)
@@ -47,7 +48,7 @@ class Tape(NamedTuple):
     corners: Any  # (S, 8) float32 trilinear weights
     given: Any  # (S, I) features, their encoding, zeros
     h1: Any  # (S, H)
-    h2: Any  # (S, H + PADDED) hidden layer and encoded direction, what the colour layers are given
+    h2: Any  # (S, H + DIRECTION) hidden layer and encoded direction, what the colour layers are given
     h3: Any  # (S, H)
     colour: Any  # (S, 3)
 
@@ -55,7 +56,7 @@ class Tape(NamedTuple):
 def make_tape(net: Net) -> Tape:
     """Room for `SAMPLES` samples."""
     inputs, hidden = net.w1.shape
-    widths = (8, inputs, hidden, hidden + K.PADDED, hidden, 3)
+    widths = (8, inputs, hidden, hidden + DIRECTION, hidden, 3)
     floats = [K.aligned((SAMPLES, width), np.float32, zeroed=True) for width in widths]
     return Tape(np.zeros((SAMPLES, 8), np.int32), np.zeros((SAMPLES, K.VALUES), np.float32), *floats)
 

@@ -10,17 +10,17 @@ import math
 
 import torch
 
-from toolkit.networks.encoding import spherical_harmonics
+from toolkit.networks.encoding import BEHIND, spherical_harmonics
 
 Tensor = torch.Tensor
-SHAPE = (9, 3)
+SHAPE = (BEHIND, 3)
 LARGEST = 1e3  # coefficient that a file may hold
 CLOSED = 0.999  # opacity from which on nothing shines through that one could see
 
 
 def sky_colours(sky: Tensor, directions: Tensor) -> Tensor:
     """(9, 3) coefficients, (N, 3) unit vectors → (N, 3) colours in [0, 1]."""
-    return (spherical_harmonics(directions) @ sky).clamp(0, 1)
+    return (spherical_harmonics(directions, BEHIND) @ sky).clamp(0, 1)
 
 
 def on_sky(colour: Tensor, opacity: Tensor, directions: Tensor, background: Tensor, sky: Tensor | None) -> Tensor:

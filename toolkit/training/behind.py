@@ -11,7 +11,7 @@ import torch
 
 from toolkit.camera import rays
 from toolkit.capture.types import Views
-from toolkit.networks.encoding import SH, spherical_harmonics
+from toolkit.networks.encoding import BEHIND, SH, spherical_harmonics
 from toolkit.render.sky import SHAPE
 
 Tensor = torch.Tensor
@@ -85,7 +85,7 @@ def _sums_of(views: Views, index: int) -> Sums:
     if mask is not None:
         chosen &= np.asarray(mask, bool)
     _, directions, _ = rays(camera, views.world_from_camera[index], np.argwhere(chosen)[:, ::-1] + 0.5)
-    harmonics = spherical_harmonics(directions).double()
+    harmonics = spherical_harmonics(directions, BEHIND).double()
     colours = torch.from_numpy(picture[chosen].astype(np.float64) / 255)
     return Sums(harmonics.T @ harmonics, harmonics.T @ colours, harmonics.sum(0), colours.sum(0), len(directions))
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from toolkit.networks.decoder import Deferred
+from toolkit.networks.encoding import DIRECTION
 from toolkit.render import kernels as K
 from toolkit.render.compiled import decoder_arrays, make_space, make_volume, render_pass
 from toolkit.render.composite import STOP, THRESHOLD
@@ -240,8 +241,8 @@ class FusedOptimiser:
         return tuple(self.layers)
 
     def _of_direction(self) -> Array:
-        """(9, hidden) weights that take the direction of view."""
-        return self.layers.w1[self.field.decoder.channels :][:9]
+        """(16, hidden) weights that take the direction of view."""
+        return self.layers.w1[self.field.decoder.channels :][: DIRECTION]
 
     def _gradients(
         self, thread: int, part: slice, picks: Array, jitter: Array, shares: Array, losses: kernels.Losses, met: Array

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from toolkit.networks.decoder import PerSample
+from toolkit.networks.encoding import DIRECTION
 from toolkit.render.compiled_per_sample import net_arrays, render_pass, turn, write_back
 from toolkit.render.composite import STOP
 from toolkit.render.field import Field
@@ -39,7 +40,7 @@ class FusedPerSampleOptimiser(FusedOptimiser):
         return _moved(self.scratch[thread].total)
 
     def _of_direction(self) -> Array:
-        return self.net.w3[len(self.net.b3) :][:9]
+        return self.net.w3[len(self.net.b3) :][: DIRECTION]
 
     def _turn_decoder(self) -> None:
         turn(self.net)

@@ -39,7 +39,7 @@ def encodings(folder: Path) -> list[Measure]:
     large = positional(torch.tensor([[1e4], [3e7], [-1e30]]), 5)
     return [
         Measure("harmonics", absolute(spherical_harmonics(directions), basis), 5e-7),
-        Measure("harmonics that are not orthonormal", absolute(share, torch.eye(9)), 0.6),
+        Measure("harmonics that are not orthonormal", absolute(share, torch.eye(basis.shape[1])), 0.6),
         Measure("sines and cosines", absolute(positional(values, 5), exact), 1e-5),
         Measure("of huge features: beyond [-1, 1] or not finite", not_finite(large) + float((large[:, 1:].abs() > 1).sum()), 0.0),
     ]

@@ -8,7 +8,7 @@ uniform vec2 size, range;  // of inverse depth, from far to near
 uniform vec3 sky[9];       // of one colour: the others are 0
 uniform int show;          // 0 colours, 1 depth, 2 opacity
 
-const int INPUTS = 7, WIDE = HIDDEN / 4, THIRD = WIDE / 3;
+const int INPUTS = 8, WIDE = HIDDEN / 4, THIRD = WIDE / 3;
 layout(std140) uniform Small { mat4 w1[WIDE * INPUTS]; vec4 b1[WIDE], b2[WIDE], w3[3 * WIDE], b3; };
 // A block holds 16 kB everywhere; the second layer takes more.
 layout(std140) uniform Large0 { mat4 w2_0[THIRD * WIDE]; };
@@ -17,9 +17,11 @@ layout(std140) uniform Large2 { mat4 w2_2[THIRD * WIDE]; };
 
 out vec4 shown;
 
-void harmonics(vec3 d, out float h[9]) {
-  h = float[9](C0, -C1 * d.y, C1 * d.z, -C1 * d.x, C2 * d.x * d.y, -C2 * d.y * d.z, C3 * (3.0 * d.z * d.z - 1.0), -C2 * d.x * d.z,
-    C4 * (d.x * d.x - d.y * d.y));
+void harmonics(vec3 d, out float h[16]) {
+  float xx = d.x * d.x, yy = d.y * d.y, zz = 5.0 * d.z * d.z;
+  h = float[16](C0, -C1 * d.y, C1 * d.z, -C1 * d.x, C2 * d.x * d.y, -C2 * d.y * d.z, C3 * (3.0 * d.z * d.z - 1.0), -C2 * d.x * d.z,
+    C4 * (xx - yy), -C5 * d.y * (3.0 * xx - yy), C6 * d.x * d.y * d.z, -C7 * d.y * (zz - 1.0), C8 * d.z * (zz - 3.0),
+    -C7 * d.x * (zz - 1.0), C9 * d.z * (xx - yy), -C5 * d.x * (xx - 3.0 * yy));
 }
 
 vec3 decoded(vec4 given[INPUTS]) {
@@ -57,7 +59,7 @@ void main() {
   }
   vec2 pixel = (vec2(gl_FragCoord.x, size.y - gl_FragCoord.y) - lens.zw) / lens.xy;
   vec3 d = turn * normalize(vec3(pixel, 1.0));
-  float h[9];
+  float h[16];
   harmonics(d, h);
   vec3 behind = vec3(0);
   for (int i = 0; i < 9; i++) behind += sky[i] * h[i];
@@ -70,6 +72,6 @@ void main() {
   vec4 given[INPUTS] = vec4[INPUTS](
     vec4(unpackHalf2x16(a.x), unpackHalf2x16(a.y)), vec4(unpackHalf2x16(a.z), unpackHalf2x16(a.w)),
     vec4(unpackHalf2x16(b.x), unpackHalf2x16(b.y)), vec4(unpackHalf2x16(b.z), unpackHalf2x16(b.w)),
-    vec4(h[0], h[1], h[2], h[3]), vec4(h[4], h[5], h[6], h[7]), vec4(h[8], 0, 0, 0));
+    vec4(h[0], h[1], h[2], h[3]), vec4(h[4], h[5], h[6], h[7]), vec4(h[8], h[9], h[10], h[11]), vec4(h[12], h[13], h[14], h[15]));
   shown = vec4(mix(behind, decoded(given), opacity), 1);
 }
