@@ -146,6 +146,8 @@ def _incremental(
     given: Path | str = ""  # nothing
     if start is not None:
         options.multiple_models = False
+        # What it begins with was adjusted, and `finish` adjusts all that it adds.
+        options.ba_local_max_refinements = options.ba_global_max_refinements = 1
         given = _empty(Path(job.folder) / "start")
         start.write_binary(given)
     try:
