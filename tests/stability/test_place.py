@@ -27,7 +27,7 @@ from toolkit.training.fit import fit_field
 
 FAR = np.array([6.0e6, -1.0e6, 3.0e5])  # metres in an earth-centred frame
 NOWHERE, AS_IT_IS = np.zeros(3), np.eye(3)
-BOUND = 1e-3  # dB that the fit's PSNR may be from that of the capture as it is; measured: 0 when turned, 3e-7 in another unit or place
+BOUND = 1e-3  # dB that the fit's PSNR may be from that of the capture as it is; measured with five seeds: 0 when turned, up to 4e-4 in another unit or place
 PLACES: dict[str, tuple[float, Array, Array]] = {  # scale, shift, turn
     "a thousandth": (1e-3, NOWHERE, AS_IT_IS),
     "turned, a thousandfold and 6,000 km away": (1e3, FAR, rotation(7)),
@@ -59,10 +59,10 @@ def stand(source: Path) -> tuple[Scene, Views]:
 
 
 def fitted_psnr(scene: Scene, views: Views) -> float:
-    """PSNR at the held-out views after a fit of a fixed number of steps."""
-    settings = load_settings("fast", pairs=["budget=1", "threads=1", "field.resolution=32", "field.hidden=64", "engine=torch"])
+    """PSNR at the held-out views after a fit of a fixed number of steps; with twice as many last digits grow to 7e-3 dB with some seeds."""
+    settings = load_settings("fast", pairs=["budget=1", "threads=1", "field.resolution=32", "engine=torch"])
     looks = itertools.count()
-    field = fit_field(views, scene, settings, ticks=lambda: next(looks) * TICK).field
+    field = fit_field(views, scene, settings, ticks=lambda: next(looks) * 2 * TICK).field
     view = make_renderer(field, "torch")
     values = [
         psnr(render_view(field, views.intrinsics[i], views.world_from_camera[i], view).rgb, views.images[i])

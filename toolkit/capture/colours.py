@@ -53,7 +53,7 @@ def _made(profile: bytes) -> Convert | None:
             return None
         target = ImageCms.createProfile("sRGB")
         way = ImageCms.buildTransform(source, target, "RGB", "RGB", ImageCms.Intent.RELATIVE_COLORIMETRIC)
-    except (ImageCms.PyCMSError, OSError, ValueError, TypeError, AttributeError):
+    except (ImageCms.PyCMSError, ImportError, OSError, ValueError, TypeError, AttributeError):  # ImportError: a Pillow without Little CMS
         return None
 
     def convert(rows: Array) -> None:
