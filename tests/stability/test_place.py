@@ -27,7 +27,8 @@ from toolkit.training.fit import fit_field
 
 FAR = np.array([6.0e6, -1.0e6, 3.0e5])  # metres in an earth-centred frame
 NOWHERE, AS_IT_IS = np.zeros(3), np.eye(3)
-BOUND = 1e-3  # dB that the fit's PSNR may be from that of the capture as it is; measured with five seeds: 0 when turned, up to 4e-4 in another unit or place
+# dB that the fit's PSNR may be from that of the capture as it is; measured with five seeds: 0 when turned, up to 4e-4 otherwise
+BOUND = 1e-3
 PLACES: dict[str, tuple[float, Array, Array]] = {  # scale, shift, turn
     "a thousandth": (1e-3, NOWHERE, AS_IT_IS),
     "turned, a thousandfold and 6,000 km away": (1e3, FAR, rotation(7)),
