@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
+# Messages quote names of files and values of foreign files, which may hold anything: line ends, codes that move a terminal's cursor, and halves
+# of characters, which no terminal or report can write.
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+")
+_HALVES = re.compile(r"[\ud800-\udfff]")
+
 
 def first_line(error: BaseException) -> str:
     """What an exception says, without what follows its first line; its kind where it says nothing."""
@@ -9,7 +16,13 @@ def first_line(error: BaseException) -> str:
 
 
 class FieldfuseError(Exception):
-    """Something that stops the job and has a reason that a user can act on (the command line exits with code 2)."""
+    """Something that stops the job and has a reason that a user can act on (the command line exits with code 2).
+
+    Its message is one line that can be written as UTF-8: line ends and other control characters become spaces, halves of surrogate pairs "?".
+    """
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(_HALVES.sub("?", _CONTROL.sub(" ", message)))
 
 
 class InputError(FieldfuseError):

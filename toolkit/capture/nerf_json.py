@@ -42,7 +42,7 @@ def number(data: Mapping[str, Any], key: str, where: str) -> float | None:
             raise ValueError
         return float(value)
     except (ValueError, OverflowError) as error:
-        raise InputError(f"{where}: {key!r} must be a finite number, not {str(value)[:40]}; correct it") from error
+        raise InputError(f"{where}: {key!r} must be a finite number, not {str(value)[:40]!r}; correct it") from error
 
 
 def matrix(value: Any, where: str) -> Array:
@@ -84,7 +84,7 @@ def listed_file(root: Path, listed: Any, where: str) -> Path | None:
         InputError: not a name, or it leads outside `root`.
     """
     if not isinstance(listed, str):
-        raise InputError(f"{where}: a file's name is expected, not {str(listed)[:40]}; correct it")
+        raise InputError(f"{where}: a file's name is expected, not {str(listed)[:40]!r}; correct it")
     path = files.inside(root, listed.replace("\\", "/"))
     if is_file(path):
         return path
