@@ -1,0 +1,36 @@
+"""What is said of a failure is one line that every terminal can show, whatever it quotes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from toolkit.errors import FieldfuseError, InputError, PoseError
+
+ANYTHING = st.text(st.characters(exclude_categories=()))
+
+
+@given(ANYTHING, st.sampled_from([FieldfuseError, InputError, PoseError]))
+def test_a_message_is_one_line_that_can_be_written(text, kind):
+    said = str(kind(f"photos/{text}: nothing"))
+    assert len(said.splitlines()) == 1 and "\x1b" not in said
+    assert said.encode("utf-8").decode("utf-8") == said
+
+
+def test_what_can_be_shown_stays():
+    assert str(InputError("Küche/фото 1.jpg – ‘a’  b")) == "Küche/фото 1.jpg – ‘a’  b"
+
+
+@pytest.mark.parametrize("name", [b"a\nb", b"caf\xe9", b"\x1b[31mred"])
+def test_a_name_that_no_terminal_can_show(tmp_path, name):
+    """File names are bytes on Linux."""
+    run = subprocess.run(
+        [sys.executable, "-m", "pipelines.cli", "run", bytes(tmp_path) + b"/" + name, "--out", str(tmp_path / "out")], capture_output=True
+    )
+    assert run.returncode == 2
+    said = run.stderr.decode("utf-8")
+    assert "\x1b" not in said and "unexpected" not in said and not (tmp_path / "out").exists()
