@@ -87,11 +87,11 @@ def _whole(path: Path, make: Any) -> str:
     Raises:
         InputError: it does not hold measurements.
     """
-    from toolkit.errors import InputError
+    from toolkit.errors import InputError, first_line
 
     try:
         return str(make())
     except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
         raise InputError(
-            f"{path} holds no results of a benchmark or a trade-off ({error}); give results.json, tradeoff.json or compare.json"
+            f"{path} holds no results of a benchmark or a trade-off ({first_line(error)}); give results.json, tradeoff.json or compare.json"
         ) from error

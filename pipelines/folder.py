@@ -15,7 +15,7 @@ from typing import IO, Any
 
 from toolkit import __version__
 from toolkit.config import Settings, settings_dict
-from toolkit.errors import FieldfuseError, InputError, Interrupted, OutputError
+from toolkit.errors import FieldfuseError, InputError, Interrupted, OutputError, first_line
 from toolkit.files import read_json, remove, write_json
 
 LOCK = ".lock"
@@ -166,12 +166,6 @@ class RunFolder:
 def command_line() -> str:
     """The command as it was typed, to be repeated by copying it."""
     return shlex.join(["fieldfuse", *sys.argv[1:]])
-
-
-def first_line(error: BaseException) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def failed_write(error: Exception) -> bool:

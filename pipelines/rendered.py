@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from toolkit.errors import InputError, OutputError
+from toolkit.errors import InputError, OutputError, first_line
 from toolkit.files import atomic_path
 
 Array = NDArray[Any]
@@ -66,7 +66,7 @@ def save_pictures(path: Path, pictures: Pictures) -> None:
         try:
             save_file(tensors, str(temporary), metadata={"pictures": json.dumps(about)})
         except SafetensorError as error:
-            raise OutputError(f"cannot write {path}: {error}; free space or choose another --out folder") from error
+            raise OutputError(f"cannot write {path}: {first_line(error)}; free space or choose another --out folder") from error
 
 
 def load_pictures(path: Path) -> Pictures:
@@ -89,8 +89,7 @@ def load_pictures(path: Path) -> Pictures:
             ]
             return Pictures(about["names"], pictures, about["seconds"], about["facts"])
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, MemoryError, RecursionError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path} cannot be read ({reason}); remove it and run the command again") from error
+        raise InputError(f"{path} cannot be read ({first_line(error)}); remove it and run the command again") from error
 
 
 def file_name(name: str) -> str:

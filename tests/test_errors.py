@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from toolkit.errors import FieldfuseError, InputError, PoseError
+from toolkit.errors import LONGEST, FieldfuseError, InputError, PoseError, first_line
 
 ANYTHING = st.text(st.characters(exclude_categories=()))
 
@@ -34,3 +34,14 @@ def test_a_name_that_no_terminal_can_show(tmp_path, name):
     assert run.returncode == 2
     said = run.stderr.decode("utf-8")
     assert "\x1b" not in said and "unexpected" not in said and not (tmp_path / "out").exists()
+
+
+@given(ANYTHING)
+def test_what_another_library_says_is_short(text):
+    said = first_line(ValueError(text * 200))
+    assert 0 < len(said) <= LONGEST + 2 and len(said.splitlines()) == 1
+
+
+def test_what_the_system_says_is_without_its_number():
+    assert first_line(OSError(28, "No space left on device", "somewhere")) == "No space left on device"
+    assert first_line(OSError("of its own")) == "of its own" and first_line(KeyError()) == "KeyError"

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError
 
-from toolkit.errors import InputError, OutputError, first_line
+from toolkit.errors import InputError, OutputError, brief, first_line
 
 MAX_JSON_BYTES = 64 * 2**20
 
@@ -74,7 +74,7 @@ def read_json(path: Path | str, max_bytes: int = MAX_JSON_BYTES) -> Any:
     except RecursionError as error:
         raise InputError(f"{path} is nested too deeply to be read as JSON; check how it was written") from error
     except ValueError as error:  # not JSON, not UTF-8, or a number of thousands of digits
-        raise InputError(f"{path} is not valid JSON ({error}); check how it was written") from error
+        raise InputError(f"{path} is not valid JSON ({first_line(error)}); check how it was written") from error
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 
@@ -89,9 +89,9 @@ def inside(root: Path, relative: str) -> Path:
     try:
         resolved = (root / relative).resolve()
     except (OSError, ValueError, RuntimeError) as error:
-        raise InputError(f"the path {relative!r} listed in {root} is not usable ({error})") from error
+        raise InputError(f"the path {brief(relative)!r} listed in {root} is not usable ({first_line(error)})") from error
     if not resolved.is_relative_to(root):
-        raise InputError(f"the path {relative!r} leads outside the capture folder {root}; only files inside it are read")
+        raise InputError(f"the path {brief(relative)!r} leads outside the capture folder {root}; only files inside it are read")
     return resolved
 
 

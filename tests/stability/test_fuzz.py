@@ -56,7 +56,8 @@ def stubborn(act):
 PLANTS = {
     "fine": lambda: None,
     "sentence": lambda: refuse("this is a good sentence"),
-    "not a sentence": lambda: refuse("two\\nlines of it"),
+    "a word": lambda: refuse("bad"),
+    "a page": lambda: refuse("line 1 of it\\n" * 80),
     "IndexError": lambda: [][1],
     "busy": lambda: stubborn(lambda: sum(range(1000))),
     "waiting": lambda: stubborn(lambda: time.sleep(0.1)),
@@ -91,7 +92,8 @@ def test_what_is_planted_is_found(tmp_path: Path) -> None:
     assert escapes == {"read outside", "write", "write outside", "shell", "process", "eval", "pickle"}
     rest = {name: kind for name, kind in told.items() if name not in escapes}
     assert rest == {
-        "not a sentence": "not a sentence",
+        "a word": "not a sentence",
+        "a page": "not a sentence",
         "IndexError": "IndexError",
         "busy": "hang",
         "waiting": "hang",

@@ -17,7 +17,7 @@ import numpy as np
 from toolkit.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, invert
 from toolkit.capture.listing import read_text
 from toolkit.capture.quaternion import rigid
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 
 MAX_TEXT = 2**30
 MAX_SIDE = 1_000_000
@@ -232,7 +232,7 @@ def _lines(path: Path) -> list[str]:
 
 
 def _broken(path: Path, number: int, error: Exception) -> InputError:
-    return InputError(f"{path}, line {number + 1} cannot be read ({error}); check how it was written")
+    return InputError(f"{path}, line {number + 1} cannot be read ({first_line(error)}); check how it was written")
 
 
 def _cameras_txt(path: Path) -> dict[int, Intrinsics]:

@@ -20,7 +20,7 @@ from toolkit.camera import Array, Intrinsics, checked_pose
 from toolkit.capture.calibration import from_matrix
 from toolkit.capture.listing import assemble, counted, picture_header, pictures_in, require_folder, same_count, unique_names
 from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 
 FOLDERS = ("image", "images", "rgb", ".")
 PREFERRED = ("cameras_sphere.npz", "cameras.npz")  # others hold perturbed or rescaled cameras
@@ -129,7 +129,7 @@ def _read_matrices(path: Path) -> dict[str, Array]:
         if any(value.dtype.kind not in "fiu" for value in out.values()):
             raise ValueError("an entry does not hold numbers")
     except Exception as error:  # NumPy's and zipfile's parsers raise many families on broken files
-        raise InputError(f"{path} is not an archive of camera matrices ({error}); check how it was written") from error
+        raise InputError(f"{path} is not an archive of camera matrices ({first_line(error)}); check how it was written") from error
     if not any(key.startswith("world_mat_") for key in out):
         raise InputError(f"{path} holds no world_mat_0, world_mat_1, …; check how it was written")
     return out

@@ -16,7 +16,7 @@ from toolkit import files
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture import heif
 from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 
 PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", *heif.SUFFIXES)
 MAX_TEXT_BYTES = 64 * 2**20
@@ -171,7 +171,7 @@ def read_numbers(path: Path) -> Array:
     try:
         return np.array([float(word) for word in read_text(path).split()], dtype=np.float64)
     except ValueError as error:
-        raise InputError(f"{path} must hold numbers only ({error}); check how it was written") from error
+        raise InputError(f"{path} must hold numbers only ({first_line(error)}); check how it was written") from error
 
 
 def read_matrix(path: Path, *shapes: tuple[int, int]) -> Array:
@@ -197,7 +197,7 @@ def read_object(path: Path) -> dict[str, Any]:
     try:
         data = files.read_json(path)
     except ValueError as error:  # whole numbers of thousands of digits
-        raise InputError(f"{path} is not valid JSON ({error}); check how it was written") from error
+        raise InputError(f"{path} is not valid JSON ({first_line(error)}); check how it was written") from error
     if not isinstance(data, dict):
         raise InputError(f"{path} must hold a JSON object at its top level; check how it was written")
     return data

@@ -13,7 +13,7 @@ import numpy as np
 from toolkit.camera import Array, Intrinsics, checked_pose, world_from_llff
 from toolkit.capture.listing import assemble, counted, fitted, picture_header, pictures_in, require_folder, unique_names
 from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 
 NAME = "poses_bounds.npy"
 
@@ -54,7 +54,7 @@ def _read_rows(path: Path) -> Array:
         if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != 17:
             raise ValueError(f"shape {rows.shape}, type {rows.dtype}")
     except Exception as error:  # NumPy's parser raises many families on broken files
-        raise InputError(f"{path} is not an LLFF array of 17 numbers a picture ({error}); check how it was written") from error
+        raise InputError(f"{path} is not an LLFF array of 17 numbers a picture ({first_line(error)}); check how it was written") from error
     return rows.astype(np.float64)
 
 

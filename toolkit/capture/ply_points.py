@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.camera import Array
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 
 MAX_BYTES = 2**30
 MAX_HEADER = 2**16
@@ -33,7 +33,7 @@ def read_ply_points(path: Path) -> Array:
     try:
         points = _parse(content)
     except (ValueError, KeyError, IndexError, OverflowError, MemoryError) as error:
-        raise InputError(f"{path} is not a PLY file that can be read ({error}); correct it or remove it from the capture") from error
+        raise InputError(f"{path} is not a readable PLY file ({first_line(error)}); correct it or remove it from the capture") from error
     return points[np.isfinite(points).all(axis=1)]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 
 VERSION = 1
 
@@ -58,7 +58,7 @@ def capture_from_dict(data: dict[str, Any]) -> Capture:
         )
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise InputError(
-            f"the stored capture is not usable ({type(error).__name__}: {error}); run the job again in a new folder"
+            f"the stored capture is not usable ({type(error).__name__}: {first_line(error)}); run the job again in a new folder"
         ) from error
 
 

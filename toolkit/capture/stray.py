@@ -17,7 +17,7 @@ from toolkit.capture.listing import assemble, fitted, is_file, picture_header, r
 from toolkit.capture.quaternion import rigid
 from toolkit.capture.types import Capture, Frame
 from toolkit.capture.video import read_video
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 
 VIDEO, POSES, LENS = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 VALUES, VALUES_NOW = 7, 9  # numbers a row, in older recordings and since
@@ -86,7 +86,7 @@ def _numbers(path: Path, header: bool) -> Array:
     try:
         rows = [[float(word) for word in line.split(",")] for line in lines]
     except ValueError as error:
-        raise InputError(f"{path} must hold numbers with commas between them ({error}); check how it was written") from error
+        raise InputError(f"{path} must hold numbers with commas between them ({first_line(error)}); check how it was written") from error
     if len({len(row) for row in rows}) > 1 or not np.isfinite(rows).all():
         raise InputError(f"{path} has rows of different length, or numbers that are not finite; check how it was written")
     return np.array(rows, dtype=np.float64)

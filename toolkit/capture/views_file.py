@@ -13,7 +13,7 @@ from safetensors.numpy import save_file
 
 from toolkit.camera import PINHOLE, Array, Intrinsics
 from toolkit.capture.types import Views
-from toolkit.errors import InputError, OutputError
+from toolkit.errors import InputError, OutputError, first_line
 from toolkit.files import atomic_path
 
 VERSION = 1
@@ -50,7 +50,7 @@ def save_views(path: Path, views: Views) -> None:
                 metadata={"format": "fieldfuse-views", "version": str(VERSION), "views": json.dumps(facts, allow_nan=False)},
             )
         except SafetensorError as error:  # a full disk arrives as this, not as an OSError
-            raise OutputError(f"cannot write {path}: {error}; free space or choose another --out folder") from error
+            raise OutputError(f"cannot write {path}: {first_line(error)}; free space or choose another --out folder") from error
 
 
 def load_views(path: Path) -> Views:

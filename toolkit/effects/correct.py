@@ -14,7 +14,7 @@ import numpy as np
 from toolkit.camera import OPENCV, PINHOLE, Array, Intrinsics, distort
 from toolkit.capture.types import Capture, Views
 from toolkit.effects.sightings import LINEAR
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 
 Gain = tuple[float, float, float]  # of red, green and blue
 
@@ -102,7 +102,7 @@ class Corrections:
             exact = {name: (values[0], values[1], values[2]) for name, values in gain.items()}
             return cls(exact, corner, lens, poses, weight)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
-            raise InputError(f"effects.json is not what the effects stage writes ({error}); remove it and run again") from error
+            raise InputError(f"effects.json is not what the effects stage writes ({first_line(error)}); remove it and run again") from error
 
 
 def canonical(image: Array, camera: Intrinsics, gain: Gain | None, corner: float | None) -> tuple[Array, Array | None]:

@@ -11,7 +11,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from toolkit.errors import InputError, OutputError
+from toolkit.errors import InputError, OutputError, first_line
 from toolkit.files import atomic_path
 from toolkit.networks.encoder import TRUNKS
 from toolkit.networks.model import ModelConfig, NerfusionModel
@@ -38,7 +38,7 @@ def save_model(path: Path | str, model: NerfusionModel, meta: dict[str, Any] | N
         try:
             save_file(tensors, str(temporary), {METADATA_KEY: described})
         except SafetensorError as error:
-            raise OutputError(f"cannot write {path}: {error}; free space or choose another folder") from error
+            raise OutputError(f"cannot write {path}: {first_line(error)}; free space or choose another folder") from error
 
 
 def load_model(path: Path | str, device: torch.device | str = "cpu") -> NerfusionModel:

@@ -10,7 +10,7 @@ import numpy as np
 
 from toolkit.camera import Array, Intrinsics, checked_pose
 from toolkit.capture.types import Capture
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 
 GIVEN = "given"
 SFM = "sfm"
@@ -85,7 +85,7 @@ class PoseResult:
                 metric=bool(data.get("metric", False)),
             )
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-            raise InputError(f"poses.json is not what the poses stage writes ({error}); remove it and run again") from error
+            raise InputError(f"poses.json is not what the poses stage writes ({first_line(error)}); remove it and run again") from error
 
     def apply(self, capture: Capture) -> Capture:
         """`capture` with its registered frames only, each with pose and intrinsics, and with the points.

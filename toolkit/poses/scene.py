@@ -9,7 +9,7 @@ import numpy as np
 
 from toolkit.camera import Array, Similarity
 from toolkit.capture.types import Capture
-from toolkit.errors import InputError, PoseError
+from toolkit.errors import InputError, PoseError, first_line
 from toolkit.poses.cloud import Cloud, cloud_of_depth, cloud_of_points
 from toolkit.poses.gravity import camera_frame, tight_turn, turn_about_z
 from toolkit.poses.hull import silhouette_cloud
@@ -87,7 +87,7 @@ class Scene:
                 warnings=[str(text) for text in data["warnings"]],
             )
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"scene.json is not what the poses stage writes ({error}); remove it and run again") from error
+            raise InputError(f"scene.json is not what the poses stage writes ({first_line(error)}); remove it and run again") from error
 
 
 def describe_scene(capture: Capture, progress: Progress = SILENT) -> Scene:

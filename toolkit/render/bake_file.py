@@ -17,7 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from toolkit.camera import Similarity
-from toolkit.errors import InputError, OutputError
+from toolkit.errors import InputError, OutputError, first_line
 from toolkit.files import atomic_path
 from toolkit.networks.encoding import DIRECTION
 from toolkit.render import kernels as K
@@ -73,7 +73,7 @@ def write_baked(path: Path | str, field: BakedField, working_from_input: Similar
             # As bytes: what safetensors writes by itself only its owner may read.
             temporary.write_bytes(save(tensors, metadata={METADATA_KEY: json.dumps(information, allow_nan=False)}))
         except (SafetensorError, ValueError) as error:
-            raise OutputError(f"cannot write {path} ({error}); free space or choose another folder") from error
+            raise OutputError(f"cannot write {path} ({first_line(error)}); free space or choose another folder") from error
 
 
 def read_baked(path: Path | str) -> BakedField:

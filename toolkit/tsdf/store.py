@@ -11,7 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from toolkit.camera import Array
-from toolkit.errors import InputError, OutputError
+from toolkit.errors import InputError, OutputError, first_line
 from toolkit.files import atomic_path
 from toolkit.tsdf.volume import BLOCK, TsdfVolume
 
@@ -45,7 +45,7 @@ def save_volume(path: Path | str, volume: TsdfVolume) -> None:
             whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
             save_file(whole, temporary, metadata={"tsdf": json.dumps(facts)})
         except SafetensorError as error:  # a full disk arrives as this, not as an OSError
-            raise OutputError(f"cannot write {path}: {error}; free space or choose another --out folder") from error
+            raise OutputError(f"cannot write {path}: {first_line(error)}; free space or choose another --out folder") from error
 
 
 def load_volume(path: Path | str) -> TsdfVolume:
@@ -61,7 +61,7 @@ def load_volume(path: Path | str) -> TsdfVolume:
         volume = TsdfVolume(voxel_size, depth_max, truncation, expected_blocks=2 * len(keys))
         volume.frames, volume.empty_frames, volume.touches = int(facts["frames"]), int(facts["empty_frames"]), int(facts["touches"])
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{path} is no TSDF volume of this program (its description lacks or misstates {error}); fuse again") from error
+        raise InputError(f"{path} is no TSDF volume of ours (its facts lack or misstate {first_line(error)}); fuse again") from error
     if len(keys) > volume.max_blocks or len(np.unique(keys, axis=0)) != len(keys):
         raise InputError(f"{path} holds {len(keys)} blocks, too many or repeated ones; fuse again with a larger tsdf.voxel_size")
     if len(keys) == 0:
@@ -84,8 +84,7 @@ def _read(path: Path) -> tuple[dict[str, float], dict[str, Array]]:
     except FileNotFoundError as error:
         raise InputError(f"{path} does not exist; fuse the capture's depth first") from error
     except (SafetensorError, OSError, ValueError, TypeError, MemoryError, RecursionError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path} is not a TSDF volume or is damaged ({reason}); fuse again") from error
+        raise InputError(f"{path} is not a TSDF volume or is damaged ({first_line(error)}); fuse again") from error
     if not isinstance(facts, dict) or facts.get("version") != VERSION:
         raise InputError(f"{path} is not a TSDF volume of version {VERSION}; fuse again with this program")
     count = len(arrays["keys"]) if "keys" in arrays and arrays["keys"].ndim == 2 else -1

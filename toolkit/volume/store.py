@@ -21,7 +21,7 @@ from torch import Tensor
 
 from toolkit import memory
 from toolkit.camera import Similarity
-from toolkit.errors import FieldfuseError, InputError, OutputError
+from toolkit.errors import FieldfuseError, InputError, OutputError, first_line
 from toolkit.files import atomic_path
 from toolkit.volume.rows import zero_rows
 from toolkit.volume.topology import MAX_TABLE_CELLS, VOXELS
@@ -114,13 +114,13 @@ def write_field(path: Path | str, data: FieldFile, precision: str = "float32") -
         text = json.dumps(information, allow_nan=False)
         _checked(tensors, text)
     except (_Unusable, ValueError, TypeError) as error:
-        raise OutputError(f"the field is not written to {path}, because {error}; please report this") from error
+        raise OutputError(f"the field is not written to {path}, because {first_line(error)}; please report this") from error
     with atomic_path(path) as temporary:
         try:
             # One metadata key only: with several their order, and so the file's bytes, would differ from run to run.
             save_file(tensors, str(temporary), metadata={METADATA_KEY: text})
         except SafetensorError as error:
-            raise OutputError(f"cannot write {path} ({error}); free space or choose another --out folder") from error
+            raise OutputError(f"cannot write {path} ({first_line(error)}); free space or choose another --out folder") from error
 
 
 def read_field(path: Path | str) -> FieldFile:

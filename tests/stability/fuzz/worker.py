@@ -26,6 +26,8 @@ from tests.stability.fuzz.targets import TARGETS, Target
 from tests.stability.fuzz.watch import Hang, Watch, bound_memory, tree
 from toolkit.errors import FieldfuseError
 
+SENTENCE = 10, 800  # characters
+
 
 @dataclass
 class Counts:
@@ -68,7 +70,7 @@ def one(target: Target, root: Path, number: int, seed: int, watch: Watch, curren
             target.act(root, number)
     except FieldfuseError as error:
         counts.refused += 1
-        if "\n" in str(error) or len(str(error)) < 10:
+        if not SENTENCE[0] <= len(str(error)) <= SENTENCE[1]:
             problem = {"kind": "not a sentence", "text": str(error)[:300]}
     except Hang as error:
         problem = {"kind": "hang", "text": str(error), "trace": traceback.format_exc()[-1500:]}

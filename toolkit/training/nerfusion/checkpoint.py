@@ -122,7 +122,7 @@ def checkpoint_settings(path: Path) -> dict[str, Any]:
         with safe_open(path, "pt") as file:
             data = json.loads((file.metadata() or {})["settings"])
     except (OSError, SafetensorError, KeyError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not a training checkpoint ({error}); choose another") from error
+        raise InputError(f"{path} is not a training checkpoint ({first_line(error)}); choose another") from error
     if not isinstance(data, dict):
         raise InputError(f"{path} is not a training checkpoint (its settings are not an object); choose another")
     return data
@@ -140,4 +140,4 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         with safe_open(path, "pt") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
     except (OSError, SafetensorError) as error:
-        raise InputError(f"cannot read {path} ({error}); it is missing or not a safetensors file") from error
+        raise InputError(f"cannot read {path} ({first_line(error)}); it is missing or not a safetensors file") from error

@@ -10,7 +10,7 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 from toolkit.files import atomic_path
 
 # Panels of the picture: title, columns drawn in it (a column that no row has is left out), and whether the axis is logarithmic.
@@ -52,7 +52,7 @@ class Curve:
                 rows = [{key: float(value) for key, value in row.items() if value} for row in csv.DictReader(file)]
             self.rows = [row for row in rows if row["step"] <= until]
         except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
-            raise InputError(f"{self.path} is not a learning curve ({error}); move it away") from error
+            raise InputError(f"{self.path} is not a learning curve ({first_line(error)}); move it away") from error
 
     def add(self, row: dict[str, float]) -> None:
         """One more row; values that are not finite are left out. Nothing is written yet."""

@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from toolkit.camera import Array, checked_pose
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 from toolkit.files import atomic_path
 from toolkit.training.nerfusion.samples import Pictures
 
@@ -89,7 +89,7 @@ class ShardScene:
             if len(poses) != shape[0] or not bool(torch.isfinite(self._intrinsics).all()):
                 raise ValueError("its cameras are not usable")
         except (OSError, SafetensorError, KeyError, ValueError) as error:
-            raise InputError(f"{path} is not a shard of training pictures ({error}); make it again") from error
+            raise InputError(f"{path} is not a shard of training pictures ({first_line(error)}); make it again") from error
         self.world_from_camera = np.stack([checked_pose(pose, f"pose {i} of {path}") for i, pose in enumerate(poses)])
 
     def pictures(self, indices: Sequence[int]) -> Pictures:

@@ -17,7 +17,7 @@ from toolkit.camera import Array, Intrinsics, checked_pose, invert
 from toolkit.capture.calibration import from_matrix
 from toolkit.capture.listing import assemble, natural_key, picture_header, read_text, require_folder
 from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from toolkit.errors import InputError, first_line
 from toolkit.training.nerfusion.captured import CapturedScene
 from toolkit.training.nerfusion.datasets.folders import listed
 
@@ -71,7 +71,7 @@ def read_camera(path: Path) -> tuple[Array, Array]:
         world_to_camera = np.array([float(word) for word in words[start + 1 : start + 17]]).reshape(4, 4)
         matrix = np.array([float(word) for word in words[middle + 1 : middle + 10]]).reshape(3, 3)
     except ValueError as error:
-        raise InputError(f"{path} is not a camera file of MVSNet ({error}); unpack it again") from error
+        raise InputError(f"{path} is not a camera file of MVSNet ({first_line(error)}); unpack it again") from error
     return invert(checked_pose(world_to_camera, str(path))), matrix
 
 
