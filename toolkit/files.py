@@ -89,9 +89,9 @@ def inside(root: Path, relative: str) -> Path:
     try:
         resolved = (root / relative).resolve()
     except (OSError, ValueError, RuntimeError) as error:
-        raise InputError(f"the path {brief(relative)!r} listed in {root} is not usable ({first_line(error)})") from error
+        raise InputError(f"the path {brief(repr(relative))} listed in {root} is not usable ({first_line(error)})") from error
     if not resolved.is_relative_to(root):
-        raise InputError(f"the path {brief(relative)!r} leads outside the capture folder {root}; only files inside it are read")
+        raise InputError(f"the path {brief(repr(relative))} leads outside the capture folder {root}; only files inside it are read")
     return resolved
 
 

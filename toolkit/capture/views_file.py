@@ -69,8 +69,7 @@ def load_views(path: Path) -> Views:
             if known:
                 return _assemble(json.loads(metadata["views"]), set(file.keys()), file)
     except (InputError, SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        detail = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"the prepared views {path} are damaged ({detail}); remove the file and run the job again") from error
+        raise InputError(f"the prepared views {path} are damaged ({first_line(error)}); remove the file and run the job again") from error
     raise InputError(f"{path} does not hold prepared views of version {VERSION}; remove it and run the job again")
 
 
