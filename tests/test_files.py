@@ -141,8 +141,9 @@ def test_paths_that_lead_outside_are_refused(tmp_path: Path, name: str) -> None:
 def test_links_in_a_circle_are_refused_or_stay_inside(tmp_path: Path) -> None:
     (tmp_path / "a").symlink_to(tmp_path / "b")
     (tmp_path / "b").symlink_to(tmp_path / "a")
-    with pytest.raises(InputError):
-        inside(tmp_path, "a/x")
+    with suppress(InputError):  # Python 3.12 and older
+        found = inside(tmp_path, "a/x")
+        assert found.is_relative_to(tmp_path.resolve()) and not found.exists()
 
 
 @pytest.mark.parametrize("name", ["a.png", "./a.png", "deep/a.png", "deep/../a.png", "", "x" * 200])

@@ -15,13 +15,14 @@ from toolkit.camera import Array
 from toolkit.capture.images import load_image, load_mask
 from toolkit.errors import InputError
 from toolkit.files import read_json, remove, write_json
-from toolkit.poses.features import sift
+from toolkit.poses.features import TILTED_SIZE, sift, tilted
 from toolkit.poses.job import Job, Picture
 from toolkit.poses.pairs import coarse
 
 THUMBNAIL = 32  # pixels a side of the picture kept to tell identical ones
 GUESSED_FOCAL = 1.2  # of the long side, when nothing is known
 MIN_INLIERS = 15  # COLMAP's own bound for a verified pair
+OBLIQUE = 2  # times as many features are kept where they are of oblique views, too
 
 Report = Callable[[float, float, str], None]
 
@@ -104,9 +105,9 @@ def _describe(picture: Picture, job: Job) -> tuple[dict[str, Any], Array, Array]
     if pixels.shape[2] == 4:
         solid = pixels[..., 3] >= 128
         usable = solid if usable is None or usable.shape != solid.shape else usable & solid
-    factor = min(1.0, job.image_size / max(width, height))
+    factor = min(1.0, (min(job.image_size, TILTED_SIZE) if job.oblique else job.image_size) / max(width, height))
     small = grey if factor == 1.0 else cv2.resize(grey, (round(width * factor), round(height * factor)), interpolation=cv2.INTER_AREA)
-    keypoints, descriptors = sift(small, job.max_features)
+    keypoints, descriptors = tilted(small, OBLIQUE * job.max_features) if job.oblique else sift(small, job.max_features)
     keypoints = keypoints * np.array([width / small.shape[1], height / small.shape[0], width / small.shape[1], 1.0], dtype=np.float32)
     if usable is not None and usable.shape == (height, width) and len(keypoints):
         column = np.clip(keypoints[:, 0].astype(int), 0, width - 1)

@@ -23,6 +23,7 @@ STILL = 0.004  # features moved by less than this share of the long side: the ca
 SMALL_ANGLE = 1.5  # degrees; the median triangulation angle below which depth is guesswork
 PRETENDED = 5.0  # times the way that the pairs tell of: a model that moves its cameras so far has a wrong lens (true ones: at most once)
 TOO_FEW = 3  # registered frames that make a model at all
+AGREES = 0.7  # share of a frame's matches that agree with its place where that can be trusted (0.70 at least where places were right)
 
 
 @dataclass(frozen=True)
@@ -239,6 +240,19 @@ def shortfalls(facts: dict[str, Any]) -> list[str]:
             cause += f"; they show little texture ({own:.0f} keypoints each, the others {usual:.0f})"
         warnings.append(f"{len(frames)} frames are missing because {cause}: {listed(runs([pictures[i]['name'] for i in frames], frames))}")
     return warnings
+
+
+def doubts(facts: dict[str, Any]) -> list[str]:
+    """A warning of the frames of a few whose place contradicts many of their matches; whoever made the facts says which (`agreement`)."""
+    shares = {int(i): share for i, share in (facts.get("agreement") or {}).items()}
+    doubtful = [i for i, share in sorted(shares.items()) if share < AGREES]
+    if not doubtful:
+        return []
+    names = runs([facts["pictures"][i]["name"] for i in doubtful], doubtful)
+    return [
+        f"the places of {len(doubtful)} of {len(shares)} frames contradict many of their matches and may be wrong: {listed(names)}; "
+        f"add photos from between"
+    ]
 
 
 def fold(facts: dict[str, Any], ordered: bool) -> list[str]:

@@ -13,6 +13,7 @@ from toolkit.config import PosesSettings
 from toolkit.files import fingerprint, read_json, write_json
 
 MAX_EXHAUSTIVE = 40  # photos; beyond it pairs are chosen
+MAX_OBLIQUE = 12  # photos; up to it those that find no place so are looked at obliquely
 MAX_ASKED_AGAIN = 120  # photos; up to it those that find no place so are matched with all others
 GONE_ON = "incremental, gone on with small angles"  # the attempt that adds to the strict one's model what that had no place for
 GONE_FAR = "incremental, gone on with tiny angles"  # the same from there, where cameras turn before a wall and hardly move
@@ -56,6 +57,7 @@ class Job:
     max_features: int
     seed: int
     threads: int
+    oblique: bool = False  # features are looked for in oblique views of the pictures, too
 
     @property
     def database(self) -> Path:
@@ -87,7 +89,8 @@ class Job:
         """Of what features and matches depend on: not on threads, not on what the mapper is told."""
         pictures = [[asdict(picture), Path(picture.image)] for picture in self.pictures]
         flat = [part for pair in pictures for part in pair]
-        return fingerprint(VERSION, self.sequential, self.one_camera, self.exif, self.image_size, self.max_features, self.seed, *flat)
+        how = [self.sequential, self.one_camera, self.exif, self.image_size, self.max_features, self.seed, self.oblique]
+        return fingerprint(VERSION, *how, *flat)
 
     def save(self, path: Path) -> None:
         write_json(path, asdict(self))

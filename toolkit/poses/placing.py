@@ -2,26 +2,40 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pycolmap
 
+from toolkit.files import remove
 from toolkit.poses import loops
-from toolkit.poses.database import pair_facts
-from toolkit.poses.job import MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, Job
+from toolkit.poses.agreement import agreement
+from toolkit.poses.database import extract, open_database, pair_facts
+from toolkit.poses.health import AGREES
+from toolkit.poses.job import GLOBAL, LOOSE, MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, MAX_OBLIQUE, Job
 from toolkit.poses.mapping import Model, Report, map_pictures
 from toolkit.poses.match import match
-from toolkit.poses.pairs import pairs_with
+from toolkit.poses.pairs import exhaustive_pairs, pairs_with
+
+Placed = tuple[Model | None, dict[str, Any]]
+OBLIQUE = "oblique"  # the folder in the job's of what was found by looking obliquely
+SURE = 0.8  # share of a picture's matches that agree with its place from which there is no reason to look again
 
 
-def place(job: Job, report: Report) -> tuple[Model | None, dict[str, Any]]:
+def place(job: Job, report: Report) -> Placed:
     """The model of the job's pictures, None where there is none, and what is told of it: `pairs` (`database.pair_facts`), `attempts`
-    (`mapping.map_pictures`) and `folded` (`loops.without_folds`).
+    (`mapping.map_pictures`), `folded` (`loops.without_folds`), and of few photos `agreement` (`agreement.agreement`).
 
-    Photos of which not all were matched with each other, and some found no place, are asked again: these with all others.
+    Photos of which not all were matched with each other, and some found no place, are asked again: these with all others. Of few photos,
+    which often stand far apart, the features of oblique views are tried, too, where these have no place or a doubtful one.
     """
     model, facts = _mapped(job, report)
     missing = _missing(job, model)
+    if not job.sequential and len(job.pictures) <= MAX_OBLIQUE:
+        facts["agreement"] = {} if model is None else agreement(job, model)
+        if missing or _fell_back(model) or min(facts["agreement"].values()) < SURE:
+            return _obliquely(job, (model, facts), report)
     if job.sequential or not missing or not MAX_EXHAUSTIVE < len(job.pictures) <= MAX_ASKED_AGAIN:
         return model, facts
 
@@ -34,13 +48,47 @@ def place(job: Job, report: Report) -> tuple[Model | None, dict[str, Any]]:
     return (better, told) if len(_missing(job, better)) < len(missing) else (model, facts)
 
 
+def _obliquely(job: Job, before: Placed, report: Report) -> Placed:
+    """What features of oblique views, too, give where that is better than `before`: more pictures whose matches agree with their place, or
+    as many and none that does not. What only the loose attempts found has to be beyond doubt.
+
+    Their database stays in the job's folder, for a run that is taken up again.
+    """
+    other = replace(job, folder=str(Path(job.folder) / OBLIQUE), oblique=True)
+    Path(other.folder).mkdir(exist_ok=True)
+    database = open_database(other)
+    total = len(job.pictures)
+
+    def again(done: float, of: float, note: str) -> None:
+        report(total, total, f"{note} (seen obliquely)")
+
+    try:
+        extract(other, database, again)
+    finally:
+        database.close()
+    match(other, exhaustive_pairs(total), again)
+    model, facts = _mapped(other, again)
+    facts["agreement"] = {} if model is None else agreement(other, model)
+    old, new = (list(told["agreement"].values()) for told in (before[1], facts))
+    gained = sum(share >= AGREES for share in new) - sum(share >= AGREES for share in old)
+    clean = min(new, default=0.0) >= AGREES
+    if (gained > 0 and (clean or not _fell_back(model))) or (gained == 0 and clean and (_fell_back(before[0]) or min(old) < min(new))):
+        return model, facts
+    remove(Path(other.folder))
+    return before
+
+
+def _fell_back(model: Model | None) -> bool:
+    return model is None or model.attempt in (LOOSE, GLOBAL)
+
+
 def _missing(job: Job, model: Model | None) -> list[int]:
     """Indices of the pictures that have no place in the model."""
     placed = set() if model is None else set(loops.axes(model))
     return [index for index in range(len(job.pictures)) if index not in placed]
 
 
-def _mapped(job: Job, report: Report) -> tuple[Model | None, dict[str, Any]]:
+def _mapped(job: Job, report: Report) -> Placed:
     """As `place`, of what has been matched."""
     database = pycolmap.Database.open(job.database)
     try:
