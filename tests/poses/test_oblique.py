@@ -19,7 +19,7 @@ from toolkit.capture import open_capture
 from toolkit.config import PosesSettings
 from toolkit.poses import database as store
 from toolkit.poses import placing
-from toolkit.poses.agreement import agreement, epipolar_distance
+from toolkit.poses.agreement import agreement, epipolar_distance, leave_out
 from toolkit.poses.features import sift, tilted
 from toolkit.poses.health import doubts
 from toolkit.poses.job import MAX_OBLIQUE, Job, plan
@@ -62,7 +62,7 @@ def test_matches_of_one_point_agree_and_others_are_as_far_as_they_are_moved(seed
     here, there = points[:, :2] / points[:, 2:], moved[:, :2] / moved[:, 2:]
     assert epipolar_distance(here, there, rotation, translation).max() < 1e-9
     # Two cameras side by side: lines are rows, and half of the distance between rows is each picture's.
-    rows = epipolar_distance(here, here + [0.1, off], np.eye(3), np.array([1.0, 0, 0]))
+    rows = epipolar_distance(here, here + np.array([0.1, off]), np.eye(3), np.array([1.0, 0, 0]))
     np.testing.assert_allclose(rows, off / np.sqrt(2), rtol=1e-6)
 
 
@@ -71,14 +71,17 @@ def test_a_picture_put_elsewhere_is_told(tmp_path):
     job = matched(tmp_path, poses)
     model, facts = placing.place(job, silent)
     assert model is not None and error(model, poses) < 0.01
-    assert facts["agreement"] == agreement(job, model) and set(facts["agreement"]) == set(range(5)) and min(facts["agreement"].values()) > 0.95
+    assert facts["agreement"] == agreement(job, model) and set(facts["agreement"]) == set(range(5))
+    assert min(facts["agreement"].values()) > 0.95
     assert not (Path(job.folder) / placing.OBLIQUE).exists()  # there is no reason to
     image = model.reconstruction.image(model.registered[3])
     pose = image.cam_from_world()
-    shifted = pycolmap.Rigid3d(pose.rotation, np.asarray(pose.translation) + [0.0, 0.4, 0.0])
+    shifted = pycolmap.Rigid3d(pose.rotation, np.asarray(pose.translation) + np.array([0.0, 0.4, 0.0]))
     model.reconstruction.frame(image.frame_id).rig_from_world = shifted
     shares = agreement(job, model)
     assert min(shares, key=shares.__getitem__) == 3 and shares[3] < 0.3
+    assert leave_out(model, shares, shares[3]) == shares and leave_out(model, shares, 0.99) == shares  # nobody, and too many
+    assert set(leave_out(model, shares, shares[3] + 0.01)) == {0, 1, 2, 4} == set(plain(model)["pictures"])
 
 
 def test_places_that_may_be_wrong_are_named():

@@ -13,7 +13,7 @@ import pycolmap
 from toolkit.camera import Array
 from toolkit.poses.database import MIN_INLIERS
 from toolkit.poses.job import Job
-from toolkit.poses.mapping import Model
+from toolkit.poses.mapping import SMALLEST, Model
 
 NEAR = 4.0  # pixels from a match to the epipolar line, COLMAP's own bound for a pair's inliers
 
@@ -47,6 +47,22 @@ def agreement(job: Job, model: Model) -> dict[int, float]:
             agree[i] += near
             total[i] += len(matches)
     return {i: agree[i] / total[i] if total[i] else 0.0 for i in sorted(placed)}
+
+
+def leave_out(model: Model, shares: dict[int, float], least: float) -> dict[int, float]:
+    """Take pictures that fewer than `least` of their matches agree with out of the model, where these are a quarter of it at most.
+
+    Of more nobody can tell who is right. What is left of `shares` comes back.
+    """
+    doubtful = [i for i, share in shares.items() if share < least]
+    if not doubtful or 4 * len(doubtful) > len(shares) or len(shares) - len(doubtful) < SMALLEST:
+        return shares
+    for image_id in list(model.registered):
+        image = model.reconstruction.image(image_id)
+        if int(image.name) in doubtful:
+            model.reconstruction.deregister_frame(image.frame_id)
+            model.registered.remove(image_id)
+    return {i: share for i, share in shares.items() if i not in doubtful}
 
 
 def epipolar_distance(first: Array, second: Array, rotation: Array, translation: Array) -> Array:

@@ -8,11 +8,11 @@ from typing import Any
 
 import pycolmap
 
-from toolkit.files import remove
+from toolkit.files import read_json, remove
 from toolkit.poses import loops
-from toolkit.poses.agreement import agreement
+from toolkit.poses.agreement import agreement, leave_out
 from toolkit.poses.database import extract, open_database, pair_facts
-from toolkit.poses.health import AGREES
+from toolkit.poses.health import AGREES, turned_only
 from toolkit.poses.job import GLOBAL, LOOSE, MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, MAX_OBLIQUE, Job
 from toolkit.poses.mapping import Model, Report, map_pictures
 from toolkit.poses.match import match
@@ -28,14 +28,19 @@ def place(job: Job, report: Report) -> Placed:
     (`mapping.map_pictures`), `folded` (`loops.without_folds`), and of few photos `agreement` (`agreement.agreement`).
 
     Photos of which not all were matched with each other, and some found no place, are asked again: these with all others. Of few photos,
-    which often stand far apart, the features of oblique views are tried, too, where these have no place or a doubtful one.
+    which often stand far apart, the features of oblique views are tried, too, where these have no place or a doubtful one, unless
+    the camera turned on the spot: then they would tell nothing more.
     """
     model, facts = _mapped(job, report)
     missing = _missing(job, model)
     if not job.sequential and len(job.pictures) <= MAX_OBLIQUE:
         facts["agreement"] = {} if model is None else agreement(job, model)
-        if missing or _fell_back(model) or min(facts["agreement"].values()) < SURE:
-            return _obliquely(job, (model, facts), report)
+        doubtful = missing or _fell_back(model) or min(facts["agreement"].values(), default=0.0) < SURE
+        if doubtful and not turned_only({**facts, "pictures": _records(job)}):
+            model, facts = _obliquely(job, (model, facts), report)
+        if model is not None:
+            facts["agreement"] = leave_out(model, facts["agreement"], AGREES)
+        return model, facts
     if job.sequential or not missing or not MAX_EXHAUSTIVE < len(job.pictures) <= MAX_ASKED_AGAIN:
         return model, facts
 
@@ -71,11 +76,17 @@ def _obliquely(job: Job, before: Placed, report: Report) -> Placed:
     facts["agreement"] = {} if model is None else agreement(other, model)
     old, new = (list(told["agreement"].values()) for told in (before[1], facts))
     gained = sum(share >= AGREES for share in new) - sum(share >= AGREES for share in old)
-    clean = min(new, default=0.0) >= AGREES
-    if (gained > 0 and (clean or not _fell_back(model))) or (gained == 0 and clean and (_fell_back(before[0]) or min(old) < min(new))):
+    clean, clearer = min(new, default=0.0) >= AGREES, min(new, default=0.0) > min(old, default=0.0)
+    if (gained > 0 and (clean or not _fell_back(model))) or (gained == 0 and clean and (clearer or _fell_back(before[0]))):
         return model, facts
     remove(Path(other.folder))
     return before
+
+
+def _records(job: Job) -> list[dict[str, Any]]:
+    """Of each picture what `database.extract` left."""
+    records = {record["name"]: record for record in read_json(job.records)}
+    return [records[picture.name] for picture in job.pictures]
 
 
 def _fell_back(model: Model | None) -> bool:
