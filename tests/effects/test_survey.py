@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.effects.seen import CAMERA, FRAMES, made
 from toolkit.effects import background, geometry, light, motion_blur, view_dependence
-from toolkit.effects.adjust import POSES, adjust, predict, residuals, rotation, scatter, vectors
+from toolkit.effects.adjust import POSES, ROWS, adjust, predict, residuals, rotation, scatter, vectors
 from toolkit.effects.paid import Paid
 from toolkit.effects.refine import believed, refined_poses
-from toolkit.effects.survey import ORDER, look
+from toolkit.effects.survey import ORDER, _rows, look
 
 
 def drift(seed: int) -> np.ndarray:
@@ -201,6 +203,21 @@ def test_readout_is_told_in_shares_of_a_step() -> None:
     found = geometry.explain(made(13, rows=0.4, noise=0.05))
     assert found is not None and "rolling_shutter" in found.kept
     assert CAMERA.height == 240 and np.abs(found.problem.motion[:, :3]).max() > 0.005
+
+
+@pytest.mark.parametrize(("share", "there"), [(0.6, True), (2.0, False)])
+def test_no_shutter_takes_longer_than_from_picture_to_picture(share: float, there: bool) -> None:
+    """What fits few photos like the rows of a shutter is none when reading them would have to begin before the picture before."""
+    random = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    for number in range(1, 6):
+        poses[number, :3, :3] = Rotation.from_rotvec(random.normal(0, 0.1, 3)).as_matrix() @ poses[number - 1, :3, :3]
+    steps = geometry.steps_of(poses, np.arange(6.0))
+    problem = SimpleNamespace(motion=share * steps, poses=poses)
+    found = SimpleNamespace(problem=problem, choices={ROWS: geometry.Choice(1.0, 0.5, True)})
+    finding = _rows(found, SimpleNamespace(times=np.arange(6.0)))  # type: ignore[arg-type]
+    assert finding.there is there and f"{share:.2f} of the time between two pictures" in finding.reason
+    assert ("more slowly" in finding.reason) is there
 
 
 def test_seconds_of_several_effects_are_split_evenly_and_add_up(monkeypatch: pytest.MonkeyPatch) -> None:

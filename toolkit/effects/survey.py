@@ -191,12 +191,14 @@ def _lens(found: geometry.Explained) -> Finding:
 def _rows(found: geometry.Explained, seen: Sightings) -> Finding:
     choice = found.choices[ROWS]
     reason = f"rows read one after the other lower what held-out points are off by {_percent(choice)}%"
+    there = choice.kept
     if choice.kept:
         share, alike = geometry.readout(found.problem.motion, geometry.steps_of(found.problem.poses, seen.times))
         if alike > 0.5:
             reason += f"; the camera turns as if reading took {share:.2f} of the time between two pictures"
-        reason += "; this is not corrected: film with a global shutter, or move more slowly"
-    return Finding(ROWS, max(_gain(choice), 0.0), geometry.MARGIN[ROWS], reason, choice.kept, choice.before, choice.after, PIXELS)
+            there = share <= 1
+        reason += "; this is not corrected: film with a global shutter, or move more slowly" if there else ", which no shutter takes"
+    return Finding(ROWS, max(_gain(choice), 0.0), geometry.MARGIN[ROWS], reason, there, choice.before, choice.after, PIXELS)
 
 
 def _poses(found: geometry.Explained) -> Finding:

@@ -23,7 +23,7 @@ STILL = 0.004  # features moved by less than this share of the long side: the ca
 SMALL_ANGLE = 1.5  # degrees; the median triangulation angle below which depth is guesswork
 PRETENDED = 5.0  # times the way that the pairs tell of: a model that moves its cameras so far has a wrong lens (true ones: at most once)
 TOO_FEW = 3  # registered frames that make a model at all
-AGREES = 0.7  # share of a frame's matches that agree with its place where that can be trusted (0.70 at least where places were right)
+AGREES = 0.7  # share of a frame's matches that agree with its place where that can be trusted (0.70 at least in right ones, but for one)
 
 
 @dataclass(frozen=True)
