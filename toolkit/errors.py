@@ -8,8 +8,6 @@ import re
 # and halves of characters, which no terminal or report can write.
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+")
 _HALVES = re.compile(r"[\ud800-\udfff]")
-
-
 LONGEST = 200  # characters of what others say that are quoted
 
 
