@@ -14,6 +14,7 @@ import psutil
 
 from pipelines.page import PAGE
 from pipelines.textured import TEXTURE, TSDF_TEXTURE
+from toolkit.config import EXPORTS
 from toolkit.evaluate import budget as model
 from toolkit.files import read_json, write_json
 
@@ -65,11 +66,12 @@ class TotalBudget:
         self.work = work_of(capture, settings)
         kept = self._kept(job)
         self._decide_effects(settings, kept)
+        self._decide_extras(settings, kept)
         if kept is not None:
             self.choice, self.again = kept, True
         else:
             self.choice = model.choose(self.speed, self.work, self.asked - self.elapsed(), settings.capture.max_frames)
-            self.choice.effects = self.work.effects
+            self.choice.effects, self.choice.texture, self.choice.page = self.work.effects, self.work.texture, self.work.page
         settings.capture.image_size = self.choice.image_size
         if self.choice.max_frames is not None:
             settings.capture.max_frames = self.choice.max_frames
@@ -90,6 +92,22 @@ class TotalBudget:
         if not wanted:
             settings.effects.mode = "off"
             self.work = replace(self.work, effects=False)
+
+    def _decide_extras(self, settings: Settings, kept: model.Choice | None) -> None:
+        """Textures, then the page to walk through, are left out of so short a run that they would take the fit's share; not where it was
+        said what is to be exported."""
+        assert self.speed is not None and self.work is not None
+        if list(settings.export.formats) != list(EXPORTS):
+            return
+        for extra in (TEXTURE, PAGE):
+            if kept is None:
+                seconds = self.asked - self.elapsed()
+                wanted = model.left_for_fit(self.speed, self.work, seconds) >= model.FIT_SHARE * self.asked
+            else:
+                wanted = getattr(kept, extra) is not False
+            if not wanted:
+                settings.export.formats = [name for name in settings.export.formats if name != extra]
+                self.work = replace(self.work, **{extra: False})
 
     def choose_fit(self, job: Job, views: Views, scene: Scene) -> None:
         """Decide the fit's seconds and its finest lattice from what is left."""
@@ -164,6 +182,8 @@ class TotalBudget:
         parts.append("no video" if not chosen.video_frames else f"{chosen.video_frames} video frames")
         if chosen.effects is False:
             parts.append("effects not looked for")
+        extras = (("textures", chosen.texture), ("page to walk through", chosen.page))
+        parts += [f"no {name}" for name, wanted in extras if wanted is False]
         return (
             f"Of the {told['asked_seconds']:g} s asked for, {told['predicted_seconds']:.0f} s were predicted and"
             f" {told['real_seconds']:.0f} s spent until this page was written; chosen: {', '.join(parts)}."

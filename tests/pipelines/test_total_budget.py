@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import pytest
 
+from pipelines.total_budget import TotalBudget
 from tests.pipelines.made import call, make_room
+from toolkit.config import EXPORTS, load_settings
 from toolkit.evaluate import budget as model
 from toolkit.files import read_json
 
@@ -40,6 +43,30 @@ def test_a_run_that_takes_what_was_asked_for(tmp_path: Path, capsys: Capsys, mon
     assert all(stage["cached"] for stage in again["stages"])
 
 
+def extras(seconds: float, formats: list[str], kept: model.Choice | None = None) -> tuple[list[str], model.Work]:
+    """What is left of `formats` for fox's photos on a machine that takes what one took, and the work then."""
+    units = {"decode": 0.0044, "features": 0.183, "ray": 1.5e-6, "fit": 3.9e-6, "score": 0.81}
+    plan = TotalBudget(seconds)
+    plan._began = time.monotonic()
+    plan.speed = model.Speed(units)
+    plan.work = model.Work(50, 540, 960, 7, posed=True, depth=False, outlined=False, texture=True, page=True)
+    settings = load_settings("balanced")
+    settings.export.formats = formats
+    plan._decide_extras(settings, kept)
+    return settings.export.formats, plan.work
+
+
+def test_textures_and_the_page_are_left_out_where_they_would_take_the_fits_share() -> None:
+    assert extras(300, list(EXPORTS))[0] == list(EXPORTS)
+    formats, work = extras(50, list(EXPORTS))
+    assert formats == [name for name in EXPORTS if name != "texture"] and work.page and not work.texture
+    formats, work = extras(20, list(EXPORTS))
+    assert formats == [name for name in EXPORTS if name not in ("texture", "page")] and not work.page and not work.texture
+    assert extras(20, ["texture", "glb"])[0] == ["texture", "glb"]  # what was asked for by name stays
+    assert extras(300, list(EXPORTS), model.Choice(160, texture=False))[0] == [name for name in EXPORTS if name != "texture"]
+    assert extras(20, list(EXPORTS), model.Choice(160))[0] == list(EXPORTS)  # an earlier plan, of before
+
+
 def test_a_flag_that_would_be_chosen_is_refused(tmp_path: Path, capsys: Capsys) -> None:
     make_room(tmp_path / "room", 4)
     for flag, value in (("--budget", "5"), ("--image-size", "100"), ("--preset", "fast")):
@@ -50,7 +77,6 @@ def test_a_flag_that_would_be_chosen_is_refused(tmp_path: Path, capsys: Capsys) 
 def test_the_work_of_a_capture_is_read_from_its_headers(tmp_path: Path) -> None:
     from pipelines.total_budget import work_of
     from toolkit.capture import open_capture
-    from toolkit.config import load_settings
 
     make_room(tmp_path / "room", 8, depth=True)
     work = work_of(open_capture(tmp_path / "room"), load_settings("balanced", flags={"holdout": 4}))

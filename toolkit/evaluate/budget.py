@@ -113,6 +113,8 @@ class Choice:
     mesh_size: int | None = None  # of a mesh's depth; None: as large as it is rendered
     video_frames: int | None = None  # 0: no video
     effects: bool | None = None  # whether they are looked for
+    texture: bool | None = None  # whether meshes get one
+    page: bool | None = None  # whether the field can be walked through in a browser
 
     def to_dict(self) -> dict[str, Any]:
         return dict(vars(self))
@@ -232,6 +234,12 @@ def choose(speed: Speed, work: Work, total: float, most_frames: int = 150) -> Ch
         if fitting:
             return Choice(max(fitting), count)
     return Choice(SIZES[0], counts[-1])
+
+
+def left_for_fit(speed: Speed, work: Work, seconds: float) -> float:
+    """What pictures as `choose` takes them and the least that is exported leave of `seconds`."""
+    choice = choose(speed, work, seconds)
+    return seconds - sum(predict(speed, work, choice).values()) - least_export_seconds(speed, work, choice)
 
 
 def _rays(speed: Speed, seconds: float) -> float:
