@@ -226,14 +226,16 @@ class TotalBudget:
         return max(least, min(model.EXPORT_SHARE * max(0.0, left), most))
 
     def _learn_effects(self, job: Job, real: float | None) -> None:
-        """Looking for effects takes less when none is corrected: what is learnt is what a picture takes."""
+        """Looking for effects takes less when none is corrected: what is learnt is what a picture takes. Where all were looked at, and none
+        was corrected after all, only the seconds tell."""
         assert self.speed is not None and self.work is not None
         path = job.folder / "effects.json"
         if not real or real < WORTH_LEARNING or not path.is_file():
             return
         made = read_json(path).get("corrections") or {}
-        every = bool(made.get("gain") or made.get("poses"))
-        self.speed.learn("effects", self.speed.seconds("effects", model.effects_work(self.work, self.choice, every)), real)
+        some, all_of_them = (self.speed.seconds("effects", model.effects_work(self.work, self.choice, every)) for every in (False, True))
+        corrected = bool(made.get("gain") or made.get("poses"))
+        self.speed.learn("effects", all_of_them if corrected else min(max(real, some), all_of_them), real)
 
     def _pace(self, job: Job) -> float:
         """How much slower than predicted the stages were so far; other work on the machine slows the rest, too."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -65,6 +66,19 @@ def test_textures_and_the_page_are_left_out_where_they_would_take_the_fits_share
     assert extras(20, ["texture", "glb"])[0] == ["texture", "glb"]  # what was asked for by name stays
     assert extras(300, list(EXPORTS), model.Choice(160, texture=False))[0] == [name for name in EXPORTS if name != "texture"]
     assert extras(20, list(EXPORTS), model.Choice(160))[0] == list(EXPORTS)  # an earlier plan, of before
+
+
+@pytest.mark.parametrize(
+    ("corrected", "real", "factor"), [(False, 1.0, 1.0), (False, 3.0, 1.0), (False, 8.0, 2.0), (True, 8.0, 2.0), (False, 0.5, 0.5)]
+)
+def test_what_looking_for_effects_teaches(tmp_path: Path, corrected: bool, real: float, factor: float) -> None:
+    """One second is predicted for the first look, at ten pictures, and four for all looks."""
+    plan = TotalBudget(60)
+    plan.speed = model.Speed({"decode": 1.0, "features": 0.1, "ray": 1.0, "fit": 1.0, "score": 1.0})
+    plan.work = model.Work(30, 640, 480, 20, posed=True, depth=False, outlined=True)
+    (tmp_path / "effects.json").write_text(json.dumps({"corrections": {"poses": [1] if corrected else []}}))
+    plan._learn_effects(SimpleNamespace(folder=tmp_path), real)  # type: ignore[arg-type]
+    assert plan.speed.factors.get("effects", 1.0) == pytest.approx(factor**model.LEARNING)
 
 
 def test_a_flag_that_would_be_chosen_is_refused(tmp_path: Path, capsys: Capsys) -> None:
