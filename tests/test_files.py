@@ -138,12 +138,11 @@ def test_paths_that_lead_outside_are_refused(tmp_path: Path, name: str) -> None:
         inside(root, name)
 
 
-def test_links_in_a_circle_are_refused_or_stay_inside(tmp_path: Path) -> None:
+def test_links_in_a_circle_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a").symlink_to(tmp_path / "b")
     (tmp_path / "b").symlink_to(tmp_path / "a")
-    with suppress(InputError):  # Python 3.12 and older
-        found = inside(tmp_path, "a/x")
-        assert found.is_relative_to(tmp_path.resolve()) and not found.exists()
+    with pytest.raises(InputError, match="is not usable"):
+        inside(tmp_path, "a/x")
 
 
 @pytest.mark.parametrize("name", ["a.png", "./a.png", "deep/a.png", "deep/../a.png", "", "x" * 200])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -90,9 +91,20 @@ def inside(root: Path, relative: str) -> Path:
         resolved = (root / relative).resolve()
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"the path {brief(repr(relative))} listed in {root} is not usable ({first_line(error)})") from error
+    if _circular(resolved):
+        raise InputError(f"the path {brief(repr(relative))} listed in {root} is not usable (its links lead in a circle)")
     if not resolved.is_relative_to(root):
         raise InputError(f"the path {brief(repr(relative))} leads outside the capture folder {root}; only files inside it are read")
     return resolved
+
+
+def _circular(path: Path) -> bool:
+    """Whether links are left after `resolve`, which says so by itself up to Python 3.12."""
+    try:
+        path.stat()
+    except OSError as error:
+        return error.errno == errno.ELOOP
+    return False
 
 
 def fingerprint(*parts: Any) -> str:

@@ -70,7 +70,7 @@ def one(target: Target, root: Path, number: int, seed: int, watch: Watch, curren
             target.act(root, number)
     except FieldfuseError as error:
         counts.refused += 1
-        if not SENTENCE[0] <= len(str(error)) <= SENTENCE[1]:
+        if "\n" in str(error) or not SENTENCE[0] <= len(str(error)) <= SENTENCE[1]:
             problem = {"kind": "not a sentence", "text": str(error)[:300]}
     except Hang as error:
         problem = {"kind": "hang", "text": str(error), "trace": traceback.format_exc()[-1500:]}
