@@ -136,7 +136,7 @@ class Settings:
     """Everything that a run can be told. `budget`, `image_size` and friends of the command line land here too."""
 
     preset: str = "balanced"
-    engine: str = "auto"  # auto (numba on the CPU, torch on CUDA) | numba | torch
+    engine: str = "auto"  # auto (numba on the CPU, triton on CUDA) | numba | triton | torch
     device: str = "auto"
     threads: int | None = None  # None: all cores
     seed: int = 0
@@ -166,7 +166,7 @@ SHORT_NAMES = {
 EFFECTS = ("exposure", "vignetting", "distortion", "rolling_shutter", "view_dependence", "background", "motion_blur", "poses")
 CHOICES = {
     "preset": ("fast", "balanced", "quality"),
-    "engine": ("auto", "numba", "torch"),
+    "engine": ("auto", "numba", "triton", "torch"),
     "device": ("auto", "cpu", "cuda"),
     "poses.source": ("auto", "given", "sfm"),
     "poses.matching": ("auto", "exhaustive", "sequential"),

@@ -28,7 +28,7 @@ from toolkit.stereo.left_out import LeftOut
 from toolkit.training import room
 from toolkit.training.behind import sky_behind
 from toolkit.training.depth import FINE, ROUGH
-from toolkit.training.engine import Engine, make_engine, warm_up
+from toolkit.training.engine import Engine, fit_device, make_engine, warm_up
 from toolkit.training.finite import NotFiniteError
 from toolkit.training.guard import Guard, refuse_broken
 from toolkit.training.levels import all_places, finer, first_field, looked_at, pruned, visible
@@ -218,11 +218,6 @@ def fit_field(
     give_back()
     result.field = replace(packed(), sky=sky_behind(views))
     return result
-
-
-def fit_device(settings: Settings) -> torch.device:
-    """Where a fit with these settings computes."""
-    return torch.device(settings.device if settings.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu")
 
 
 def _first(
