@@ -22,3 +22,8 @@ def _there() -> bool:
 def fits(*values: Tensor) -> bool:
     """Whether the kernels can take these: float32 on a CUDA device."""
     return all(value.is_cuda and value.dtype == torch.float32 for value in values) and _there()
+
+
+def takes(values: Tensor) -> bool:
+    """Whether the convolution can take rows: on a CUDA device, in any of the numbers that networks compute in."""
+    return values.is_cuda and values.dtype in (torch.float32, torch.bfloat16, torch.float16) and _there()
