@@ -29,7 +29,8 @@ def describe(images: Tensor, side: int = SIDE) -> Tensor:
     if long > side:
         size = [max(1, round(length * side / long)) for length in images.shape[-2:]]
         images = F.interpolate(images, size, mode="bilinear", antialias=True)
-    grey = (images * images.new_tensor(GREY).view(3, 1, 1)).sum(1, keepdim=True)
+    red, green, blue = images.split(1, 1)
+    grey = GREY[0] * red + GREY[1] * green + GREY[2] * blue
     return torch.cat([images, _patches(grey, 1), _patches(grey, 2)], 1)
 
 

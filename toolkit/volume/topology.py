@@ -13,6 +13,8 @@ from functools import cached_property, lru_cache
 import torch
 from torch import Tensor
 
+from toolkit.volume.waiting import asks_freely
+
 BLOCK = 8
 VOXELS = BLOCK**3
 LOOKUP = (BLOCK + 1) ** 3
@@ -39,6 +41,7 @@ class Topology:
         table: (Sz, Sy, Sx) int32 slot or −1, or None; cell (z, y, x) is block key table_origin + (x, y, z).
         table_origin: (x, y, z) of the table's first cell, Python integers. The outermost layer of cells is always empty.
         table_size: (Sx, Sy, Sz), Python integers.
+        own_cells: (M,) int64 cell of each block in the flat table; only where there is a table.
 
     Raises:
         ValueError: wrong shape, keys beyond int32, a key twice, or too many blocks for int32 rows.
@@ -70,7 +73,7 @@ class Topology:
         if sx * sy * sz <= max_table_cells:
             slots = torch.arange(len(keys), dtype=torch.int32, device=keys.device)
             flat = torch.full((sx * sy * sz,), -1, dtype=torch.int32, device=keys.device)
-            self._own = cells = self._cells(wide)
+            self.own_cells = cells = self._cells(wide)
             flat[cells] = slots
             unique = bounds is not None or bool((flat[cells] == slots).all())
             self.table = flat.view(sz, sy, sx)
@@ -106,7 +109,7 @@ class Topology:
     def _cells(self, wide: Tensor) -> Tensor:
         """(..., 3) int64 keys inside the table's box → (...) flat cell."""
         (ox, oy, oz), (sx, sy, _) = self.table_origin, self.table_size
-        if wide.is_cuda:  # fewer launches
+        if not asks_freely(wide.device):  # fewer launches
             return (wide * constant((1, sx, sx * sy), wide.device)).sum(-1).sub_((oz * sy + oy) * sx + ox)
         return ((wide[..., 2] - oz) * sy + (wide[..., 1] - oy)) * sx + (wide[..., 0] - ox)
 
@@ -131,7 +134,7 @@ class Topology:
         sx, sy, _ = self.table_size
         # The margin keeps every step inside the table.
         steps = constant(tuple((dz * sy + dy) * sx + dx for dx, dy, dz in shifts), self.device)
-        return self.table.view(-1)[self._own[:, None] + steps].to(torch.int64)
+        return self.table.view(-1)[self.own_cells[:, None] + steps].to(torch.int64)
 
     @property
     def neighbours(self) -> Tensor:
