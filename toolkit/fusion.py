@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -32,6 +33,7 @@ from toolkit.networks.unproject import EncodedView
 from toolkit.progress import SILENT, Progress
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
+from toolkit.volume.waiting import asks_freely
 
 KEPT_PICTURES = 12  # encoded pictures kept for key frames to come
 
@@ -65,16 +67,21 @@ class Fused:
     Attributes:
         frame: index of the key frame's picture.
         volume: the finest global volume; shares memory with the loop, valid until it goes on.
-        allowed: (M · 512,) bool, cells whose coarser ones are not see-through.
         seconds: spent on this key frame.
         encode_seconds: of these, on encoding pictures.
+        judge: finds `allowed`.
     """
 
     frame: int
     volume: LatentVolume
-    allowed: Tensor
     seconds: float
     encode_seconds: float
+    judge: Callable[[], Tensor]
+
+    @cached_property
+    def allowed(self) -> Tensor:
+        """(M · 512,) bool, cells whose coarser ones are not see-through; found when they are first asked for, before the loop goes on."""
+        return self.judge()
 
 
 def fusion_lattice(space: Space, voxel_size: float, levels: int) -> Lattice:
@@ -124,7 +131,7 @@ class Fusion:
         """
         options = self.options
         keys = self._keys[visible_blocks(*self._balls, cameras[0], options.near, options.far)]
-        topology, finer = Topology(keys), None
+        topology, finer = Topology(keys, bounds=self.stores[0].lattice.bounds(keys.device)), None
         bounded = options.near > 0 or math.isfinite(options.far)
         if swept is None and bounded:
             swept = self.model.sweep(views, cameras, options.near, options.far, depth, self.empty)
@@ -167,19 +174,29 @@ class Fusion:
 class _Pictures:
     """Encoded pictures, the most recently used ones kept."""
 
-    def __init__(self, model: NerfusionModel, views: Views, side: int, precision: str) -> None:
+    def __init__(self, model: NerfusionModel, views: Views, side: int | None, precision: str) -> None:
         self.model, self.views, self.side, self.precision = model, views, side, precision
         self._kept: Recent[tuple[EncodedView, Cameras]] = Recent(KEPT_PICTURES)
 
-    def __call__(self, index: int) -> tuple[EncodedView, Cameras]:
-        return self._kept.get(index, self._encode)
+    def __call__(self, group: Sequence[int]) -> list[tuple[EncodedView, Cameras]]:
+        """The pictures at `group`; those that are new are encoded together where that takes fewer launches."""
+        new = [index for index in group if index not in self._kept]
+        together = len({self.views.images[index].shape for index in new}) == 1 and not asks_freely(self.model.device)
+        for some in [new] if together else [[index] for index in new]:
+            for index, made in zip(some, self._encode(some), strict=True):
+                self._kept.put(index, made)
+        return [self._kept.get(index, lambda index: self._encode([index])[0]) for index in group]
 
     @torch.no_grad()
-    def _encode(self, index: int) -> tuple[EncodedView, Cameras]:
+    def _encode(self, indices: Sequence[int]) -> list[tuple[EncodedView, Cameras]]:
         views, device = self.views, self.model.device
-        cameras = Cameras.of([views.intrinsics[index]], views.world_from_camera[index : index + 1], device)
+        lenses = [views.intrinsics[index] for index in indices]
+        cameras = Cameras.of(lenses, views.world_from_camera[list(indices)], device)
+        pictures = [picture(views, index, device) for index in indices]
+        images = pictures[0] if len(pictures) == 1 else torch.cat(pictures)
         with computing(self.precision, device):
-            return self.model.encode(picture(views, index, device), cameras, self.side)[0], cameras
+            encoded = self.model.encode(images, cameras, self.side)
+        return [(view, cameras[number]) for number, view in enumerate(encoded)]
 
 
 def fuse_views(
@@ -209,13 +226,14 @@ def fuse_views(
     if len(key_frames.indices) == 0:
         raise InputError("there are no key frames to fuse; give more pictures")
     fusion = Fusion(model, lattice, options, empty)
-    encoded = _Pictures(model, views, SIDE if empty is None else SIDE_WITHIN, fusion.options.precision)
+    side = None if witnesses is not None else SIDE if empty is None else SIDE_WITHIN
+    encoded = _Pictures(model, views, side, fusion.options.precision)
     near, far, measured = fusion.options.near, fusion.options.far, fusion.options.measured
     sweeps = None if witnesses is None else KeySweeps(views, key_frames, witnesses, near, far, measured, model.device)
     for done, (key, neighbours) in enumerate(zip(key_frames.indices, key_frames.neighbours, strict=True)):
         progress.check()
         begin = time.perf_counter()
-        group = [encoded(index) for index in together(int(key), neighbours)]
+        group = encoded(together(int(key), neighbours))
         encode_seconds = time.perf_counter() - begin
         depth = sensed(views, int(key), model.device) if measured else None
         swept = None if sweeps is None else sweeps(done)
@@ -224,5 +242,5 @@ def fuse_views(
         if (done + 1) % fusion.options.prune_every == 0:
             fusion.prune()
         seconds = time.perf_counter() - begin
-        yield Fused(int(key), fusion.volume, fusion.allowed(), seconds, encode_seconds)
+        yield Fused(int(key), fusion.volume, seconds, encode_seconds, fusion.allowed)
         progress.update(done + 1, len(key_frames.indices), f"{fusion.volume.topology.blocks} blocks")

@@ -113,6 +113,9 @@ class Recent(Generic[T]):
         self.most = most
         self._kept: OrderedDict[int, T] = OrderedDict()
 
+    def __contains__(self, index: int) -> bool:
+        return index in self._kept
+
     def get(self, index: int, make: Callable[[int], T]) -> T:
         """What is kept for `index`, or what `make` gives for it."""
         return self.put(index, self._kept[index] if index in self._kept else make(index))
@@ -133,7 +136,10 @@ def together(key: int, neighbours: Array) -> list[int]:
 
 def picture(views: Views, index: int, device: torch.device | str) -> Tensor:
     """(1, 3, H, W) RGB in [0, 1]."""
-    return torch.from_numpy(np.ascontiguousarray(views.images[index])).to(device).permute(2, 0, 1)[None].float() / 255
+    pixels = torch.from_numpy(np.ascontiguousarray(views.images[index]))
+    if torch.device(device).type == "cuda":  # from memory that stays in place, which nobody has to wait for
+        pixels = pixels.pin_memory().to(device, non_blocking=True)
+    return pixels.to(device).permute(2, 0, 1)[None].float() / 255
 
 
 def sensed(views: Views, index: int, device: torch.device | str) -> Tensor | None:

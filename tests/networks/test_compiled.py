@@ -25,7 +25,7 @@ def places(count: int = 20_000, seed: int = 0) -> torch.Tensor:
     return torch.rand((count, 3), generator=generator) * torch.tensor([8.0, 8.0, 9.0]) - torch.tensor([4.0, 4.0, 1.0])
 
 
-def everything(views: int = 4) -> dict[str, torch.Tensor]:
+def everything(views: int = 4, asked: int = 20_000) -> dict[str, torch.Tensor]:
     """What a key frame and its witness come to."""
     described, seen_by = wall(views)
     compared = compare(described, seen_by, NEAR, FAR)
@@ -35,8 +35,8 @@ def everything(views: int = 4) -> dict[str, torch.Tensor]:
     said = evidence(compared, [other, witness(alone)], certain(compared, alone))
     made = decide(compared, said=said)
     assert said is not None
-    read = made.look(places(), torch.full((len(places()),), 0.1))
-    spoken, seen = other.ask(places())
+    read = made.look(places(asked), torch.full((asked,), 0.1))
+    spoken, seen = other.ask(places(asked))
     return {
         "cost": compared.cost,
         "alone": alone.table,

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from toolkit.networks import gpu
 from toolkit.volume.topology import BLOCK, HALO, VOXELS, Topology
 
 DEFAULT_CHUNK = 64  # blocks at a time: 4 MB of halo at 16 channels in float32
@@ -108,6 +109,10 @@ def _clear(rows: Tensor, kept: Tensor) -> None:
 
 def _convolve(rows: Tensor, weight: Tensor, bias: Tensor | None, topology: Topology, occupied: Tensor | None, chunk: int) -> Tensor:
     """(M · 512 + 1, C) → (M · 512 + 1, C')."""
+    if gpu.takes(rows):
+        from toolkit.networks.gpu import convolution
+
+        return convolution.convolve(rows, topology.around, weight, bias, occupied)
     out = rows.new_empty((topology.zero_row + 1, len(weight)))
     out[-1] = 0
     chunk = min(chunk, topology.blocks)
@@ -165,6 +170,10 @@ class _BlockConv(torch.autograd.Function):
 
 def _weight_gradient(rows: Tensor, gradient: Tensor, weight: Tensor, topology: Topology, chunk: int) -> Tensor:
     """(C', C, 3, 3, 3) in the weight's type, summed over chunks in it."""
+    if gpu.takes(rows):
+        from toolkit.networks.gpu import convolution
+
+        return convolution.weight_gradient(rows, topology.around, gradient).to(weight.dtype)
     total = torch.zeros_like(weight, memory_format=torch.contiguous_format)
     shaped = weight.to(rows.dtype).contiguous(memory_format=torch.channels_last_3d)
     chunk = min(chunk, topology.blocks)

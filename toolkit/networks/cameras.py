@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -20,19 +20,21 @@ class Cameras:
         intrinsics: (K, 4) fx, fy, cx, cy in pixels.
         size: (K, 2) width and height in pixels.
         world_from_camera: (K, 4, 4).
+        host: the same cameras in the processor's memory, where they came from there, so that asking for them does not wait for the device.
     """
 
     intrinsics: Tensor
     size: Tensor
     world_from_camera: Tensor
+    host: Cameras | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def of(cls, intrinsics: Sequence[Intrinsics], world_from_camera: Array, device: torch.device | str = "cpu") -> Cameras:
         """From the toolkit's cameras; lenses are not looked at (pictures are undistorted before)."""
-        inner = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in intrinsics], dtype=torch.float32, device=device)
-        size = torch.tensor([[c.width, c.height] for c in intrinsics], dtype=torch.float32, device=device)
-        poses = torch.from_numpy(np.asarray(world_from_camera, dtype=np.float32)).to(device)
-        return cls(inner.view(-1, 4), size.view(-1, 2), poses.view(-1, 4, 4))
+        inner = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in intrinsics], dtype=torch.float32)
+        size = torch.tensor([[c.width, c.height] for c in intrinsics], dtype=torch.float32)
+        poses = torch.from_numpy(np.asarray(world_from_camera, dtype=np.float32))
+        return cls(inner.view(-1, 4), size.view(-1, 2), poses.view(-1, 4, 4)).to(device)
 
     @classmethod
     def same_size(cls, intrinsics: Tensor, world_from_camera: Tensor, width: int, height: int) -> Cameras:
@@ -45,12 +47,16 @@ class Cameras:
     def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> Cameras:
         """Some of the cameras (one stays a bundle of one)."""
         if isinstance(index, int):
-            index = [index]
-        return Cameras(self.intrinsics[index], self.size[index], self.world_from_camera[index])
+            index = slice(index, index + 1) if index != -1 else slice(index, None)
+        host = None if self.host is None or isinstance(index, Tensor) else self.host[index]
+        return Cameras(self.intrinsics[index], self.size[index], self.world_from_camera[index], host)
 
     @classmethod
     def together(cls, parts: Sequence[Cameras]) -> Cameras:
         """All of them in one bundle."""
+        hosts = [part.host for part in parts if part.host is not None]
+        if hosts and len(hosts) == len(parts):
+            return cls.together(hosts).to(parts[0].intrinsics.device)
         return cls(
             torch.cat([part.intrinsics for part in parts]),
             torch.cat([part.size for part in parts]),
@@ -58,8 +64,18 @@ class Cameras:
         )
 
     def to(self, device: torch.device | str) -> Cameras:
-        """The same cameras on another device."""
-        return Cameras(self.intrinsics.to(device), self.size.to(device), self.world_from_camera.to(device))
+        """The same cameras on another device, in one piece."""
+        device = torch.device(device)
+        if device.type == self.intrinsics.device.type:
+            return self
+        if device.type == "cpu" and self.host is not None:
+            return self.host
+        parts = self.intrinsics, self.size, self.world_from_camera
+        whole = torch.cat([part.reshape(-1) for part in parts])
+        # What comes back is waited for; what goes there is not.
+        moved = whole.to(device, non_blocking=device.type != "cpu").split([part.numel() for part in parts])
+        inner, size, poses = (new.view(old.shape) for new, old in zip(moved, parts, strict=True))
+        return Cameras(inner, size, poses, self if self.intrinsics.device.type == "cpu" else None)
 
     @property
     def positions(self) -> Tensor:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from itertools import pairwise
 from pathlib import Path
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -58,6 +59,9 @@ class ImageEncoder(nn.Module):
         widths: channels of the levels at 1/2, 1/4, 1/8 and 1/16.
     """
 
+    mean: Tensor  # of ImageNet's pictures, (3, 1, 1)
+    deviation: Tensor
+
     def __init__(self, channels: int = 64, trunk: str = SMALL) -> None:
         super().__init__()
         self.trunk = trunk
@@ -71,6 +75,8 @@ class ImageEncoder(nn.Module):
         self.laterals = nn.ModuleList(_linear(width, channels, 1) for width in self.widths[1:])
         self.smooth = _linear(channels, channels, 3)
         self.norm = nn.GroupNorm(channels, channels)
+        for name, values in (("mean", MEAN), ("deviation", DEVIATION)):
+            self.register_buffer(name, torch.tensor(values).view(3, 1, 1), persistent=False)
 
     def load_imagenet(self, path: Path | str | None = None) -> None:
         """Fill the trunk with ImageNet weights; see `lite.load_imagenet`.
@@ -88,7 +94,7 @@ class ImageEncoder(nn.Module):
 
     def maps(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """The stem's map at half the size, (V, widths[0], ⌈H/16⌉·8, ⌈W/16⌉·8), and the fused one."""
-        x = (padded(images) - images.new_tensor(MEAN).view(3, 1, 1)) / images.new_tensor(DEVIATION).view(3, 1, 1)
+        x = (padded(images) - self.mean) / self.deviation
         half = x = self.stem(x)
         levels = []
         for stage in self.stages:

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from toolkit.volume.space import Space
-from toolkit.volume.topology import BLOCK, VOXELS, Topology
+from toolkit.volume.topology import BLOCK, VOXELS, Bounds, Topology
+from toolkit.volume.waiting import asks_freely
 
 CHUNK = 1024  # blocks at a time
 
@@ -33,6 +34,14 @@ class Lattice:
     def voxel_size(self) -> float:
         """Side of a voxel inside the region of interest, working units."""
         return self.voxel * self.space.half
+
+    def bounds(self, device: torch.device | str) -> Bounds | None:
+        """Keys that blocks of the lattice can have, with one more on each side for corners of its outermost cells. On the CPU None: there
+        it costs nothing to look at keys, and tables are as small as they can be."""
+        if asks_freely(torch.device(device)):
+            return None
+        most = self.resolution // BLOCK + 1
+        return (-1, -1, -1), (most, most, most)
 
     def finer(self) -> Lattice:
         """The lattice of half the voxel size."""
@@ -112,7 +121,7 @@ class LocalVolume(LatentVolume):
 
 def empty_volume(lattice: Lattice, channels: int, device: torch.device | str = "cpu") -> LatentVolume:
     """A volume of which nothing is known yet."""
-    topology = Topology(torch.zeros((0, 3), dtype=torch.int32, device=device))
+    topology = Topology(torch.zeros((0, 3), dtype=torch.int32, device=device), bounds=lattice.bounds(device))
     return LatentVolume(lattice, topology, torch.zeros((1, channels), device=device), torch.zeros(0, device=device))
 
 

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from toolkit.networks import compiled
+from toolkit.networks import compiled, gpu
 
 SIDE = 256  # pixels of the long side at which pictures are compared (docs/measured/few_views.md) …
 SIDE_WITHIN = 448  # … and where silhouettes leave a part of them
@@ -29,7 +29,8 @@ def describe(images: Tensor, side: int = SIDE) -> Tensor:
     if long > side:
         size = [max(1, round(length * side / long)) for length in images.shape[-2:]]
         images = F.interpolate(images, size, mode="bilinear", antialias=True)
-    grey = (images * images.new_tensor(GREY).view(3, 1, 1)).sum(1, keepdim=True)
+    red, green, blue = images.split(1, 1)
+    grey = GREY[0] * red + GREY[1] * green + GREY[2] * blue
     return torch.cat([images, _patches(grey, 1), _patches(grey, 2)], 1)
 
 
@@ -66,6 +67,10 @@ def semi_global(cost: Tensor) -> Tensor:
     """(D, h, w) costs → the same smoothed along four directions, each the cheapest path up to the pixel (semi-global matching)."""
     if compiled.fits(cost) and len(cost) > 2:
         return compiled.semi_global(cost, SMALL, LARGE)
+    if gpu.fits(cost):
+        from toolkit.networks.gpu import matching
+
+        return matching.semi_global(cost, SMALL, LARGE)
     volume = cost.permute(1, 2, 0)  # (h, w, D)
     down, right = volume, volume.transpose(0, 1)
     total = _paths(down) + _paths(down.flip(0)).flip(0)
@@ -87,5 +92,9 @@ def _paths(volume: Tensor) -> Tensor:
 
 def distribution(cost: Tensor) -> Tensor:
     """(D, h, w) costs → how likely the surface lies at each plane; sums to one over D."""
+    if gpu.fits(cost):
+        from toolkit.networks.gpu import matching
+
+        return matching.distribution(cost, SMALL, LARGE, TEMPERATURE)
     along = semi_global(cost).permute(1, 2, 0)  # (h, w, D), where the planes of a pixel lie next to each other in memory on the CPU
     return torch.softmax(along.div_(-TEMPERATURE), 2).permute(2, 0, 1)

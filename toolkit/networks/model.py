@@ -32,13 +32,15 @@ from toolkit.networks.head import FieldHead
 from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume, empty_volume
 from toolkit.networks.local import INSIDE, LocalReconstruction, colour_latent, inside_latent
 from toolkit.networks.matching import SIDE, describe
-from toolkit.networks.pyramid import Pyramid
+from toolkit.networks.pyramid import pyramids
 from toolkit.networks.refine import with_blocks
 from toolkit.networks.sweep import Empty, Sighted, Sweep, sweep
 from toolkit.networks.unproject import EncodedView, look_up, project
 from toolkit.volume.topology import VOXELS, Topology
+from toolkit.volume.waiting import asks_freely
 
 CHUNK = 2**15  # voxels at a time: what the views show of them is many times larger than what is kept
+AT_ONCE = 2**19  # where there is memory for that: 0.4 kB a voxel and view
 COLOURS = 3
 COLOUR_GAIN = 4.0  # pictures' RGB as numbers of about unit deviation
 LEVELS = 3  # of the feature maps
@@ -88,7 +90,7 @@ class NerfusionModel(nn.Module):
     def device(self) -> torch.device:
         return next(self.parameters()).device
 
-    def encode(self, images: Tensor, cameras: Cameras, side: int = SIDE) -> list[EncodedView]:
+    def encode(self, images: Tensor, cameras: Cameras, side: int | None = SIDE) -> list[EncodedView]:
         """Everything that voxels look up in pictures.
 
         A viewing direction is the same for a pixel and for every voxel behind it, so G is evaluated for the cells of the maps and not
@@ -97,18 +99,17 @@ class NerfusionModel(nn.Module):
         Args:
             images: (V, 3, H, W) RGB in [0, 1], undistorted; of one size.
             cameras: V cameras for exactly these pictures.
-            side: pixels of the long side at which they are compared.
+            side: pixels of the long side at which they are compared; None: they are not (their sweep is made elsewhere).
         """
         maps = self.sample(*self.encoder.maps(images)).float()  # variances are looked for in them
-        whole, described = padded((images - 0.5) * COLOUR_GAIN), describe(images, side)
-        views = []
-        for index in range(len(images)):
-            features = Pyramid.of(maps[index], STRIDE, LEVELS)
-            if self.direction is not None:
-                codes = self.direction(cameras.directions(index, features.pixels()))
-                features = features.with_columns(codes.to(features.rows.dtype))
-            views.append(EncodedView(features, Pyramid.of(whole[index], 1, COLOUR_LEVELS), described[index]))
-        return views
+        whole = padded((images - 0.5) * COLOUR_GAIN)
+        described = images.new_zeros((len(images), 0, 0, 0)) if side is None else describe(images, side)
+        features, colours = pyramids(maps, STRIDE, LEVELS), pyramids(whole, 1, COLOUR_LEVELS)
+        if self.direction is not None:
+            pixels = features[0].pixels()
+            codes = self.direction(torch.stack([cameras.directions(index, pixels) for index in range(len(images))]))
+            features = [one.with_columns(code.to(one.rows.dtype)) for one, code in zip(features, codes, strict=True)]
+        return [EncodedView(*parts) for parts in zip(features, colours, described, strict=True)]
 
     def sweep(
         self,
@@ -148,12 +149,14 @@ class NerfusionModel(nn.Module):
         """
         if topology is None:
             keys = all_blocks(lattice, cameras.intrinsics.device)
-            topology = Topology(keys[visible_blocks(*block_balls(lattice, keys), cameras[0], near, far)])
+            keys = keys[visible_blocks(*block_balls(lattice, keys), cameras[0], near, far)]
+            topology = Topology(keys, bounds=lattice.bounds(keys.device))
         if swept is None:
             bounded = near > 0 or math.isfinite(far)
             swept = self.sweep(views, cameras, *((near, far) if bounded else _depths(lattice, topology, cameras)))
         rows = torch.arange(topology.zero_row, device=topology.device) if wanted is None else wanted.nonzero().view(-1)
-        parts = [self._observe(views, cameras, lattice, topology, part, near, far, swept) for part in rows.split(CHUNK)]
+        few = CHUNK if asks_freely(rows.device) else AT_ONCE
+        parts = [self._observe(views, cameras, lattice, topology, part, near, far, swept) for part in rows.split(few)]
         where, projected, starts, counts, weights = (torch.cat(values) for values in zip(*parts, strict=True))
         topology, where = _without_empty_blocks(topology, where)
         config, size = self.config, topology.zero_row
@@ -161,8 +164,11 @@ class NerfusionModel(nn.Module):
         weight = torch.zeros(size, device=topology.device).index_copy(0, where, weights)
         start = starts.new_zeros((size + 1, config.channels)).index_copy(0, where, F.pad(starts, (0, config.channels - starts.shape[1])))
         # Convolutions cost most, and free space needs none.
-        active = torch.zeros(topology.blocks, dtype=torch.bool, device=topology.device)
-        active[where[starts[:, INSIDE] > inside_latent(starts.new_tensor([FREE]))].div(VOXELS, rounding_mode="floor")] = True
+        active = torch.zeros(topology.blocks + 1, dtype=torch.bool, device=topology.device)
+        slots = where.div(VOXELS, rounding_mode="floor")
+        busy_rows = starts[:, INSIDE] > _latent_of(FREE)
+        # One more block takes those that are free: to choose the others would be to wait for the device.
+        active = active.index_fill(0, torch.where(busy_rows, slots, topology.blocks), True)[:-1]
         latent = projected.new_zeros((size + 1, config.hidden)).index_copy(0, where, projected)
         busy, place = _blocks(topology, active)
         raw = start.index_copy(0, place, self.local(latent[place], start[place], busy, count[place[:-1]] > 0))
@@ -186,7 +192,9 @@ class NerfusionModel(nn.Module):
         projection = project(points, size, cameras, near, far)
         seen = projection.visible[0]
         if lattice.space.shell == 0:
-            seen &= (contracted.abs() <= contracted.new_tensor(lattice.space.box) + 1.01 * lattice.voxel).all(1)
+            x, y, z = contracted.abs().unbind(1)
+            across, along, up = (side + 1.01 * lattice.voxel for side in lattice.space.box)
+            seen = seen & (x <= across) & (y <= along) & (z <= up)
         sighted = swept.look(points, TRUNCATION * size)
         kept = (seen & (sighted.open > HIDDEN)).nonzero().view(-1)
         rows, points, projection, sighted = rows[kept], points[kept], projection[kept], sighted[kept]
@@ -235,6 +243,9 @@ class NerfusionModel(nn.Module):
 
     def thickness(self, volume: LatentVolume) -> Tensor:
         """(M · 512 + 1,) the first of what `head` gives, alone."""
+        if not asks_freely(volume.rows.device):
+            mask = torch.cat([volume.known, volume.known.new_zeros(1)])
+            return torch.where(mask, self.to_field.thickness(volume.rows).float(), 0.0)
         known = volume.known.nonzero().view(-1)
         values = self.to_field.thickness(volume.rows[known]).float()
         return torch.zeros(len(volume.rows), device=known.device).index_copy(0, known, values)
@@ -254,6 +265,11 @@ class NerfusionModel(nn.Module):
         )
 
 
+def _latent_of(signed: float) -> float:
+    """`inside_latent` of one number."""
+    return float(inside_latent(torch.tensor([signed])))
+
+
 def _weight(sighted: Sighted) -> Tensor:
     """How much a key frame can say of voxels: little of what is hidden, and where the pictures fit at no depth better than at others."""
     return sighted.open.clamp_min(HIDDEN) * (BLIND + (1 - BLIND) * sighted.sure)
@@ -270,14 +286,16 @@ def _depths(lattice: Lattice, topology: Topology, cameras: Cameras) -> tuple[flo
 
 def _blocks(topology: Topology, kept: Tensor) -> tuple[Topology, Tensor]:
     """The blocks of the mask (M,) alone, and their rows, the zero row last (the same way back)."""
-    rows = kept.repeat_interleave(VOXELS).nonzero().view(-1)
-    return Topology(topology.keys[kept]), torch.cat([rows, rows.new_tensor([topology.zero_row])])
+    blocks = kept.nonzero().view(-1)
+    rows = (blocks[:, None] * VOXELS + torch.arange(VOXELS, device=blocks.device)).view(-1)
+    return topology.alike(topology.keys[blocks]), torch.cat([rows, rows.new_full((1,), topology.zero_row)])
 
 
 def _without_empty_blocks(topology: Topology, rows: Tensor) -> tuple[Topology, Tensor]:
     """The blocks that own at least one of the rows, in their order, and the same rows in them."""
     slot = rows.div(VOXELS, rounding_mode="floor")
     filled = torch.zeros(topology.blocks, dtype=torch.bool, device=rows.device).index_fill(0, slot, True)
-    if bool(filled.all()):
+    kept = filled.nonzero().view(-1)
+    if len(kept) == topology.blocks:
         return topology, rows
-    return Topology(topology.keys[filled]), rows + ((torch.cumsum(filled, 0) - 1)[slot] - slot) * VOXELS
+    return topology.alike(topology.keys[kept]), rows + ((torch.cumsum(filled, 0) - 1)[slot] - slot) * VOXELS

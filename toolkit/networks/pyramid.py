@@ -7,6 +7,7 @@ over views says nothing. So each lookup names its level.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -34,11 +35,7 @@ class Pyramid:
     @classmethod
     def of(cls, image: Tensor, stride: int, levels: int) -> Pyramid:
         """(C, h, w), the first level → a pyramid by averaging 2×2 cells, as long as both sides are even."""
-        maps = [image]
-        while len(maps) < levels and maps[-1].shape[1] % 2 == 0 and maps[-1].shape[2] % 2 == 0:
-            maps.append(F.avg_pool2d(maps[-1][None], 2)[0])
-        rows = torch.cat([level.flatten(1).T for level in maps])
-        return cls(rows.contiguous(), tuple((level.shape[1], level.shape[2]) for level in maps), stride)
+        return pyramids(image[None], stride, levels)[0]
 
     def with_columns(self, columns: Tensor) -> Pyramid:
         """More channels (R, C') beside these."""
@@ -46,11 +43,7 @@ class Pyramid:
 
     def pixels(self) -> Tensor:
         """(R, 2) the pixel of the picture (centres at +0.5) at the middle of each cell."""
-        parts = []
-        for level, (height, width) in enumerate(self.sizes):
-            v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-            parts.append((torch.stack([u, v], -1).view(-1, 2) + 0.5) * self.stride * 2**level)
-        return torch.cat(parts).to(self.rows)
+        return _middles(self.sizes, self.stride, self.rows.device, self.rows.dtype)
 
     def lookup(self, pixels: Tensor, footprint: Tensor) -> Tensor:
         """Bilinear values.
@@ -81,6 +74,26 @@ class Pyramid:
     def lookup_into(self, pixels: Tensor, footprint: Tensor, out: Tensor, first: int = 0) -> None:
         """`lookup` into columns `first` … of `out` (N, C'), where `compiled_lookup.fits`; nothing of it is differentiable."""
         compiled_lookup.look_up(self.rows, self.sizes, self.stride, pixels, footprint, out, first)
+
+
+def pyramids(images: Tensor, stride: int, levels: int) -> list[Pyramid]:
+    """(V, C, h, w), first levels → pyramids by averaging 2×2 cells, as long as both sides are even."""
+    maps = [images]
+    while len(maps) < levels and maps[-1].shape[2] % 2 == 0 and maps[-1].shape[3] % 2 == 0:
+        maps.append(F.avg_pool2d(maps[-1], 2))
+    rows = torch.cat([level.flatten(2).transpose(1, 2) for level in maps], 1)
+    sizes = tuple((level.shape[2], level.shape[3]) for level in maps)
+    return [Pyramid(one, sizes, stride) for one in rows.contiguous()]
+
+
+@lru_cache(maxsize=8)
+def _middles(sizes: tuple[tuple[int, int], ...], stride: int, device: torch.device, kind: torch.dtype) -> Tensor:
+    """(R, 2) see `Pyramid.pixels`; pictures of a capture share them."""
+    parts = []
+    for level, (height, width) in enumerate(sizes):
+        v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        parts.append((torch.stack([u, v], -1).view(-1, 2) + 0.5) * stride * 2**level)
+    return torch.cat(parts).to(device, kind)
 
 
 class _Lookup(torch.autograd.Function):

@@ -54,6 +54,10 @@ def split_volume(volume: LatentVolume, kept: Tensor) -> LatentVolume:
 
 def adopt(state: LatentVolume, inherited: LatentVolume) -> LatentVolume:
     """A volume that also knows what it inherits; what it knows already stays as it is, bit for bit."""
+    if inherited.topology is state.topology:
+        new = inherited.known & (state.count == 0)
+        rows = torch.where(_mask(new), inherited.rows.to(state.rows.dtype), state.rows)
+        return replace(state, rows=rows, count=torch.where(new, inherited.count, state.count))
     state, slots = with_blocks(state, inherited.topology.keys)
     place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
     new = (inherited.known & (state.count[place] == 0)).nonzero().view(-1)
@@ -78,8 +82,12 @@ def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
 
 def merged(before: LatentVolume, after: LatentVolume, changed: Tensor) -> LatentVolume:
     """`after` where `changed` (M · 512,), else `before`; both have the same blocks."""
-    mask = torch.cat([changed, changed.new_zeros(1)])[:, None]
-    return replace(before, rows=torch.where(mask, after.rows, before.rows), count=torch.where(changed, after.count, before.count))
+    return replace(before, rows=torch.where(_mask(changed), after.rows, before.rows), count=torch.where(changed, after.count, before.count))
+
+
+def _mask(corners: Tensor) -> Tensor:
+    """(M · 512,) bool → (M · 512 + 1, 1), false in the zero row."""
+    return torch.cat([corners, corners.new_zeros(1)])[:, None]
 
 
 def with_blocks(state: LatentVolume, keys: Tensor) -> tuple[LatentVolume, Tensor]:
@@ -94,7 +102,7 @@ def with_blocks(state: LatentVolume, keys: Tensor) -> tuple[LatentVolume, Tensor
     return (
         replace(
             state,
-            topology=Topology(torch.cat([state.topology.keys, keys[fresh].to(torch.int32)])),
+            topology=state.topology.alike(torch.cat([state.topology.keys, keys[fresh].to(torch.int32)])),
             rows=torch.cat([rows[:-1], rows.new_zeros((new + 1, rows.shape[1]))]),
             count=torch.cat([count, count.new_zeros(new)]),
         ),

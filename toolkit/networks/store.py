@@ -8,6 +8,7 @@ from torch import Tensor
 from toolkit.networks.lattice import LatentVolume, Lattice
 from toolkit.networks.refine import part
 from toolkit.volume.topology import VOXELS, Topology
+from toolkit.volume.waiting import asks_freely
 
 GROWTH = 1.5  # a buffer that must grow gets at least this much more room
 
@@ -17,7 +18,7 @@ class GlobalStore:
 
     def __init__(self, lattice: Lattice, channels: int, device: torch.device | str = "cpu") -> None:
         self.lattice = lattice
-        self.topology = Topology(torch.zeros((0, 3), dtype=torch.int32, device=device))
+        self.topology = Topology(torch.zeros((0, 3), dtype=torch.int32, device=device), bounds=lattice.bounds(device))
         self._rows = torch.zeros((VOXELS + 1, channels), device=device)
         self._count = torch.zeros(VOXELS, device=device)
 
@@ -37,10 +38,15 @@ class GlobalStore:
     def write(self, values: LatentVolume, changed: Tensor) -> None:
         """Take over the corners `changed` (M · 512,) of some blocks."""
         slots = self._slots(values.topology.keys)
-        which = changed.nonzero().view(-1)
-        place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)[which]
-        self._rows[place] = values.rows[which]
-        self._count[place] = values.count[which]
+        place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
+        if asks_freely(place.device):
+            which = changed.nonzero().view(-1)
+            place = place[which]
+            self._rows[place] = values.rows[which]
+            self._count[place] = values.count[which]
+        else:  # what has not changed is written as it is: to choose the others would be to wait for the device
+            self._rows[place] = torch.where(changed[:, None], values.rows[:-1], self._rows[place])
+            self._count[place] = torch.where(changed, values.count, self._count[place])
 
     def keep(self, blocks: Tensor) -> None:
         """Forget all blocks but those of the mask (M,)."""
@@ -50,7 +56,7 @@ class GlobalStore:
         self._rows[: self.topology.zero_row] = 0
         self._count[: self.topology.zero_row] = 0
         self._rows[: len(rows)], self._count[: len(count)] = rows, count
-        self.topology = Topology(self.topology.keys[kept])
+        self.topology = self.topology.alike(self.topology.keys[kept])
 
     def _slots(self, keys: Tensor) -> Tensor:
         """(M,) slots of blocks, made where missing."""
@@ -58,7 +64,7 @@ class GlobalStore:
         fresh = keys[slots < 0]
         if len(fresh) == 0:
             return slots
-        self.topology = Topology(torch.cat([self.topology.keys, fresh.to(torch.int32)]))
+        self.topology = self.topology.alike(torch.cat([self.topology.keys, fresh.to(torch.int32)]))
         needed = self.topology.zero_row
         if needed > len(self._count):
             room = max(needed, int(GROWTH * len(self._count) / VOXELS) * VOXELS)

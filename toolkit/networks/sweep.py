@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from toolkit.networks import compiled
+from toolkit.networks import compiled, gpu
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.matching import COLOUR_GAIN, UNKNOWN, difference, distribution, together
 
@@ -80,6 +80,10 @@ class Sweep:
         if compiled.fits(points, truncation, self.table):
             pose, lens = self.camera.world_from_camera[0], self.camera.lens(0)
             return Sighted(*compiled.look(points, truncation, self.table, pose, lens, self.lowest, self.step).T)
+        if gpu.fits(points, truncation, self.table):
+            from toolkit.networks.gpu import reading
+
+            return Sighted(*reading.look(points, truncation, self.table, self.camera, self.lowest, self.step))
         local = self.camera.local(points)[0]
         depth = local[:, 2].clamp_min(1e-6)
         focal, middle = self.camera.intrinsics[0, :2], self.camera.intrinsics[0, 2:]
@@ -110,6 +114,7 @@ class Compared:
         camera: one, of the window alone.
         rays: (h · w, 3) of the working frame, through pixels of the key view, of unit depth along its axis.
         inverses: (D,) inverse depths of the planes, evenly spaced, ascending.
+        lowest, step: the first of them, and from one to the next.
         cost: (D, h, w) in [0, 1].
         empty: (D, h, w) bool, where silhouettes say that there is nothing; None without any.
         window: left, upper, right and lower edge in the key view's whole picture, 0 to 1. Beyond it nothing is but what is `empty`.
@@ -119,15 +124,12 @@ class Compared:
     camera: Cameras
     rays: Tensor
     inverses: Tensor
+    lowest: float
+    step: float
     cost: Tensor
     empty: Tensor | None = None
     window: tuple[float, float, float, float] = WHOLE
     spacing: int = SPACING
-
-    @property
-    def step(self) -> float:
-        """Inverse depth between planes."""
-        return float(self.inverses[1] - self.inverses[0])
 
 
 @torch.no_grad()
@@ -149,12 +151,15 @@ def compare(described: Sequence[Tensor], cameras: Cameras, near: float, far: flo
 
 def _compared(described: Sequence[Tensor], cameras: Cameras, near: float, far: float, empty: Empty | None) -> Compared:
     """`compare`, with both ends known."""
-    inverses = torch.linspace(1 / far, 1 / near, _planes(described, cameras, near, far), device=cameras.intrinsics.device)
+    scale = [view.shape[2] for view in described]
+    ladder = torch.linspace(1 / far, 1 / near, _planes(scale, cameras.to("cpu"), near, far))  # without asking the device
+    lowest, step = float(ladder[0]), float(ladder[1] - ladder[0])
+    inverses = ladder.to(cameras.intrinsics.device, non_blocking=True)
     spacing = SPACING if empty is None else WITHIN
     rays, own, shape = _pixels(described[0], cameras, spacing)
     world = rays @ cameras.world_from_camera[0, :3, :3].T
     if empty is None:
-        return Compared(cameras[0], world, inverses, _volume(_costs(described, cameras, inverses, rays, own), shape))
+        return Compared(cameras[0], world, inverses, lowest, step, _volume(_costs(described, cameras, inverses, rays, own), shape))
     depths, origin = (1 / inverses)[:, None], cameras.positions[0]
     few = PART if world.device.type == "cpu" else AT_ONCE
     nothing = torch.cat([empty(torch.addcmul(origin, part[:, None], depths).view(-1, 3)) for part in world.split(few)]).view(*shape, -1)
@@ -165,7 +170,7 @@ def _compared(described: Sequence[Tensor], cameras: Cameras, near: float, far: f
     shape = (rows.stop - rows.start, columns.stop - columns.start)
     some = (~nothing).any(1).nonzero().view(-1)
     cost = rays.new_full(nothing.shape, UNKNOWN).index_copy(0, some, _costs(described, cameras, inverses, rays[some], own[some]))
-    return Compared(camera, world, inverses, _volume(cost, shape), _volume(nothing, shape), window, spacing)
+    return Compared(camera, world, inverses, lowest, step, _volume(cost, shape), _volume(nothing, shape), window, spacing)
 
 
 def _cropped(camera: Cameras, wanted: Tensor) -> tuple[Cameras, tuple[float, float, float, float], slice, slice]:
@@ -195,6 +200,12 @@ def _costs(described: Sequence[Tensor], cameras: Cameras, inverses: Tensor, rays
         for view in range(1, len(cameras)):
             comparison.add(described[view], *_way(cameras, view), cameras.lens(view))
         return comparison.result(UNKNOWN)
+    if gpu.fits(rays, *described):
+        from toolkit.networks.gpu import matching
+
+        world = rays @ cameras.world_from_camera[0, :3, :3].T
+        lenses = cameras.intrinsics, cameras.size, cameras.world_from_camera
+        return matching.costs(list(described), *lenses, inverses, world, own, COLOUR_GAIN, UNKNOWN)
     parts = []
     for ray, mine in zip(rays.split(AT_ONCE), own.split(AT_ONCE), strict=True):
         found = [_warped(described[view], cameras, view, ray, inverses) for view in range(1, len(cameras))]
@@ -221,7 +232,7 @@ def decide(compared: Compared, depth: Tensor | None = None, said: Tensor | None 
         likely = carved(likely, compared.empty)
     if depth is not None:
         likely = measured(likely, compared.inverses, depth, compared.spacing, compared.window)
-    return Sweep(compared.camera, _table(likely, compared.step), float(compared.inverses[0]), compared.step)
+    return Sweep(compared.camera, _table(likely, compared.step), compared.lowest, compared.step)
 
 
 def sweep(
@@ -287,6 +298,10 @@ def _table(likely: Tensor, step: float) -> Tensor:
     """(D, h, w) likelihoods, farthest first → what `Sweep` keeps."""
     if compiled.fits(likely):
         return compiled.table(likely, step, PEAK)
+    if gpu.fits(likely):
+        from toolkit.networks.gpu import matching
+
+        return matching.table(likely, step, PEAK)
     nearer = likely.flip(0).cumsum(0).flip(0) - 0.5 * likely  # the surface lies anywhere about its plane
     middle = 0.5 * (nearer[1:] + nearer[:-1]) * step
     integral = torch.cat([torch.zeros_like(nearer[:1]), middle.cumsum(0)])
@@ -340,9 +355,14 @@ def _warped(described: Tensor, cameras: Cameras, view: int, rays: Tensor, invers
     return found.permute(1, 2, 0), visible
 
 
-def _planes(described: Sequence[Tensor], cameras: Cameras, near: float, far: float) -> int:
-    """How many planes: pictures of the view that moves most move by `STEP` from one to the next at nine places of the first."""
-    spots = torch.cartesian_prod(torch.tensor([0.1, 0.5, 0.9]), torch.tensor([0.1, 0.5, 0.9])).to(cameras.intrinsics)
+def _planes(widths: Sequence[int], cameras: Cameras, near: float, far: float) -> int:
+    """How many planes: pictures of the view that moves most move by `STEP` from one to the next at nine places of the first.
+
+    Args:
+        widths: K, of the pictures that are compared.
+        cameras: on the CPU.
+    """
+    spots = torch.cartesian_prod(torch.tensor([0.1, 0.5, 0.9]), torch.tensor([0.1, 0.5, 0.9]))
     flat = (spots * cameras.size[0] - cameras.intrinsics[0, 2:]) / cameras.intrinsics[0, :2]
     rays = torch.cat([flat, torch.ones_like(flat[:, :1])], 1)
     most = 0.0
@@ -353,6 +373,6 @@ def _planes(described: Sequence[Tensor], cameras: Cameras, near: float, far: flo
         if not bool(front.any()):
             continue
         one, two = ((end[front, :2] / end[front, 2:]) * cameras.intrinsics[view, :2] for end in ends)
-        scale = described[view].shape[2] / float(cameras.size[view, 0])
+        scale = widths[view] / float(cameras.size[view, 0])
         most = max(most, float((one - two).norm(dim=1).median()) * scale)
     return int(min(max(math.ceil(most / STEP) + 1, PLANES[0]), PLANES[1]))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from toolkit.networks import compiled_lookup
+from toolkit.networks import compiled_lookup, gpu
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.pyramid import Pyramid
 
@@ -84,6 +84,10 @@ def look_up(views: Sequence[EncodedView], projection: Projection, step: Tensor) 
     tables = [pyramid.rows for view in views for pyramid in (view.features, view.colours)]
     if compiled_lookup.fits(tables, projection.pixels, step, projection.footprint):
         return _filled(views, projection, step)
+    if not torch.is_grad_enabled() and gpu.fits(*tables, projection.pixels, step, projection.footprint):
+        from toolkit.networks.gpu import lookup
+
+        return lookup.look_up(views, projection.pixels, step, projection.footprint, COLOURED)
     parts = []
     for view, pixels, footprint in zip(views, projection.pixels, projection.footprint, strict=True):
         fine = [view.features.lookup(pixels, step), view.colours.lookup(pixels, step)]

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from toolkit.networks import compiled, compiled_witness
+from toolkit.networks import compiled, compiled_witness, gpu
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.sweep import Compared, Sweep
 
@@ -62,6 +62,10 @@ class Witness:
 
 def witness(swept: Sweep) -> Witness:
     """What others may ask a key frame, from its sweep."""
+    if gpu.fits(swept.table):
+        from toolkit.networks.gpu import reading
+
+        return Witness(swept.camera, reading.says(swept.table, FOR, AGAINST, ABOUT), swept.lowest, swept.step)
     nearer = swept.table[0].permute(1, 2, 0).contiguous()  # (h, w, D): planes of a pixel next to each other in memory
     hidden = F.pad(nearer[..., ABOUT:], (0, ABOUT))
     not_free = F.pad(nearer[..., :-ABOUT], (ABOUT, 0), value=1.0)
@@ -71,7 +75,14 @@ def witness(swept: Sweep) -> Witness:
 
 @torch.no_grad()
 def certain(compared: Compared, swept: Sweep) -> Tensor:
-    """(N, 3) of the working frame: the likeliest places of pixels along which `swept`, made of `compared`, is sure of one depth."""
+    """(N, 3) of the working frame: the likeliest places of pixels along which `swept`, made of `compared`, is sure of one depth.
+
+    On CUDA all pixels, with places that are not numbers, which no witness sees, for those that are not: how many there are is not asked.
+    """
+    if gpu.fits(swept.table):
+        from toolkit.networks.gpu import reading
+
+        return reading.surest(swept.table, compared.rays, compared.inverses, compared.camera.positions[0], SURE)
     likely = torch.diff(swept.table[0], dim=0).neg().flatten(1)  # between planes
     best = likely.argmax(0)
     middle = 0.5 * (compared.inverses[best] + compared.inverses[best + 1])
@@ -101,14 +112,17 @@ def evidence(compared: Compared, witnesses: Sequence[Witness], surface: Tensor |
     planes, height, width = compared.cost.shape
     coarse = [-(-side // SPACING) for side in (height, width)]
     rays = F.interpolate(compared.rays.T.view(1, 3, height, width), coarse, mode="bilinear").view(3, -1).T.contiguous()
-    beliefs = [1.0 if surface is None else credit(one, surface) for one in witnesses]
-    mean = SHARE * _mean(rays, compared.inverses, compared.camera.positions[0], witnesses, beliefs)
+    mean = SHARE * _mean(rays, compared.inverses, compared.camera.positions[0], witnesses, surface)
     return F.interpolate(mean.view(1, *coarse, planes).permute(0, 3, 1, 2), (height, width), mode="bilinear")[0]
 
 
-def _mean(rays: Tensor, inverses: Tensor, origin: Tensor, witnesses: Sequence[Witness], beliefs: Sequence[float]) -> Tensor:
-    """(P, D) what witnesses that look there say in the mean, each by how far it is believed, along rays (P, 3) at inverse depths (D,)."""
-    if compiled.fits(rays, inverses, *(one.says for one in witnesses)):
+def _mean(rays: Tensor, inverses: Tensor, origin: Tensor, witnesses: Sequence[Witness], surface: Tensor | None) -> Tensor:
+    """(P, D) what witnesses that look there say in the mean, each by how far it is believed (`credit`), along rays (P, 3) at (D,)."""
+    volumes = [one.says for one in witnesses]
+    if gpu.fits(rays, inverses, *volumes):
+        return _mean_on_device(rays, inverses, origin, witnesses, surface)
+    beliefs = [1.0 if surface is None else credit(one, surface) for one in witnesses]
+    if compiled.fits(rays, inverses, *volumes):
         asked = compiled_witness.Question(rays, inverses, origin)
         for one, belief in zip(witnesses, beliefs, strict=True):
             asked.put(one.says, one.camera.world_from_camera[0], one.camera.lens(0), one.lowest, one.step, belief)
@@ -119,3 +133,15 @@ def _mean(rays: Tensor, inverses: Tensor, origin: Tensor, witnesses: Sequence[Wi
         said, seen = one.ask(points)
         total, count = total + belief * said, count + seen
     return (total / count.clamp_min(1)).view(len(rays), -1)
+
+
+def _mean_on_device(rays: Tensor, inverses: Tensor, origin: Tensor, witnesses: Sequence[Witness], surface: Tensor | None) -> Tensor:
+    """`_mean` without waiting for CUDA: how far witnesses are believed stays there."""
+    from toolkit.networks.gpu import reading
+
+    if surface is None:
+        beliefs = rays.new_ones(len(witnesses))
+    else:
+        said, count = reading.confirmed(witnesses, surface).unbind(1)
+        beliefs = torch.where(count > 0, (said / count.clamp_min(1) / BELIEVED).clamp(0, 1), 1.0)
+    return reading.mean(rays, inverses, origin, witnesses, beliefs)

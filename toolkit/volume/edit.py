@@ -15,12 +15,14 @@ from torch import Tensor
 
 from toolkit.volume.lookup import corners, gather
 from toolkit.volume.rows import zero_rows
-from toolkit.volume.topology import BLOCK, VOXELS, Topology
+from toolkit.volume.topology import BLOCK, VOXELS, Bounds, Topology, constant
+from toolkit.volume.waiting import asks_freely
 
 CHUNK = 1024  # blocks at a time …
 COPIED = 128  # … and of those that are copied
 MODES = ("trilinear", "nearest")
-_ELEMENTS = 2**19  # values gathered at a time by `resample`: about what fits into a core's cache
+_ELEMENTS = 2**19  # values gathered at a time by `resample`: about what fits into a core's cache …
+_AT_ONCE = 2**27  # … and on another device
 
 
 def corner_nodes(topology: Topology, occupied: Tensor) -> Tensor:
@@ -45,6 +47,8 @@ def _pooled(topology: Topology, occupied: Tensor, last: int) -> Tensor:
 
 def _with_reached_blocks(topology: Topology, occupied: Tensor, lowest: int) -> Topology:
     """These blocks, then the absent ones that hold a row one step (from `lowest` to +1 along each axis) beside an occupied row."""
+    if topology.bounds is not None and topology.table is not None:
+        return _with_marked_blocks(topology, occupied, lowest)
     cube = occupied.view(-1, BLOCK, BLOCK, BLOCK)
     parts = {-1: slice(0, 1), 0: slice(None), 1: slice(BLOCK - 1, BLOCK)}
     steps = range(lowest, 2)
@@ -54,7 +58,28 @@ def _with_reached_blocks(topology: Topology, occupied: Tensor, lowest: int) -> T
         reaches &= topology.around[:, (dz + 1) * 9 + (dy + 1) * 3 + dx + 1] < 0
         found.append(topology.keys[reaches].long() + torch.tensor([dx, dy, dz], device=topology.device))
     new = torch.unique(torch.cat(found), dim=0)
-    return topology if len(new) == 0 else Topology(torch.cat([topology.keys.long(), new]))
+    return topology if len(new) == 0 else topology.alike(torch.cat([topology.keys.long(), new]))
+
+
+def _with_marked_blocks(topology: Topology, occupied: Tensor, lowest: int) -> Topology:
+    """The same by marks in the table, which asks the device once; new blocks in the table's order."""
+    table = topology.table
+    assert table is not None
+    sx, sy, sz = topology.table_size
+    # (M, 3, 3, 3) steps: whether a row of a block lies at its low end, anywhere, or at its high end along each axis.
+    reaches = occupied.view(-1, BLOCK, BLOCK, BLOCK)
+    for axis in (1, 2, 3):
+        low, high = reaches.narrow(axis, 0, 1), reaches.narrow(axis, BLOCK - 1, 1)
+        reaches = torch.cat([low, reaches.any(axis, keepdim=True), high], axis)
+    line = range(lowest, 2)
+    steps = [(z, y, x) for z in line for y in line for x in line]
+    chosen = constant(tuple(((z + 1) * 3 + y + 1) * 3 + x + 1 for z, y, x in steps), occupied.device)
+    cells = constant(tuple((z * sy + y) * sx + x for z, y, x in steps), occupied.device)
+    nowhere = table.numel()  # one more cell takes what is not reached
+    reached = torch.where(reaches.flatten(1)[:, chosen], topology.own_cells[:, None] + cells, nowhere)
+    marks = torch.zeros(nowhere + 1, dtype=torch.bool, device=occupied.device).index_fill_(0, reached.view(-1), True)
+    new = (marks[:-1].view(sz, sy, sx) & (table < 0)).nonzero().flip(1) + constant(topology.table_origin, occupied.device)
+    return topology if len(new) == 0 else topology.alike(torch.cat([topology.keys, new.to(torch.int32)]))
 
 
 def with_corner_blocks(topology: Topology, occupied: Tensor) -> tuple[Topology, Tensor]:
@@ -87,7 +112,7 @@ def erase_empty_blocks(topology: Topology, occupied: Tensor, rows: Sequence[Tens
     nodes = corner_nodes(topology, occupied).view(-1, VOXELS)
     kept = nodes.any(1).nonzero().view(-1)
     values = [_of_blocks(of, kept, nodes) for of in rows]
-    return Topology(topology.keys[kept]), occupied.view(-1, VOXELS)[kept].view(-1), values
+    return topology.alike(topology.keys[kept]), occupied.view(-1, VOXELS)[kept].view(-1), values
 
 
 def _of_blocks(values: Tensor, kept: Tensor, nodes: Tensor) -> Tensor:
@@ -149,7 +174,7 @@ def split(topology: Topology, occupied: Tensor, rows: Sequence[Tensor], mode: st
         topology (children in the order of their parents, then blocks that only hold corners), occupancy, and values, which are zero
         at corners that no occupied voxel touches.
     """
-    octants = torch.tensor([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], device=topology.device)
+    octants = constant(tuple(k for z in (0, 1) for y in (0, 1) for x in (0, 1) for k in (x, y, z)), topology.device).view(8, 3)
     # (M, z half, z, y half, y, x half, x) → (M, 8 octants, 4, 4, 4)
     cubes = occupied.view(-1, 2, 4, 2, 4, 2, 4).permute(0, 1, 3, 5, 2, 4, 6).reshape(-1, 8, 4, 4, 4)
     parent, octant = cubes.flatten(2).any(2).nonzero().unbind(1)
@@ -157,10 +182,25 @@ def split(topology: Topology, occupied: Tensor, rows: Sequence[Tensor], mode: st
     for axis in (1, 2, 3):
         child = child.repeat_interleave(2, axis)
     keys = topology.keys[parent].long() * 2 + octants[octant]
-    new_topology, new_occupied = with_corner_blocks(Topology(keys), child.reshape(-1))
+    bounds = None if topology.bounds is None else _doubled(*topology.bounds)
+    new_topology, new_occupied = with_corner_blocks(Topology(keys, bounds=bounds), child.reshape(-1))
     out = resample(topology, occupied, rows, new_topology.keys, 0.5, mode)
-    unused = (~corner_nodes(new_topology, new_occupied)).nonzero().view(-1)
-    return new_topology, new_occupied, [values.index_fill_(0, unused, 0.0) for values in out]
+    unused = ~corner_nodes(new_topology, new_occupied)
+    return new_topology, new_occupied, [_cleared(values, unused) for values in out]
+
+
+def _cleared(values: Tensor, unused: Tensor) -> Tensor:
+    """(N + 1, …) rows, in place, zero where `unused` (N,)."""
+    if asks_freely(values.device):
+        return values.index_fill_(0, unused.nonzero().view(-1), 0.0)
+    values[:-1].masked_fill_(unused.view(-1, *[1] * (values.ndim - 1)), 0.0)
+    return values
+
+
+def _doubled(low: tuple[int, int, int], high: tuple[int, int, int]) -> Bounds:
+    """Bounds of the blocks' children, and of the blocks that hold corners of these."""
+    (ax, ay, az), (bx, by, bz) = low, high
+    return (2 * ax, 2 * ay, 2 * az), (2 * bx + 2, 2 * by + 2, 2 * bz + 2)
 
 
 def resample(
@@ -182,14 +222,15 @@ def resample(
         raise ValueError(f"mode must be one of {', '.join(MODES)} and scale positive, not {mode!r} and {scale}")
     nodes = corner_nodes(topology, occupied)
     row_of_valid = torch.where(nodes, torch.arange(len(nodes), device=nodes.device), topology.zero_row)
-    row_of_valid = torch.cat([row_of_valid, row_of_valid.new_tensor([topology.zero_row])])
+    row_of_valid = torch.cat([row_of_valid, row_of_valid.new_full((1,), topology.zero_row)])
     if not rows:
         return []
     out = [values.new_zeros((len(new_keys) * VOXELS + 1, *values.shape[1:])) for values in rows]
     flat = [values.flatten(1) if values.ndim > 1 else values[:, None] for values in rows]
     side = math.floor((BLOCK - 1) * scale) + 3
     widths = [values.shape[1] for values in flat]
-    step = max(_ELEMENTS // (side**3 * (sum(widths) + 1)), 1)
+    most = _ELEMENTS if asks_freely(topology.device) else _AT_ONCE
+    step = max(most // (side**3 * (sum(widths) + 1)), 1)
     for start in range(0, len(new_keys), step):
         corner = new_keys[start : start + step].long()[..., None] * BLOCK + torch.arange(BLOCK, device=new_keys.device)
         place = corner.double() * scale  # (n, 3, 8) in the old lattice
@@ -210,7 +251,10 @@ def _box_rows(topology: Topology, low: Tensor, side: int) -> Tensor:
     block = line >> 3
     local = line & (BLOCK - 1)
     first = block[..., :1]
-    spans = int((block[..., -1:] - first).amax()) + 1 if len(low) else 1
+    if asks_freely(low.device):
+        spans = int((block[..., -1:] - first).amax()) + 1 if len(low) else 1
+    else:  # as many as there can be
+        spans = (side + BLOCK - 2) // BLOCK + 1
     reach = torch.arange(spans, device=low.device)
     near = first + reach  # (n, 3, spans): the blocks that a cube can touch
     z, y, x = (near[:, axis] for axis in (2, 1, 0))

@@ -7,10 +7,13 @@ Value arrays that are read through `lookup_rows` or `halo_rows` carry one more r
 
 from __future__ import annotations
 
-from functools import cached_property
+import math
+from functools import cached_property, lru_cache
 
 import torch
 from torch import Tensor
+
+from toolkit.volume.waiting import asks_freely
 
 BLOCK = 8
 VOXELS = BLOCK**3
@@ -19,6 +22,7 @@ HALO = (BLOCK + 2) ** 3
 MAX_TABLE_CELLS = 2**26
 MAX_BLOCKS = 2**31 // VOXELS - 2
 KEY_LOW, KEY_HIGH = -(2**31), 2**31 - 1
+Bounds = tuple[tuple[int, int, int], tuple[int, int, int]]
 SELF = 13  # the block itself among the 27 of `around`
 
 
@@ -29,29 +33,38 @@ class Topology:
         keys: (M, 3) integer block keys (bx, by, bz), each within int32, none twice.
         max_table_cells: the dense block table is built when the keys' bounding box (with a margin of one block) has at most
             this many cells; otherwise `find` searches sorted codes and `table` is None.
+        bounds: lowest and highest key that there can be, each (x, y, z). Keys are then believed to lie within and to differ, the table
+            covers all of these (where it is small enough), and nothing is asked of the device that holds the keys.
 
     Attributes:
         keys: (M, 3) int32.
         table: (Sz, Sy, Sx) int32 slot or −1, or None; cell (z, y, x) is block key table_origin + (x, y, z).
         table_origin: (x, y, z) of the table's first cell, Python integers. The outermost layer of cells is always empty.
         table_size: (Sx, Sy, Sz), Python integers.
+        own_cells: (M,) int64 cell of each block in the flat table; only where there is a table.
 
     Raises:
         ValueError: wrong shape, keys beyond int32, a key twice, or too many blocks for int32 rows.
     """
 
-    def __init__(self, keys: Tensor, max_table_cells: int = MAX_TABLE_CELLS) -> None:
+    def __init__(self, keys: Tensor, max_table_cells: int = MAX_TABLE_CELLS, bounds: Bounds | None = None) -> None:
         if keys.ndim != 2 or keys.shape[1] != 3 or keys.is_floating_point():
             raise ValueError(f"block keys must be an integer (M, 3) tensor, not {keys.dtype} {tuple(keys.shape)}")
         if len(keys) > MAX_BLOCKS:
             raise ValueError(f"{len(keys)} blocks are more than int32 rows can number ({MAX_BLOCKS})")
+        if bounds is not None and math.prod(high - low + 3 for low, high in zip(*bounds, strict=True)) > max_table_cells:
+            bounds = None
+        self.bounds = bounds
         wide = keys.to(torch.int64)
-        if len(keys) and bool(((wide < KEY_LOW) | (wide > KEY_HIGH)).any()):
+        if bounds is None and len(keys) and bool(((wide < KEY_LOW) | (wide > KEY_HIGH)).any()):
             raise ValueError("block keys must fit into int32")
         self.keys = keys.to(torch.int32).contiguous()
         self._max_table_cells = max_table_cells
-        low = wide.amin(0).tolist() if len(keys) else [0, 0, 0]
-        high = wide.amax(0).tolist() if len(keys) else [0, 0, 0]
+        if bounds is not None:
+            low, high = (list(ends) for ends in bounds)
+        else:
+            low = wide.amin(0).tolist() if len(keys) else [0, 0, 0]
+            high = wide.amax(0).tolist() if len(keys) else [0, 0, 0]
         self.table_origin = (low[0] - 1, low[1] - 1, low[2] - 1)
         self.table_size = (high[0] - low[0] + 3, high[1] - low[1] + 3, high[2] - low[2] + 3)
         sx, sy, sz = self.table_size
@@ -60,9 +73,9 @@ class Topology:
         if sx * sy * sz <= max_table_cells:
             slots = torch.arange(len(keys), dtype=torch.int32, device=keys.device)
             flat = torch.full((sx * sy * sz,), -1, dtype=torch.int32, device=keys.device)
-            cells = self._cells(wide)
+            self.own_cells = cells = self._cells(wide)
             flat[cells] = slots
-            unique = bool((flat[cells] == slots).all())
+            unique = bounds is not None or bool((flat[cells] == slots).all())
             self.table = flat.view(sz, sy, sx)
         else:
             self._codes = _Codes(wide)
@@ -84,14 +97,20 @@ class Topology:
     def device(self) -> torch.device:
         return self.keys.device
 
+    def alike(self, keys: Tensor) -> Topology:
+        """Other blocks of the same lattice, as much believed as these."""
+        return Topology(keys, self._max_table_cells, self.bounds)
+
     def to(self, device: torch.device | str) -> Topology:
         """The same blocks in the same order on another device (self when already there)."""
         keys = self.keys.to(device)
-        return self if keys.device == self.device else Topology(keys, self._max_table_cells)
+        return self if keys.device == self.device else Topology(keys, self._max_table_cells, self.bounds)
 
     def _cells(self, wide: Tensor) -> Tensor:
         """(..., 3) int64 keys inside the table's box → (...) flat cell."""
         (ox, oy, oz), (sx, sy, _) = self.table_origin, self.table_size
+        if not asks_freely(wide.device):  # fewer launches
+            return (wide * constant((1, sx, sx * sy), wide.device)).sum(-1).sub_((oz * sy + oy) * sx + ox)
         return ((wide[..., 2] - oz) * sy + (wide[..., 1] - oy)) * sx + (wide[..., 0] - ox)
 
     def find(self, query: Tensor) -> Tensor:
@@ -100,23 +119,22 @@ class Topology:
         if self.table is None:
             assert self._codes is not None
             return self._codes.find(wide)
-        low = torch.tensor(self.table_origin, device=wide.device)
-        high = low + torch.tensor(self.table_size, device=wide.device) - 1
+        ends = tuple(first + size - 1 for first, size in zip(self.table_origin, self.table_size, strict=True))
+        low, high = constant(self.table_origin, wide.device), constant(ends, wide.device)
         # Far keys are moved to the table's empty margin, so no mask is needed afterwards.
         return self.table.view(-1)[self._cells(torch.minimum(torch.maximum(wide, low), high))].to(torch.int64)
 
     @cached_property
     def around(self) -> Tensor:
         """(M, 27) int64 slots of the 3×3×3 blocks around each, −1 absent; column (dz+1)·9 + (dy+1)·3 + (dx+1), itself in column 13."""
-        wide = self.keys.to(torch.int64)
-        offset = torch.arange(-1, 2, device=self.device)
-        dz, dy, dx = torch.meshgrid(offset, offset, offset, indexing="ij")
-        shifts = torch.stack([dx, dy, dz], dim=-1).view(27, 3)
+        line = range(-1, 2)
+        shifts = [(dx, dy, dz) for dz in line for dy in line for dx in line]
         if self.table is None:
-            return self.find(wide[:, None] + shifts)
+            return self.find(self.keys.to(torch.int64)[:, None] + torch.tensor(shifts, device=self.device))
         sx, sy, _ = self.table_size
-        steps = (shifts[:, 2] * sy + shifts[:, 1]) * sx + shifts[:, 0]  # the margin keeps every step inside the table
-        return self.table.view(-1)[self._cells(wide)[:, None] + steps].to(torch.int64)
+        # The margin keeps every step inside the table.
+        steps = constant(tuple((dz * sy + dy) * sx + dx for dx, dy, dz in shifts), self.device)
+        return self.table.view(-1)[self.own_cells[:, None] + steps].to(torch.int64)
 
     @property
     def neighbours(self) -> Tensor:
@@ -130,10 +148,7 @@ class Topology:
 
     def _rows(self, start: int, stop: int, first: int, size: int) -> Tensor:
         """(stop − start, size³) int32 rows of the lattice corners first … first + size − 1 along each axis of blocks start … stop."""
-        line = torch.arange(first, first + size, device=self.device)
-        side, local = (line // BLOCK + 1), line % BLOCK
-        which = ((side[:, None, None] * 3 + side[:, None]) * 3 + side).view(-1)
-        inner = ((local[:, None, None] * BLOCK + local[:, None]) * BLOCK + local).view(-1).to(torch.int32)
+        which, inner = _pattern(first, size, self.device)
         around = self.around[start:stop]
         base = torch.where(around < 0, self.zero_row, around * VOXELS).to(torch.int32)
         # Absent blocks start at the zero row; whatever is added to that is clamped back to it.
@@ -209,6 +224,22 @@ class Topology:
             distance.masked_fill_(fresh, step)
             reached = grown
         return distance
+
+
+@lru_cache(maxsize=256)
+def constant(values: tuple[int, ...], device: torch.device) -> Tensor:
+    """(N,) int64 on a device, sent there once."""
+    return torch.tensor(values, dtype=torch.int64).to(device)
+
+
+@lru_cache(maxsize=16)
+def _pattern(first: int, size: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """(size³,) int64 which of the 3×3×3 blocks the corners first … first + size − 1 along each axis lie in, and int32 their rows there."""
+    line = torch.arange(first, first + size)
+    side, local = (line // BLOCK + 1), line % BLOCK
+    which = ((side[:, None, None] * 3 + side[:, None]) * 3 + side).view(-1)
+    inner = ((local[:, None, None] * BLOCK + local[:, None]) * BLOCK + local).view(-1).to(torch.int32)
+    return which.to(device), inner.to(device)
 
 
 def _spread(mask: Tensor) -> Tensor:

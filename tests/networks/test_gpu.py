@@ -1,0 +1,89 @@
+"""The kernels for CUDA, in Triton's interpreter on the CPU: against the tensors that they stand for."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+
+import pytest
+import torch
+
+os.environ.setdefault("TRITON_INTERPRET", "1")
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("triton") is None or os.environ["TRITON_INTERPRET"] != "1", reason="needs Triton, interpreting"
+)
+
+from tests.networks.made import cameras, pictures, small_model  # noqa: E402
+from tests.networks.test_compiled import everything, places  # noqa: E402
+from toolkit.networks import compiled, compiled_lookup, gpu  # noqa: E402
+from toolkit.networks.block_conv import block_conv3d  # noqa: E402
+from toolkit.networks.matching import LARGE, SMALL, distribution, semi_global  # noqa: E402
+from toolkit.networks.sweep import _table  # noqa: E402
+from toolkit.networks.unproject import look_up, project  # noqa: E402
+from toolkit.volume.topology import Topology  # noqa: E402
+
+
+def forced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tensors on the CPU take the way of those on CUDA."""
+    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    monkeypatch.setattr(gpu, "fits", lambda *values: True)
+
+
+@pytest.mark.parametrize("shape", [(40, 7, 9), (33, 5, 4), (3, 6, 1), (64, 1, 5)])
+def test_matching(shape: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    cost = torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    smooth, likely = semi_global(cost), distribution(cost)
+    table = _table(likely, 0.1)
+    forced(monkeypatch)
+    torch.testing.assert_close(semi_global(cost), smooth, atol=1e-6, rtol=0)
+    torch.testing.assert_close(distribution(cost), likely, atol=1e-5, rtol=0)
+    made = _table(likely, 0.1)
+    torch.testing.assert_close(made, table, atol=1e-5, rtol=0)
+    assert made.stride() == table.stride()
+
+
+@pytest.mark.parametrize("views", [1, 2, 4])
+def test_a_sweep_and_its_witnesses(views: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    slow = everything(views, 1000)
+    forced(monkeypatch)
+    for name, quick in everything(views, 1000).items():
+        torch.testing.assert_close(quick, slow[name], atol=2e-4, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
+
+
+@pytest.mark.parametrize(("inside", "outside"), [(4, 8), (16, 16), (32, 8)])
+def test_convolution_and_its_gradients(inside: int, outside: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(0)
+    topology = Topology(torch.tensor([[0, 0, 0], [1, 0, 0], [1, 1, 0], [5, 0, 2]]))
+    rows = torch.randn(topology.zero_row + 1, inside, generator=generator)
+    occupied = torch.rand(topology.zero_row, generator=generator) < 0.6
+    rows[:-1] *= occupied[:, None]
+    rows[-1] = 0
+    weight, bias = torch.randn(outside, inside, 3, 3, 3, generator=generator), torch.randn(outside, generator=generator)
+    slopes = torch.randn(len(rows), outside, generator=generator)
+
+    def everything() -> list[torch.Tensor]:
+        given = [value.clone().requires_grad_() for value in (rows, weight, bias)]
+        out = block_conv3d(given[0], topology, given[1], given[2], occupied)
+        out.backward(slopes)
+        return [out.detach(), *(value.grad for value in given)]
+
+    slow = everything()
+    monkeypatch.setattr(gpu, "takes", lambda values: True)
+    for quick, expected in zip(everything(), slow, strict=True):
+        torch.testing.assert_close(quick, expected, atol=2e-3, rtol=1e-4)
+
+
+def test_lookup(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(0)
+    model, seen_by = small_model(), cameras(3)
+    views = model.encode(pictures(3), seen_by)
+    points = torch.rand(300, 3, generator=generator) * 2 - 1
+    projection = project(points, torch.rand(300, generator=generator) * 0.4, seen_by, 0.0, 9.0)
+    step = torch.rand(300, generator=generator) * 6
+    monkeypatch.setattr(compiled_lookup, "fits", lambda *values: False)
+    with torch.no_grad():
+        slow = look_up(views, projection, step)
+        monkeypatch.setattr(gpu, "fits", lambda *values: True)
+        torch.testing.assert_close(look_up(views, projection, step), slow, atol=1e-5, rtol=1e-5)

@@ -1,0 +1,29 @@
+"""Kernels for CUDA, in Triton, of what takes hundreds of short operations as tensors. Modules in here are imported only when tensors lie there.
+
+Everything has a way in tensors beside it, which is taken where Triton is not installed and which the tests compare with. `FIELDFUSE_TRITON=0`
+leaves the kernels out.
+"""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from importlib import util
+
+import torch
+from torch import Tensor
+
+
+@cache
+def _there() -> bool:
+    return os.environ.get("FIELDFUSE_TRITON", "1") != "0" and util.find_spec("triton") is not None
+
+
+def fits(*values: Tensor) -> bool:
+    """Whether the kernels can take these: float32 on a CUDA device."""
+    return all(value.is_cuda and value.dtype == torch.float32 for value in values) and _there()
+
+
+def takes(values: Tensor) -> bool:
+    """Whether the convolution can take rows: on a CUDA device, in any of the numbers that networks compute in."""
+    return values.is_cuda and values.dtype in (torch.float32, torch.bfloat16, torch.float16) and _there()

@@ -1,0 +1,117 @@
+"""The block-sparse 3×3×3 convolution on CUDA in one launch, which reads neighbours where they lie (`block_conv.py` in tensors)."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from toolkit.volume.topology import VOXELS
+
+TILE = 128  # voxels of a block at a time: two of its layers
+
+
+@triton.jit
+def _convolve(
+    rows, around, weight, bias, occupied, out, blocks,
+    CIN: tl.constexpr, COUT: tl.constexpr, BIN: tl.constexpr, BOUT: tl.constexpr, BIASED: tl.constexpr, MASKED: tl.constexpr,
+    RELU: tl.constexpr, EXACT: tl.constexpr, TILE: tl.constexpr,
+):  # fmt: skip
+    parts: tl.constexpr = 512 // TILE
+    block = tl.program_id(0) // parts
+    voxel = (tl.program_id(0) % parts) * TILE + tl.arange(0, TILE)
+    z, y, x = voxel // 64, (voxel // 8) % 8, voxel % 8
+    c, o = tl.arange(0, BIN), tl.arange(0, BOUT)
+    total = tl.zeros((TILE, BOUT), tl.float32)
+    for tap in range(27):
+        nz, ny, nx = z + tap // 9 + 7, y + (tap // 3) % 3 + 7, x + tap % 3 + 7  # of the 3 × 3 × 3 blocks, 0 to 23
+        slot = tl.load(around + block * 27 + (nz // 8 * 3 + ny // 8) * 3 + nx // 8)
+        row = slot * 512 + (nz % 8 * 8 + ny % 8) * 8 + nx % 8
+        there = (slot >= 0)[:, None] & (c < CIN)[None, :]
+        values = tl.load(rows + row[:, None] * CIN + c[None, :], there, 0.0)
+        if RELU:
+            values = tl.maximum(values, 0.0).to(rows.dtype.element_ty)
+        kernel = tl.load(weight + (tap * CIN + c[:, None]) * COUT + o[None, :], (c < CIN)[:, None] & (o < COUT)[None, :], 0.0)
+        if EXACT:
+            total = tl.dot(values, kernel, total, input_precision="tf32x3")
+        else:
+            total = tl.dot(values, kernel, total)
+    if BIASED:
+        total += tl.load(bias + o, o < COUT, 0.0).to(tl.float32)[None, :]
+    place = tl.cast(block, tl.int64) * 512 + voxel
+    if MASKED:
+        kept = tl.load(occupied + place) != 0
+        total = tl.where(kept[:, None], total, 0.0)
+    tl.store(out + place[:, None] * COUT + o[None, :], total.to(out.dtype.element_ty), (o < COUT)[None, :] & (voxel < 512)[:, None])
+
+
+def convolve(
+    rows: Tensor, around: Tensor, weight: Tensor, bias: Tensor | None, occupied: Tensor | None, relu: bool = False
+) -> Tensor:
+    """Convolve rows of blocks.
+
+    Args:
+        rows: (M · 512 or more, C); what lies beyond the blocks' own is not read.
+        around: (M, 27) int64, `Topology.around`.
+        weight: (C', C, 3, 3, 3); bias: (C',); both of the rows' type.
+        occupied: (M · 512,) bool; None: every voxel.
+        relu: of the rows, before.
+
+    Returns:
+        (M · 512 + 1, C'), zero at unoccupied voxels and in the last row.
+    """
+    blocks, outside, inside = len(around), len(weight), weight.shape[1]
+    out = rows.new_empty((blocks * VOXELS + 1, outside))
+    out[-1:].zero_()
+    if blocks:
+        kernel = weight.permute(2, 3, 4, 1, 0).contiguous()
+        _convolve[(blocks * (VOXELS // TILE),)](
+            rows.contiguous(), around, kernel, kernel if bias is None else bias, out if occupied is None else occupied.view(torch.uint8),
+            out, blocks, CIN=inside, COUT=outside, BIN=max(16, triton.next_power_of_2(inside)), BOUT=max(16, triton.next_power_of_2(outside)),
+            BIASED=bias is not None, MASKED=occupied is not None, RELU=relu, EXACT=rows.dtype == torch.float32, TILE=TILE,
+        )  # fmt: skip
+    return out
+
+
+@triton.jit
+def _weigh(
+    rows, around, gradient, out, blocks, share,
+    CIN: tl.constexpr, COUT: tl.constexpr, BIN: tl.constexpr, BOUT: tl.constexpr, EXACT: tl.constexpr, TILE: tl.constexpr,
+):  # fmt: skip
+    """Products of what lies at one of the 27 places beside voxels with their gradients, summed over a share of the blocks."""
+    tap, part = tl.program_id(0), tl.program_id(1)
+    c, o = tl.arange(0, BIN), tl.arange(0, BOUT)
+    total = tl.zeros((BIN, BOUT), tl.float32)
+    tile = part * share * (512 // TILE)
+    last = tl.minimum((part + 1) * share, blocks) * (512 // TILE)
+    while tile < last:
+        block = tile // (512 // TILE)
+        voxel = (tile % (512 // TILE)) * TILE + tl.arange(0, TILE)
+        nz, ny, nx = voxel // 64 + tap // 9 + 7, (voxel // 8) % 8 + (tap // 3) % 3 + 7, voxel % 8 + tap % 3 + 7
+        slot = tl.load(around + block * 27 + (nz // 8 * 3 + ny // 8) * 3 + nx // 8)
+        row = slot * 512 + (nz % 8 * 8 + ny % 8) * 8 + nx % 8
+        values = tl.load(rows + row[None, :] * CIN + c[:, None], (slot >= 0)[None, :] & (c < CIN)[:, None], 0.0)
+        place = tl.cast(block, tl.int64) * 512 + voxel
+        slopes = tl.load(gradient + place[:, None] * COUT + o[None, :], (o < COUT)[None, :] & (voxel < 512)[:, None], 0.0)
+        if EXACT:
+            total = tl.dot(values, slopes, total, input_precision="tf32x3")
+        else:
+            total = tl.dot(values, slopes, total)
+        tile += 1
+    at = ((part * 27 + tap) * CIN + c[:, None]) * COUT + o[None, :]
+    tl.store(out + at, total, (c < CIN)[:, None] & (o < COUT)[None, :])
+
+
+def weight_gradient(rows: Tensor, around: Tensor, gradient: Tensor) -> Tensor:
+    """(C', C, 3, 3, 3) float32, from rows (M · 512 or more, C) and the result's gradient (M · 512 or more, C'), of one type."""
+    blocks, inside, outside = len(around), rows.shape[1], gradient.shape[1]
+    parts = max(1, min(32, blocks // 4))
+    share = triton.cdiv(blocks, parts)
+    out = rows.new_empty((parts, 27, inside, outside), dtype=torch.float32)
+    _weigh[(27, parts)](
+        rows.contiguous(), around, gradient.contiguous(), out, blocks, share,
+        CIN=inside, COUT=outside, BIN=max(16, triton.next_power_of_2(inside)), BOUT=max(16, triton.next_power_of_2(outside)),
+        EXACT=rows.dtype == torch.float32, TILE=64,
+    )  # fmt: skip
+    return out.sum(0).view(3, 3, 3, inside, outside).permute(4, 3, 0, 1, 2).contiguous()

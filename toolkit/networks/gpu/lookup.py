@@ -1,0 +1,82 @@
+"""What views show at voxels on CUDA, a launch a view (`Pyramid.lookup` and `unproject.look_up` in tensors)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+BLOCK = 64  # voxels at a time
+
+
+@triton.jit
+def _corners(x, y, footprint, height, width, STRIDE: tl.constexpr, LEVELS: tl.constexpr):
+    """Rows of the four cells about pixels in the level whose cells are nearest to a footprint, and their weights."""
+    level = tl.minimum(tl.floor(tl.log2(tl.maximum(footprint / STRIDE, 1.0)) + 0.5), LEVELS - 1.0).to(tl.int32)
+    first = tl.zeros_like(level)
+    for k in tl.static_range(LEVELS - 1):
+        first += tl.where(level > k, (height >> k) * (width >> k), 0)
+    tall, wide = height >> level, width >> level
+    scale = 1.0 / (STRIDE * (1 << level).to(tl.float32))
+    x = tl.minimum(tl.maximum(x * scale - 0.5, 0.0), (wide - 1).to(tl.float32))
+    y = tl.minimum(tl.maximum(y * scale - 0.5, 0.0), (tall - 1).to(tl.float32))
+    left, top = tl.floor(x), tl.floor(y)
+    fx, fy = x - left, y - top
+    column, row = left.to(tl.int32), top.to(tl.int32)
+    right, below = tl.where(column + 1 < wide, 1, 0), tl.where(row + 1 < tall, wide, 0)
+    corner = first + row * wide + column
+    return corner, right, below, (1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy
+
+
+@triton.jit
+def _read(table, out, stride, column, n, some, corner, right, below, w0, w1, w2, w3, CHANNELS: tl.constexpr, WIDE: tl.constexpr):
+    """Write the weighted mean of four rows into columns of `out`."""
+    c = tl.arange(0, WIDE)[None, :]
+    mask = some[:, None] & (c < CHANNELS)
+    at = table + corner[:, None] * CHANNELS + c
+    value = tl.load(at, mask, 0.0) * w0[:, None]
+    value += tl.load(at + right[:, None] * CHANNELS, mask, 0.0) * w1[:, None]
+    value += tl.load(at + below[:, None] * CHANNELS, mask, 0.0) * w2[:, None]
+    value += tl.load(at + (right + below)[:, None] * CHANNELS, mask, 0.0) * w3[:, None]
+    tl.store(out + n[:, None] * stride + column + c, value, mask)
+
+
+@triton.jit
+def _shown(
+    pixels, step, footprint, features, colours, out, count, height, width, across, down, part,
+    CHANNELS: tl.constexpr, WIDE: tl.constexpr, COLOURS: tl.constexpr, FINE: tl.constexpr, FINE_LEVELS: tl.constexpr,
+    STRIDE: tl.constexpr, LEVELS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    some = n < count
+    x, y = tl.load(pixels + 2 * n, some, 0.0), tl.load(pixels + 2 * n + 1, some, 0.0)
+    size, cell = tl.load(step + n, some, 1.0), tl.load(footprint + n, some, 1.0)
+    stride: tl.constexpr = CHANNELS + 2 * COLOURS
+    corner, right, below, w0, w1, w2, w3 = _corners(x, y, size, height, width, STRIDE, LEVELS)
+    _read(features, out, stride, 0, n, some, corner, right, below, w0, w1, w2, w3, CHANNELS, WIDE)
+    corner, right, below, w0, w1, w2, w3 = _corners(x, y, size, down, across, FINE, FINE_LEVELS)
+    _read(colours, out, stride, CHANNELS, n, some, corner, right, below, w0, w1, w2, w3, COLOURS, 4)
+    corner, right, below, w0, w1, w2, w3 = _corners(x, y, part * cell, down, across, FINE, FINE_LEVELS)
+    _read(colours, out, stride, CHANNELS + COLOURS, n, some, corner, right, below, w0, w1, w2, w3, COLOURS, 4)
+
+
+def look_up(views: Sequence[Any], pixels: Tensor, step: Tensor, footprint: Tensor, part: float) -> Tensor:
+    """(K, N, C) as `unproject.look_up`, of K views at pixels (K, N, 2), with steps (N,) and footprints (K, N)."""
+    count = len(step)
+    channels, colours = views[0].features.rows.shape[1], views[0].colours.rows.shape[1]
+    out = step.new_empty((len(views), count, channels + 2 * colours))
+    if count == 0:
+        return out
+    pixels, step, footprint = pixels.contiguous(), step.contiguous(), footprint.contiguous()
+    for number, view in enumerate(views):
+        fine = view.colours
+        _shown[(triton.cdiv(count, BLOCK),)](
+            pixels[number], step, footprint[number], view.features.rows, fine.rows, out[number], count,
+            *view.features.sizes[0], fine.sizes[0][1], fine.sizes[0][0], part,
+            CHANNELS=channels, WIDE=triton.next_power_of_2(channels), COLOURS=colours, FINE=fine.stride, FINE_LEVELS=len(fine.sizes),
+            STRIDE=view.features.stride, LEVELS=len(view.features.sizes), BLOCK=BLOCK,
+        )  # fmt: skip
+    return out
