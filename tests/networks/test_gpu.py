@@ -14,7 +14,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 from tests.networks.made import cameras, pictures, small_model  # noqa: E402
-from tests.networks.test_compiled import everything, places  # noqa: E402
+from tests.networks.test_compiled import everything  # noqa: E402
 from toolkit.networks import compiled, compiled_lookup, gpu  # noqa: E402
 from toolkit.networks.block_conv import block_conv3d  # noqa: E402
 from toolkit.networks.matching import LARGE, SMALL, distribution, semi_global  # noqa: E402

@@ -19,25 +19,25 @@ LOG2E = tl.constexpr(1.4426950408889634)
 
 
 @triton.jit
-def exp(x):  # type: ignore[no-untyped-def]
+def exp(x):
     """eˣ by the unit that raises 2 to a power."""
     return tl.exp2(x * LOG2E)
 
 
 @triton.jit
-def stopped(tau):  # type: ignore[no-untyped-def]
+def stopped(tau):
     """1 - exp(-τ), with the digits of thin media."""
     return tl.where(tau < 0.02, tau * (1 - tau * (0.5 - tau * (0.16666667 - tau * 0.041666667))), 1 - exp(-tau))
 
 
 @triton.jit
-def largest(x, y, z):  # type: ignore[no-untyped-def]
+def largest(x, y, z):
     """max(|x|, |y|, |z|)."""
     return tl.maximum(tl.maximum(tl.abs(x), tl.abs(y)), tl.abs(z))
 
 
 @triton.jit
-def contract(x, y, z, shell, HAS_SHELL: tl.constexpr):  # type: ignore[no-untyped-def]
+def contract(x, y, z, shell, HAS_SHELL: tl.constexpr):
     """`Space.contract` of a normalised place."""
     if HAS_SHELL:
         norm = tl.maximum(largest(x, y, z), 1.0)
@@ -47,7 +47,7 @@ def contract(x, y, z, shell, HAS_SHELL: tl.constexpr):  # type: ignore[no-untype
 
 
 @triton.jit
-def bricks_away(skip, x, y, z, extent, per_brick, width):  # type: ignore[no-untyped-def]
+def bricks_away(skip, x, y, z, extent, per_brick, width):
     """Distance in bricks from a contracted place to the nearest brick that holds something, at most what the table knows."""
     i = tl.minimum(tl.maximum(tl.floor((x + extent) * per_brick).to(tl.int32) + 1, 0), width - 1)
     j = tl.minimum(tl.maximum(tl.floor((y + extent) * per_brick).to(tl.int32) + 1, 0), width - 1)
@@ -56,7 +56,7 @@ def bricks_away(skip, x, y, z, extent, per_brick, width):  # type: ignore[no-unt
 
 
 @triton.jit
-def voxel_of(table, x, y, z, extent, per_voxel, top, tx, ty, tz, sx, sy, sz, mask):  # type: ignore[no-untyped-def]
+def voxel_of(table, x, y, z, extent, per_voxel, top, tx, ty, tz, sx, sy, sz, mask):
     """Row of the voxel about a contracted place, −1 where its block is not there, and the place within it."""
     u = tl.minimum(tl.maximum((x + extent) * per_voxel, 0.0), top)
     v = tl.minimum(tl.maximum((y + extent) * per_voxel, 0.0), top)
@@ -74,7 +74,7 @@ def voxel_of(table, x, y, z, extent, per_voxel, top, tx, ty, tz, sx, sy, sz, mas
 
 
 @triton.jit
-def corner(cell, lookup, DX: tl.constexpr, DY: tl.constexpr, DZ: tl.constexpr, mask):  # type: ignore[no-untyped-def]
+def corner(cell, lookup, DX: tl.constexpr, DY: tl.constexpr, DZ: tl.constexpr, mask):
     """Row of one corner of the voxels `cell`: arithmetic within a block, the index of its halo at its far sides."""
     local = cell & (C_VOXELS - 1)
     x, y, z = local & 7, (local >> 3) & 7, local >> 6
@@ -85,13 +85,13 @@ def corner(cell, lookup, DX: tl.constexpr, DY: tl.constexpr, DZ: tl.constexpr, m
 
 
 @triton.jit
-def share(f, D: tl.constexpr):  # type: ignore[no-untyped-def]
+def share(f, D: tl.constexpr):
     """Trilinear weight along one axis."""
     return f if D == 1 else 1 - f
 
 
 @triton.jit
-def raw_density(density, cell, fx, fy, fz, lookup, mask):  # type: ignore[no-untyped-def]
+def raw_density(density, cell, fx, fy, fz, lookup, mask):
     """Trilinear raw density in voxels `cell`."""
     raw = fx * 0
     for d in tl.static_range(8):

@@ -26,20 +26,18 @@ from toolkit.render.triton_lookup import (
 )
 
 RAYS = 32  # of a program: a warp, each thread with a ray of its own
-OX, OY, OZ, DX, DY, DZ, RED, GREEN, BLUE, COUNTS, TARGET, JITTER, BACK_R, BACK_G, BACK_B = range(15)  # layers of `rays` (LAYERS, N)
-LAYERS = 15
-FX, FY, FZ, WEIGHT, AFTER, SLOPE, DISTANCE, PLACE, PULL = range(9)  # layers of `notes` (NOTES, SLOTS, N); rendering has the first four
-NOTES, SHOWN = 9, 4
-OPACITY, MOMENT, MEDIAN, G_OPACITY = range(4)  # layers of `sums` (SUMS, N)
-SUMS = 4
+# Layers of `rays` (LAYERS, N): origin, direction, colour, what a ray counts, distance to a known surface, jitter, what is behind.
+DX, RED, COUNTS, TARGET, JITTER, BEHIND, LAYERS = 3, 6, 9, 10, 11, 12, 15
+NOTES, SHOWN = 9, 4  # layers of `notes` (NOTES, SLOTS, N): those of C_FX … below; rendering has the first four
+OPACITY, MEDIAN, SUMS = 0, 2, 4  # layers of `sums` (SUMS, N): those of C_OPACITY … below
 C_JITTER, C_STOP, C_SOLID, C_OPAQUE, C_STRETCH = (tl.constexpr(v) for v in (JITTER, STOP, SOLID, OPAQUE, MAX_STRETCH))
-C_FX, C_FY, C_FZ, C_WEIGHT, C_AFTER, C_SLOPE, C_DISTANCE, C_PLACE = (tl.constexpr(v) for v in range(8))
-C_OPACITY, C_MOMENT, C_MEDIAN = (tl.constexpr(v) for v in range(3))
+C_FX, C_FY, C_FZ, C_WEIGHT, C_AFTER, C_SLOPE, C_DISTANCE, C_PLACE, C_PULL = (tl.constexpr(v) for v in range(9))
+C_OPACITY, C_MOMENT, C_MEDIAN, C_G_OPACITY = (tl.constexpr(v) for v in range(4))
 C_FLOOR = tl.constexpr(1e-6)  # rays.OPACITY_FLOOR
 
 
 @triton.jit
-def _stride(ox, oy, oz, dx, dy, dz, t, rise, far, h, near_limit):  # type: ignore[no-untyped-def]
+def _stride(ox, oy, oz, dx, dy, dz, t, rise, far, h, near_limit):
     """Where the step that begins at distance `t` ends, beyond the region of interest as within it (`march._coarse_distances`)."""
     norm = tl.maximum(largest(ox + dx * t, oy + dy * t, oz + dz * t), 1.0)
     stretch = tl.minimum(tl.maximum(norm * norm * rise, 1.0), C_STRETCH)
@@ -47,7 +45,7 @@ def _stride(ox, oy, oz, dx, dy, dz, t, rise, far, h, near_limit):  # type: ignor
 
 
 @triton.jit(do_not_specialize=["count", "stride", "width", "tx", "ty", "tz", "sx", "sy", "sz"])
-def walk(  # type: ignore[no-untyped-def]
+def walk(
     rays, cells, notes, counts, sums, seen, visits,
     skip, table, occupied, lookup, density,
     count, stride,  # rays of this call, and of a layer
@@ -192,7 +190,7 @@ def walk(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def gathered(features, cell, fx, fy, fz, lookup, channel, C: tl.constexpr, mask, wanted):  # type: ignore[no-untyped-def]
+def gathered(features, cell, fx, fy, fz, lookup, channel, C: tl.constexpr, mask, wanted):
     """(B, P) trilinear features of voxels `cell` (B,)."""
     value = tl.zeros([cell.shape[0], channel.shape[0]], tl.float32)
     for d in tl.static_range(8):
@@ -203,7 +201,7 @@ def gathered(features, cell, fx, fy, fz, lookup, channel, C: tl.constexpr, mask,
 
 
 @triton.jit(do_not_specialize=["count", "stride", "columns"])
-def composite(  # type: ignore[no-untyped-def]
+def composite(
     cells, notes, counts, sums, features, lookup, inputs,
     count, stride, columns,
     C: tl.constexpr, P: tl.constexpr, SLOTS: tl.constexpr, B: tl.constexpr,

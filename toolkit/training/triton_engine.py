@@ -1,6 +1,6 @@
 """The engine of a fit on CUDA: a step is some thirty launches whose shapes are known beforehand, recorded once and replayed.
 
-What `Optimiser._deferred` does with flat lists of samples is done here ray by ray (`triton_march`, `triton_kernels`); the decoder's
+What `Optimiser._deferred` does with flat lists of samples is done here ray by ray (`triton_march` and the other modules of that name); the decoder's
 layers are products of matrices. Nothing waits for the GPU but a look at every `LOOK`-th step for what was not finite: such a step moves
 nothing.
 """
@@ -17,12 +17,15 @@ from toolkit.networks.encoding import DIRECTION, spherical_harmonics
 from toolkit.render.field import Field
 from toolkit.render.march import BRICK
 from toolkit.render.triton_field import Tables, TritonRenderer, buffers_for, launch_composite, launch_walk
-from toolkit.render.triton_march import COUNTS, JITTER, NOTES, RED, TARGET
-from toolkit.training import triton_kernels as kernels
+from toolkit.render.triton_march import BEHIND, COUNTS, JITTER, NOTES, RED, TARGET
 from toolkit.training.finite import NotFiniteError
 from toolkit.training.importance import RENEW, densities, tile_grid
 from toolkit.training.rays import Batch, PixelPool
 from toolkit.training.step import Rates
+from toolkit.training.triton_adam import count_step, learn, move
+from toolkit.training.triton_draw import draw
+from toolkit.training.triton_gradients import inspect, judge, spread
+from toolkit.training.triton_rates import RATES, told
 from toolkit.training.view import blind
 
 Tensor = torch.Tensor
@@ -69,8 +72,8 @@ class TritonOptimiser:
         self.bad, self.failed = (torch.zeros(1, dtype=torch.int32, device=self.device) for _ in range(2))
         self.limit = torch.zeros(1, dtype=torch.int64, device=self.device)
         self.total = torch.zeros(1, device=self.device)
-        self.rates = torch.zeros(kernels.RATES, device=self.device)
-        self._staged = [torch.zeros(kernels.RATES, pin_memory=self.device.type == "cuda") for _ in range(2 * LOOK)]
+        self.rates = torch.zeros(RATES, device=self.device)
+        self._staged = [torch.zeros(RATES, pin_memory=self.device.type == "cuda") for _ in range(2 * LOOK)]
         self._known_bad, self._limit, self.steps = 0, -1, 0
         self.renew_rows(field)
 
@@ -144,7 +147,7 @@ class TritonOptimiser:
         rays[COUNTS] = (1.0 if batch.weight is None else batch.weight) / count
         rays[TARGET] = 0.0 if batch.distance is None else batch.distance
         rays[JITTER] = jitter
-        rays[JITTER + 1 :] = (self.field.background.expand(count, 3) if behind is None else behind).T
+        rays[BEHIND:] = (self.field.background.expand(count, 3) if behind is None else behind).T
         self.inputs[:, self.field.feature_rows.shape[1] :] = spherical_harmonics(batch.directions)
         self._learn(count, remember=False)
         return self._look()
@@ -165,8 +168,7 @@ class TritonOptimiser:
     def _tell(self, rates: Rates) -> None:
         """The step sizes, to where the kernels read them."""
         staged = self._staged[self.steps % len(self._staged)]
-        values = (rates.density, rates.feature, rates.decoder, rates.distortion, rates.opacity, rates.depth, rates.depth_noise)
-        for place, value in enumerate((*values, rates.slow_within, float(rates.random_background))):
+        for place, value in enumerate(told(rates)):
             staged[place] = value
         self.threshold = rates.colour_threshold
         self.rates.copy_(staged, non_blocking=True)
@@ -183,7 +185,7 @@ class TritonOptimiser:
 
     def _draw(self, rays: int) -> None:
         pool = self.pool
-        kernels.draw[(triton.cdiv(rays, 128),)](
+        draw[(triton.cdiv(rays, 128),)](
             *(self.buffers[0], self.tiles, self.inputs, self.state, self.rates),
             *(pool.colour, pool.places, pool.starts, pool.distance, pool.camera, pool.pose, self.tile_density, self.field.background),
             *(self.limit, rays, rays, self.inputs.shape[1], self.field.feature_rows.shape[1], len(pool.pose)),
@@ -211,7 +213,7 @@ class TritonOptimiser:
         two = torch.addmm(b2, one, w2.T).relu_()
         logits = torch.addmm(b3, two, w3.T).add_(self.inputs[:, :3])
         self.total.zero_()
-        kernels.judge[(triton.cdiv(rays, 128),)](
+        judge[(triton.cdiv(rays, 128),)](
             *(around, sums, logits, self.g_logits, self.tiles, self.tile_error, self.total, self.rates, rays, rays),
             REMEMBER=remember,
             B=128,
@@ -225,7 +227,7 @@ class TritonOptimiser:
         torch.mm(behind.T, self.inputs, out=g1)
         torch.sum(behind, 0, out=h1)
         g_inputs = behind @ w1[:, :channels]
-        kernels.spread[(triton.cdiv(rays, 32),)](
+        spread[(triton.cdiv(rays, 32),)](
             *(around, cells, notes, counts, sums, self.inputs, g_inputs, self.g_logits, field.feature_rows, self.tables.lookup),
             *(self.g_density, self.g_feature, self.touched, self.bad, self.rates),
             *(rays, rays, self.inputs.shape[1], field.topology.zero_row, BRICK / (field.fine * field.resolution)),
@@ -235,12 +237,12 @@ class TritonOptimiser:
             B=32,
             num_warps=1,
         )
-        kernels.inspect[(1,)](self.decoder.gradient, self.total, self.bad, len(self.decoder.gradient), B=1024)
+        inspect[(1,)](self.decoder.gradient, self.total, self.bad, len(self.decoder.gradient), B=1024)
 
     def _move(self) -> None:
         """Both optimisers' steps, unless something was not finite."""
         field, channels, rows = self.field, self.field.feature_rows.shape[1], self.field.topology.zero_row
-        kernels.move[(triton.cdiv(max(rows, 1), 64),)](
+        move[(triton.cdiv(max(rows, 1), 64),)](
             *(field.density_rows, field.feature_rows, self.g_density, self.g_feature, self.second_density, self.second_feature),
             *(self.touch_steps, self.touched, self.bad, self.rates, rows, math.log2(DECAY), DECAY, EPSILON),
             C=channels,
@@ -248,12 +250,12 @@ class TritonOptimiser:
             B=64,
         )
         state = self.decoder
-        kernels.learn[(triton.cdiv(len(state.values), 256),)](
+        learn[(triton.cdiv(len(state.values), 256),)](
             *(state.values, state.gradient, state.first, state.second, state.kept, self.state, self.bad, self.rates),
             *(len(state.values), math.log2(FIRST), math.log2(DECAY), EPSILON),
             B=256,
         )
-        kernels.count_step[(1,)](self.state, self.bad, self.failed)
+        count_step[(1,)](self.state, self.bad, self.failed)
 
     def _look(self) -> float:
         """The last step's mean squared error.
