@@ -21,7 +21,7 @@ from tests.stereo.test_moving import with_passer
 from tests.training.test_guided import SCENE, wanted
 from toolkit.capture.types import Views
 from toolkit.stereo import moving
-from toolkit.training import depth_start
+from toolkit.training import depth_start, fit
 from toolkit.training.guided import fit_guided
 from toolkit.volume.grid_host import GridHost
 
@@ -51,7 +51,7 @@ def missed(views: Views, decoder: str, host: GridHost | None) -> Kernels:
         look = next(looks)
         if look == 0:
             before[0] = ready()
-        return 0.01 * look
+        return 0.02 * look
 
     result = fit_guided(views, SCENE, wanted("budget=1", f"field.decoder={decoder}"), ticks=ticks, host=host)
     assert result.steps > 20 and result.field.resolution > 16  # it went from one level to the next
@@ -61,7 +61,8 @@ def missed(views: Views, decoder: str, host: GridHost | None) -> Kernels:
 
 def main(decoder: str) -> None:
     torch.set_num_threads(1)
-    moving.FEWEST = depth_start.FEW_VIEWS = 6  # six pictures are enough here
+    moving.FEWEST = depth_start.FEW_VIEWS = 6  # six pictures are enough here …
+    fit.TIMELINE_PIXELS = 256  # … and few pixels
     told = {name: sorted(missed(views, decoder, GridHost() if name == "depth" else None)) for name, views in captures().items()}
     several = [name for name, number in Counter(name for name, _ in ready()).items() if number > 1]
     sys.stdout.write(json.dumps({"missed": told, "several": several}) + "\n")
