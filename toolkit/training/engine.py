@@ -102,7 +102,7 @@ def chosen_engine(settings: Settings, device: torch.device) -> str:
 
 
 def make_engine(settings: Settings, field: Field, pool: PixelPool) -> Engine:
-    """The engine that the settings ask for, or `auto`: compiled on the CPU, torch elsewhere."""
+    """The engine that the settings ask for, or for `auto` the fastest that there is."""
     chosen = chosen_engine(settings, field.device)
     if chosen == "torch":
         return TorchEngine(field, pool, settings.seed)
@@ -138,5 +138,5 @@ def warm_up(settings: Settings, progress: Progress) -> None:
 
     kind = (settings.field.decoder, settings.field.channels, settings.field.width)
     if not warm.ready(*kind):
-        progress.update(0, 1, "compiling the fast engine, once on this machine, about a minute")
+        progress.update(0, 1, "compiling the fast engine, once on this machine, about half a minute")
         warm.run(*kind)
