@@ -20,6 +20,8 @@ from toolkit.networks.block_conv import block_conv3d  # noqa: E402
 from toolkit.networks.matching import LARGE, SMALL, distribution, semi_global  # noqa: E402
 from toolkit.networks.sweep import _table  # noqa: E402
 from toolkit.networks.unproject import look_up, project  # noqa: E402
+from toolkit.render.march import MarchGrid, march  # noqa: E402
+from toolkit.volume.space import Space  # noqa: E402
 from toolkit.volume.topology import Topology  # noqa: E402
 
 
@@ -87,3 +89,38 @@ def test_lookup(monkeypatch: pytest.MonkeyPatch) -> None:
         slow = look_up(views, projection, step)
         monkeypatch.setattr(gpu, "fits", lambda *values: True)
         torch.testing.assert_close(look_up(views, projection, step), slow, atol=1e-5, rtol=1e-5)
+
+
+def test_the_gradient_of_lookup(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(0)
+    model, seen_by = small_model(), cameras(2)
+    points = torch.rand(100, 3, generator=generator) * 2 - 1
+    projection = project(points, torch.rand(100, generator=generator) * 0.4, seen_by, 0.0, 9.0)
+    step = torch.rand(100, generator=generator) * 6
+
+    def gradients() -> list[torch.Tensor]:
+        views = model.encode(pictures(2), seen_by)
+        shown = look_up(views, projection, step)
+        slopes = torch.rand(shown.shape, generator=torch.Generator().manual_seed(1))
+        return list(torch.autograd.grad(shown, list(model.sample.parameters()), slopes))
+
+    slow = gradients()
+    monkeypatch.setattr(gpu, "fits", lambda *values: True)
+    for quick, expected in zip(gradients(), slow, strict=True):
+        torch.testing.assert_close(quick, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_coarse_steps_of_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(0)
+    origins = torch.rand(40, 3, generator=generator) - 0.5
+    directions = torch.nn.functional.normalize(torch.randn(40, 3, generator=generator), dim=1)
+    topology = Topology(torch.tensor([[1, 1, 1], [2, 2, 2]]))
+    grid = MarchGrid(Space((0.0, 0.0, 0.0), 0.7, 1.0), 32, topology, torch.ones(topology.zero_row, dtype=torch.bool))
+    jitter = torch.rand(40, generator=generator)
+    slow = march(grid, origins, directions, 0.1, 4, jitter)
+    monkeypatch.setattr(gpu, "fits", lambda *values: True)
+    quick = march(grid, origins, directions, 0.1, 4, jitter)
+    for name in ("ray", "cell"):
+        assert torch.equal(getattr(quick, name), getattr(slow, name))
+    for name in ("distance", "span", "length", "place", "inside"):
+        torch.testing.assert_close(getattr(quick, name), getattr(slow, name), atol=1e-4, rtol=1e-4)

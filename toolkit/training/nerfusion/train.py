@@ -83,7 +83,7 @@ class Trainer:
         self.model = make_model(settings).to(crew.device)
         self.adam = torch.optim.Adam(self.model.parameters(), lr=settings.optimiser.rate, betas=BETAS)
         self.average = Average(self.model, settings.optimiser.average, settings.optimiser.start_share)
-        self.mixture = Mixture(settings, crew.rank)
+        self.mixture = Mixture(settings, crew.rank, crew.device)
         self.stepper = Stepper(self.model, settings)
         self.curve = Curve(out)
         self.gates = GateWatch(self.model)
