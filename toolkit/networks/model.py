@@ -20,6 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from toolkit.networks import gpu
 from toolkit.networks.aggregate import CUES, FLAGS, aggregate, agreement, direction_spread, evidence
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.compiled import fits
@@ -35,7 +36,7 @@ from toolkit.networks.matching import SIDE, describe
 from toolkit.networks.pyramid import pyramids
 from toolkit.networks.refine import with_blocks
 from toolkit.networks.sweep import Empty, Sighted, Sweep, sweep
-from toolkit.networks.unproject import EncodedView, look_up, project
+from toolkit.networks.unproject import COLOURED, EncodedView, look_up, project
 from toolkit.volume.topology import VOXELS, Topology
 from toolkit.volume.waiting import asks_freely
 
@@ -154,10 +155,7 @@ class NerfusionModel(nn.Module):
         if swept is None:
             bounded = near > 0 or math.isfinite(far)
             swept = self.sweep(views, cameras, *((near, far) if bounded else _depths(lattice, topology, cameras)))
-        rows = torch.arange(topology.zero_row, device=topology.device) if wanted is None else wanted.nonzero().view(-1)
-        few = CHUNK if asks_freely(rows.device) else AT_ONCE
-        parts = [self._observe(views, cameras, lattice, topology, part, near, far, swept) for part in rows.split(few)]
-        where, projected, starts, counts, weights = (torch.cat(values) for values in zip(*parts, strict=True))
+        where, projected, starts, counts, weights = self._seen(views, cameras, lattice, topology, wanted, near, far, swept)
         topology, where = _without_empty_blocks(topology, where)
         config, size = self.config, topology.zero_row
         count = torch.zeros(size, device=topology.device).index_copy(0, where, counts)
@@ -173,6 +171,31 @@ class NerfusionModel(nn.Module):
         busy, place = _blocks(topology, active)
         raw = start.index_copy(0, place, self.local(latent[place], start[place], busy, count[place[:-1]] > 0))
         return LocalVolume(lattice, topology, torch.tanh(raw), count, raw, weight, busy, place)
+
+    def _seen(
+        self,
+        views: Sequence[EncodedView],
+        cameras: Cameras,
+        lattice: Lattice,
+        topology: Topology,
+        wanted: Tensor | None,
+        near: float,
+        far: float,
+        swept: Sweep,
+    ) -> tuple[Tensor, ...]:
+        """`_observe` of all corners that are `wanted`, None: of all."""
+        rows = None if wanted is None else wanted.nonzero().view(-1)
+        if not torch.is_grad_enabled() and self.config.hidden in (16, 32) and gpu.fits(swept.table, *(v.features.rows for v in views)):
+            from toolkit.networks.gpu.observe import Observer
+
+            observer = Observer(views, cameras, near, far, swept, (TRUNCATION, HIDDEN, BLIND, COLOUR_GAIN, COLOURED))
+            rows = observer.choose(lattice, topology.keys, rows)
+            return rows, *observer.observe(lattice, topology.keys, rows, self.local.project, self.config.sampled, self.config.variance)
+        if rows is None:
+            rows = torch.arange(topology.zero_row, device=topology.device)
+        few = CHUNK if asks_freely(rows.device) else AT_ONCE
+        parts = [self._observe(views, cameras, lattice, topology, part, near, far, swept) for part in rows.split(few)]
+        return tuple(torch.cat(values) for values in zip(*parts, strict=True))
 
     def _observe(
         self,
@@ -229,7 +252,8 @@ class NerfusionModel(nn.Module):
 
     def fuse_part(self, part: LatentVolume, local: LocalVolume) -> LatentVolume:
         """One step of the recurrence on the blocks of a local volume alone: `part` is the global volume there."""
-        if isinstance(self.fusion, FusionGRU) and not torch.is_grad_enabled() and fits(part.rows, part.count, local.rows, local.raw):
+        known = part.rows, part.count, local.rows, local.raw
+        if isinstance(self.fusion, FusionGRU) and not torch.is_grad_enabled() and (fits(*known) or gpu.fits(*known)):
             return replace(part, rows=self.fusion.compiled(part, local), count=part.count * local.known + local.weight)
         inside = local.known
         count = part.count * inside

@@ -70,7 +70,7 @@ def adopt(state: LatentVolume, inherited: LatentVolume) -> LatentVolume:
 
 def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
     """A copy of some blocks of a volume; where it has no such block, nothing is known."""
-    slots = volume.topology.find(topology.keys)
+    slots = volume.topology.slots_of(topology)
     place = (slots.clamp_min(0)[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
     here = (slots >= 0).repeat_interleave(VOXELS)
     if volume.topology.blocks == 0:

@@ -37,7 +37,7 @@ class GlobalStore:
 
     def write(self, values: LatentVolume, changed: Tensor) -> None:
         """Take over the corners `changed` (M · 512,) of some blocks."""
-        slots = self._slots(values.topology.keys)
+        slots = self._slots(values.topology)
         place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
         if asks_freely(place.device):
             which = changed.nonzero().view(-1)
@@ -58,10 +58,10 @@ class GlobalStore:
         self._rows[: len(rows)], self._count[: len(count)] = rows, count
         self.topology = self.topology.alike(self.topology.keys[kept])
 
-    def _slots(self, keys: Tensor) -> Tensor:
+    def _slots(self, topology: Topology) -> Tensor:
         """(M,) slots of blocks, made where missing."""
-        slots = self.topology.find(keys)
-        fresh = keys[slots < 0]
+        slots = self.topology.slots_of(topology)
+        fresh = topology.keys[slots < 0]
         if len(fresh) == 0:
             return slots
         self.topology = self.topology.alike(torch.cat([self.topology.keys, fresh.to(torch.int32)]))
@@ -71,4 +71,4 @@ class GlobalStore:
             rows, count = self._rows.new_zeros((room + 1, self._rows.shape[1])), self._count.new_zeros(room)
             rows[: len(self._rows)], count[: len(self._count)] = self._rows, self._count
             self._rows, self._count = rows, count
-        return self.topology.find(keys)
+        return self.topology.slots_of(topology)

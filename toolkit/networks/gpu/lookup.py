@@ -15,7 +15,7 @@ BLOCK = 64  # voxels at a time
 
 
 @triton.jit
-def _corners(x, y, footprint, height, width, STRIDE: tl.constexpr, LEVELS: tl.constexpr):
+def corners(x, y, footprint, height, width, STRIDE: tl.constexpr, LEVELS: tl.constexpr):
     """Rows of the four cells about pixels in the level whose cells are nearest to a footprint, and their weights."""
     level = tl.minimum(tl.floor(tl.log2(tl.maximum(footprint / STRIDE, 1.0)) + 0.5), LEVELS - 1.0).to(tl.int32)
     first = tl.zeros_like(level)
@@ -57,11 +57,11 @@ def _shown(
     x, y = tl.load(pixels + 2 * n, some, 0.0), tl.load(pixels + 2 * n + 1, some, 0.0)
     size, cell = tl.load(step + n, some, 1.0), tl.load(footprint + n, some, 1.0)
     stride: tl.constexpr = CHANNELS + 2 * COLOURS
-    corner, right, below, w0, w1, w2, w3 = _corners(x, y, size, height, width, STRIDE, LEVELS)
+    corner, right, below, w0, w1, w2, w3 = corners(x, y, size, height, width, STRIDE, LEVELS)
     _read(features, out, stride, 0, n, some, corner, right, below, w0, w1, w2, w3, CHANNELS, WIDE)
-    corner, right, below, w0, w1, w2, w3 = _corners(x, y, size, down, across, FINE, FINE_LEVELS)
+    corner, right, below, w0, w1, w2, w3 = corners(x, y, size, down, across, FINE, FINE_LEVELS)
     _read(colours, out, stride, CHANNELS, n, some, corner, right, below, w0, w1, w2, w3, COLOURS, 4)
-    corner, right, below, w0, w1, w2, w3 = _corners(x, y, part * cell, down, across, FINE, FINE_LEVELS)
+    corner, right, below, w0, w1, w2, w3 = corners(x, y, part * cell, down, across, FINE, FINE_LEVELS)
     _read(colours, out, stride, CHANNELS + COLOURS, n, some, corner, right, below, w0, w1, w2, w3, COLOURS, 4)
 
 
@@ -74,7 +74,7 @@ def _spread(
     n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     some = n < count
     x, y, size = tl.load(pixels + 2 * n, some, 0.0), tl.load(pixels + 2 * n + 1, some, 0.0), tl.load(step + n, some, 1.0)
-    corner, right, below, w0, w1, w2, w3 = _corners(x, y, size, height, width, STRIDE, LEVELS)
+    corner, right, below, w0, w1, w2, w3 = corners(x, y, size, height, width, STRIDE, LEVELS)
     c = tl.arange(0, WIDE)[None, :]
     mask = some[:, None] & (c < CHANNELS)
     slope = tl.load(slopes + n[:, None] * stride + c, mask, 0.0)

@@ -1,0 +1,89 @@
+"""Masks and rows of blocks on CUDA: what lies about lattice corners, and values on a finer lattice (`volume/edit.py` in tensors)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from toolkit.volume.topology import VOXELS, Topology
+
+
+@triton.jit
+def _pool(mask, around, out, FIRST: tl.constexpr, WIDTH: tl.constexpr, EVERY: tl.constexpr):
+    """Whether any, or every, row among the offsets FIRST … FIRST + WIDTH − 1 along each axis is set; one block."""
+    block = tl.program_id(0)
+    voxel = tl.arange(0, 512)
+    z, y, x = voxel // 64, (voxel // 8) % 8, voxel % 8
+    found = tl.full((512,), 1 if EVERY else 0, tl.int32)
+    for k in range(WIDTH * WIDTH * WIDTH):
+        nz = z + FIRST + k // (WIDTH * WIDTH) + 8  # of the 3 × 3 × 3 blocks, 0 to 23
+        ny, nx = y + FIRST + (k // WIDTH) % WIDTH + 8, x + FIRST + k % WIDTH + 8
+        slot = tl.load(around + block * 27 + (nz // 8 * 3 + ny // 8) * 3 + nx // 8)
+        value = tl.load(mask + slot * 512 + (nz % 8 * 8 + ny % 8) * 8 + nx % 8, slot >= 0, 0).to(tl.int32)
+        found = (found & value) if EVERY else (found | value)
+    tl.store(out + block.to(tl.int64) * 512 + voxel, found.to(tl.uint8))
+
+
+def pooled(topology: Topology, mask: Tensor, first: int, width: int, every: bool = False) -> Tensor:
+    """(M · 512,) bool: whether any, or every, of the rows `first` … `first` + `width` − 1 steps off along each axis is set."""
+    out = torch.empty_like(mask)
+    if topology.blocks:
+        given = mask.contiguous().view(torch.uint8), topology.around, out.view(torch.uint8)
+        _pool[(topology.blocks,)](*given, FIRST=first, WIDTH=width, EVERY=every)
+    return out
+
+
+@triton.jit
+def _resample(
+    rows, nodes, table, keys, out, ox, oy, oz, sx, sy, sz, scale, CHANNELS: tl.constexpr, WIDE: tl.constexpr, TILE: tl.constexpr
+):  # fmt: skip
+    """Values at corners of one new block from the corners about them that count, in proportion to their weights."""
+    parts: tl.constexpr = 512 // TILE
+    block = tl.program_id(0) // parts
+    voxel = (tl.program_id(0) % parts) * TILE + tl.arange(0, TILE)
+    px = (tl.load(keys + 3 * block).to(tl.int32) * 8 + voxel % 8).to(tl.float32) * scale
+    py = (tl.load(keys + 3 * block + 1).to(tl.int32) * 8 + (voxel // 8) % 8).to(tl.float32) * scale
+    pz = (tl.load(keys + 3 * block + 2).to(tl.int32) * 8 + voxel // 64).to(tl.float32) * scale
+    fx, fy, fz = tl.floor(px), tl.floor(py), tl.floor(pz)
+    lx, ly, lz = fx.to(tl.int32), fy.to(tl.int32), fz.to(tl.int32)
+    fx, fy, fz = px - fx, py - fy, pz - fz
+    c = tl.arange(0, WIDE)[None, :]
+    total = tl.zeros((TILE, WIDE), tl.float32)
+    share = tl.zeros((TILE,), tl.float32)
+    for k in range(8):
+        x, y, z = lx + k % 2, ly + (k // 2) % 2, lz + k // 4
+        weight = tl.where(k % 2 == 1, fx, 1 - fx) * tl.where((k // 2) % 2 == 1, fy, 1 - fy) * tl.where(k // 4 == 1, fz, 1 - fz)
+        # Far blocks are moved to the table's empty margin.
+        bx = tl.minimum(tl.maximum((x >> 3) - ox, 0), sx - 1)
+        by = tl.minimum(tl.maximum((y >> 3) - oy, 0), sy - 1)
+        bz = tl.minimum(tl.maximum((z >> 3) - oz, 0), sz - 1)
+        slot = tl.load(table + (bz * sy + by) * sx + bx).to(tl.int64)
+        row = slot * 512 + ((z & 7) * 8 + (y & 7)) * 8 + (x & 7)
+        counts = tl.load(nodes + row, slot >= 0, 0) != 0
+        weight = tl.where(counts, weight, 0.0)
+        share += weight
+        total += weight[:, None] * tl.load(rows + row[:, None] * CHANNELS + c, counts[:, None] & (c < CHANNELS), 0.0)
+    value = tl.where((share > 1e-6)[:, None], total / tl.maximum(share, 1e-6)[:, None], 0.0)
+    place = block.to(tl.int64) * 512 + voxel
+    tl.store(out + place[:, None] * CHANNELS + c, value, (c < CHANNELS) & (voxel < 512)[:, None])
+
+
+def resample(topology: Topology, nodes: Tensor, rows: Sequence[Tensor], new_keys: Tensor, scale: float) -> list[Tensor]:
+    """`edit.resample`, trilinear, of float32 rows; `nodes`: (M · 512,) bool, the corners that count."""
+    table = topology.table
+    assert table is not None
+    nodes, keys, out = nodes.view(torch.uint8), new_keys.contiguous(), []
+    for values in rows:
+        flat = values.reshape(len(values), -1).contiguous()
+        made = flat.new_empty((len(keys) * VOXELS + 1, flat.shape[1]))
+        made[-1:].zero_()
+        if len(keys):
+            sizes = {"CHANNELS": flat.shape[1], "WIDE": triton.next_power_of_2(flat.shape[1]), "TILE": 128}
+            ends = *topology.table_origin, *topology.table_size
+            _resample[(len(keys) * 4,)](flat, nodes, table, keys, made, *ends, scale, **sizes)
+        out.append(made.view(-1, *values.shape[1:]))
+    return out
