@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
@@ -156,6 +157,8 @@ class NerfusionModel(nn.Module):
             bounded = near > 0 or math.isfinite(far)
             swept = self.sweep(views, cameras, *((near, far) if bounded else _depths(lattice, topology, cameras)))
         where, projected, starts, counts, weights = self._seen(views, cameras, lattice, topology, wanted, near, far, swept)
+        if not torch.is_grad_enabled() and starts.shape[1] == INSIDE + 1 and gpu.fits(projected):
+            return self._laid(lattice, topology, where, projected, starts, counts, weights)
         topology, where = _without_empty_blocks(topology, where)
         config, size = self.config, topology.zero_row
         count = torch.zeros(size, device=topology.device).index_copy(0, where, counts)
@@ -171,6 +174,39 @@ class NerfusionModel(nn.Module):
         busy, place = _blocks(topology, active)
         raw = start.index_copy(0, place, self.local(latent[place], start[place], busy, count[place[:-1]] > 0))
         return LocalVolume(lattice, topology, torch.tanh(raw), count, raw, weight, busy, place)
+
+    def _laid(
+        self, lattice: Lattice, topology: Topology, where: Tensor, projected: Tensor, starts: Tensor, counts: Tensor, weights: Tensor
+    ) -> LocalVolume:
+        """The rest of `local_volume` on CUDA without gradients: the device is asked once which blocks are worked on."""
+        from toolkit.networks.gpu import blocks
+
+        channels, threshold = self.config.channels, _latent_of(FREE)
+        laid = blocks.lay(topology.blocks, where, projected, starts, counts, weights, channels, threshold)
+        marks = laid[-1].cpu().bool()
+        filled, busy = marks[:, 0].nonzero().view(-1), marks[:, 1].nonzero().view(-1)
+        both = torch.cat([filled, busy]).to(where.device, non_blocking=True)
+        kept, active = both[: len(filled)], both[len(filled) :]
+        size = len(filled) * VOXELS
+
+        def of(values: Tensor, some: Tensor, more: int) -> Tensor:
+            """Rows of some of the blocks, and `more` zero rows."""
+            rows = values[: topology.zero_row].view(topology.blocks, -1)[some].view(-1, *values.shape[1:])
+            return F.pad(rows, (0, 0, 0, more)) if more else rows
+
+        latent, start, count, weight = laid[:4]
+        small = topology.alike(topology.keys[active])
+        learned = self.local(of(latent, active, 1), of(start, active, 1), small, of(count, active, 0) > 0)
+        if len(filled) < topology.blocks:
+            start, count, weight = of(start, kept, 1), of(count, kept, 0), of(weight, kept, 0)
+            among = (torch.cumsum(marks[:, 0], 0) - 1)[busy].to(where.device, non_blocking=True)
+            topology = topology.alike(topology.keys[kept])
+        else:
+            among = active
+        place = (among[:, None] * VOXELS + torch.arange(VOXELS, device=among.device)).view(-1)
+        place = torch.cat([place, place.new_full((1,), size)])
+        raw = start.index_copy(0, place, learned)
+        return LocalVolume(lattice, topology, torch.tanh(raw), count, raw, weight, small, place)
 
     def _seen(
         self,
@@ -289,6 +325,7 @@ class NerfusionModel(nn.Module):
         )
 
 
+@lru_cache(maxsize=4)
 def _latent_of(signed: float) -> float:
     """`inside_latent` of one number."""
     return float(inside_latent(torch.tensor([signed])))
