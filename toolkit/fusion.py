@@ -35,7 +35,9 @@ from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
 from toolkit.volume.waiting import asks_freely
 
-KEPT_PICTURES = 12  # encoded pictures kept for key frames to come
+KEPT_PICTURES = 12  # encoded pictures kept for key frames to come …
+KEPT_ON_DEVICE = 32  # … and where they are encoded ahead, 20 MB each at 640×480
+AHEAD = 4  # key frames whose pictures are encoded at once there: it takes as many launches as one
 
 
 @dataclass(frozen=True)
@@ -176,16 +178,25 @@ class _Pictures:
 
     def __init__(self, model: NerfusionModel, views: Views, side: int | None, precision: str) -> None:
         self.model, self.views, self.side, self.precision = model, views, side, precision
-        self._kept: Recent[tuple[EncodedView, Cameras]] = Recent(KEPT_PICTURES)
+        self.ahead = 1 if asks_freely(model.device) else AHEAD
+        self._kept: Recent[tuple[EncodedView, Cameras]] = Recent(KEPT_PICTURES if self.ahead == 1 else KEPT_ON_DEVICE)
 
-    def __call__(self, group: Sequence[int]) -> list[tuple[EncodedView, Cameras]]:
-        """The pictures at `group`; those that are new are encoded together where that takes fewer launches."""
-        new = [index for index in group if index not in self._kept]
-        together = len({self.views.images[index].shape for index in new}) == 1 and not asks_freely(self.model.device)
-        for some in [new] if together else [[index] for index in new]:
-            for index, made in zip(some, self._encode(some), strict=True):
+    def __call__(self, groups: Sequence[Sequence[int]]) -> list[tuple[EncodedView, Cameras]]:
+        """The pictures of the first of `groups`; where one of them is new, those of `ahead` groups that are new are encoded together."""
+        group = groups[0]
+        if self.ahead > 1 and any(index not in self._kept for index in group):
+            for index in group:  # they stay when others come
+                if index in self._kept:
+                    self._kept.get(index, self._one)
+            some = dict.fromkeys(index for one in groups[: self.ahead] for index in one if index not in self._kept)
+            shape = self.views.images[group[0]].shape
+            new = [index for index in some if self.views.images[index].shape == shape][: KEPT_ON_DEVICE - len(group)]
+            for index, made in zip(new, self._encode(new), strict=True) if new else ():
                 self._kept.put(index, made)
-        return [self._kept.get(index, lambda index: self._encode([index])[0]) for index in group]
+        return [self._kept.get(index, self._one) for index in group]
+
+    def _one(self, index: int) -> tuple[EncodedView, Cameras]:
+        return self._encode([index])[0]
 
     @torch.no_grad()
     def _encode(self, indices: Sequence[int]) -> list[tuple[EncodedView, Cameras]]:
@@ -230,10 +241,11 @@ def fuse_views(
     encoded = _Pictures(model, views, side, fusion.options.precision)
     near, far, measured = fusion.options.near, fusion.options.far, fusion.options.measured
     sweeps = None if witnesses is None else KeySweeps(views, key_frames, witnesses, near, far, measured, model.device)
-    for done, (key, neighbours) in enumerate(zip(key_frames.indices, key_frames.neighbours, strict=True)):
+    groups = [together(int(key), neighbours) for key, neighbours in zip(key_frames.indices, key_frames.neighbours, strict=True)]
+    for done, key in enumerate(key_frames.indices):
         progress.check()
         begin = time.perf_counter()
-        group = encoded(together(int(key), neighbours))
+        group = encoded(groups[done:])
         encode_seconds = time.perf_counter() - begin
         depth = sensed(views, int(key), model.device) if measured else None
         swept = None if sweeps is None else sweeps(done)

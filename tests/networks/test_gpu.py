@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import importlib.util
 import os
+from dataclasses import replace
 
 import pytest
 import torch
 
+if importlib.util.find_spec("triton") is None or torch.cuda.is_available():
+    pytest.skip("needs Triton, interpreting; with a CUDA device see test_gpu_device.py", allow_module_level=True)
 os.environ.setdefault("TRITON_INTERPRET", "1")
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("triton") is None or os.environ["TRITON_INTERPRET"] != "1", reason="needs Triton, interpreting"
-)
 
-from tests.networks.made import cameras, pictures, small_model  # noqa: E402
-from tests.networks.test_compiled import everything  # noqa: E402
+from tests.networks.made import SMALL as SIZES  # noqa: E402
+from tests.networks.made import cameras, lattice, pictures, small_model  # noqa: E402
+from tests.networks.test_compiled import everything, places  # noqa: E402
+from tests.networks.test_compiled_gru import trained, volumes  # noqa: E402
 from toolkit.networks import compiled, compiled_lookup, gpu  # noqa: E402
 from toolkit.networks.block_conv import block_conv3d  # noqa: E402
+from toolkit.networks.cull import all_blocks  # noqa: E402
+from toolkit.networks.lattice import cells  # noqa: E402
 from toolkit.networks.matching import LARGE, SMALL, distribution, semi_global  # noqa: E402
 from toolkit.networks.sweep import _table  # noqa: E402
 from toolkit.networks.unproject import look_up, project  # noqa: E402
+from toolkit.render.march import MarchGrid, march  # noqa: E402
+from toolkit.volume.edit import corner_nodes, split  # noqa: E402
+from toolkit.volume.space import Space  # noqa: E402
 from toolkit.volume.topology import Topology  # noqa: E402
 
 
@@ -87,3 +94,106 @@ def test_lookup(monkeypatch: pytest.MonkeyPatch) -> None:
         slow = look_up(views, projection, step)
         monkeypatch.setattr(gpu, "fits", lambda *values: True)
         torch.testing.assert_close(look_up(views, projection, step), slow, atol=1e-5, rtol=1e-5)
+
+
+def test_the_gradient_of_lookup(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(0)
+    model, seen_by = small_model(), cameras(2)
+    points = torch.rand(100, 3, generator=generator) * 2 - 1
+    projection = project(points, torch.rand(100, generator=generator) * 0.4, seen_by, 0.0, 9.0)
+    step = torch.rand(100, generator=generator) * 6
+
+    def gradients() -> list[torch.Tensor]:
+        views = model.encode(pictures(2), seen_by)
+        shown = look_up(views, projection, step)
+        slopes = torch.rand(shown.shape, generator=torch.Generator().manual_seed(1))
+        return list(torch.autograd.grad(shown, list(model.sample.parameters()), slopes))
+
+    slow = gradients()
+    monkeypatch.setattr(gpu, "fits", lambda *values: True)
+    for quick, expected in zip(gradients(), slow, strict=True):
+        torch.testing.assert_close(quick, expected, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("shell", "variance", "count"), [(0.0, True, 3), (1.0, True, 2), (1.0, False, 1)])
+def test_what_corners_are_seen_to_be(shell: float, variance: bool, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = small_model(config=replace(SIZES, hidden=16, variance=variance))
+    seen_by, space = cameras(count), lattice(16, shell)
+    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    monkeypatch.setattr(compiled_lookup, "fits", lambda *values: False)
+    with torch.no_grad():
+        for parameter in model.local.project.parameters():
+            parameter.normal_(generator=torch.Generator().manual_seed(1))
+        views = model.encode(pictures(count), seen_by)
+        swept = model.sweep(views, seen_by, 0.8, 4.0)
+        topology = Topology(all_blocks(space)[:3])
+        given = views, seen_by, space, topology
+        few = torch.rand(topology.zero_row, generator=torch.Generator().manual_seed(2)) < 0.4
+        for wanted in (None, few):
+            slow = model._seen(*given, wanted, 0.1, 4.0, swept)
+            with monkeypatch.context() as patch:
+                patch.setattr(gpu, "fits", lambda *values: True)
+                quick = model._seen(*given, wanted, 0.1, 4.0, swept)
+            assert torch.equal(quick[0], slow[0]) and len(slow[0])
+            for mine, expected in zip(quick[1:], slow[1:], strict=True):
+                torch.testing.assert_close(mine, expected, atol=2e-4, rtol=2e-4)
+
+
+@pytest.mark.parametrize("busy", [0, 1, 8])
+def test_a_step_of_the_gru(busy: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    part, local = volumes(busy, busy)
+    made = trained()
+    monkeypatch.setattr("toolkit.networks.model.fits", lambda *_: False)
+    with torch.no_grad():
+        expected = made.fuse_part(part, local)
+        monkeypatch.setattr(gpu, "fits", lambda *values: True)
+        monkeypatch.setattr("toolkit.networks.gru.on_cpu", lambda device: False)
+        found = made.fuse_part(part, local)
+    torch.testing.assert_close(found.rows, expected.rows, atol=3e-5, rtol=0)
+    torch.testing.assert_close(found.count, expected.count)
+
+
+@pytest.mark.parametrize("believed", [False, True])
+def test_a_finer_lattice(believed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where keys are believed to be what they are, and nothing is asked of the device."""
+    generator = torch.Generator().manual_seed(0)
+    keys = torch.tensor([[0, 0, 0], [1, 0, 0], [1, 1, 0], [3, 0, 2]])
+    topology = Topology(keys)
+    occupied = torch.rand(topology.zero_row, generator=generator) < 0.05
+    rows = torch.cat([torch.rand(topology.zero_row, 5, generator=generator), torch.zeros(1, 5)])
+    slow, inside, (values,) = split(topology, occupied, [rows])
+    nodes = corner_nodes(slow, inside)
+    if believed:
+        topology = Topology(keys, bounds=((-1, -1, -1), (5, 5, 5)))
+        for module in ("toolkit.volume.edit", "toolkit.volume.topology"):
+            monkeypatch.setattr(f"{module}.asks_freely", lambda device: False)
+    monkeypatch.setattr(gpu, "fits", lambda *values: True)
+    monkeypatch.setattr(gpu, "there", lambda values: True)
+    quick, inside_quick, (made,) = split(topology, occupied, [rows])
+    place = quick.find(slow.keys)
+    assert len(quick.keys) == len(slow.keys) and bool((place >= 0).all())
+    order = (place[:, None] * 512 + torch.arange(512)).view(-1)
+    assert torch.equal(inside_quick[order], inside) and torch.equal(corner_nodes(quick, inside_quick)[order], nodes)
+    torch.testing.assert_close(made[:-1][order], values[:-1], atol=1e-5, rtol=1e-5)
+    for every in (False, True):
+        mask = torch.rand(slow.zero_row, generator=generator) < 0.5
+        with monkeypatch.context() as patch:
+            patch.setattr(gpu, "there", lambda values: False)
+            expected = cells(slow, mask, every)
+        assert torch.equal(cells(slow, mask, every), expected)
+
+
+def test_coarse_steps_of_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(0)
+    origins = torch.rand(40, 3, generator=generator) - 0.5
+    directions = torch.nn.functional.normalize(torch.randn(40, 3, generator=generator), dim=1)
+    topology = Topology(torch.tensor([[1, 1, 1], [2, 2, 2]]))
+    grid = MarchGrid(Space((0.0, 0.0, 0.0), 0.7, 1.0), 32, topology, torch.ones(topology.zero_row, dtype=torch.bool))
+    jitter = torch.rand(40, generator=generator)
+    slow = march(grid, origins, directions, 0.1, 4, jitter)
+    monkeypatch.setattr(gpu, "fits", lambda *values: True)
+    quick = march(grid, origins, directions, 0.1, 4, jitter)
+    for name in ("ray", "cell"):
+        assert torch.equal(getattr(quick, name), getattr(slow, name))
+    for name in ("distance", "span", "length", "place", "inside"):
+        torch.testing.assert_close(getattr(quick, name), getattr(slow, name), atol=1e-4, rtol=1e-4)

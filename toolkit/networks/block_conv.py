@@ -46,16 +46,22 @@ class BlockConv3d(nn.Module):
         if self.bias is not None:
             nn.init.zeros_(self.bias)
 
-    def forward(self, rows: Tensor, topology: Topology, occupied: Tensor | None = None) -> Tensor:
+    def forward(self, rows: Tensor, topology: Topology, occupied: Tensor | None = None, relu: bool = False) -> Tensor:
         """See `block_conv3d`."""
-        return block_conv3d(rows, topology, self.weight, self.bias, occupied, self.chunk)
+        return block_conv3d(rows, topology, self.weight, self.bias, occupied, self.chunk, relu)
 
     def extra_repr(self) -> str:
         return f"{self.weight.shape[1]}, {self.weight.shape[0]}, bias={self.bias is not None}"
 
 
 def block_conv3d(
-    rows: Tensor, topology: Topology, weight: Tensor, bias: Tensor | None = None, occupied: Tensor | None = None, chunk: int = DEFAULT_CHUNK
+    rows: Tensor,
+    topology: Topology,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    occupied: Tensor | None = None,
+    chunk: int = DEFAULT_CHUNK,
+    relu: bool = False,
 ) -> Tensor:
     """Convolve block rows; differentiable once in `rows`, `weight` and `bias`. Under autocast it computes in the reduced type.
 
@@ -64,6 +70,7 @@ def block_conv3d(
         weight: (C', C, 3, 3, 3).
         bias: (C',).
         occupied: (M · 512,) bool; None: every voxel of every block.
+        relu: of the rows, before.
 
     Returns:
         (M · 512, C') or (M · 512 + 1, C'), zero at unoccupied voxels and in the zero row.
@@ -79,6 +86,15 @@ def block_conv3d(
         return rows.new_zeros((len(rows), len(weight)))
     kind = rows.device.type
     reduced = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else None
+    if not torch.is_grad_enabled() and gpu.takes(rows):
+        from toolkit.networks.gpu import convolution
+
+        numbers = reduced or rows.dtype
+        given = rows.to(numbers), topology.around, weight.to(numbers), None if bias is None else bias.to(numbers)
+        out = convolution.convolve(*given, occupied, relu)
+        return out if len(rows) > topology.zero_row else out[:-1]
+    if relu:
+        rows = torch.relu(rows)
     result: Tensor = _BlockConv.apply(rows, weight, bias, topology, occupied, chunk, reduced)
     return result
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.lattice import Lattice
 from toolkit.volume.topology import BLOCK
+from toolkit.volume.waiting import asks_freely
 
 SLACK = 1.25  # balls grow by this much: views tell of a voxel beside their pictures, and blocks of the contracted shell are bent
 
@@ -37,6 +38,11 @@ def block_balls(lattice: Lattice, keys: Tensor) -> tuple[Tensor, Tensor]:
 
 def visible_blocks(centres: Tensor, radii: Tensor, cameras: Cameras, near: float, far: float) -> Tensor:
     """(M,) bool: a part of the ball lies in at least one camera's frustum between the depths `near` and `far` (never too few)."""
+    if not asks_freely(centres.device):
+        normals, offsets = _planes(cameras.to("cpu"), near, far)
+        normals, offsets = (values.to(centres.device, non_blocking=True) for values in (normals, offsets))
+        apart = torch.addmm(offsets, centres, normals.T) + radii[:, None]  # (M, K · 6)
+        return (apart > 0).view(len(centres), -1, 6).all(2).any(1)
     local = cameras.local(centres)  # (K, M, 3)
     fx, fy, cx, cy = (value[:, None] for value in cameras.intrinsics.unbind(1))
     width, height = (value[:, None] for value in cameras.size.unbind(1))
@@ -47,3 +53,20 @@ def visible_blocks(centres: Tensor, radii: Tensor, cameras: Cameras, near: float
         inside &= (focal * across - low * z) / (focal**2 + low**2).sqrt() > -radii
         inside &= (high * z - focal * across) / (focal**2 + high**2).sqrt() > -radii
     return inside.any(0)
+
+
+def _planes(cameras: Cameras, near: float, far: float) -> tuple[Tensor, Tensor]:
+    """(K · 6, 3) unit normals of the frusta's planes, inwards, working frame, and (K · 6,) offsets: n · x + offset is how far inside x lies.
+
+    Args:
+        cameras: on the CPU.
+    """
+    fx, fy, cx, cy = cameras.intrinsics.unbind(1)
+    width, height = cameras.size.unbind(1)
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    sides = [(fx, zero, cx), (-fx, zero, width - cx), (zero, fy, cy), (zero, -fy, height - cy)]
+    local = torch.stack([torch.stack(plane, 1) for plane in [*sides, (zero, zero, one), (zero, zero, -one)]], 1)  # (K, 6, 3)
+    world = torch.nn.functional.normalize(local, dim=2) @ cameras.world_from_camera[:, :3, :3].transpose(1, 2)
+    ends = torch.tensor([0.0, 0.0, 0.0, 0.0, -near, min(far, 1e30)])
+    offsets = ends - (world * cameras.positions[:, None]).sum(2)
+    return world.reshape(-1, 3), offsets.reshape(-1)

@@ -14,6 +14,7 @@ for ever: it is always a mixture of values of tanh.
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -50,7 +51,7 @@ class _Gate(nn.Module):
         """`begun`: what the first convolution gives for `rows`, if that is known already."""
         rows = self.first(rows, topology, inside) if begun is None else begun
         for convolution in self.convolutions[1:]:
-            rows = convolution(torch.relu(rows), topology, inside)
+            rows = convolution(rows, topology, inside, True)
         return rows
 
 
@@ -90,17 +91,20 @@ class FusionGRU(nn.Module):
 
     def compiled(self, part: LatentVolume, local: LocalVolume) -> Tensor:
         """The running mean on all rows of `part` (the global volume on the local one's blocks) and `forward` on those of busy blocks,
-        without gradients, on the CPU (float32; convolutions in what autocast says).
+        without gradients, by kernels (float32; convolutions in what autocast says).
 
         Returns:
             (M · 512 + 1, C), zero outside the local volume.
         """
-        place, busy = local.place[:-1], local.busy
-        step = Step(place, part, local, LEAST, self.most)
+        place, busy, kind = local.place[:-1], local.busy, part.rows.device.type
+        maker: Any = Step
+        if not on_cpu(part.rows.device):
+            from toolkit.networks.gpu.gru import Step as maker
+        step = maker(place, part, local, LEAST, self.most)
         rows = step.average()
         if busy.blocks:
             inside = local.known[place]
-            both = step.beside(torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else torch.float32)
+            both = step.beside(torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32)
             update, reset = self._gates(both, busy, inside)
             step.forget(reset, both)
             step.update(update, self.candidate(both, busy, inside), INSIDE, CHANGE, rows)
@@ -113,6 +117,10 @@ class FusionGRU(nn.Module):
         weight, bias = torch.cat([one.weight, other.weight]), torch.cat([one.bias, other.bias])
         rows = block_conv3d(both, topology, weight, bias, inside, one.chunk)
         return [gate(both, topology, inside, part) for gate, part in zip((self.update, self.reset), rows.chunk(2, 1), strict=True)]
+
+
+def on_cpu(device: torch.device) -> bool:
+    return device.type == "cpu"
 
 
 def _beside(one: Tensor, other: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from toolkit.networks import gpu
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK, VOXELS, Bounds, Topology
 from toolkit.volume.waiting import asks_freely
@@ -135,6 +136,10 @@ def cells(topology: Topology, corners: Tensor, every: bool) -> Tensor:
     Returns:
         (M · 512,) bool: cells whose lowest corner is that row. Corners of absent blocks count as not set.
     """
+    if gpu.there(corners):
+        from toolkit.networks.gpu import blocks
+
+        return blocks.pooled(topology, corners, 0, 2, every)
     padded = torch.cat([corners, corners.new_zeros(1)])
     out = torch.empty_like(corners)
     for start in range(0, topology.blocks, CHUNK):

@@ -75,5 +75,5 @@ class LocalReconstruction(nn.Module):
             (M · 512 + 1, channels), zero where nothing is seen.
         """
         for number, convolution in enumerate(self.convolutions):
-            rows = convolution(torch.relu(rows) if number else rows, topology, seen)
+            rows = convolution(rows, topology, seen, number > 0)
         return held(rows) + start

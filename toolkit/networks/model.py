@@ -15,11 +15,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from toolkit.networks import gpu
 from toolkit.networks.aggregate import CUES, FLAGS, aggregate, agreement, direction_spread, evidence
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.compiled import fits
@@ -35,7 +37,7 @@ from toolkit.networks.matching import SIDE, describe
 from toolkit.networks.pyramid import pyramids
 from toolkit.networks.refine import with_blocks
 from toolkit.networks.sweep import Empty, Sighted, Sweep, sweep
-from toolkit.networks.unproject import EncodedView, look_up, project
+from toolkit.networks.unproject import COLOURED, EncodedView, look_up, project
 from toolkit.volume.topology import VOXELS, Topology
 from toolkit.volume.waiting import asks_freely
 
@@ -154,10 +156,9 @@ class NerfusionModel(nn.Module):
         if swept is None:
             bounded = near > 0 or math.isfinite(far)
             swept = self.sweep(views, cameras, *((near, far) if bounded else _depths(lattice, topology, cameras)))
-        rows = torch.arange(topology.zero_row, device=topology.device) if wanted is None else wanted.nonzero().view(-1)
-        few = CHUNK if asks_freely(rows.device) else AT_ONCE
-        parts = [self._observe(views, cameras, lattice, topology, part, near, far, swept) for part in rows.split(few)]
-        where, projected, starts, counts, weights = (torch.cat(values) for values in zip(*parts, strict=True))
+        where, projected, starts, counts, weights = self._seen(views, cameras, lattice, topology, wanted, near, far, swept)
+        if not torch.is_grad_enabled() and starts.shape[1] == INSIDE + 1 and gpu.fits(projected):
+            return self._laid(lattice, topology, where, projected, starts, counts, weights)
         topology, where = _without_empty_blocks(topology, where)
         config, size = self.config, topology.zero_row
         count = torch.zeros(size, device=topology.device).index_copy(0, where, counts)
@@ -173,6 +174,64 @@ class NerfusionModel(nn.Module):
         busy, place = _blocks(topology, active)
         raw = start.index_copy(0, place, self.local(latent[place], start[place], busy, count[place[:-1]] > 0))
         return LocalVolume(lattice, topology, torch.tanh(raw), count, raw, weight, busy, place)
+
+    def _laid(
+        self, lattice: Lattice, topology: Topology, where: Tensor, projected: Tensor, starts: Tensor, counts: Tensor, weights: Tensor
+    ) -> LocalVolume:
+        """The rest of `local_volume` on CUDA without gradients: the device is asked once which blocks are worked on."""
+        from toolkit.networks.gpu import blocks
+
+        channels, threshold = self.config.channels, _latent_of(FREE)
+        laid = blocks.lay(topology.blocks, where, projected, starts, counts, weights, channels, threshold)
+        marks = laid[-1].cpu().bool()
+        filled, busy = marks[:, 0].nonzero().view(-1), marks[:, 1].nonzero().view(-1)
+        both = torch.cat([filled, busy]).to(where.device, non_blocking=True)
+        kept, active = both[: len(filled)], both[len(filled) :]
+        size = len(filled) * VOXELS
+
+        def of(values: Tensor, some: Tensor, more: int) -> Tensor:
+            """Rows of some of the blocks, and `more` zero rows."""
+            rows = values[: topology.zero_row].view(topology.blocks, -1)[some].view(-1, *values.shape[1:])
+            return F.pad(rows, (0, 0, 0, more)) if more else rows
+
+        latent, start, count, weight = laid[:4]
+        small = topology.alike(topology.keys[active])
+        learned = self.local(of(latent, active, 1), of(start, active, 1), small, of(count, active, 0) > 0)
+        if len(filled) < topology.blocks:
+            start, count, weight = of(start, kept, 1), of(count, kept, 0), of(weight, kept, 0)
+            among = (torch.cumsum(marks[:, 0], 0) - 1)[busy].to(where.device, non_blocking=True)
+            topology = topology.alike(topology.keys[kept])
+        else:
+            among = active
+        place = (among[:, None] * VOXELS + torch.arange(VOXELS, device=among.device)).view(-1)
+        place = torch.cat([place, place.new_full((1,), size)])
+        raw = start.index_copy(0, place, learned)
+        return LocalVolume(lattice, topology, torch.tanh(raw), count, raw, weight, small, place)
+
+    def _seen(
+        self,
+        views: Sequence[EncodedView],
+        cameras: Cameras,
+        lattice: Lattice,
+        topology: Topology,
+        wanted: Tensor | None,
+        near: float,
+        far: float,
+        swept: Sweep,
+    ) -> tuple[Tensor, ...]:
+        """`_observe` of all corners that are `wanted`, None: of all."""
+        rows = None if wanted is None else wanted.nonzero().view(-1)
+        if not torch.is_grad_enabled() and self.config.hidden in (16, 32) and gpu.fits(swept.table, *(v.features.rows for v in views)):
+            from toolkit.networks.gpu.observe import Observer
+
+            observer = Observer(views, cameras, near, far, swept, (TRUNCATION, HIDDEN, BLIND, COLOUR_GAIN, COLOURED))
+            rows = observer.choose(lattice, topology.keys, rows)
+            return rows, *observer.observe(lattice, topology.keys, rows, self.local.project, self.config.sampled, self.config.variance)
+        if rows is None:
+            rows = torch.arange(topology.zero_row, device=topology.device)
+        few = CHUNK if asks_freely(rows.device) else AT_ONCE
+        parts = [self._observe(views, cameras, lattice, topology, part, near, far, swept) for part in rows.split(few)]
+        return tuple(torch.cat(values) for values in zip(*parts, strict=True))
 
     def _observe(
         self,
@@ -229,7 +288,8 @@ class NerfusionModel(nn.Module):
 
     def fuse_part(self, part: LatentVolume, local: LocalVolume) -> LatentVolume:
         """One step of the recurrence on the blocks of a local volume alone: `part` is the global volume there."""
-        if isinstance(self.fusion, FusionGRU) and not torch.is_grad_enabled() and fits(part.rows, part.count, local.rows, local.raw):
+        known = part.rows, part.count, local.rows, local.raw
+        if isinstance(self.fusion, FusionGRU) and not torch.is_grad_enabled() and (fits(*known) or gpu.fits(*known)):
             return replace(part, rows=self.fusion.compiled(part, local), count=part.count * local.known + local.weight)
         inside = local.known
         count = part.count * inside
@@ -265,6 +325,7 @@ class NerfusionModel(nn.Module):
         )
 
 
+@lru_cache(maxsize=4)
 def _latent_of(signed: float) -> float:
     """`inside_latent` of one number."""
     return float(inside_latent(torch.tensor([signed])))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from toolkit.networks import gpu
 from toolkit.networks.lattice import LatentVolume, Lattice
 from toolkit.networks.refine import part
 from toolkit.volume.topology import VOXELS, Topology
@@ -37,7 +38,12 @@ class GlobalStore:
 
     def write(self, values: LatentVolume, changed: Tensor) -> None:
         """Take over the corners `changed` (M · 512,) of some blocks."""
-        slots = self._slots(values.topology.keys)
+        slots = self._slots(values.topology)
+        if gpu.fits(self._rows, values.rows):
+            from toolkit.networks.gpu import blocks
+
+            blocks.put(self._rows, self._count, slots, values.rows, values.count, changed)
+            return
         place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
         if asks_freely(place.device):
             which = changed.nonzero().view(-1)
@@ -58,12 +64,13 @@ class GlobalStore:
         self._rows[: len(rows)], self._count[: len(count)] = rows, count
         self.topology = self.topology.alike(self.topology.keys[kept])
 
-    def _slots(self, keys: Tensor) -> Tensor:
+    def _slots(self, topology: Topology) -> Tensor:
         """(M,) slots of blocks, made where missing."""
-        slots = self.topology.find(keys)
-        fresh = keys[slots < 0]
-        if len(fresh) == 0:
+        slots = self.topology.slots_of(topology)
+        missing = (slots < 0).nonzero().view(-1)
+        if len(missing) == 0:
             return slots
+        fresh, before = topology.keys[missing], self.topology.blocks
         self.topology = self.topology.alike(torch.cat([self.topology.keys, fresh.to(torch.int32)]))
         needed = self.topology.zero_row
         if needed > len(self._count):
@@ -71,4 +78,4 @@ class GlobalStore:
             rows, count = self._rows.new_zeros((room + 1, self._rows.shape[1])), self._count.new_zeros(room)
             rows[: len(self._rows)], count[: len(self._count)] = self._rows, self._count
             self._rows, self._count = rows, count
-        return self.topology.find(keys)
+        return slots.index_copy(0, missing, before + torch.arange(len(missing), device=slots.device))

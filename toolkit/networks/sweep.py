@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -362,17 +363,20 @@ def _planes(widths: Sequence[int], cameras: Cameras, near: float, far: float) ->
         widths: K, of the pictures that are compared.
         cameras: on the CPU.
     """
-    spots = torch.cartesian_prod(torch.tensor([0.1, 0.5, 0.9]), torch.tensor([0.1, 0.5, 0.9]))
-    flat = (spots * cameras.size[0] - cameras.intrinsics[0, 2:]) / cameras.intrinsics[0, :2]
-    rays = torch.cat([flat, torch.ones_like(flat[:, :1])], 1)
+    numbers = [values.numpy() for values in (cameras.intrinsics, cameras.size, cameras.world_from_camera)]
+    lenses, sizes, poses = numbers
+    spots = np.array([[u, v, 1.0] for u in (0.1, 0.5, 0.9) for v in (0.1, 0.5, 0.9)], dtype=np.float32)
+    rays = spots.copy()
+    rays[:, :2] = (spots[:, :2] * sizes[0] - lenses[0, 2:]) / lenses[0, :2]
     most = 0.0
     for view in range(1, len(cameras)):
-        turn, shift = _way(cameras, view)
-        ends = [rays @ turn + shift / depth for depth in (near, far)]
-        front = (ends[0][:, 2] > 0.05) & (ends[1][:, 2] > 0.05)
-        if not bool(front.any()):
+        axes = poses[view, :3, :3]
+        turn, shift = poses[0, :3, :3].T @ axes, (poses[0, :3, 3] - poses[view, :3, 3]) @ axes
+        one, two = (rays @ turn + shift / np.float32(depth) for depth in (near, far))
+        front = (one[:, 2] > 0.05) & (two[:, 2] > 0.05)
+        if not front.any():
             continue
-        one, two = ((end[front, :2] / end[front, 2:]) * cameras.intrinsics[view, :2] for end in ends)
-        scale = widths[view] / float(cameras.size[view, 0])
-        most = max(most, float((one - two).norm(dim=1).median()) * scale)
+        one, two = (end[front, :2] / end[front, 2:] * lenses[view, :2] for end in (one, two))
+        moved = np.sort(np.linalg.norm(one - two, axis=1))
+        most = max(most, float(moved[(len(moved) - 1) // 2]) * widths[view] / float(sizes[view, 0]))
     return int(min(max(math.ceil(most / STEP) + 1, PLANES[0]), PLANES[1]))

@@ -84,7 +84,7 @@ def look_up(views: Sequence[EncodedView], projection: Projection, step: Tensor) 
     tables = [pyramid.rows for view in views for pyramid in (view.features, view.colours)]
     if compiled_lookup.fits(tables, projection.pixels, step, projection.footprint):
         return _filled(views, projection, step)
-    if not torch.is_grad_enabled() and gpu.fits(*tables, projection.pixels, step, projection.footprint):
+    if gpu.fits(*tables, projection.pixels, step, projection.footprint):
         from toolkit.networks.gpu import lookup
 
         return lookup.look_up(views, projection.pixels, step, projection.footprint, COLOURED)

@@ -13,6 +13,7 @@ from functools import cached_property
 import torch
 import torch.nn.functional as F
 
+from toolkit.networks import gpu
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
 
@@ -127,13 +128,17 @@ def _coarse_distances(grid: MarchGrid, origins: Tensor, directions: Tensor, near
         lattice = torch.arange(count + 1, device=origins.device) - jitter[:, None]
         distance = enter[:, None] + lattice * (step / speed)[:, None]
         return torch.where((leave > enter)[:, None], distance, torch.full_like(distance, -1.0)).clamp_max(leave.clamp_min(-1.0)[:, None])
+    far = space.shell / grid.voxel  # |y| in the outermost voxel: the last step starts before it
+    limit = int(2 * math.sqrt(3) * 2 * space.extent / step) + 8
+    if gpu.fits(origins, directions, jitter):
+        from toolkit.render import march_gpu
+
+        return march_gpu.walk(origins, directions, jitter, 2 * limit, near, step, far, space.shell, space.extent, MAX_STRETCH)
     # Beyond the region a place moves in contracted space by at most c / n² of its way, c² = b² + (extent · closest approach)².
     closest = origins - directions * ((origins * directions).sum(1) / speed**2)[:, None]
     rise = 1 / (space.shell**2 + space.extent**2 * closest.square().sum(1)).sqrt()
-    far = space.shell / grid.voxel  # |y| in the outermost voxel: the last step starts before it
     distance = near - jitter * step / speed
     out = [distance]
-    limit = int(2 * math.sqrt(3) * 2 * space.extent / step) + 8
     for _ in range(2 * limit):
         norm = torch.addcmul(origins, directions, distance[:, None]).abs_().amax(1).clamp_min_(1.0)
         if bool((norm > far).all()):

@@ -13,6 +13,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 
+from toolkit.networks import gpu
 from toolkit.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids
 
 Tensor = torch.Tensor
@@ -48,6 +49,10 @@ def cast(solids: Solids, origins: Tensor, directions: Tensor) -> tuple[Tensor, T
         distance (N,), `FAR` where nothing is hit, and the number of the solid (N,) int64, −1 where nothing is hit. A solid that
         the ray starts in is not seen (rooms are seen from inside).
     """
+    if gpu.fits(origins, directions):
+        from toolkit.simulate import cast_gpu
+
+        return cast_gpu.cast(solids, origins, directions, FAR, NEAREST)
     parts = [
         _cast(solids, origins if len(origins) == 1 else origins[i : i + RAYS_A_CHUNK], directions[i : i + RAYS_A_CHUNK])
         for i in range(0, len(directions), RAYS_A_CHUNK)

@@ -72,10 +72,10 @@ class Scene:
     def device(self) -> torch.device:
         return self.solids.centre.device
 
-    def to(self, device: torch.device | str) -> Scene:
-        """The same scene with its tensors on another device."""
+    def to(self, device: torch.device | str, bank: TextureBank | None = None) -> Scene:
+        """The same scene with its tensors on another device; `bank`: its textures, where they are there already."""
         materials = Materials(self.materials.items, device)
-        return replace(self, solids=self.solids.to(device), materials=materials, bank=self.bank.to(device))
+        return replace(self, solids=self.solids.to(device), materials=materials, bank=bank or self.bank.to(device))
 
     def clearance(self, points: Tensor) -> Tensor:
         """(N,) metres from (N, 3) points to the nearest surface; negative inside a solid or outside the room."""

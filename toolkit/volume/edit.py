@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from toolkit.networks import gpu
 from toolkit.volume.lookup import corners, gather
 from toolkit.volume.rows import zero_rows
 from toolkit.volume.topology import BLOCK, VOXELS, Bounds, Topology, constant
@@ -32,9 +33,13 @@ def corner_nodes(topology: Topology, occupied: Tensor) -> Tensor:
 
 def _pooled(topology: Topology, occupied: Tensor, last: int) -> Tensor:
     """(M · 512,) bool: rows with an occupied row among the offsets −1 … `last` along each axis."""
+    width = last + 2
+    if gpu.there(occupied):
+        from toolkit.networks.gpu import blocks
+
+        return blocks.pooled(topology, occupied, -1, width)
     padded = torch.cat([occupied, occupied.new_zeros(1)])
     out = torch.empty_like(occupied)
-    width = last + 2
     side = BLOCK + width - 1
     for start in range(0, topology.blocks, CHUNK):
         stop = min(start + CHUNK, topology.blocks)
@@ -221,6 +226,10 @@ def resample(
     if mode not in MODES or not 0 < scale < math.inf:
         raise ValueError(f"mode must be one of {', '.join(MODES)} and scale positive, not {mode!r} and {scale}")
     nodes = corner_nodes(topology, occupied)
+    if mode == "trilinear" and topology.bounds is not None and gpu.fits(*rows):  # keys are small there
+        from toolkit.networks.gpu import blocks
+
+        return blocks.resample(topology, nodes, rows, new_keys, scale)
     row_of_valid = torch.where(nodes, torch.arange(len(nodes), device=nodes.device), topology.zero_row)
     row_of_valid = torch.cat([row_of_valid, row_of_valid.new_full((1,), topology.zero_row)])
     if not rows:

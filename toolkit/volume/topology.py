@@ -124,6 +124,12 @@ class Topology:
         # Far keys are moved to the table's empty margin, so no mask is needed afterwards.
         return self.table.view(-1)[self._cells(torch.minimum(torch.maximum(wide, low), high))].to(torch.int64)
 
+    def slots_of(self, other: Topology) -> Tensor:
+        """(M',) int64 slots here of the other's blocks, −1 where there is no such block."""
+        if self.bounds is not None and self.bounds == other.bounds and self.table is not None:
+            return self.table.view(-1)[other.own_cells].to(torch.int64)
+        return self.find(other.keys)
+
     @cached_property
     def around(self) -> Tensor:
         """(M, 27) int64 slots of the 3×3×3 blocks around each, −1 absent; column (dz+1)·9 + (dy+1)·3 + (dx+1), itself in column 13."""

@@ -19,6 +19,11 @@ def _there() -> bool:
     return os.environ.get("FIELDFUSE_TRITON", "1") != "0" and util.find_spec("triton") is not None
 
 
+def there(values: Tensor) -> bool:
+    """Whether values of any kind lie where the kernels are."""
+    return values.is_cuda and _there()
+
+
 def fits(*values: Tensor) -> bool:
     """Whether the kernels can take these: float32 on a CUDA device."""
     return all(value.is_cuda and value.dtype == torch.float32 for value in values) and _there()
@@ -26,4 +31,4 @@ def fits(*values: Tensor) -> bool:
 
 def takes(values: Tensor) -> bool:
     """Whether the convolution can take rows: on a CUDA device, in any of the numbers that networks compute in."""
-    return values.is_cuda and values.dtype in (torch.float32, torch.bfloat16, torch.float16) and _there()
+    return there(values) and values.dtype in (torch.float32, torch.bfloat16, torch.float16)

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 import triton
 import triton.language as tl
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 BLOCK = 64  # voxels at a time
 
 
 @triton.jit
-def _corners(x, y, footprint, height, width, STRIDE: tl.constexpr, LEVELS: tl.constexpr):
+def corners(x, y, footprint, height, width, STRIDE: tl.constexpr, LEVELS: tl.constexpr):
     """Rows of the four cells about pixels in the level whose cells are nearest to a footprint, and their weights."""
     level = tl.minimum(tl.floor(tl.log2(tl.maximum(footprint / STRIDE, 1.0)) + 0.5), LEVELS - 1.0).to(tl.int32)
     first = tl.zeros_like(level)
@@ -55,16 +57,72 @@ def _shown(
     x, y = tl.load(pixels + 2 * n, some, 0.0), tl.load(pixels + 2 * n + 1, some, 0.0)
     size, cell = tl.load(step + n, some, 1.0), tl.load(footprint + n, some, 1.0)
     stride: tl.constexpr = CHANNELS + 2 * COLOURS
-    corner, right, below, w0, w1, w2, w3 = _corners(x, y, size, height, width, STRIDE, LEVELS)
+    corner, right, below, w0, w1, w2, w3 = corners(x, y, size, height, width, STRIDE, LEVELS)
     _read(features, out, stride, 0, n, some, corner, right, below, w0, w1, w2, w3, CHANNELS, WIDE)
-    corner, right, below, w0, w1, w2, w3 = _corners(x, y, size, down, across, FINE, FINE_LEVELS)
+    corner, right, below, w0, w1, w2, w3 = corners(x, y, size, down, across, FINE, FINE_LEVELS)
     _read(colours, out, stride, CHANNELS, n, some, corner, right, below, w0, w1, w2, w3, COLOURS, 4)
-    corner, right, below, w0, w1, w2, w3 = _corners(x, y, part * cell, down, across, FINE, FINE_LEVELS)
+    corner, right, below, w0, w1, w2, w3 = corners(x, y, part * cell, down, across, FINE, FINE_LEVELS)
     _read(colours, out, stride, CHANNELS + COLOURS, n, some, corner, right, below, w0, w1, w2, w3, COLOURS, 4)
+
+
+@triton.jit
+def _spread(
+    pixels, step, slopes, total, count, height, width, stride,
+    CHANNELS: tl.constexpr, WIDE: tl.constexpr, STRIDE: tl.constexpr, LEVELS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Add the gradients of what was read to the rows that it was read from."""
+    n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    some = n < count
+    x, y, size = tl.load(pixels + 2 * n, some, 0.0), tl.load(pixels + 2 * n + 1, some, 0.0), tl.load(step + n, some, 1.0)
+    corner, right, below, w0, w1, w2, w3 = corners(x, y, size, height, width, STRIDE, LEVELS)
+    c = tl.arange(0, WIDE)[None, :]
+    mask = some[:, None] & (c < CHANNELS)
+    slope = tl.load(slopes + n[:, None] * stride + c, mask, 0.0)
+    at = total + corner[:, None] * CHANNELS + c
+    tl.atomic_add(at, slope * w0[:, None], mask)
+    tl.atomic_add(at + right[:, None] * CHANNELS, slope * w1[:, None], mask)
+    tl.atomic_add(at + below[:, None] * CHANNELS, slope * w2[:, None], mask)
+    tl.atomic_add(at + (right + below)[:, None] * CHANNELS, slope * w3[:, None], mask)
+
+
+class _Shown(torch.autograd.Function):
+    """`_look_up` with gradients for the features' rows, which are summed in no fixed order."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, views: Sequence[Any], pixels: Tensor, step: Tensor, footprint: Tensor, part: float, *rows: Tensor
+    ) -> Tensor:
+        ctx.save_for_backward(pixels, step)
+        ctx.shapes = [(one.features.rows.shape, one.features.sizes, one.features.stride) for one in views]
+        return _look_up(views, pixels, step, footprint, part)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        pixels, step = ctx.saved_tensors
+        gradient, pixels, step = gradient.contiguous(), pixels.contiguous(), step.contiguous()
+        totals: list[Tensor] = []
+        for number, (shape, sizes, stride) in enumerate(ctx.shapes):
+            total = gradient.new_zeros(shape)
+            if len(step):
+                _spread[(triton.cdiv(len(step), BLOCK),)](
+                    pixels[number], step, gradient[number], total, len(step), *sizes[0], gradient.shape[2],
+                    CHANNELS=shape[1], WIDE=triton.next_power_of_2(shape[1]), STRIDE=stride, LEVELS=len(sizes), BLOCK=BLOCK,
+                )  # fmt: skip
+            totals.append(total)
+        return None, None, None, None, None, *totals
 
 
 def look_up(views: Sequence[Any], pixels: Tensor, step: Tensor, footprint: Tensor, part: float) -> Tensor:
     """(K, N, C) as `unproject.look_up`, of K views at pixels (K, N, 2), with steps (N,) and footprints (K, N)."""
+    rows = [one.features.rows for one in views]
+    if torch.is_grad_enabled() and any(one.requires_grad for one in rows):
+        found: Tensor = _Shown.apply(views, pixels, step, footprint, part, *rows)
+        return found
+    return _look_up(views, pixels, step, footprint, part)
+
+
+def _look_up(views: Sequence[Any], pixels: Tensor, step: Tensor, footprint: Tensor, part: float) -> Tensor:
     count = len(step)
     channels, colours = views[0].features.rows.shape[1], views[0].colours.rows.shape[1]
     out = step.new_empty((len(views), count, channels + 2 * colours))

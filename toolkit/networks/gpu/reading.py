@@ -23,7 +23,7 @@ def _axes(pose):
 
 
 @triton.jit
-def _local(x, y, z, pose):
+def local(x, y, z, pose):
     """Places of the working frame in a camera's axes."""
     r00, r01, r02, r10, r11, r12, r20, r21, r22, px, py, pz = _axes(pose)
     x, y, z = x - px, y - py, z - pz
@@ -54,18 +54,16 @@ def _between(table, left, right, fx, top, below, fy, low, high, fz, width, plane
 
 
 @triton.jit
-def _look(points, truncation, table, pose, lens, size, out, count, height, width, planes, lowest, step, BLOCK: tl.constexpr):
-    n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
-    some = n < count
-    x, y, z = tl.load(points + 3 * n, some, 0.0), tl.load(points + 3 * n + 1, some, 0.0), tl.load(points + 3 * n + 2, some, 1.0)
-    x, y, z = _local(x, y, z, pose)
+def sighted(x, y, z, truncation, table, pose, lens, size, height, width, planes, lowest, step, some):
+    """Signed distance, openness and sureness of places of the working frame, as `Sighted`."""
+    x, y, z = local(x, y, z, pose)
     depth = tl.maximum(z, 1e-6)
     u = (x / depth * tl.load(lens) + tl.load(lens + 2)) / tl.load(size) * width - 0.5
     v = (y / depth * tl.load(lens + 1) + tl.load(lens + 3)) / tl.load(size + 1) * height - 0.5
     left, right, fx = _bounded(u, width)
     top, below, fy = _bounded(v, height)
     inverse = 1 / depth
-    half = inverse * tl.minimum(tl.load(truncation + n, some, 1.0) / depth, 0.9)
+    half = inverse * tl.minimum(truncation / depth, 0.9)
     near, far = (inverse + half - lowest) / step, (inverse - half - lowest) / step
     low, high, fz = _bounded(near, planes)
     hidden = _between(table, left, right, fx, top, below, fy, low, high, fz, width, planes, some, 3)
@@ -73,10 +71,20 @@ def _look(points, truncation, table, pose, lens, size, out, count, height, width
     sure = _between(table + 2, left, right, fx, top, below, fy, low, high, fz, width, planes, some, 3)
     low, high, fz = _bounded(far, planes)
     lower = _between(table + 1, left, right, fx, top, below, fy, low, high, fz, width, planes, some, 3) - tl.maximum(-far, 0.0) * step
-    signed = 1 - (upper - lower) / half
-    tl.store(out + n, tl.minimum(tl.maximum(signed, -1.0), 1.0), some)
-    tl.store(out + count + n, tl.minimum(tl.maximum(1 - hidden, 0.0), 1.0), some)
-    tl.store(out + 2 * count + n, tl.minimum(tl.maximum(sure, 0.0), 1.0), some)
+    signed = tl.minimum(tl.maximum(1 - (upper - lower) / half, -1.0), 1.0)
+    return signed, tl.minimum(tl.maximum(1 - hidden, 0.0), 1.0), tl.minimum(tl.maximum(sure, 0.0), 1.0)
+
+
+@triton.jit
+def _look(points, truncation, table, pose, lens, size, out, count, height, width, planes, lowest, step, BLOCK: tl.constexpr):
+    n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    some = n < count
+    x, y, z = tl.load(points + 3 * n, some, 0.0), tl.load(points + 3 * n + 1, some, 0.0), tl.load(points + 3 * n + 2, some, 1.0)
+    cut = tl.load(truncation + n, some, 1.0)
+    signed, clear, sure = sighted(x, y, z, cut, table, pose, lens, size, height, width, planes, lowest, step, some)
+    tl.store(out + n, signed, some)
+    tl.store(out + count + n, clear, some)
+    tl.store(out + 2 * count + n, sure, some)
 
 
 def look(points: Tensor, truncation: Tensor, table: Tensor, camera: Any, lowest: float, step: float) -> Tensor:
@@ -98,7 +106,7 @@ def look(points: Tensor, truncation: Tensor, table: Tensor, camera: Any, lowest:
 @triton.jit
 def _asked(x, y, z, says, pose, lens, size, height, width, planes, lowest, step, mask):
     """What a witness says of places, and whether it sees them."""
-    x, y, z = _local(x, y, z, pose)
+    x, y, z = local(x, y, z, pose)
     seen = (z > 1e-4) & mask
     inverse = 1 / tl.where(seen, z, 1.0)
     u = (x * inverse * tl.load(lens) + tl.load(lens + 2)) / tl.load(size)

@@ -43,7 +43,7 @@ def draw_sample(
     targets = torch.from_numpy(places[split:].reshape(choice.targets.shape)).long()
     poses = np.array(scene.world_from_camera[used], dtype=np.float64)
     poses[:, :3, 3] -= scene.world_from_camera[choice.references[0, 0], :3, 3]
-    pictures = replace(pictures, world_from_camera=torch.from_numpy(poses.astype(np.float32)))
+    pictures = replace(pictures, world_from_camera=torch.from_numpy(poses.astype(np.float32)).to(pictures.images.device))
     near, middle, far = depth_range(pictures.depths[references.unique()], scene.depth_hint, scene.name)
     key = int(references[0, 0])
     ahead = poses[key, :3, 3] + middle * poses[key, :3, 2]

@@ -7,6 +7,7 @@ from functools import partial
 from typing import TypeVar
 
 import numpy as np
+import torch
 
 from toolkit.errors import InputError
 from toolkit.training.nerfusion.datasets.dtu import dtu_scene, dtu_scenes
@@ -33,15 +34,16 @@ class Mixture:
 
     Args:
         rank: number of this process; each process sees other samples.
+        device: where procedural scenes are drawn.
 
     Raises:
         InputError: a data set is not where the settings say.
     """
 
-    def __init__(self, settings: TrainSettings, rank: int = 0) -> None:
+    def __init__(self, settings: TrainSettings, rank: int = 0, device: torch.device | str = "cpu") -> None:
         self.settings, self.rank = settings, rank
         used = [source for source in settings.sources if source.weight > 0]
-        self._makers = [_maker(source, settings) for source in used]
+        self._makers = [_maker(source, settings, torch.device(device)) for source in used]
         weights = np.array([source.weight for source in used])
         self._share = weights / weights.sum()
         self._scenes: dict[int, TrainingScene] = {}
@@ -80,9 +82,9 @@ class Mixture:
         return self._scenes[key]
 
 
-def _maker(source: SourceSettings, settings: TrainSettings) -> Maker:
+def _maker(source: SourceSettings, settings: TrainSettings, device: torch.device) -> Maker:
     if source.kind == "procedural":
-        return partial(_procedural, source.scene, settings.pictures.frames)
+        return partial(_procedural, source.scene, settings.pictures.frames, device)
     assert source.path is not None
     if source.kind == "shards":
         return partial(_among, shard_files(source.path), ShardScene)
@@ -95,9 +97,9 @@ def _maker(source: SourceSettings, settings: TrainSettings) -> Maker:
     return partial(_among, synthetic_folders(source.path), synthetic_scene)
 
 
-def _procedural(kind: str, frames: int, rng: np.random.Generator, long_side: int) -> TrainingScene:
+def _procedural(kind: str, frames: int, device: torch.device, rng: np.random.Generator, long_side: int) -> TrainingScene:
     chosen = kind if kind != "any" else ("object", "room")[int(rng.integers(2))]
-    return ProceduralScene(chosen, rng, long_side, frames, int(rng.integers(BANKS)))
+    return ProceduralScene(chosen, rng, long_side, frames, int(rng.integers(BANKS)), device)
 
 
 def _among(places: list[T], make: Callable[[T, int], TrainingScene], rng: np.random.Generator, long_side: int) -> TrainingScene:

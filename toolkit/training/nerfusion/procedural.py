@@ -11,7 +11,7 @@ import torch
 from toolkit.camera import Array, Intrinsics
 from toolkit.effects import transfer
 from toolkit.errors import InputError
-from toolkit.simulate.eye import eye_of, take
+from toolkit.simulate.eye import eye_of, take, take_all
 from toolkit.simulate.materials import TextureBank, texture_bank
 from toolkit.simulate.procedural import random_scene
 from toolkit.simulate.scene import EDGE_SIDE
@@ -26,9 +26,9 @@ TEXELS = 256  # a side of a texture: training pictures are small
 TRIES = 6
 
 
-@lru_cache(maxsize=BANKS)
-def _bank(number: int) -> TextureBank:
-    return texture_bank(number, TEXELS)
+@lru_cache(maxsize=2 * BANKS)
+def _bank(number: int, device: torch.device) -> TextureBank:
+    return texture_bank(number, TEXELS) if device.type == "cpu" else _bank(number, torch.device("cpu")).to(device)
 
 
 class ProceduralScene:
@@ -41,6 +41,7 @@ class ProceduralScene:
         kind: "object" or "room".
         bank: set of textures, 0 … `BANKS` − 1.
         frames: cameras on the path.
+        device: where pictures are drawn, and stay.
 
     Raises:
         InputError: no path was found after several scenes.
@@ -49,12 +50,14 @@ class ProceduralScene:
     ordered: bool
     depth_hint: float | None
 
-    def __init__(self, kind: str, rng: np.random.Generator, long_side: int, frames: int, bank: int = 0) -> None:
-        self.kind = kind
+    def __init__(
+        self, kind: str, rng: np.random.Generator, long_side: int, frames: int, bank: int = 0, device: torch.device | str = "cpu"
+    ) -> None:
+        self.kind, self._device = kind, torch.device(device)
         poses = None
         for _ in range(TRIES):
             named = str(rng.choice(OBJECTS if kind == "object" else ROOMS))
-            self._scene = random_scene(named, rng, _bank(bank))
+            self._scene = random_scene(named, rng, _bank(bank, torch.device("cpu")))
             self.name = f"procedural {named}"
             focus = np.asarray(self._scene.focus, dtype=np.float64)
             make = around if kind == "object" and rng.random() < 0.75 else hand_held
@@ -70,37 +73,47 @@ class ProceduralScene:
         self.world_from_camera = poses.copy()
         self.world_from_camera[:, :3, 3] *= self._scale
         self._camera = _camera(rng, long_side)
-        self._eye = eye_of(self._camera, EDGE_SIDE, torch.device("cpu"))  # kept: scenes take turns, and rays are dear to make
+        if self._device.type != "cpu":
+            self._scene = self._scene.to(self._device, _bank(bank, self._device))
+        self._eye = eye_of(self._camera, EDGE_SIDE, self._device)  # kept: scenes take turns, and rays are dear to make
         # Exposure and white balance differ between captures, not within one.
-        self._gain = torch.from_numpy(np.exp(rng.normal(0, 0.12) + rng.normal(0, 0.04, 3))).float()
+        self._gain = torch.from_numpy(np.exp(rng.normal(0, 0.12) + rng.normal(0, 0.04, 3))).float().to(self._device)
         self._noise = float(rng.choice([0.0, rng.uniform(0.0, 0.02)]))
         self._seed = int(rng.integers(2**31))
         self._drawn: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
-        middle = self._frame(frames // 2)[1]
+        self._draw([frames // 2])
+        middle = self._drawn[frames // 2][1]
         seen = middle[middle > 0]
         self.depth_hint = float(seen.median()) if len(seen) else None
 
     def _clearance(self, points: Array) -> Array:
         return np.asarray(self._scene.clearance(torch.from_numpy(points)).numpy(), dtype=np.float64)
 
-    def _frame(self, index: int) -> tuple[torch.Tensor, torch.Tensor]:
-        if index not in self._drawn:
-            seen = take(self._scene, self._eye, self._poses[index][None])
+    def _draw(self, indices: Sequence[int]) -> None:
+        """Draw the frames at `indices` that are not drawn yet."""
+        new = list(dict.fromkeys(index for index in indices if index not in self._drawn))
+        if not new:
+            return
+        if self._device.type == "cpu":
+            taken = [take(self._scene, self._eye, self._poses[index][None]) for index in new]
+        else:
+            taken = take_all(self._scene, self._eye, self._poses[new])
+        for index, seen in zip(new, taken, strict=True):
             picture = transfer.encode(seen.linear).permute(2, 0, 1) * self._gain[:, None, None]
             if self._noise > 0:
-                generator = torch.Generator().manual_seed(self._seed + index)
-                picture = picture + self._noise * torch.randn(picture.shape, generator=generator)
+                generator = torch.Generator(self._device).manual_seed(self._seed + index)
+                picture = picture + self._noise * torch.randn(picture.shape, generator=generator, device=self._device)
             self._drawn[index] = picture.clamp(0, 1).contiguous(), seen.depth * self._scale
-        return self._drawn[index]
 
     def pictures(self, indices: Sequence[int]) -> Pictures:
         """The frames at `indices`."""
-        drawn = [self._frame(int(index)) for index in indices]
+        self._draw([int(index) for index in indices])
+        drawn = [self._drawn[int(index)] for index in indices]
         c = self._camera
         return Pictures(
             images=torch.stack([picture for picture, _ in drawn]),
-            intrinsics=torch.tensor([[c.fx, c.fy, c.cx, c.cy]]).repeat(len(drawn), 1),
-            world_from_camera=torch.from_numpy(self.world_from_camera[list(indices)].astype(np.float32)),
+            intrinsics=torch.tensor([[c.fx, c.fy, c.cx, c.cy]]).repeat(len(drawn), 1).to(self._device),
+            world_from_camera=torch.from_numpy(self.world_from_camera[list(indices)].astype(np.float32)).to(self._device),
             depths=torch.stack([depth for _, depth in drawn]),
         )
 

@@ -70,15 +70,15 @@ def in_sight(rays: TargetRays, pictures: Pictures, references: Tensor) -> Tensor
     points = rays.origins + rays.directions * rays.distance[:, None]
     height, width = pictures.images.shape[2:]
     seen = rays.distance == 0
-    for view in references.unique().tolist():
-        pose, (fx, fy, cx, cy) = pictures.world_from_camera[view], pictures.intrinsics[view].unbind()
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
-        depth = local[:, 2].clamp_min(1e-9)
-        u, v = local[:, 0] / depth * fx + cx, local[:, 1] / depth * fy + cy
-        inside = (local[:, 2] > 0) & (u >= 0) & (u <= width) & (v >= 0) & (v <= height)
-        there = pictures.depths[view, v.long().clamp(0, height - 1), u.long().clamp(0, width - 1)]
-        seen |= inside & ((there == 0) | (depth <= (1 + HIDDEN) * there))
-    return seen
+    views = references.reshape(-1)
+    pose, lens = pictures.world_from_camera[views], pictures.intrinsics[views]
+    fx, fy, cx, cy = (value[:, None] for value in lens.unbind(1))
+    local = (points - pose[:, None, :3, 3]) @ pose[:, :3, :3]  # (V, R, 3)
+    depth = local[..., 2].clamp_min(1e-9)
+    u, v = local[..., 0] / depth * fx + cx, local[..., 1] / depth * fy + cy
+    inside = (local[..., 2] > 0) & (u >= 0) & (u <= width) & (v >= 0) & (v <= height)
+    there = pictures.depths[views[:, None], v.long().clamp(0, height - 1), u.long().clamp(0, width - 1)]
+    return seen | (inside & ((there == 0) | (depth <= (1 + HIDDEN) * there))).any(0)
 
 
 def picture_rays(pictures: Pictures, view: int) -> TargetRays:

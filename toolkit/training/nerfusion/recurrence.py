@@ -15,6 +15,7 @@ from toolkit.networks.cameras import Cameras
 from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume, cells
 from toolkit.networks.model import NerfusionModel
 from toolkit.networks.refine import adopt, children, solid_cells, split_volume, surface_cells
+from toolkit.networks.sweep import Sweep
 from toolkit.networks.unproject import EncodedView
 from toolkit.volume.topology import VOXELS
 
@@ -47,9 +48,12 @@ class Recurrence:
             lattice = lattice.finer()
         return cls(tuple(volumes), near, far, gamma, most)
 
-    def add(self, model: NerfusionModel, views: Sequence[EncodedView], cameras: Cameras) -> tuple[Recurrence, LocalVolume]:
-        """The state after one more key frame, and its local volume on the coarsest lattice."""
-        swept = model.sweep(views, cameras, self.near, self.far)
+    def add(
+        self, model: NerfusionModel, views: Sequence[EncodedView], cameras: Cameras, swept: Sweep | None = None
+    ) -> tuple[Recurrence, LocalVolume]:
+        """The state after one more key frame, and its local volume on the coarsest lattice. `swept`: its sweep; None: made here, alone."""
+        if swept is None:
+            swept = model.sweep(views, cameras, self.near, self.far)
         local = model.local_volume(views, cameras, self.volumes[0].lattice, near=self.near, far=self.far, swept=swept)
         volumes = [model.fuse(self.volumes[0], local)]
         newest = local

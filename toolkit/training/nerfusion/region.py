@@ -54,12 +54,12 @@ def region_around(points: Tensor, fallback: tuple[Array, float], part: float, cl
         low, high = torch.quantile(points, points.new_tensor([0.005, 0.995]), dim=0)
         size = ((high - low) / 2 * MARGIN).clamp_min(1e-6)
         half = float(size.max())
-        box = _triple((size / half).clamp_min(0.05).double().numpy())
-        return Space(_triple(((low + high) / 2).double().numpy()), half, 0.0, box)
+        box = _triple((size / half).clamp_min(0.05).double().cpu().numpy())
+        return Space(_triple(((low + high) / 2).double().cpu().numpy()), half, 0.0, box)
     middle = points.median(0).values
     reach = (points - middle).abs().amax(1)
     half = float(torch.quantile(reach, part).clamp_min(1e-6)) * MARGIN
-    return Space(_triple(middle.double().numpy()), half, SHELL)
+    return Space(_triple(middle.double().cpu().numpy()), half, SHELL)
 
 
 def lattice_resolution(space: Space, voxel_size: float, most: int) -> int:

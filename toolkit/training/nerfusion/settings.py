@@ -66,6 +66,7 @@ class StageSettings:
     gamma: float = 0.95  # coarse cells in which exp(−optical thickness) exceeds this are not looked at finer
     most_split: int = 6000  # coarse cells that are looked at finer, a key frame at most
     prune_from: float = 0.5  # share of stage 2 after which the fused volume is pruned
+    witnesses: bool = False  # stage 2 and validation: key frames of a sample are each other's witnesses, as in direct inference
 
 
 @dataclass

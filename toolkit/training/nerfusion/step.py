@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import torch
 
-from toolkit.networks.cameras import Cameras
 from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume
+from toolkit.networks.matching import SIDE
 from toolkit.networks.model import NerfusionModel
 from toolkit.render.fused import GAMMA, make_field
 from toolkit.training.nerfusion.health import feature_deviation, rendering_health
@@ -17,6 +17,7 @@ from toolkit.training.nerfusion.recurrence import Recurrence
 from toolkit.training.nerfusion.samples import Pictures, Sample
 from toolkit.training.nerfusion.settings import TrainSettings
 from toolkit.training.nerfusion.tracing import trace
+from toolkit.training.nerfusion.witnessed import cameras_of, sweeps_of
 
 Tensor = torch.Tensor
 LOCAL, FUSED = "local", "fused"
@@ -37,12 +38,6 @@ class Outcome:
     def means(self) -> dict[str, float]:
         """Each number's mean over the step."""
         return {name: sum(values) / len(values) for name, values in self.numbers.items()}
-
-
-def cameras_of(pictures: Pictures, indices: Tensor) -> Cameras:
-    """The networks' cameras of some pictures."""
-    height, width = pictures.images.shape[2:]
-    return Cameras.same_size(pictures.intrinsics[indices], pictures.world_from_camera[indices], width, height)
 
 
 def background_of(pictures: Pictures, count: int, generator: torch.Generator | None) -> Tensor:
@@ -147,14 +142,15 @@ class Stepper:
         stage, weights, frames = settings.stage, settings.loss, len(sample.references)
         rays = max(1, weights.rays // ((1 + stage.levels) * frames))
         state = begin(model, sample, stage.levels, stage.gamma, stage.most_split)
+        sweeps = sweeps_of(sample) if stage.witnesses else None
         pending: list[Tensor] = []
         for frame in range(frames):
             indices = sample.references[frame]
             cameras = cameras_of(sample.pictures, indices)
-            views = model.encode(sample.pictures.images[indices], cameras)
+            views = model.encode(sample.pictures.images[indices], cameras, SIDE if sweeps is None else None)
             if self.watched and frame == 0:
                 log.note({"feature_deviation": encoder_deviation(model, sample.pictures.images[indices[:1]])})
-            state, local = state.add(model, views, cameras)
+            state, local = state.add(model, views, cameras, None if sweeps is None else sweeps[frame])
             pending.append(
                 weights.local / frames * self._loss(local, sample, sample.targets[frame], indices, rays, LOCAL, step, generator, log)
             )

@@ -83,7 +83,7 @@ class Trainer:
         self.model = make_model(settings).to(crew.device)
         self.adam = torch.optim.Adam(self.model.parameters(), lr=settings.optimiser.rate, betas=BETAS)
         self.average = Average(self.model, settings.optimiser.average, settings.optimiser.start_share)
-        self.mixture = Mixture(settings, crew.rank)
+        self.mixture = Mixture(settings, crew.rank, crew.device)
         self.stepper = Stepper(self.model, settings)
         self.curve = Curve(out)
         self.gates = GateWatch(self.model)
@@ -193,8 +193,9 @@ class Trainer:
     def _validate(self) -> None:
         sheet = self.out / f"validation-{self.step:07d}.png"
         levels = self.settings.stage.levels if self.step > self.settings.stage.steps else 1
+        witnesses = self.settings.stage.witnesses
         with self.average.applied(self.model):
-            numbers, each = validate(self.model, self.cases, self.crew.device, sheet, self.stepper.prunes(self.step), levels)
+            numbers, each = validate(self.model, self.cases, self.crew.device, sheet, self.stepper.prunes(self.step), levels, witnesses)
         for name, values in each.items():
             numbers |= {f"{key} {name}": value for key, value in values.items()}
         self.curve.add({"step": float(self.step), **numbers})

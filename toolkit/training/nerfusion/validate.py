@@ -20,7 +20,8 @@ from toolkit.training.nerfusion.health import relative_depth_error
 from toolkit.training.nerfusion.losses import Traced, depth_likelihood, psnr
 from toolkit.training.nerfusion.rays import TargetRays, picture_rays
 from toolkit.training.nerfusion.real import Case
-from toolkit.training.nerfusion.step import background_of, begin, cameras_of, render_volume
+from toolkit.training.nerfusion.step import background_of, begin, render_volume
+from toolkit.training.nerfusion.witnessed import cameras_of, sweeps_of
 
 Tensor = torch.Tensor
 CHUNK = 4096  # rays at a time
@@ -38,10 +39,12 @@ class Predicted:
 
 
 @torch.no_grad()
-def predict(model: NerfusionModel, case: Case, device: torch.device, prune: bool, levels: int = 1) -> Predicted:
+def predict(
+    model: NerfusionModel, case: Case, device: torch.device, prune: bool, levels: int = 1, witnesses: bool = False
+) -> Predicted:
     """Direct inference of one case: the local volume of the nearest key frame, and the volumes of all key frames fused.
 
-    Returns numbers `psnr_local`, `psnr_fused` (coarsest level), `psnr_fused_1` (half its voxel size), `psnr_nearest` (the nearest
+    With `witnesses` key frames are each other's. Returns numbers `psnr_local`, `psnr_fused` (coarsest level), `psnr_fused_1` (half its voxel size), `psnr_nearest` (the nearest
     training picture shown unchanged), and with true depth `depth_error` (median, relative) and `depth_likelihood` of the finest one.
     """
     sample = case.sample.to(device)
@@ -49,9 +52,10 @@ def predict(model: NerfusionModel, case: Case, device: torch.device, prune: bool
     rays = picture_rays(sample.pictures, target)
     state = begin(model, sample, levels)
     local: LatentVolume = state.volumes[0]
-    for indices in sample.references:
+    sweeps = sweeps_of(sample) if witnesses else [None] * len(sample.references)
+    for indices, swept in zip(sample.references, sweeps, strict=True):
         cameras = cameras_of(sample.pictures, indices)
-        state, local = state.add(model, model.encode(sample.pictures.images[indices], cameras), cameras)
+        state, local = state.add(model, model.encode(sample.pictures.images[indices], cameras), cameras, swept)
     behind = background_of(sample.pictures, 1, None)
     truth = sample.pictures.images[target].permute(1, 2, 0)
     numbers = {"psnr_nearest": psnr((sample.pictures.images[case.nearest].permute(1, 2, 0) - truth).square().mean())}
@@ -84,7 +88,13 @@ def _render(
 
 
 def validate(
-    model: NerfusionModel, cases: Sequence[Case], device: torch.device, sheet: Path | None = None, prune: bool = False, levels: int = 1
+    model: NerfusionModel,
+    cases: Sequence[Case],
+    device: torch.device,
+    sheet: Path | None = None,
+    prune: bool = False,
+    levels: int = 1,
+    witnesses: bool = False,
 ) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
     """Means over the captures (each counts the same) with names `val_…`, and means of each capture.
 
@@ -98,7 +108,7 @@ def validate(
     model.eval()
     by_capture: dict[str, list[Predicted]] = defaultdict(list)
     for case in cases:
-        by_capture[case.capture].append(predict(model, case, device, prune, levels))
+        by_capture[case.capture].append(predict(model, case, device, prune, levels, witnesses))
     model.train(was)
     each = {name: _means([one.numbers for one in found]) for name, found in by_capture.items()}
     if sheet is not None:

@@ -1,0 +1,175 @@
+"""Masks and rows of blocks on CUDA: what lies about lattice corners, and values on a finer lattice (`volume/edit.py` in tensors)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from toolkit.volume.topology import VOXELS, Topology
+
+
+@triton.jit
+def _pool(mask, around, out, FIRST: tl.constexpr, WIDTH: tl.constexpr, EVERY: tl.constexpr):
+    """Whether any, or every, row among the offsets FIRST … FIRST + WIDTH − 1 along each axis is set; one block."""
+    block = tl.program_id(0)
+    voxel = tl.arange(0, 512)
+    z, y, x = voxel // 64, (voxel // 8) % 8, voxel % 8
+    found = tl.full((512,), 1 if EVERY else 0, tl.int32)
+    for k in range(WIDTH * WIDTH * WIDTH):
+        nz = z + FIRST + k // (WIDTH * WIDTH) + 8  # of the 3 × 3 × 3 blocks, 0 to 23
+        ny, nx = y + FIRST + (k // WIDTH) % WIDTH + 8, x + FIRST + k % WIDTH + 8
+        slot = tl.load(around + block * 27 + (nz // 8 * 3 + ny // 8) * 3 + nx // 8)
+        value = tl.load(mask + slot * 512 + (nz % 8 * 8 + ny % 8) * 8 + nx % 8, slot >= 0, 0).to(tl.int32)
+        found = (found & value) if EVERY else (found | value)
+    tl.store(out + block.to(tl.int64) * 512 + voxel, found.to(tl.uint8))
+
+
+def pooled(topology: Topology, mask: Tensor, first: int, width: int, every: bool = False) -> Tensor:
+    """(M · 512,) bool: whether any, or every, of the rows `first` … `first` + `width` − 1 steps off along each axis is set."""
+    out = torch.empty_like(mask)
+    if topology.blocks:
+        given = mask.contiguous().view(torch.uint8), topology.around, out.view(torch.uint8)
+        _pool[(topology.blocks,)](*given, FIRST=first, WIDTH=width, EVERY=every)
+    return out
+
+
+@triton.jit
+def _resample(
+    rows, nodes, table, keys, out, ox, oy, oz, sx, sy, sz, scale, CHANNELS: tl.constexpr, WIDE: tl.constexpr, TILE: tl.constexpr
+):  # fmt: skip
+    """Values at corners of one new block from the corners about them that count, in proportion to their weights."""
+    parts: tl.constexpr = 512 // TILE
+    block = tl.program_id(0) // parts
+    voxel = (tl.program_id(0) % parts) * TILE + tl.arange(0, TILE)
+    px = (tl.load(keys + 3 * block).to(tl.int32) * 8 + voxel % 8).to(tl.float32) * scale
+    py = (tl.load(keys + 3 * block + 1).to(tl.int32) * 8 + (voxel // 8) % 8).to(tl.float32) * scale
+    pz = (tl.load(keys + 3 * block + 2).to(tl.int32) * 8 + voxel // 64).to(tl.float32) * scale
+    fx, fy, fz = tl.floor(px), tl.floor(py), tl.floor(pz)
+    lx, ly, lz = fx.to(tl.int32), fy.to(tl.int32), fz.to(tl.int32)
+    fx, fy, fz = px - fx, py - fy, pz - fz
+    c = tl.arange(0, WIDE)[None, :]
+    total = tl.zeros((TILE, WIDE), tl.float32)
+    share = tl.zeros((TILE,), tl.float32)
+    for k in range(8):
+        x, y, z = lx + k % 2, ly + (k // 2) % 2, lz + k // 4
+        weight = tl.where(k % 2 == 1, fx, 1 - fx) * tl.where((k // 2) % 2 == 1, fy, 1 - fy) * tl.where(k // 4 == 1, fz, 1 - fz)
+        # Far blocks are moved to the table's empty margin.
+        bx = tl.minimum(tl.maximum((x >> 3) - ox, 0), sx - 1)
+        by = tl.minimum(tl.maximum((y >> 3) - oy, 0), sy - 1)
+        bz = tl.minimum(tl.maximum((z >> 3) - oz, 0), sz - 1)
+        slot = tl.load(table + (bz * sy + by) * sx + bx).to(tl.int64)
+        row = slot * 512 + ((z & 7) * 8 + (y & 7)) * 8 + (x & 7)
+        counts = tl.load(nodes + row, slot >= 0, 0) != 0
+        weight = tl.where(counts, weight, 0.0)
+        share += weight
+        total += weight[:, None] * tl.load(rows + row[:, None] * CHANNELS + c, counts[:, None] & (c < CHANNELS), 0.0)
+    value = tl.where((share > 1e-6)[:, None], total / tl.maximum(share, 1e-6)[:, None], 0.0)
+    place = block.to(tl.int64) * 512 + voxel
+    tl.store(out + place[:, None] * CHANNELS + c, value, (c < CHANNELS) & (voxel < 512)[:, None])
+
+
+def resample(topology: Topology, nodes: Tensor, rows: Sequence[Tensor], new_keys: Tensor, scale: float) -> list[Tensor]:
+    """`edit.resample`, trilinear, of float32 rows; `nodes`: (M · 512,) bool, the corners that count."""
+    table = topology.table
+    assert table is not None
+    nodes, keys, out = nodes.view(torch.uint8), new_keys.contiguous(), []
+    for values in rows:
+        flat = values.reshape(len(values), -1).contiguous()
+        made = flat.new_empty((len(keys) * VOXELS + 1, flat.shape[1]))
+        made[-1:].zero_()
+        if len(keys):
+            sizes = {"CHANNELS": flat.shape[1], "WIDE": triton.next_power_of_2(flat.shape[1]), "TILE": 128}
+            ends = *topology.table_origin, *topology.table_size
+            _resample[(len(keys) * 4,)](flat, nodes, table, keys, made, *ends, scale, **sizes)
+        out.append(made.view(-1, *values.shape[1:]))
+    return out
+
+
+@triton.jit
+def _take(rows, count, slots, out, out_count, CHANNELS: tl.constexpr, WIDE: tl.constexpr, TILE: tl.constexpr):
+    """Rows and counts of one block, zero where there is none."""
+    parts: tl.constexpr = 512 // TILE
+    block = (tl.program_id(0) // parts).to(tl.int64)
+    voxel = (tl.program_id(0) % parts) * TILE + tl.arange(0, TILE)
+    c = tl.arange(0, WIDE)[None, :]
+    slot = tl.load(slots + block)
+    here = (voxel < 512) & (slot >= 0)
+    value = tl.load(rows + (slot * 512 + voxel)[:, None] * CHANNELS + c, here[:, None] & (c < CHANNELS), 0.0)
+    tl.store(out + (block * 512 + voxel)[:, None] * CHANNELS + c, value, (voxel < 512)[:, None] & (c < CHANNELS))
+    tl.store(out_count + block * 512 + voxel, tl.load(count + slot * 512 + voxel, here, 0.0), voxel < 512)
+
+
+def take(rows: Tensor, count: Tensor, slots: Tensor) -> tuple[Tensor, Tensor]:
+    """(N, C) rows and (N,) counts of all blocks → (M · 512 + 1, C) and (M · 512,) of those at `slots` (M,), zero where a slot is −1."""
+    channels = rows.shape[1]
+    out, out_count = rows.new_empty((len(slots) * VOXELS + 1, channels)), rows.new_empty(len(slots) * VOXELS)
+    out[-1:].zero_()
+    if len(slots):
+        sizes = {"CHANNELS": channels, "WIDE": triton.next_power_of_2(channels), "TILE": 128}
+        _take[(len(slots) * 4,)](rows.contiguous(), count, slots, out, out_count, **sizes)
+    return out, out_count
+
+
+@triton.jit
+def _put(rows, count, slots, values, values_count, changed, CHANNELS: tl.constexpr, WIDE: tl.constexpr, TILE: tl.constexpr):
+    """Rows and counts of one block, where they have changed, to where they are kept."""
+    parts: tl.constexpr = 512 // TILE
+    block = (tl.program_id(0) // parts).to(tl.int64)
+    voxel = (tl.program_id(0) % parts) * TILE + tl.arange(0, TILE)
+    c = tl.arange(0, WIDE)[None, :]
+    at, to = block * 512 + voxel, tl.load(slots + block) * 512 + voxel
+    new = tl.load(changed + at, voxel < 512, 0) != 0
+    mask = new[:, None] & (c < CHANNELS)
+    tl.store(rows + to[:, None] * CHANNELS + c, tl.load(values + at[:, None] * CHANNELS + c, mask, 0.0), mask)
+    tl.store(count + to, tl.load(values_count + at, new, 0.0), new)
+
+
+def put(rows: Tensor, count: Tensor, slots: Tensor, values: Tensor, values_count: Tensor, changed: Tensor) -> None:
+    """The way back of `take`, of the corners `changed` (M · 512,) alone, in place."""
+    if len(slots):
+        sizes = {"CHANNELS": rows.shape[1], "WIDE": triton.next_power_of_2(rows.shape[1]), "TILE": 128}
+        given = values.contiguous(), values_count.contiguous(), changed.contiguous().view(torch.uint8)
+        _put[(len(slots) * 4,)](rows, count, slots, *given, **sizes)
+
+
+@triton.jit
+def _lay(
+    where, projected, starts, counts, weights, latent, start, count, weight, marks, corners, threshold,
+    HIDDEN: tl.constexpr, BELOW: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """What is seen at corners to their rows; marks of their blocks: 1 where something is seen, and 1 where it may be a surface."""
+    n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    some = n < corners
+    row = tl.load(where + n, some, 0)
+    h, c = tl.arange(0, HIDDEN)[None, :], tl.arange(0, WIDE)[None, :]
+    tl.store(latent + row[:, None] * HIDDEN + h, tl.load(projected + n[:, None] * HIDDEN + h, some[:, None], 0.0), some[:, None])
+    value = tl.load(starts + 4 * n[:, None] + c, some[:, None] & (c < 4), 0.0)
+    tl.store(start + row[:, None] * CHANNELS + c, value, some[:, None] & (c < BELOW))
+    tl.store(count + row, tl.load(counts + n, some, 0.0), some)
+    tl.store(weight + row, tl.load(weights + n, some, 0.0), some)
+    slot = row // 512
+    tl.store(marks + 2 * slot, tl.full((BLOCK,), 1, tl.uint8), some)
+    tl.store(marks + 2 * slot + 1, tl.full((BLOCK,), 1, tl.uint8), some & (tl.load(starts + 4 * n + 3, some, 0.0) > threshold))
+
+
+def lay(
+    blocks: int, where: Tensor, projected: Tensor, starts: Tensor, counts: Tensor, weights: Tensor, channels: int, threshold: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """What is seen at corners `where` (N,) of blocks: first rows (M · 512 + 1, H), start (M · 512 + 1, channels), count and weight
+    (M · 512,), zero elsewhere, and (M, 2) uint8, blocks of which something is seen and those in which the fourth of `starts` (N, 4) lies
+    beyond `threshold`."""
+    size, hidden = blocks * VOXELS, projected.shape[1]
+    # One piece of memory is cleared at once.
+    whole = projected.new_zeros((size + 1) * (hidden + channels) + 2 * size)
+    parts = whole.split([(size + 1) * hidden, (size + 1) * channels, size, size])
+    latent, start, count, weight = parts[0].view(-1, hidden), parts[1].view(-1, channels), parts[2], parts[3]
+    marks = torch.zeros((blocks, 2), dtype=torch.uint8, device=where.device)
+    if len(where):
+        sizes = {"HIDDEN": hidden, "BELOW": min(4, channels), "CHANNELS": channels, "WIDE": 4, "BLOCK": 128}
+        given = projected.contiguous(), starts.contiguous(), counts, weights
+        _lay[(triton.cdiv(len(where), 128),)](where, *given, latent, start, count, weight, marks, len(where), threshold, **sizes)
+    return latent, start, count, weight, marks

@@ -1,0 +1,239 @@
+"""From corners of a lattice to the local network's first rows on CUDA, without gradients: two launches (`model._observe` in tensors)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from toolkit.networks.gpu.lookup import corners
+from toolkit.networks.gpu.reading import local, sighted
+
+BLOCK = 32
+
+
+@triton.jit
+def _corner(row, keys, voxel, extent, half, cx, cy, cz, shell, some, SHELL: tl.constexpr):
+    """Contracted and working places of lattice corners, and the length of a voxel there."""
+    slot, inner = row // 512, (row % 512).to(tl.int32)
+    u = (tl.load(keys + 3 * slot, some, 0) * 8 + inner % 8).to(tl.float32) * voxel - extent
+    v = (tl.load(keys + 3 * slot + 1, some, 0) * 8 + (inner // 8) % 8).to(tl.float32) * voxel - extent
+    w = (tl.load(keys + 3 * slot + 2, some, 0) * 8 + inner // 64).to(tl.float32) * voxel - extent
+    x, y, z, size = u, v, w, tl.zeros_like(u) + voxel * half
+    if SHELL:
+        norm = tl.maximum(tl.maximum(tl.abs(u), tl.abs(v)), tl.abs(w))
+        beyond = norm > 1
+        outer = shell / tl.maximum(1 + shell - norm, 1e-4)
+        grown = tl.where(beyond, outer / tl.maximum(norm, 1e-12), 1.0)
+        x, y, z, size = x * grown, y * grown, z * grown, size * grown
+    return u, v, w, x * half + cx, y * half + cy, z * half + cz, size
+
+
+@triton.jit
+def _seen(x, y, z, size, poses, lenses, sizes, view, near, far):
+    """Pixel, visibility and footprint of places in a view (`unproject.project`)."""
+    x, y, z = local(x, y, z, poses + 16 * view)
+    fx, fy = tl.load(lenses + 4 * view), tl.load(lenses + 4 * view + 1)
+    deep = (z > near) & (z <= far)
+    z = tl.where(deep, z, 1.0)
+    u, v = x / z * fx + tl.load(lenses + 4 * view + 2), y / z * fy + tl.load(lenses + 4 * view + 3)
+    footprint = size * (0.5 * (fx + fy)) / z
+    visible = deep & (u >= -footprint) & (v >= -footprint)
+    visible = visible & (u <= tl.load(sizes + 2 * view) + footprint) & (v <= tl.load(sizes + 2 * view + 1) + footprint)
+    return tl.where(visible, u, 0.0), tl.where(visible, v, 0.0), visible, tl.where(visible, footprint, 1.0)
+
+
+@triton.jit
+def _choose(
+    rows, keys, poses, lenses, sizes, table, out, count, height, width, planes, lowest, step,
+    voxel, extent, half, cx, cy, cz, shell, bx, by, bz, near, far, truncation, hidden,
+    ALL: tl.constexpr, SHELL: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Corners that the key frame sees and that are not for sure hidden."""
+    n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    some = n < count
+    row = n if ALL else tl.load(rows + n, some, 0)
+    u, v, w, x, y, z, size = _corner(row, keys, voxel, extent, half, cx, cy, cz, shell, some, SHELL)
+    _, _, seen, _ = _seen(x, y, z, size, poses, lenses, sizes, 0, near, far)
+    if not SHELL:
+        seen = seen & (tl.abs(u) <= bx) & (tl.abs(v) <= by) & (tl.abs(w) <= bz)
+    _, clear, _ = sighted(x, y, z, truncation * size, table, poses, lenses, sizes, height, width, planes, lowest, step, some)
+    tl.store(out + n, (seen & (clear > hidden)).to(tl.uint8), some)
+
+
+@triton.jit
+def _fetch(table, corner, right, below, w0, w1, w2, w3, mask, CHANNELS: tl.constexpr, WIDE: tl.constexpr):
+    """Bilinear rows (BLOCK, WIDE)."""
+    c = tl.arange(0, WIDE)[None, :]
+    here = mask[:, None] & (c < CHANNELS)
+    at = table + corner[:, None] * CHANNELS + c
+    value = tl.load(at, here, 0.0) * w0[:, None] + tl.load(at + right[:, None] * CHANNELS, here, 0.0) * w1[:, None]
+    value += tl.load(at + below[:, None] * CHANNELS, here, 0.0) * w2[:, None]
+    return value + tl.load(at + (right + below)[:, None] * CHANNELS, here, 0.0) * w3[:, None]
+
+
+@triton.jit
+def _projected(mean, variance, several, weight, first, whole, INPUTS: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, HIDDEN: tl.constexpr):
+    """What a group of channels (BLOCK, WIDE), whose first one is `first` of `whole`, adds to the local network's first rows."""
+    c, h = tl.arange(0, WIDE)[:, None], tl.arange(0, HIDDEN)[None, :]
+    here = c < CHANNELS
+    at = weight + h * INPUTS + first + c
+    squashed = variance / (1 + variance) * several[:, None]
+    logarithm = (tl.log(variance + 1e-4) / 4 + 1) * several[:, None]
+    out = tl.dot(mean, tl.load(at, here, 0.0), input_precision="tf32x3")
+    out = tl.dot(squashed, tl.load(at + whole, here, 0.0), out, input_precision="tf32x3")
+    return tl.dot(logarithm, tl.load(at + 2 * whole, here, 0.0), out, input_precision="tf32x3")
+
+
+@triton.jit
+def _atanh(x):
+    x = tl.minimum(tl.maximum(x, -0.93), 0.93)
+    return 0.5 * tl.log((1 + x) / (1 - x))
+
+
+@triton.jit
+def _observe(
+    rows, keys, poses, lenses, sizes, table, features, colours, weight, bias, projected, start, counts, weights,
+    count, height, width, planes, lowest, step, voxel, extent, half, cx, cy, cz, shell, near, far, truncation, hidden, blind,
+    tall, wide, cells, down, across, pixels, part, gain,
+    VIEWS: tl.constexpr, SHELL: tl.constexpr, VARIANCE: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, SAMPLED: tl.constexpr,
+    STRIDE: tl.constexpr, LEVELS: tl.constexpr, FINE: tl.constexpr, FINE_LEVELS: tl.constexpr, HIDDEN: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """All that is known of corners: projected evidence, what latents start from, how many views see them, and how much that weighs."""
+    n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    some = n < count
+    row = tl.load(rows + n, some, 0)
+    u, v, w, x, y, z, size = _corner(row, keys, voxel, extent, half, cx, cy, cz, shell, some, SHELL)
+    signed, clear, sure = sighted(x, y, z, truncation * size, table, poses, lenses, sizes, height, width, planes, lowest, step, some)
+    # How many views see it, how large it is there, and how far their directions lie apart.
+    views, mark = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
+    mx, my, mz = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
+    for k in tl.static_range(VIEWS):
+        _, _, visible, footprint = _seen(x, y, z, size, poses, lenses, sizes, k, near, far)
+        dx, dy, dz = x - tl.load(poses + 16 * k + 3), y - tl.load(poses + 16 * k + 7), z - tl.load(poses + 16 * k + 11)
+        length = tl.maximum(tl.sqrt(dx * dx + dy * dy + dz * dz), 1e-12)
+        views += visible.to(tl.float32)
+        mark += tl.where(visible, tl.log(footprint), 0.0)
+        mx += tl.where(visible, dx / length, 0.0)
+        my += tl.where(visible, dy / length, 0.0)
+        mz += tl.where(visible, dz / length, 0.0)
+    share = 1 / tl.maximum(views, 1.0)
+    mx, my, mz = mx * share, my * share, mz * share
+    apart = tl.zeros((BLOCK,), tl.float32)
+    for k in tl.static_range(VIEWS):
+        _, _, visible, footprint = _seen(x, y, z, size, poses, lenses, sizes, k, near, far)
+        dx, dy, dz = x - tl.load(poses + 16 * k + 3), y - tl.load(poses + 16 * k + 7), z - tl.load(poses + 16 * k + 11)
+        length = tl.maximum(tl.sqrt(dx * dx + dy * dy + dz * dz), 1e-12)
+        gx, gy, gz = dx / length - mx, dy / length - my, dz / length - mz
+        apart += tl.where(visible, (gx * gx + gy * gy + gz * gz) * share, 0.0)
+    footprint_mean = tl.exp(mark * share)
+    move = footprint_mean * tl.sqrt(tl.where(views == 1, 0.0, apart))
+    several = (views >= 2).to(tl.float32)
+    # Mean, then variance, of what they show.
+    mean, deep = tl.zeros((BLOCK, WIDE), tl.float32), tl.zeros((BLOCK, WIDE), tl.float32)
+    fine, fine_deep = tl.zeros((BLOCK, 16), tl.float32), tl.zeros((BLOCK, 16), tl.float32)
+    whole, whole_deep = tl.zeros((BLOCK, 16), tl.float32), tl.zeros((BLOCK, 16), tl.float32)
+    for k in tl.static_range(2 * VIEWS):
+        px, py, visible, footprint = _seen(x, y, z, size, poses, lenses, sizes, k % VIEWS, near, far)
+        visible = visible & some
+        each = tl.where(visible, share, 0.0)[:, None]
+        corner, right, below, w0, w1, w2, w3 = corners(px, py, move, tall, wide, STRIDE, LEVELS)
+        shown = _fetch(features + (k % VIEWS) * cells, corner, right, below, w0, w1, w2, w3, visible, CHANNELS, WIDE)
+        corner, right, below, w0, w1, w2, w3 = corners(px, py, move, down, across, FINE, FINE_LEVELS)
+        shown_fine = _fetch(colours + (k % VIEWS) * pixels, corner, right, below, w0, w1, w2, w3, visible, 3, 16)
+        corner, right, below, w0, w1, w2, w3 = corners(px, py, part * footprint, down, across, FINE, FINE_LEVELS)
+        shown_whole = _fetch(colours + (k % VIEWS) * pixels, corner, right, below, w0, w1, w2, w3, visible, 3, 16)
+        if k < VIEWS:
+            mean += shown * each
+            fine += shown_fine * each
+            whole += shown_whole * each
+        else:
+            deep += (shown - mean) * (shown - mean) * each
+            fine_deep += (shown_fine - fine) * (shown_fine - fine) * each
+            whole_deep += (shown_whole - whole) * (shown_whole - whole) * each
+    kept = (views != 1)[:, None] & VARIANCE
+    deep, fine_deep, whole_deep = tl.where(kept, deep, 0.0), tl.where(kept, fine_deep, 0.0), tl.where(kept, whole_deep, 0.0)
+    total: tl.constexpr = CHANNELS + 6
+    inputs: tl.constexpr = 3 * total + 9
+    out = _projected(mean, deep, several, weight, 0, total, inputs, CHANNELS, WIDE, HIDDEN)
+    out += _projected(fine, fine_deep, several, weight, CHANNELS, total, inputs, 3, 16, HIDDEN)
+    out += _projected(whole, whole_deep, several, weight, CHANNELS + 3, total, inputs, 3, 16, HIDDEN)
+    h = tl.arange(0, HIDDEN)[None, :]
+    at = weight + h * inputs + 3 * total
+    out += tl.load(bias + h) + several[:, None] * tl.load(at) + share[:, None] * tl.load(at + 1)
+    out += (tl.log2(footprint_mean) / 4)[:, None] * tl.load(at + 2)
+    out += (tl.log2(move + 0.05) * several / 4)[:, None] * tl.load(at + 3)
+    c = tl.arange(0, WIDE)[None, :]
+    agree = tl.sum(tl.where(c < SAMPLED, deep, 0.0), 1) / SAMPLED
+    out += ((tl.log(agree + 1e-4) / 4 + 1) * several)[:, None] * tl.load(at + 4)
+    c = tl.arange(0, 16)[None, :]
+    agree = tl.sum(tl.where(c < 3, fine_deep, 0.0), 1) / 3
+    out += ((tl.log(agree + 1e-4) / 4 + 1) * several)[:, None] * tl.load(at + 5)
+    out += signed[:, None] * tl.load(at + 6) + clear[:, None] * tl.load(at + 7) + sure[:, None] * tl.load(at + 8)
+    tl.store(projected + n[:, None] * HIDDEN + h, tl.maximum(out, 0.0), some[:, None])
+    shade = tl.minimum(tl.maximum(whole / gain + 0.5, 1e-4), 1 - 1e-4)
+    latent = _atanh(tl.log(shade / (1 - shade)) / 4)
+    tl.store(start + 4 * n[:, None] + c, latent, some[:, None] & (c < 3))
+    tl.store(start + 4 * n + 3, _atanh(-signed), some)
+    tl.store(counts + n, views, some)
+    tl.store(weights + n, tl.maximum(clear, hidden) * (blind + (1 - blind) * sure), some)
+
+
+class Observer:
+    """The networks' sight of a key frame and its neighbours (K ≥ 1), without gradients.
+
+    Args:
+        numbers: truncation, hidden, blind and the colours' gain of `model`, and `unproject.COLOURED`.
+    """
+
+    def __init__(self, views: Sequence[Any], cameras: Any, near: float, far: float, swept: Any, numbers: tuple[float, ...]) -> None:
+        self.poses, self.lenses, self.sizes = (
+            values.contiguous() for values in (cameras.world_from_camera, cameras.intrinsics, cameras.size)
+        )
+        self.table = swept.table.permute(2, 3, 1, 0).contiguous()
+        self.swept, self.views, self.numbers = swept, views, numbers
+        self.near, self.far = max(near, 0.0), far
+        self.features, self.colours = (torch.stack(rows) for rows in zip(*((v.features.rows, v.colours.rows) for v in views), strict=True))
+
+    def _space(self, lattice: Any) -> tuple[float, ...]:
+        space = lattice.space
+        return lattice.voxel, space.extent, space.half, *space.centre, space.shell
+
+    def choose(self, lattice: Any, keys: Tensor, rows: Tensor | None) -> Tensor:
+        """(N,) int64, of the corners `rows` of blocks (M, 3), None: all, those that the key frame sees and that may be open."""
+        count = len(keys) * 512 if rows is None else len(rows)
+        out = torch.empty(count, dtype=torch.uint8, device=keys.device)
+        if count:
+            given = keys if rows is None else rows, keys, self.poses, self.lenses, self.sizes, self.table, out, count
+            box = tuple(side + 1.01 * lattice.voxel for side in lattice.space.box)
+            truncation, hidden = self.numbers[:2]
+            _choose[(triton.cdiv(count, 128),)](
+                *given, *self.table.shape[:3], self.swept.lowest, self.swept.step, *self._space(lattice), *box, self.near, self.far,
+                truncation, hidden, ALL=rows is None, SHELL=lattice.space.shell > 0, BLOCK=128,
+            )  # fmt: skip
+        kept = out.nonzero().view(-1)
+        return kept if rows is None else rows[kept]
+
+    def observe(self, lattice: Any, keys: Tensor, rows: Tensor, layer: Any, sampled: int, variance: bool) -> tuple[Tensor, ...]:
+        """Of corners `rows` (N,): evidence through `layer` and a ReLU, what latents start from (N, 4), view count and weight (N,)."""
+        count, hidden = len(rows), len(layer.weight)
+        projected, start = self.poses.new_empty((count, hidden)), self.poses.new_empty((count, 4))
+        counts, weights = self.poses.new_empty(count), self.poses.new_empty(count)
+        if count:
+            fine, coarse = self.views[0].colours, self.views[0].features
+            channels = self.features.shape[2]
+            truncation, least, blind, gain, part = self.numbers
+            _observe[(triton.cdiv(count, BLOCK),)](
+                rows, keys, self.poses, self.lenses, self.sizes, self.table, self.features, self.colours, layer.weight, layer.bias,
+                projected, start, counts, weights, count, *self.table.shape[:3], self.swept.lowest, self.swept.step, *self._space(lattice),
+                self.near, self.far, truncation, least, blind, *coarse.sizes[0], self.features[0].numel(), *fine.sizes[0],
+                self.colours[0].numel(), part, gain,
+                VIEWS=len(self.views), SHELL=lattice.space.shell > 0, VARIANCE=variance, CHANNELS=channels,
+                WIDE=max(16, triton.next_power_of_2(channels)), SAMPLED=sampled, STRIDE=coarse.stride, LEVELS=len(coarse.sizes),
+                FINE=fine.stride, FINE_LEVELS=len(fine.sizes), HIDDEN=hidden, BLOCK=BLOCK,
+            )  # fmt: skip
+        return projected, start, counts, weights
