@@ -33,6 +33,7 @@ SLOTS = 128  # samples of a ray that can get a gradient; lattices so fine that m
 LOOK = 16  # steps from one look at what was not finite to the next; also how far launches may run ahead
 DECAY, EPSILON = 0.99, 1e-10  # of both optimisers, as in `LazyAdam`; the decoder's first moment:
 FIRST = 0.9
+ROWS = {"cuda": 64, "cpu": 4096}  # of a program of `move`; Triton's interpreter, which tests use on the CPU, likes few programs
 EAGER = 2  # steps of a new shape before it is recorded: kernels are compiled and libraries made ready
 
 
@@ -242,12 +243,13 @@ class TritonOptimiser:
     def _move(self) -> None:
         """Both optimisers' steps, unless something was not finite."""
         field, channels, rows = self.field, self.field.feature_rows.shape[1], self.field.topology.zero_row
-        move[(triton.cdiv(max(rows, 1), 64),)](
+        many = ROWS[self.device.type]
+        move[(triton.cdiv(max(rows, 1), many),)](
             *(field.density_rows, field.feature_rows, self.g_density, self.g_feature, self.second_density, self.second_feature),
             *(self.touch_steps, self.touched, self.bad, self.rates, rows, math.log2(DECAY), DECAY, EPSILON),
             C=channels,
             P=triton.next_power_of_2(channels),
-            B=64,
+            B=many,
         )
         state = self.decoder
         learn[(triton.cdiv(len(state.values), 256),)](
