@@ -56,7 +56,7 @@ def visible_blocks(centres: Tensor, radii: Tensor, cameras: Cameras, near: float
 
 
 def _planes(cameras: Cameras, near: float, far: float) -> tuple[Tensor, Tensor]:
-    """(K · 6, 3) unit normals of the frusta's planes, inwards, working frame, and (K · 6,) offsets: n · x + offset is how far inside x lies.
+    """(K · 6, 3) unit normals of the frusta's planes, inwards, working frame, and (K · 6,) offsets: x lies n · x + offset inside.
 
     Args:
         cameras: on the CPU.

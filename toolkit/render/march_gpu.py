@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """The coarse steps of rays beyond the region of interest on CUDA, in one launch (`march._coarse_distances` in tensors)."""
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ def _walk(
     n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     some = n < rays
     ox, oy, oz = tl.load(origins + 3 * n, some, 0.0), tl.load(origins + 3 * n + 1, some, 0.0), tl.load(origins + 3 * n + 2, some, 0.0)
-    dx, dy, dz = tl.load(directions + 3 * n, some, 1.0), tl.load(directions + 3 * n + 1, some, 0.0), tl.load(directions + 3 * n + 2, some, 0.0)
+    dx, dy = tl.load(directions + 3 * n, some, 1.0), tl.load(directions + 3 * n + 1, some, 0.0)
+    dz = tl.load(directions + 3 * n + 2, some, 0.0)
     square = dx * dx + dy * dy + dz * dz
     speed = tl.sqrt(square)
     along = (ox * dx + oy * dy + oz * dz) / square

@@ -260,10 +260,9 @@ def _box_rows(topology: Topology, low: Tensor, side: int) -> Tensor:
     block = line >> 3
     local = line & (BLOCK - 1)
     first = block[..., :1]
+    spans = (side + BLOCK - 2) // BLOCK + 1  # as many as there can be
     if asks_freely(low.device):
         spans = int((block[..., -1:] - first).amax()) + 1 if len(low) else 1
-    else:  # as many as there can be
-        spans = (side + BLOCK - 2) // BLOCK + 1
     reach = torch.arange(spans, device=low.device)
     near = first + reach  # (n, 3, spans): the blocks that a cube can touch
     z, y, x = (near[:, axis] for axis in (2, 1, 0))

@@ -1,7 +1,7 @@
-"""Kernels for CUDA, in Triton, of what takes hundreds of short operations as tensors. Modules in here are imported only when tensors lie there.
+"""Kernels for CUDA, in Triton, of what takes hundreds of short operations as tensors. Modules in here are imported when tensors lie there.
 
-Everything has a way in tensors beside it, which is taken where Triton is not installed and which the tests compare with. `FIELDFUSE_TRITON=0`
-leaves the kernels out.
+Everything has a way in tensors beside it, which is taken where Triton is not installed and which the tests compare with.
+`FIELDFUSE_TRITON=0` leaves the kernels out.
 """
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """Masks and rows of blocks on CUDA: what lies about lattice corners, and values on a finer lattice (`volume/edit.py` in tensors)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """What the GRU does between its convolutions on CUDA, a launch each (`FusionGRU.forward` in tensors, `compiled_gru.py` on the CPU)."""
 
 from __future__ import annotations
@@ -115,6 +116,5 @@ class Step:
     def update(self, update: Tensor, candidate: Tensor, channel: int, change: float, rows: Tensor) -> None:
         """H' into `rows` (M · 512 + 1, C), in place; see `compiled_gru.Step.update`."""
         given = self.place, self.state, self.count, self.raw, self.weight, self.seen
-        _step[self._grid](
-            *given, update.contiguous(), candidate.contiguous(), rows, len(self.place), self.least, self.most, channel, change, **self._sizes
-        )
+        learned = update.contiguous(), candidate.contiguous()
+        _step[self._grid](*given, *learned, rows, len(self.place), self.least, self.most, channel, change, **self._sizes)

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """What views show at voxels on CUDA, a launch a view (`Pyramid.lookup` and `unproject.look_up` in tensors)."""
 
 from __future__ import annotations
@@ -89,9 +90,7 @@ class _Shown(torch.autograd.Function):
     """`_look_up` with gradients for the features' rows, which are summed in no fixed order."""
 
     @staticmethod
-    def forward(
-        ctx: Any, views: Sequence[Any], pixels: Tensor, step: Tensor, footprint: Tensor, part: float, *rows: Tensor
-    ) -> Tensor:
+    def forward(ctx: Any, views: Sequence[Any], pixels: Tensor, step: Tensor, footprint: Tensor, part: float, *rows: Tensor) -> Tensor:
         ctx.save_for_backward(pixels, step)
         ctx.shapes = [(one.features.rows.shape, one.features.sizes, one.features.stride) for one in views]
         return _look_up(views, pixels, step, footprint, part)

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """The plane sweep on CUDA: costs of planes, semi-global matching, likelihoods and their table, a launch each (`compiled.py` on the CPU).
 
 Volumes are (P, D), pixel by pixel with the planes next to each other in memory, since all that follows goes along planes. Results equal

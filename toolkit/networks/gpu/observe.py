@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """From corners of a lattice to the local network's first rows on CUDA, without gradients: two launches (`model._observe` in tensors)."""
 
 from __future__ import annotations
@@ -77,7 +78,10 @@ def _fetch(table, corner, right, below, w0, w1, w2, w3, mask, CHANNELS: tl.const
 
 
 @triton.jit
-def _projected(mean, variance, several, weight, first, whole, INPUTS: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, HIDDEN: tl.constexpr):
+def _projected(
+    mean, variance, several, weight, first, whole,
+    INPUTS: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, HIDDEN: tl.constexpr,
+):  # fmt: skip
     """What a group of channels (BLOCK, WIDE), whose first one is `first` of `whole`, adds to the local network's first rows."""
     c, h = tl.arange(0, WIDE)[:, None], tl.arange(0, HIDDEN)[None, :]
     here = c < CHANNELS
@@ -107,7 +111,7 @@ def _observe(
     n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     some = n < count
     row = tl.load(rows + n, some, 0)
-    u, v, w, x, y, z, size = _corner(row, keys, voxel, extent, half, cx, cy, cz, shell, some, SHELL)
+    _, _, _, x, y, z, size = _corner(row, keys, voxel, extent, half, cx, cy, cz, shell, some, SHELL)
     signed, clear, sure = sighted(x, y, z, truncation * size, table, poses, lenses, sizes, height, width, planes, lowest, step, some)
     # How many views see it, how large it is there, and how far their directions lie apart.
     views, mark = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)

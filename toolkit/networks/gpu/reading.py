@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """What sweeps and witnesses are asked on CUDA: tables read between pixels and planes (`Sweep.look`, `witness.py` in tensors)."""
 
 from __future__ import annotations
