@@ -18,6 +18,7 @@ from torch import Tensor
 
 from toolkit.capture.types import Views
 from toolkit.errors import InputError
+from toolkit.gpu import asks_freely
 from toolkit.key_sweeps import KeySweeps, Recent, picture, sensed, together
 from toolkit.keyframes import KeyFrames
 from toolkit.networks.cameras import Cameras
@@ -33,7 +34,6 @@ from toolkit.networks.unproject import EncodedView
 from toolkit.progress import SILENT, Progress
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
-from toolkit.volume.waiting import asks_freely
 
 KEPT_PICTURES = 12  # encoded pictures kept for key frames to come …
 KEPT_ON_DEVICE = 32  # … and where they are encoded ahead, 20 MB each at 640×480

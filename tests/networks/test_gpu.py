@@ -17,7 +17,8 @@ from tests.networks.made import SMALL as SIZES
 from tests.networks.made import cameras, lattice, pictures, small_model
 from tests.networks.test_compiled import everything
 from tests.networks.test_compiled_gru import trained, volumes
-from toolkit.networks import compiled, compiled_lookup, gpu
+from toolkit import gpu
+from toolkit.networks import compiled, compiled_lookup
 from toolkit.networks.block_conv import block_conv3d
 from toolkit.networks.cull import all_blocks
 from toolkit.networks.lattice import cells

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from toolkit.networks import gpu
+from toolkit import gpu
 
 if not torch.cuda.is_available():
     pytest.skip("needs a CUDA device", allow_module_level=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from toolkit.gpu import asks_freely
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.lattice import Lattice
 from toolkit.volume.topology import BLOCK
-from toolkit.volume.waiting import asks_freely
 
 SLACK = 1.25  # balls grow by this much: views tell of a voxel beside their pictures, and blocks of the contracted shell are bent
 
