@@ -43,8 +43,12 @@ demo: $(VENV)/.installed
 # `make test WORKERS=0` runs them in one.
 WORKERS ?= $(if $(filter-out 0 1,$(shell nproc 2>/dev/null)),2,0)
 
-test: lint
-	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile
+# Types take one core most of a minute, so they are checked beside the tests; their errors count all the same.
+test: $(VENV)/.installed-test
+	$(RUFF) $(SOURCES)
+	$(BIN)/lint-imports
+	$(BIN)/mypy & types=$$!; tests=0; \
+	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile || tests=$$?; wait $$types; exit $$tests
 
 stability: $(VENV)/.installed-test
 	$(BIN)/python -m tests.stability.page docs/stability.md

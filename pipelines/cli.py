@@ -19,6 +19,7 @@ from pipelines import (
     bake,
     bench,
     bench_effects,
+    bench_engines,
     compare,
     evaluate,
     export,
@@ -159,6 +160,7 @@ bench.app.command("effects")(bench_effects.effects)
 bench.app.command("effects-by-hand")(bench_effects.by_hand)
 bench.app.command("few-views")(few_views.few_views)
 bench.app.command("ablations")(few_views.ablations)
+bench.app.command("engines")(bench_engines.engines)
 app.add_typer(bench.app, name="bench")
 
 

@@ -44,7 +44,7 @@ def few_views(
 
     seconds, measured = numbers(budgets, "budgets"), part_of(starts)
     counts = [None if part == ALL else int(part) for part in wanted(views)]
-    with _job(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as (job, posed, corrections):
+    with opened(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as (job, posed, corrections):
         path = job.folder.path / f"{FILE}.json"
         rows: list[dict[str, Any]] = read_kept(path, FEW_VIEWS)["rows"] if path.is_file() else []
         model = load_networks(job.settings.network.weights, job.settings.device)
@@ -54,9 +54,9 @@ def few_views(
             done = {(row["views"], row["start"], row["budget"]) for row in rows}
             for row in few_views_rows(ground, model, seconds, done, measured, job.progress):
                 rows.append(row)
-                _keep(job, FILE, rows, few_views_table(rows))
+                keep_rows(job, FILE, rows, few_views_table(rows))
                 job.progress.say(f"{row['views']} views, {row['start']}, {row['budget']:g} s: {row['psnr']:.2f} dB")
-    _tell(few_views_table(rows), quiet)
+    tell(few_views_table(rows), quiet)
 
 
 def ablations(
@@ -75,13 +75,13 @@ def ablations(
 
     count = None if views == ALL else int(numbers(views, "views")[0])
     rows = []
-    with _job(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as (job, posed, corrections):
+    with opened(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as (job, posed, corrections):
         model = load_networks(job.settings.network.weights, job.settings.device)
         job.progress.begin(ABLATIONS)
         for row in ablation_rows(ground_of(job, posed, count, corrections), model, job.progress):
             rows.append(row)
-            _keep(job, ABLATIONS, rows, ablation_table(rows))
-    _tell(ablation_table(rows), quiet)
+            keep_rows(job, ABLATIONS, rows, ablation_table(rows))
+    tell(ablation_table(rows), quiet)
 
 
 def wanted(text: str) -> list[str]:
@@ -133,7 +133,7 @@ def numbers(text: str, name: str) -> list[float]:
 
 
 @contextmanager
-def _job(source: Path, out: Path, options: dict[str, Any], quiet: bool) -> Iterator[tuple[Job, Capture, Corrections]]:
+def opened(source: Path, out: Path, options: dict[str, Any], quiet: bool) -> Iterator[tuple[Job, Capture, Corrections]]:
     """A job of one thread on `source`, with everything up to the effects done as a run does it with all training pictures, so that poses
     are the same for every number of views."""
     from pipelines.console import make_progress
@@ -164,7 +164,7 @@ def ground_of(job: Job, posed: Capture, count: int | None, corrections: Correcti
     return Ground(corrections.on_views(views), scene, job.settings)
 
 
-def _keep(job: Job, name: str, rows: list[dict[str, Any]], table: str) -> None:
+def keep_rows(job: Job, name: str, rows: list[dict[str, Any]], table: str) -> None:
     from toolkit.config import settings_dict
     from toolkit.evaluate.speed import machine
     from toolkit.files import atomic_path, write_json
@@ -175,6 +175,6 @@ def _keep(job: Job, name: str, rows: list[dict[str, Any]], table: str) -> None:
         temporary.write_text(table, encoding="utf-8")
 
 
-def _tell(table: str, quiet: bool) -> None:
+def tell(table: str, quiet: bool) -> None:
     if not quiet:
         typer.echo(table.rstrip())

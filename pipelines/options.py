@@ -24,7 +24,9 @@ Holdout = Annotated[
 Device = Annotated[str | None, typer.Option(help="auto (default), cpu or cuda.", show_default=False)]
 Threads = Annotated[int | None, typer.Option(help="Threads to use; default: all cores.", show_default=False)]
 Seed = Annotated[int | None, typer.Option(help="Seed of all random numbers; default 0.", show_default=False)]
-Engine = Annotated[str | None, typer.Option(help="auto (default): numba on the CPU, torch on CUDA; numba or torch.", show_default=False)]
+Engine = Annotated[
+    str | None, typer.Option(help="auto (default): numba on the CPU, triton on CUDA; numba, triton or torch.", show_default=False)
+]
 Decoder = Annotated[str | None, typer.Option(help="deferred (default) or per_sample (the paper's).", show_default=False)]
 Init = Annotated[
     str | None,

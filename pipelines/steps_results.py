@@ -88,7 +88,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     from toolkit.stereo.left_out import save_left_out
     from toolkit.training.guided import fit_guided
     from toolkit.training.network_start import network_start
-    from toolkit.volume.grid_host import GridHost
+    from toolkit.volume.grid_host import host_for
 
     settings = job.settings
     path, times = job.folder / "field.safetensors", job.folder / "timeline.json"
@@ -113,11 +113,11 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
         if start is None:
             first = None if made is None else network_start(made.field, views, scene, settings)
             coarse = first is not None
-            result = fit_guided(views, scene, settings, job.progress, host=GridHost(settings.device), start=first, coarse=coarse)
+            result = fit_guided(views, scene, settings, job.progress, host=host_for(settings.device), start=first, coarse=coarse)
             tell(result)
             return result.field, result.timeline
         field, timeline = load()
-        result = fit_guided(views, scene, settings, job.progress, host=GridHost(settings.device), start=field)
+        result = fit_guided(views, scene, settings, job.progress, host=host_for(settings.device), start=field)
         tell(result)
         spent = timeline[-1]["seconds"] if timeline else 0.0
         return result.field, timeline + result.after(spent)

@@ -114,7 +114,7 @@ def make_field(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dict
     """Fit a field, then show it as it is kept (16-bit features) and in each of the variants."""
     from toolkit.render.field import Field
     from toolkit.training.guided import fit_guided
-    from toolkit.volume.grid_host import GridHost
+    from toolkit.volume.grid_host import host_for
 
     settings, wanted = ground.settings, spec["wanted"]
     settings.fit = replace(settings.fit, budget=float(wanted["iterations"]), patience=False)
@@ -124,7 +124,7 @@ def make_field(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dict
     )
     path = scratch / "field.safetensors"
     with Cost(ground) as cost:
-        result = fit_guided(ground.chosen, ground.scene, settings, host=GridHost(settings.device))
+        result = fit_guided(ground.chosen, ground.scene, settings, host=host_for(settings.device))
         cost.lap("fit")
         result.field.save(path, ground.scene.working_from_input)
         cost.lap("save")

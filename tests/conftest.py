@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # before anything imports it: kernels for CUDA are tried here without a GPU
 torch.set_num_threads(1)  # the tensors are small, and two threads that share one core wait for each other
 
 

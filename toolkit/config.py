@@ -136,7 +136,7 @@ class Settings:
     """Everything that a run can be told. `budget`, `image_size` and friends of the command line land here too."""
 
     preset: str = "balanced"
-    engine: str = "auto"  # auto (numba on the CPU, torch on CUDA) | numba | torch
+    engine: str = "auto"  # auto (numba on the CPU, triton on CUDA) | numba | triton | torch
     device: str = "auto"
     threads: int | None = None  # None: all cores
     seed: int = 0
@@ -166,7 +166,7 @@ SHORT_NAMES = {
 EFFECTS = ("exposure", "vignetting", "distortion", "rolling_shutter", "view_dependence", "background", "motion_blur", "poses")
 CHOICES = {
     "preset": ("fast", "balanced", "quality"),
-    "engine": ("auto", "numba", "torch"),
+    "engine": ("auto", "numba", "triton", "torch"),
     "device": ("auto", "cpu", "cuda"),
     "poses.source": ("auto", "given", "sfm"),
     "poses.matching": ("auto", "exhaustive", "sequential"),
@@ -192,8 +192,7 @@ def _keys(node: DictConfig, prefix: str = "") -> list[str]:
     return out
 
 
-def _set(config: DictConfig, key: str, value: Any, where: str) -> None:
-    known = _keys(config)
+def _set(config: DictConfig, known: list[str], key: str, value: Any, where: str) -> None:
     full = SHORT_NAMES.get(key, key)
     if full not in known:
         near = difflib.get_close_matches(key, known + list(SHORT_NAMES), n=1, cutoff=0.3)
@@ -283,9 +282,10 @@ def load_settings(
             raise InputError(f"--set {pair!r} must have the form key=value")
         layers.append(("--set", [(key.strip(), _read_yaml(f"value: {value}", f"--set {pair!r}")[0][1])]))
     layers.append(("command line", [(key, value) for key, value in (flags or {}).items() if value is not None]))
+    known = _keys(config)
     for where, entries in layers:
         for key, value in entries:
-            _set(config, key, value, where)
+            _set(config, known, key, value, where)
     config.preset = preset
     for key, choices in CHOICES.items():
         value = OmegaConf.select(config, key)

@@ -162,7 +162,7 @@ def test_a_browser_draws_what_the_baked_field_is(name: str, tmp_path: Path) -> N
 
 def test_a_visitor_walks(tmp_path: Path) -> None:
     write_page(tmp_path / "field.html", bake(coloured_field()), tour(), "sphere")
-    with driven((tmp_path / "field.html").as_uri(), tmp_path, (640, 480)) as browser:
+    with driven((tmp_path / "field.html").as_uri(), tmp_path, (520, 400)) as browser:
         loaded(browser)
 
         def pose() -> list[float]:

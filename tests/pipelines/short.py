@@ -12,7 +12,7 @@ from toolkit.files import read_json
 
 ALONE = ["--threads", "1", "--init", "classical"]
 SMALL = ["--budget", "3", *ALONE, "--set", "field.resolution=32", "--set", "export.mesh_views=6", "--set", "export.video_frames=4"]
-FAST = ["--budget", "2", *ALONE, "--set", "field.resolution=16", "--set", "export.formats=[points]", "--set", "export.mesh_views=3"]
+FAST = ["--budget", "1", *ALONE, "--set", "field.resolution=16", "--set", "export.formats=[points]", "--set", "export.mesh_views=3"]
 
 
 def report(folder: Path) -> dict[str, Any]:

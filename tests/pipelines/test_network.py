@@ -206,3 +206,23 @@ def test_lists_of_numbers() -> None:
         wanted("0")
     with pytest.raises(InputError, match="magic"):
         part_of("magic")
+
+
+def test_engines_are_measured_side_by_side(room: Path, tmp_path: Path, capsys: Capsys) -> None:
+    """Each engine fits within the same seconds, and pictures of its field are timed."""
+    answer = call(
+        *(capsys, "bench", "engines", room, "--out", tmp_path / "engines", "--budgets", "1", "--engines", "auto,torch"),
+        *("--threads", 1, "--set", "field.resolution=32", "--set", "effects=off", "--quiet"),
+    )
+    assert answer.code == 0, answer.err
+    kept = read_json(tmp_path / "engines" / "engines.json")
+    assert [row["engine"] for row in kept["rows"]] == ["numba", "torch"]
+    for row in kept["rows"]:
+        assert row["psnr"] > 10 and row["picture_ms"] > 0 and row["timeline"]
+    assert kept["rows"][0]["rays"] > kept["rows"][1]["rays"]
+    assert len((tmp_path / "engines" / "engines.md").read_text(encoding="utf-8").splitlines()) == 4
+
+
+def test_an_unknown_engine_is_told(room: Path, tmp_path: Path, capsys: Capsys) -> None:
+    answer = call(capsys, "bench", "engines", room, "--out", tmp_path / "engines", "--engines", "auto,steam")
+    assert answer.code == 2 and "there is no 'steam'; known are auto, numba, triton, torch" in answer.err

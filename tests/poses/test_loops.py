@@ -33,7 +33,8 @@ def silent(done: float, total: float, note: str) -> None:
 def walked(tmp_path_factory) -> tuple[PoseResult, Path]:
     """A post that looks the same from the front and the back, and from the left and the right."""
     out = tmp_path_factory.mktemp("post")
-    pictures = [render(pose, planes=post((3, 4, 3, 4)))[0] for pose in POSES]
+    planes = post((3, 4, 3, 4))
+    pictures = [render(pose, planes=planes)[0] for pose in POSES]
     capture = write_capture(out / "photos", pictures, ordered=True)
     return find_poses(capture, out, PosesSettings(max_features=800), seed=3, threads=1), out
 
@@ -103,7 +104,8 @@ def test_a_fold_that_pairs_tell_of_is_never_mapped(again):
 
 def test_a_circle_without_a_fold_is_mapped_as_ever(tmp_path):
     """All sides differ, and the second turn meets the first."""
-    capture = write_capture(tmp_path / "photos", [render(pose, planes=post((3, 4, 13, 14)))[0] for pose in POSES], ordered=True)
+    planes = post((3, 4, 13, 14))
+    capture = write_capture(tmp_path / "photos", [render(pose, planes=planes)[0] for pose in POSES], ordered=True)
     result = find_poses(capture, tmp_path, PosesSettings(max_features=800), seed=3, threads=1)
     assert result.registered == FRAMES and aligned_error(result.world_from_camera[:, :3, 3], POSES[:, :3, 3]) < 0.005
     job = Job.load(tmp_path / "sparse" / "job.json")
@@ -195,7 +197,8 @@ def test_each_outcome_has_its_sentence(walked):
 def test_photos_in_any_order_are_left_alone(tmp_path):
     """All sides differ, names are shuffled: neighbours by name need not see the same, and nothing is taken back."""
     poses = orbit(20, 0.8)[np.random.default_rng(1).permutation(20)]
-    capture = write_capture(tmp_path / "photos", [render(pose, planes=post((3, 4, 13, 14)))[0] for pose in poses])
+    planes = post((3, 4, 13, 14))
+    capture = write_capture(tmp_path / "photos", [render(pose, planes=planes)[0] for pose in poses])
     result = find_poses(replace(capture, ordered=False), tmp_path, PosesSettings(max_features=800), seed=3, threads=1)
     assert result.registered >= 18 and not result.warnings[1 if result.registered < 20 else 0 :]
     assert json.loads((tmp_path / "sparse" / "result.json").read_text())["folded"] is None

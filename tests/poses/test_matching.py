@@ -32,7 +32,8 @@ def silent(done: float, total: float, note: str) -> None:
 def featured(tmp_path_factory) -> Job:
     """Pictures of a post, their features in the database and nothing matched."""
     folder = tmp_path_factory.mktemp("post")
-    pictures = [render(pose, planes=post((3, 4, 13, 14)))[0] for pose in orbit(COUNT, 0.35)]
+    planes = post((3, 4, 13, 14))
+    pictures = [render(pose, planes=planes)[0] for pose in orbit(COUNT, 0.35)]
     capture = write_capture(folder / "photos", pictures, ordered=True)
     job = plan(capture, folder / "sparse", PosesSettings(max_features=800), seed=3, threads=1)
     Path(job.folder).mkdir()

@@ -31,7 +31,8 @@ def silent(done: float, total: float, note: str) -> None:
 def matched(tmp_path_factory) -> Job:
     """Photos of a post, all matched with each other but for two, with which nothing was."""
     folder = tmp_path_factory.mktemp("post")
-    pictures = [render(pose, planes=post((3, 4, 13, 14)))[0] for pose in POSES]
+    planes = post((3, 4, 13, 14))
+    pictures = [render(pose, planes=planes)[0] for pose in POSES]
     capture = replace(write_capture(folder / "photos", pictures, ordered=True), ordered=False)
     job = plan(capture, folder / "sparse", PosesSettings(max_features=800), seed=3, threads=1)
     Path(job.folder).mkdir()

@@ -3,6 +3,7 @@ turns."""
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -73,26 +74,44 @@ def render(pose: Array, camera: Intrinsics = CAMERA, planes: list[tuple[Any, Any
     """(H, W, 3) uint8 picture and (H, W) float32 z-depth of the planes (the corner's without any); twofold supersampled."""
     planes = planes or [(*plane, texture(index)) for index, plane in enumerate(PLANES)]
     fine = camera.scaled(2 * camera.width, 2 * camera.height)
-    v, u = np.mgrid[0 : fine.height, 0 : fine.width] + 0.5
-    local = np.stack([(u - fine.cx) / fine.fx, (v - fine.cy) / fine.fy, np.ones_like(u)], axis=-1)
-    rays = local @ pose[:3, :3].T
-    depth = np.full(u.shape, np.inf)
-    picture = np.full(u.shape, 90, np.uint8)
+    rays = _directions(fine) @ pose[:3, :3].T
+    depth = np.full(rays.shape[:2], np.inf)
+    picture = np.full(rays.shape[:2], 90, np.uint8)
     for corner, first, second, painted in planes:
         corner, first, second = (np.array(values, float) for values in (corner, first, second))
+        part = _shown(np.array([corner, corner + first, corner + second, corner + first + second]), pose, fine)
+        if rays[part].size == 0:
+            continue
         normal = np.cross(first, second)
-        t = ((corner - pose[:3, 3]) @ normal) / (rays @ normal)
-        hit = pose[:3, 3] + t[..., None] * rays - corner
+        t = ((corner - pose[:3, 3]) @ normal) / (rays[part] @ normal)
+        hit = pose[:3, 3] + t[..., None] * rays[part] - corner
         a, b = hit @ first / (first @ first), hit @ second / (second @ second)
-        nearer = (t > 1e-6) & (t < depth) & (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1)
+        nearer = (t > 1e-6) & (t < depth[part]) & (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1)
         size = len(painted)
         surface = cv2.remap(
             painted, (a * size).astype(np.float32), (b * size).astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
         )
-        picture[nearer], depth[nearer] = surface[nearer], t[nearer]
+        picture[part][nearer], depth[part][nearer] = surface[nearer], t[nearer]
     small = cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     z = depth[::2, ::2].astype(np.float32)
     return cv2.cvtColor(small, cv2.COLOR_GRAY2RGB), np.where(np.isfinite(z), z, 0)
+
+
+@cache
+def _directions(camera: Intrinsics) -> Array:
+    """(H, W, 3) through the pixels' centres, in the camera's frame, 1 long along z."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
+    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+
+
+def _shown(corners: Array, pose: Array, camera: Intrinsics) -> tuple[slice, slice]:
+    """Rows and columns of a picture outside which nothing of what lies between the corners (4, 3) is seen."""
+    local = (corners - pose[:3, 3]) @ pose[:3, :3]
+    if local[:, 2].min() < 1e-3:
+        return slice(None), slice(None)
+    u, v = camera.fx * local[:, 0] / local[:, 2] + camera.cx, camera.fy * local[:, 1] / local[:, 2] + camera.cy
+    rows, columns = ((max(0, int(np.floor(x.min())) - 1), max(0, int(np.ceil(x.max())) + 1)) for x in (v, u))
+    return slice(*rows), slice(*columns)
 
 
 def turning(count: int, step_degrees: float = 4.0) -> list[Array]:

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from toolkit.errors import InputError
 from toolkit.volume.grid import BlockGrid
-from toolkit.volume.grid_host import GridHost
+from toolkit.volume.grid_host import GridHost, host_for
+from toolkit.volume.host import TorchHost
 from toolkit.volume.topology import VOXELS, Topology
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -299,3 +300,9 @@ def test_a_fits_rows_are_open3ds_memory_from_a_cache_line_on(channels: int) -> N
             buffer = host.grid.rows(name)
             assert int((buffer == value).sum()) == (len(keys) * 512 + 1) * buffer.shape[1]
     host.close()
+
+
+def test_rows_live_where_open3d_can_have_them() -> None:
+    """On the CPU in its hash map; on CUDA too where its build can, else in plain tensors: a fit there needs no other Open3D."""
+    assert isinstance(host_for("cpu"), GridHost)
+    assert isinstance(host_for("cuda"), GridHost if o3d.core.cuda.is_available() else TorchHost)

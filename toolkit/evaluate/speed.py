@@ -90,6 +90,11 @@ def pinned(threads: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def gpu_name() -> str | None:
+    """The GPU that torch sees, if any."""
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else None
+
+
 def machine(threads: int) -> dict[str, Any]:
     """What numbers depend on: kind of machine, versions, threads, and how busy it is."""
     versions = {}
@@ -102,6 +107,7 @@ def machine(threads: int) -> dict[str, Any]:
         "machine": platform.machine(),
         "system": platform.system(),
         "cores": os.cpu_count(),
+        "gpu": gpu_name(),
         "threads": threads,
         "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
         "python": platform.python_version(),

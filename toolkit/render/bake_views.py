@@ -46,7 +46,7 @@ def mark_pass(space: Any, volume: Any, cameras: Any, poses: Any, first: Any, las
             dz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]
             scale = K.ONE / np.sqrt(dx * dx + dy * dy + dz * dz)
             dx, dy, dz = dx * scale, dy * scale, dz * scale
-            march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, K.TWO, marks, 0, cells, rows, values, result)
+            march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, K.TWO, marks, K.START, cells, rows, values, result)
 
 
 def seen_voxels(

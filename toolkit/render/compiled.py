@@ -119,7 +119,7 @@ def render_pass(
             ray = begin + one
             ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
             dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-            kept = march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, threshold, marks, 0, cells, rows, values, result)
+            kept = march_ray(space, volume, ox, oy, oz, dx, dy, dz, K.ZERO, stop, threshold, marks, K.START, cells, rows, values, result)
             for c in range(channels):
                 mean[c] = K.ZERO
             opacity = K.ZERO

@@ -106,7 +106,7 @@ def render_pass(
     starts = np.empty(RAYS + 1, np.int64)
     number = 0
     while number < len(origins):
-        begun, used, rays = number, 0, 0
+        begun, used, rays = number, K.START, K.START
         while number < len(origins) and rays < RAYS and used < BATCH:
             for k in range(3):
                 ray[k], ray[3 + k] = origins[number, k], directions[number, k]

@@ -12,6 +12,7 @@ import torch
 from toolkit.camera import Array, Intrinsics, pixel_grid, rays
 from toolkit.networks.decoder import Deferred
 from toolkit.render.field import Field
+from toolkit.render.on_cuda import runs_triton
 from toolkit.render.rays import RayValues, render_rays
 from toolkit.render.sky import on_sky
 
@@ -30,17 +31,21 @@ class Rendered:
 
 
 class View(Protocol):
-    """What gives colours, distances and opacities for rays."""
+    """What gives colours, distances and opacities for rays, on their device or on one that it has as `device`."""
 
     def __call__(self, origins: torch.Tensor, directions: torch.Tensor) -> RayValues: ...
 
 
 def make_renderer(field: Field, engine: str = "auto") -> View:
-    """What renders rays of `field`, for many pictures: compiled on the CPU, torch elsewhere.
+    """What renders rays of `field`, for many pictures: compiled on the CPU and, where a ray is decoded once, on CUDA; torch elsewhere.
 
     Args:
-        engine: auto | numba | torch. The compiled one runs on the CPU alone.
+        engine: auto | numba | triton | torch. Numba runs on the CPU alone, Triton on CUDA alone.
     """
+    if engine in ("auto", "triton") and isinstance(field.decoder, Deferred) and runs_triton(field.device):
+        from toolkit.render.triton_field import TritonRenderer
+
+        return TritonRenderer(field)
     if engine == "torch" or field.device.type != "cpu":
         return partial(_in_chunks, field)
     from toolkit.render.compiled import CompiledRenderer
@@ -66,15 +71,32 @@ def _in_chunks(field: Field, origins: torch.Tensor, directions: torch.Tensor) ->
 
 def render_view(field: Field, intrinsics: Intrinsics, world_from_camera: Array, view: View | None = None) -> Rendered:
     """The field as a pinhole camera at `world_from_camera` (4, 4), working frame, sees it. `view`: see `make_renderer`."""
-    height, width = intrinsics.height, intrinsics.width
-    origins, directions, cosine = rays(intrinsics, world_from_camera, pixel_grid(width, height))
     view = view or make_renderer(field)
+    device = getattr(view, "device", torch.device("cpu"))
+    origins, directions, cosine = _rays_on(device, intrinsics, world_from_camera)
     values = view(origins, directions)
-    depth = torch.where(values.opacity >= SOLID, values.distance * cosine, torch.zeros(1))
-    colour = on_sky(values.colour, values.opacity, directions, field.background.cpu(), field.sky)
-    shape = (height, width)
+    depth = torch.where(values.opacity >= SOLID, values.distance * cosine, torch.zeros(1, device=device))
+    sky = None if field.sky is None else field.sky.to(device)
+    colour = on_sky(values.colour, values.opacity, directions, field.background.to(device), sky)
+    shape = (intrinsics.height, intrinsics.width)
     return Rendered(
-        colour.reshape(*shape, 3).numpy().astype(np.float32),
-        depth.view(shape).numpy().astype(np.float32),
-        values.opacity.reshape(shape).numpy().astype(np.float32),
+        colour.reshape(*shape, 3).cpu().numpy().astype(np.float32),
+        depth.view(shape).cpu().numpy().astype(np.float32),
+        values.opacity.reshape(shape).cpu().numpy().astype(np.float32),
     )
+
+
+def _rays_on(device: torch.device, intrinsics: Intrinsics, world_from_camera: Array) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Rays through all pixels, as `camera.rays` makes them, on `device`: it takes longer to send them than to make them there."""
+    height, width = intrinsics.height, intrinsics.width
+    if device.type == "cpu":
+        return rays(intrinsics, world_from_camera, pixel_grid(width, height))
+    pose = torch.from_numpy(np.ascontiguousarray(world_from_camera, dtype=np.float64)).to(device)
+    x = (torch.arange(width, device=device, dtype=torch.float64) + 0.5 - intrinsics.cx) / intrinsics.fx
+    y = (torch.arange(height, device=device, dtype=torch.float64) + 0.5 - intrinsics.cy) / intrinsics.fy
+    camera = torch.stack([x.expand(height, width), y[:, None].expand(height, width), torch.ones_like(x).expand(height, width)], 2).view(
+        -1, 3
+    )
+    cosine = 1 / camera.norm(dim=1)
+    directions = (camera * cosine[:, None]) @ pose[:3, :3].T
+    return pose[:3, 3].expand_as(directions).float(), directions.float(), cosine.float()

@@ -33,6 +33,7 @@ LEAF: dict[str, Any] = {**OPTIONS, **({"_nrt": False} if hasattr(DefaultOptions,
 INLINE: dict[str, Any] = {**LEAF, "forceinline": True}
 
 ZERO, HALF, ONE, TWO = F(0), F(0.5), F(1), F(2)
+START = np.int64(0)  # a number that a function gets: given a Python literal, it would be compiled once more for this very value
 SOLID, RAW_MAX, UNITS = F(composite.SOLID), F(composite.RAW_MAX), F(composite.UNITS)
 STRETCH = F(MAX_STRETCH)
 THIN = F(0.01)  # below this optical thickness 1 - exp(-τ) is taken from its series: the difference would lose digits

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from toolkit.networks.encoding import SH
-from toolkit.render.kernels import LEAF, ONE, OPTIONS, ZERO, Decoder, F, aligned
+from toolkit.render.kernels import LEAF, ONE, OPTIONS, START, ZERO, Decoder, F, aligned
 from toolkit.render.kernels_matrix import LANES, product
 
 _C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9 = (F(value) for value in SH)
@@ -84,10 +84,10 @@ def rays_of(layers: Layers) -> Rays:
 @njit(**OPTIONS)
 def decode(layers: Any, tape: Any, rays: Any) -> None:
     """`Deferred.forward` of the first `rays` rows of `tape`, which is `Rays` or has what they have: given → h1, h2, colour."""
-    product(tape.given, 0, rays, layers.w1, tape.h1)
-    rectify(tape.h1, 0, rays, layers.b1)
-    product(tape.h1, 0, rays, layers.w2, tape.h2)
-    rectify(tape.h2, 0, rays, layers.b2)
+    product(tape.given, START, rays, layers.w1, tape.h1)
+    rectify(tape.h1, START, rays, layers.b1)
+    product(tape.h1, START, rays, layers.w2, tape.h2)
+    rectify(tape.h2, START, rays, layers.b2)
     _colours(layers, tape.given, tape.h2, rays, tape.colour)
 
 

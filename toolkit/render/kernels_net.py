@@ -110,8 +110,8 @@ def decode_densities(space: Any, volume: Any, net: Net, tape: Tape, first: Any, 
 @njit(**K.OPTIONS)
 def decode_colours(net: Net, tape: Tape, count: Any) -> None:
     """Colours of the first `count` samples, whose densities and directions are there."""
-    product(tape.h2, 0, count, net.w3, tape.h3)
-    rectify(tape.h3, 0, count, net.b3)
+    product(tape.h2, K.START, count, net.w3, tape.h3)
+    rectify(tape.h3, K.START, count, net.b3)
     for i in range(count):
         own = tape.h3[i]
         a, b, c = net.b4[0], net.b4[1], net.b4[2]

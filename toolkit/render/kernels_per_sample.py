@@ -129,7 +129,7 @@ def march_ray(
     far = shell / space.voxel
     light[0], light[1], light[2], light[3], light[4] = ZERO, ONE, ZERO, ZERO, ZERO
     cells = np.empty(TILE, np.int32)
-    kept, waiting = 0, 0
+    kept, waiting = K.START, K.START
     strongest_cell = 0
     step_index = 0
     unit = step / (TWO * extent)
@@ -212,8 +212,8 @@ def march_ray(
                 values[BEGIN], values[SPAN] = (s + (s1 - s) * F(index) * per_fine) * half, (s1 - s) * per_fine * half
                 waiting += 1
                 if waiting == TILE:
-                    more, cell = settle(space, volume, net, tape, first + kept, TILE, stop, threshold, marks, cells, light)
-                    kept, waiting = kept + more, 0
+                    more, cell = settle(space, volume, net, tape, first + kept, waiting, stop, threshold, marks, cells, light)
+                    kept, waiting = kept + more, K.START
                     strongest_cell = cell if cell >= 0 else strongest_cell
                     if light[1] < stop:
                         break

@@ -152,22 +152,26 @@ def spread_along(guide: Array, values: Array, away: float, edge: float) -> None:
     for number in range(PASSES):
         reach = away * np.sqrt(3) * 2 ** (PASSES - 1 - number) / np.sqrt(4**PASSES - 1)
         keep = np.exp(-np.sqrt(2) / reach)
-        _pass_on(values, (keep**across).astype(np.float32))
-        _pass_on(values.transpose(1, 0, 2), (keep**down).astype(np.float32).T)
+        _pass_on(values[:, :, None], (keep**across).astype(np.float32)[:, :, None])
+        _pass_on(values[None], (keep**down).astype(np.float32)[None])
 
 
 @numba.njit(cache=True, nogil=True)
 def _pass_on(values: Array, keep: Array) -> None:
-    """Along each row, there and back, every value becomes (1 − keep) of itself and keep[·, x] of the one before it."""
-    for v in range(values.shape[0]):
-        for x in range(1, values.shape[1]):
-            share = keep[v, x - 1]
-            for k in range(values.shape[2]):
-                values[v, x, k] += share * (values[v, x - 1, k] - values[v, x, k])
-        for x in range(values.shape[1] - 2, -1, -1):
-            share = keep[v, x]
-            for k in range(values.shape[2]):
-                values[v, x, k] += share * (values[v, x + 1, k] - values[v, x, k])
+    """Along the second axis of values (A, B, C, K), there and back, every value becomes (1 − keep) of itself and keep[·, b, ·] of the one
+    before it; keep (A, B − 1, C)."""
+    lines, length, beside, channels = values.shape
+    for a in range(lines):
+        for b in range(1, length):
+            for c in range(beside):
+                share = keep[a, b - 1, c]
+                for k in range(channels):
+                    values[a, b, c, k] += share * (values[a, b - 1, c, k] - values[a, b, c, k])
+        for b in range(length - 2, -1, -1):
+            for c in range(beside):
+                share = keep[a, b, c]
+                for k in range(channels):
+                    values[a, b, c, k] += share * (values[a, b + 1, c, k] - values[a, b, c, k])
 
 
 def _middle(values: Array) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
 
@@ -36,7 +38,7 @@ def depth_of(which: Array, camera: Intrinsics, local: Array, slant: float) -> Ar
 
 
 @numba.njit(cache=True, nogil=True)
-def _inverse_on(planes: Array, which: int, x: float, y: float, slant: float) -> float:
+def _inverse_on(planes: Array, which: Any, x: float, y: float, slant: float) -> float:
     """Inverse depth of the plane `which` on the ray (x, y, 1), 0: behind the camera, or too much aslant."""
     along = planes[which, 0] * x + planes[which, 1] * y + planes[which, 2]
     offset = planes[which, 3]
@@ -68,6 +70,6 @@ def _depths(which: Array, camera: Array, planes: Array, slant: float, out: Array
     for v in range(which.shape[0]):
         for u in range(which.shape[1]):
             if which[v, u] >= 0:
-                inverse = _inverse_on(planes, which[v, u], (u + 0.5 - cx) / fx, (v + 0.5 - cy) / fy, slant)
+                inverse = _inverse_on(planes, np.int64(which[v, u]), (u + 0.5 - cx) / fx, (v + 0.5 - cy) / fy, slant)
                 if inverse > 0:
                     out[v, u] = 1 / inverse

@@ -110,7 +110,8 @@ def depth_start(views: Views, scene: Scene, settings: Settings, device: torch.de
 
 def votes(space: Space, resolution: int, places: Tensor, views: Views) -> Votes:
     """What the depth of `views` says of the voxels `places` (N, 3)."""
-    centres, radius = (np.ascontiguousarray(one) for one in radii(space, resolution, places, WHOLE))
+    # Also writeable: numba compiles kernels anew for arrays that are not.
+    centres, radius = (np.require(one, requirements=("C", "W")) for one in radii(space, resolution, places, WHOLE))
     worlds = np.stack([invert(pose) for pose in views.world_from_camera])
     cameras = np.array([(c.fx, c.fy, c.cx, c.cy) for c in views.intrinsics])
     out = np.zeros((3, len(places)), np.int32)

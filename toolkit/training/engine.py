@@ -1,6 +1,6 @@
-"""Two engines, one field: what a fit asks of either, and which one it gets.
+"""Three engines, one field: what a fit asks of each, and which one it gets.
 
-`torch` is the reference, runs everywhere and is what CUDA uses; `numba` is the fast path of the CPU. They agree in values and gradients
+`torch` is the reference and runs everywhere; `numba` is the fast path of the CPU, `triton` that of CUDA. They agree in values and gradients
 (tests compare them), not in the random numbers that they draw.
 """
 
@@ -15,6 +15,7 @@ from toolkit.config import Settings
 from toolkit.networks.decoder import Deferred
 from toolkit.progress import Progress
 from toolkit.render.field import Field
+from toolkit.render.on_cuda import runs_triton
 from toolkit.render.rays import render_rays
 from toolkit.training.adam import LazyAdam
 from toolkit.training.importance import Errors
@@ -93,14 +94,22 @@ class TorchEngine(Optimiser):
 
 
 def chosen_engine(settings: Settings, device: torch.device) -> str:
-    """numba or torch: the compiled engine runs on the CPU."""
-    return "numba" if device.type == "cpu" and settings.engine != "torch" else "torch"
+    """numba, triton or torch: the first runs on the CPU, the second on CUDA and where a ray is decoded once."""
+    if device.type == "cpu":
+        return "torch" if settings.engine == "torch" else "numba"
+    fast = settings.engine in ("auto", "triton") and settings.field.decoder == "deferred" and runs_triton(device)
+    return "triton" if fast else "torch"
 
 
 def make_engine(settings: Settings, field: Field, pool: PixelPool) -> Engine:
-    """The engine that the settings ask for, or `auto`: compiled on the CPU, torch elsewhere."""
-    if chosen_engine(settings, field.device) == "torch":
+    """The engine that the settings ask for, or for `auto` the fastest that there is."""
+    chosen = chosen_engine(settings, field.device)
+    if chosen == "torch":
         return TorchEngine(field, pool, settings.seed)
+    if chosen == "triton":
+        from toolkit.training.triton_engine import TritonOptimiser
+
+        return TritonOptimiser(field, pool, settings.seed)
     if isinstance(field.decoder, Deferred):
         from toolkit.training.fused import FusedOptimiser
 
@@ -110,13 +119,24 @@ def make_engine(settings: Settings, field: Field, pool: PixelPool) -> Engine:
     return FusedPerSampleOptimiser(field, pool, settings.seed)
 
 
+def fit_device(settings: Settings) -> torch.device:
+    """Where a fit with these settings computes."""
+    return torch.device(settings.device if settings.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu")
+
+
 def warm_up(settings: Settings, progress: Progress) -> None:
     """Have the kernels compiled (once a machine: they are kept on disk) or loaded, before any clock runs."""
-    if chosen_engine(settings, torch.device("cpu")) == "torch":
+    chosen = chosen_engine(settings, device := fit_device(settings))
+    if chosen == "torch":
+        return
+    if chosen == "triton":
+        from toolkit.training import triton_warm
+
+        triton_warm.run(settings.field.channels, settings.field.width, device, progress)
         return
     from toolkit.training import warm
 
     kind = (settings.field.decoder, settings.field.channels, settings.field.width)
     if not warm.ready(*kind):
-        progress.update(0, 1, "compiling the fast engine, once on this machine, about a minute")
+        progress.update(0, 1, "compiling the fast engine, once on this machine, about half a minute")
         warm.run(*kind)

@@ -28,12 +28,12 @@ from toolkit.stereo.left_out import LeftOut
 from toolkit.training import room
 from toolkit.training.behind import sky_behind
 from toolkit.training.depth import FINE, ROUGH
-from toolkit.training.engine import Engine, make_engine, warm_up
+from toolkit.training.engine import Engine, chosen_engine, fit_device, make_engine, warm_up
 from toolkit.training.finite import NotFiniteError
 from toolkit.training.guard import Guard, refuse_broken
 from toolkit.training.levels import all_places, finer, first_field, looked_at, pruned, visible
 from toolkit.training.rays import PixelPool
-from toolkit.training.schedule import RUNGS, Schedule, most_rays
+from toolkit.training.schedule import RUNGS, WIDER, Schedule, most_rays
 from toolkit.training.start import NEAR, THIN, colour_behind, finest_resolution, levels, possible, space_of
 from toolkit.training.view import limit
 from toolkit.volume.host import Host, TorchHost
@@ -161,7 +161,9 @@ def fit_field(
     limit_rays = most_rays(len(pool), bool(aside.any()), settings.fit.passes)
     slow_within = settings.fit.slow_within * scene.median_depth
     trust = ROUGH if views.rough else FINE
-    plan = Schedule(ladder, budget, settings.fit, views.background is None, settings.fit.patience, limit_rays, slow_within, trust, rungs)
+    wider = WIDER if chosen_engine(settings, device) == "triton" else 1
+    opaque, patient = views.background is None, settings.fit.patience
+    plan = Schedule(ladder, budget, settings.fit, opaque, patient, limit_rays, slow_within, trust, rungs, wider)
     guard = Guard()
     result = FitResult(current, notes=guard.notes)
     marks = [budget * 0.02 * 50 ** (i / (TIMELINE_POINTS - 1)) for i in range(TIMELINE_POINTS - 1)]
@@ -218,11 +220,6 @@ def fit_field(
     give_back()
     result.field = replace(packed(), sky=sky_behind(views))
     return result
-
-
-def fit_device(settings: Settings) -> torch.device:
-    """Where a fit with these settings computes."""
-    return torch.device(settings.device if settings.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu")
 
 
 def _first(

@@ -186,7 +186,7 @@ class FusedOptimiser:
         out = np.empty((len(origins), 5), np.float32)
         limits = (np.float32(STOP), np.float32(THRESHOLD))
         given = (self.space, self.volume, self.layers, rays_of(self.layers), self.background)
-        render_pass(*given, origins.numpy(), directions.numpy(), *limits, out)
+        render_pass(*given, origins.contiguous().numpy(), directions.contiguous().numpy(), *limits, out)
         return torch.from_numpy(out[:, :3])
 
     def _broken(self, thread: int, error: float, weights: tuple[Array, ...]) -> str | None:

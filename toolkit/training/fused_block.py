@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from toolkit.render import kernels as K
-from toolkit.render.kernels_decode import RAYS, decode, encode_direction
+from toolkit.render.kernels_decode import RAYS, Rays, decode, encode_direction
 from toolkit.render.kernels_lookup import gather_row
 from toolkit.render.kernels_march import march_ray
 from toolkit.training.fused_decoder import Tape, decode_backward, forget_gradients
@@ -87,12 +87,13 @@ def gradient_pass(
     Returns:
         rows touched, part of the mean over the batch of squared colour errors, samples looked up.
     """
-    used, looked, number, error = 0, 0, 0, 0.0
+    used, looked, number, error = K.START, K.START, K.START, 0.0
     forget_gradients(block.tape.total)
+    rays = Rays(block.tape.given, block.tape.h1, block.tape.h2, block.tape.colour)  # so that `decode` is compiled for these alone
     while number < len(picks):
         count, seen = _march(space, volume, pixels, picks, number, jitter, losses, marks, block, met)
         _composite(space, volume, index, block, block.tape, count)
-        decode(layers, block.tape, count)
+        decode(layers, rays, count)
         error += _compare(background, pixels, picks, shares, number, losses, block, block.tape, count, met)
         decode_backward(layers, back, block.tape, count)
         where = index, thread + 1, bases[thread]
@@ -109,7 +110,7 @@ def _march(
     """Samples of as many rays from picks[number] on as there is room for → their number, and that of samples looked up."""
     ray, starts, result = block.ray, block.starts, block.result
     stop = max(losses.stop, losses.threshold)  # no sample behind weighs more than the light that is left
-    count, filled, looked = 0, 0, 0
+    count, filled, looked = K.START, K.START, K.START
     while count < RAYS and number + count < len(picks) and filled + MOST <= ROOM:
         at = number + count
         if at + AHEAD < len(picks):

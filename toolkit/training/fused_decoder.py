@@ -82,9 +82,9 @@ def forget_gradients(total: Layers) -> None:
 def decode_backward(layers: Layers, back: Turned, tape: Tape, rays: Any) -> None:
     """From tape.g_logit of the first `rays` rows to tape.g_given; gradients of the weights are added to tape.total."""
     _last_backward(layers, tape.h2, tape.g_logit, rays, tape.g2)
-    product(tape.g2, 0, rays, back.w2, tape.g1)
+    product(tape.g2, K.START, rays, back.w2, tape.g1)
     _stop(tape.h1, rays, tape.g1)
-    product(tape.g1, 0, rays, back.w1, tape.g_given)
+    product(tape.g1, K.START, rays, back.w1, tape.g_given)
     add_outer(tape.given, tape.g1, rays, tape.total.w1)
     add_outer(tape.h1, tape.g2, rays, tape.total.w2)
     _add_sums(tape, tape.total, rays)

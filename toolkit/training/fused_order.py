@@ -42,12 +42,12 @@ def hit_codes(space: Any, pixels: Any, picks: Any, memory: Any, grid: Any, codes
     """
     ray = np.empty((1, 6), np.float32)
     top = F(1023)
-    high, wide = np.int32(grid[0]), np.int32(grid[1])
+    high, wide = grid
     for index in range(len(picks)):
         if index + AHEAD < len(picks):
             ask_for(pixels, picks[index + AHEAD])
         pick = picks[index]
-        pixel_ray(pixels, pick, ray, 0)
+        pixel_ray(pixels, pick, ray, K.START)
         tile = fused_draw.tile_of(pixels, pick, high, wide)
         tiles[index] = tile
         t = memory[tile, 0] / space.half

@@ -66,7 +66,7 @@ class FusedPerSampleOptimiser(FusedOptimiser):
         out = np.empty((len(origins), 5), np.float32)
         limits = (np.float32(STOP), np.float32(NEGLIGIBLE))
         given = (self.space, self.volume, self.net, make_tape(self.net), self.background)
-        render_pass(*given, origins.numpy(), directions.numpy(), *limits, out)
+        render_pass(*given, origins.contiguous().numpy(), directions.contiguous().numpy(), *limits, out)
         return torch.from_numpy(out[:, :3])
 
 

@@ -86,7 +86,7 @@ def decoder_backward(width: Any, net: Net, scratch: Scratch, count: Any) -> None
             g[j] = value if own[j] > ZERO else ZERO
     add_outer(tape.h2, scratch.g3, count, total.w3)
     _add_rows(scratch.g3, count, total.b3)
-    product(scratch.g3, 0, count, net.w3_back, scratch.g2)
+    product(scratch.g3, K.START, count, net.w3_back, scratch.g2)
     for i in range(count):
         own, g, g_raw = tape.h2[i], scratch.g2[i], scratch.g_raw[i]
         total.density_bias[0] += g_raw
@@ -96,14 +96,14 @@ def decoder_backward(width: Any, net: Net, scratch: Scratch, count: Any) -> None
             g[j] = value if own[j] > ZERO else ZERO
     add_outer(tape.h1, scratch.g2, count, total.w2)
     _add_rows(scratch.g2, count, total.b2)
-    product(scratch.g2, 0, count, net.w2_back, scratch.g1)
+    product(scratch.g2, K.START, count, net.w2_back, scratch.g1)
     for i in range(count):
         own, g = tape.h1[i], scratch.g1[i]
         for j in range(hidden):
             g[j] = g[j] if own[j] > ZERO else ZERO
     add_outer(tape.given, scratch.g1, count, total.w1)
     _add_rows(scratch.g1, count, total.b1)
-    product(scratch.g1, 0, count, net.w1_back, scratch.g_given)
+    product(scratch.g1, K.START, count, net.w1_back, scratch.g_given)
     for i in range(count):
         _encode_backward(width, tape.given[i], scratch.g_given[i])
         for k in range(3):
@@ -244,12 +244,11 @@ def gradient_pass(
     zero_row = volume.density.shape[0] - 1
     rays_of, light, starts = np.empty((1, 6), np.float32), np.empty(5, np.float32), np.empty(RAYS + 1, np.int64)
     ray = rays_of.reshape(-1)
-    used, looked, number = 0, 0, 0
-    error = 0.0
+    used, looked, number, error = K.START, K.START, K.START, 0.0
     while number < len(picks):
-        begun, samples, rays = number, 0, 0
+        begun, samples, rays = number, K.START, K.START
         while number < len(picks) and rays < RAYS and samples < BATCH:
-            pixel_ray(pixels, picks[number], rays_of, 0)
+            pixel_ray(pixels, picks[number], rays_of, K.START)
             starts[rays] = samples
             kept = march_ray(space, volume, net, tape, samples, ray, jitter[number], losses.stop, losses.threshold, marks, light)
             for i in range(samples, samples + kept):

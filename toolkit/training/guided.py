@@ -24,8 +24,8 @@ from toolkit.render.field import Field
 from toolkit.stereo import moving, quick
 from toolkit.stereo.left_out import LeftOut
 from toolkit.training import depth_start
-from toolkit.training.engine import warm_up
-from toolkit.training.fit import DEFAULT_BUDGET, Clock, FitResult, fit_device, fit_field
+from toolkit.training.engine import fit_device, warm_up
+from toolkit.training.fit import DEFAULT_BUDGET, Clock, FitResult, fit_field
 from toolkit.training.schedule import GUESSED, PARTLY, RUNGS
 from toolkit.volume.host import Host
 

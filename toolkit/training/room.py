@@ -22,8 +22,11 @@ def row_bytes(settings: Settings, device: torch.device) -> int:
     """Memory of one lattice corner at its most: its values, the optimiser's state, and what threads gather for it."""
     channels, threads = settings.field.channels, settings.threads or torch.get_num_threads()
     values = 4 * (1 + channels)
-    if chosen_engine(settings, device) == "torch":
+    chosen = chosen_engine(settings, device)
+    if chosen == "torch":
         return values + 4 * (channels + 3) + 8
+    if chosen == "triton":
+        return 3 * values + 4 + 1  # gradients and moments; steps and a mark
     return values + 4 + threads * (4 + 10 + 4 * channels + 2 * (2 + channels))  # moments have two bytes
 
 

@@ -24,6 +24,7 @@ LAST_PRUNE = 0.8  # of the budget; from here on the field is only polished, on a
 SLOWING = 1e7  # rays after which step sizes begin to fall
 LAST_RATE = 0.08  # of the step sizes, at the very end
 FIRST_BATCH = 256  # rays a step at the coarsest lattice, and as many times more as one is finer: early on the number of steps counts
+WIDER = 4  # times as many of them on CUDA, where a step of few takes as long; with sixteen times as many fits are worse
 WORTH = 0.5  # rays that must be left for every voxel of a finer level: with fewer it ends blurred, and worse than the coarser one
 LOOK_STEPS = 60  # from one look at the validation views to the next …
 FINEST_LOOK_STEPS = 250  # … and at the finest level
@@ -54,6 +55,7 @@ class Schedule:
         slow_within: distance before a camera up to which things move slowly, working units (`near`).
         trust: how far the pictures' depth is believed.
         rungs: share of the budget at which each level of the ladder ends at the latest.
+        wider: times as many rays a step as `FIRST_BATCH` and `fit.max_rays` say.
     """
 
     ladder: list[int]
@@ -65,6 +67,7 @@ class Schedule:
     slow_within: float = 0.0
     trust: Trust = FINE
     rungs: tuple[float, ...] = RUNGS
+    wider: int = 1
     level: int = 0
     steps_here: int = 0
     slower: float = 1.0
@@ -87,7 +90,7 @@ class Schedule:
     @property
     def rays(self) -> int:
         """Rays of the next step."""
-        return min(FIRST_BATCH * max(self.resolution, COARSEST) // COARSEST, self.settings.max_rays)
+        return self.wider * min(FIRST_BATCH * max(self.resolution, COARSEST) // COARSEST, self.settings.max_rays)
 
     def position(self, seconds: float, rays: int = 0) -> float:
         """0 … 1: how far the fit is, by its seconds or its rays, whichever are spent first.

@@ -11,7 +11,7 @@ from toolkit.render.composite import RAW_MAX, SOLID, STOP, distortion, ray_sum, 
 from toolkit.render.field import Field, density
 from toolkit.render.march import BRICK, Samples, march
 from toolkit.render.rays import OPACITY_FLOOR
-from toolkit.training.adam import LazyAdam
+from toolkit.training.adam import Adam, LazyAdam
 from toolkit.training.depth import FINE, depth_gradient
 from toolkit.training.finite import NotFiniteError, check
 from toolkit.training.near import slowness
@@ -43,7 +43,7 @@ class Optimiser:
 
     def __init__(self, field: Field) -> None:
         self.blind = blind(field.decoder)
-        self.decoder = torch.optim.Adam(field.decoder.parameters(), lr=1e-3, betas=(0.9, 0.99), eps=1e-10)
+        self.decoder = Adam(field.decoder.parameters(), (0.9, 0.99), 1e-10)
         self.renew_rows(field)
 
     def renew_rows(self, field: Field) -> None:
@@ -115,20 +115,18 @@ class Optimiser:
         field = self.field
         jitter = torch.rand(len(batch.origins), generator=generator).to(field.device)
         samples = march(field.grid, batch.origins, batch.directions, field.near, field.fine, jitter)
-        for group in self.decoder.param_groups:
-            group["lr"] = rates.decoder
         deferred = isinstance(field.decoder, Deferred)
         behind = torch.rand(len(batch.origins), 3, generator=generator).to(field.device) if rates.random_background else field.background
         try:
             error = (self._deferred if deferred else self._per_sample)(batch, samples, rates, behind)
         except NotFiniteError:
-            self.decoder.zero_grad(set_to_none=True)
+            self.decoder.forget()
             self.seen.nan_to_num_(0.0)
             raise
-        self.decoder.step()
+        self.decoder.step(rates.decoder)
         if self.blind.any():
             of_direction(field.decoder)[:, self.blind] = 0.0
-        self.decoder.zero_grad(set_to_none=True)
+        self.decoder.forget()
         return error, len(samples)
 
     def _deferred(self, batch: Batch, samples: Samples, rates: Rates, behind: Tensor) -> float:

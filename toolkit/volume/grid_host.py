@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import open3d as o3d
 import torch
 
 from toolkit.volume.grid import BlockGrid
-from toolkit.volume.host import Hosted
+from toolkit.volume.host import Host, Hosted, TorchHost
 from toolkit.volume.rows import zero_rows
 from toolkit.volume.topology import VOXELS, Topology
 
 Tensor = torch.Tensor
 LINE = 64  # bytes of a cache line
+
+
+def host_for(device: torch.device | str) -> Host:
+    """Open3D's hash map where this Open3D can use the device. The packages for the CPU cannot use CUDA: there rows are plain tensors."""
+    device = torch.device(device)
+    return GridHost(device) if device.type == "cpu" or o3d.core.cuda.is_available() else TorchHost(device)
 
 
 class GridHost:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import trimesh
 from PIL import Image
 from safetensors.numpy import save_file
 
@@ -19,7 +18,6 @@ from toolkit.capture import open_capture
 from toolkit.capture.types import Views
 from toolkit.errors import FieldfuseError
 from toolkit.evaluate.compare_truth import find_truth, true_depths
-from toolkit.evaluate.geometry import read_mesh, surface_points
 from toolkit.files import write_json
 from toolkit.simulate.mesh_scene import load_mesh_scene
 from toolkit.simulate.seen import Rays
@@ -40,6 +38,8 @@ DATASETS = (
 
 def make_meshes(root: Path) -> None:
     """A box in every format that is read, one with colours at vertices, two with a picture on it."""
+    import trimesh
+
     root.mkdir(parents=True)
     box = trimesh.creation.box()
     (root / "ascii.ply").write_bytes(box.export(file_type="ply", encoding="ascii"))
@@ -59,6 +59,8 @@ def make_meshes(root: Path) -> None:
 
 def read_meshes(root: Path, number: int) -> None:
     """Each file as a mesh and as a scene to film, with a few rays."""
+    from toolkit.evaluate.geometry import read_mesh, surface_points  # here, for workers that read other things: it brings Open3D
+
     directions = torch.nn.functional.normalize(torch.tensor([[0.1, 0.1, -1.0], [0.0, 0.2, -1.0]]), dim=1)
     rays = Rays(torch.tensor([[0.0, 0.0, 3.0]]), directions, 0.01)
     names = [name for name in MESHES if not name.endswith((".mtl", ".png"))]
@@ -70,6 +72,8 @@ def read_meshes(root: Path, number: int) -> None:
 
 def make_truth(root: Path) -> None:
     """A capture that brings its true surface and depth."""
+    import trimesh
+
     LAYOUTS["transforms"][1](root)
     (root / "ground_truth").mkdir()
     (root / "ground_truth" / "mesh.ply").write_bytes(trimesh.creation.box().export(file_type="ply"))
@@ -82,6 +86,8 @@ def make_truth(root: Path) -> None:
 
 def read_truth(root: Path, number: int) -> None:
     """Depth of one view and points of the surface."""
+    from toolkit.evaluate.geometry import read_mesh, surface_points
+
     capture = open_capture(root)
     truth = find_truth(capture)
     if truth is None:

@@ -26,7 +26,6 @@ from toolkit.training.nerfusion.caution import Caution
 from toolkit.training.nerfusion.checkpoint import checkpoint_settings, load_caution, load_checkpoint, save_checkpoint
 from toolkit.training.nerfusion.settings import load_train_settings, train_settings_dict
 from toolkit.training.nerfusion.shards import ShardScene, write_shard
-from toolkit.training.nerfusion.train import make_model
 
 
 def make_models(root: Path) -> None:
@@ -61,6 +60,8 @@ def read_models(root: Path, number: int) -> None:
 
 def make_training(root: Path) -> None:
     """A shard of training pictures, a checkpoint, settings, depth by matching, and what is remembered of a machine."""
+    from toolkit.training.nerfusion.train import make_model  # here, for workers that read other things: it brings matplotlib
+
     root.mkdir(parents=True)
     rng = np.random.default_rng(0)
     pictures, depths = rng.integers(0, 255, (4, 3, 12, 16), dtype=np.uint8), np.ones((4, 12, 16), np.float32)
@@ -86,6 +87,8 @@ def make_training(root: Path) -> None:
 
 def read_training(root: Path, number: int) -> None:
     """Each file by its own reader; a file of speeds that is damaged counts as none."""
+    from toolkit.training.nerfusion.train import make_model
+
     os.environ["XDG_CACHE_HOME"] = str(root)
     budget.remembered("machine")
     load_train_settings(root / "train.yaml")

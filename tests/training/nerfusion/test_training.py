@@ -23,12 +23,18 @@ from toolkit.networks.weights import load_model
 from toolkit.progress import Progress
 from toolkit.training.nerfusion.caution import RECOVER, Caution
 from toolkit.training.nerfusion.checkpoint import checkpoint_settings, checkpoints
-from toolkit.training.nerfusion.curve import Curve
+from toolkit.training.nerfusion.curve import Curve, draw_curve
 from toolkit.training.nerfusion.distributed import Crew, join_crew
 from toolkit.training.nerfusion.health import ALIVE
 from toolkit.training.nerfusion.train import WEIGHTS, Trainer, learning_rate
 
 ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture(autouse=True)
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No picture of the curve, which takes a second at each checkpoint, but where it is looked at."""
+    monkeypatch.setattr("toolkit.training.nerfusion.curve.draw_curve", lambda *_: None)
 
 
 def state(trainer: Trainer) -> dict[str, torch.Tensor]:
@@ -39,8 +45,9 @@ def same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> boo
     return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
 
 
-def test_a_run_leaves_weights_curve_and_checkpoint(tmp_path: Path) -> None:
-    trainer = Trainer(tiny_settings(), tmp_path, Crew())
+def test_a_run_leaves_weights_curve_and_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("toolkit.training.nerfusion.curve.draw_curve", draw_curve)
+    trainer = Trainer(tiny_settings(record={"health_every": 2}), tmp_path, Crew())
     before = state(trainer)
     assert trainer.run() == 4
     assert [path.name for path in checkpoints(tmp_path)] == ["checkpoint-0000004.safetensors"]

@@ -16,7 +16,7 @@ SMALL: dict[str, Any] = {
     "loss": {"rays": 96, "depth_steps": 2},
     "stage": {"steps": 2, "fused_steps": 2, "most_split": 100},
     "optimiser": {"warmup": 2},
-    "record": {"log_every": 1, "health_every": 1, "checkpoint_every": 100},
+    "record": {"log_every": 1, "health_every": 100, "checkpoint_every": 100},
 }
 
 
