@@ -6,9 +6,12 @@ taken where Triton is not installed and which the tests compare with. `FIELDFUSE
 
 from __future__ import annotations
 
+import inspect
 import os
+from collections.abc import Callable
 from functools import cache
 from importlib import util
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -38,3 +41,26 @@ def asks_freely(device: torch.device) -> bool:
     """Whether it costs nothing to ask how many there are: true on the CPU. A device of its own works behind the processor, which has to
     wait for the answer; there what is not chosen is computed along, where that is cheaper."""
     return device.type == "cpu"
+
+
+def kernel(*aligned: str) -> Callable[[Callable[..., Any]], Any]:
+    """A decorator: a Triton kernel that is compiled once for each set of its `tl.constexpr` values and of its tensors' types.
+
+    Triton would compile anew for numbers that are 1 or divisible by 16, and for tensors that do not start at multiples of 16 bytes: in the
+    middle of a capture, and for every other training sample.
+
+    Args:
+        aligned: tensors that always start there (whole ones, not parts of others), which are then read in larger pieces.
+    """
+    import triton
+
+    def made(function: Callable[..., Any]) -> Any:
+        given = inspect.signature(function).parameters
+        names = [name for name, of in given.items() if "constexpr" not in str(of.annotation)]
+        if unknown := set(aligned) - set(names):
+            raise ValueError(f"{function.__name__} has no tensor {', '.join(sorted(unknown))}")
+        out = triton.jit(function, do_not_specialize=[name for name in names if name not in aligned])
+        out.aligned = aligned
+        return out
+
+    return made

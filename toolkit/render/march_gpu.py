@@ -7,10 +7,12 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from toolkit.gpu import kernel
+
 BLOCK = 64
 
 
-@triton.jit
+@kernel("out")
 def _walk(
     origins, directions, jitter, out, rays, columns, near, step, far, shell, extent, MOST: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip
@@ -46,6 +48,6 @@ def walk(
     if len(origins):
         origins, directions, jitter = origins.contiguous(), directions.contiguous(), jitter.contiguous()
         _walk[(triton.cdiv(len(origins), BLOCK),)](
-            origins, directions, jitter, out, len(origins), columns, near, step, far, shell, extent, MOST=most, BLOCK=BLOCK
+            origins, directions, jitter, out, len(origins), columns, float(near), step, far, shell, extent, MOST=most, BLOCK=BLOCK
         )
     return out
