@@ -18,7 +18,8 @@ from torch import Tensor
 
 from toolkit.capture.types import Views
 from toolkit.errors import InputError
-from toolkit.key_sweeps import KeySweeps, Recent, picture, sensed, together
+from toolkit.gpu import asks_freely
+from toolkit.key_sweeps import Brought, KeySweeps, Recent, picture, sensed, together
 from toolkit.keyframes import KeyFrames
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
@@ -33,7 +34,6 @@ from toolkit.networks.unproject import EncodedView
 from toolkit.progress import SILENT, Progress
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
-from toolkit.volume.waiting import asks_freely
 
 KEPT_PICTURES = 12  # encoded pictures kept for key frames to come …
 KEPT_ON_DEVICE = 32  # … and where they are encoded ahead, 20 MB each at 640×480
@@ -179,6 +179,7 @@ class _Pictures:
     def __init__(self, model: NerfusionModel, views: Views, side: int | None, precision: str) -> None:
         self.model, self.views, self.side, self.precision = model, views, side, precision
         self.ahead = 1 if asks_freely(model.device) else AHEAD
+        self.brought = None if self.ahead == 1 else Brought(views, model.device)
         self._kept: Recent[tuple[EncodedView, Cameras]] = Recent(KEPT_PICTURES if self.ahead == 1 else KEPT_ON_DEVICE)
 
     def __call__(self, groups: Sequence[Sequence[int]]) -> list[tuple[EncodedView, Cameras]]:
@@ -203,7 +204,7 @@ class _Pictures:
         views, device = self.views, self.model.device
         lenses = [views.intrinsics[index] for index in indices]
         cameras = Cameras.of(lenses, views.world_from_camera[list(indices)], device)
-        pictures = [picture(views, index, device) for index in indices]
+        pictures = [picture(views, index, device) if self.brought is None else self.brought(index) for index in indices]
         images = pictures[0] if len(pictures) == 1 else torch.cat(pictures)
         with computing(self.precision, device):
             encoded = self.model.encode(images, cameras, self.side)
@@ -240,7 +241,7 @@ def fuse_views(
     side = None if witnesses is not None else SIDE if empty is None else SIDE_WITHIN
     encoded = _Pictures(model, views, side, fusion.options.precision)
     near, far, measured = fusion.options.near, fusion.options.far, fusion.options.measured
-    sweeps = None if witnesses is None else KeySweeps(views, key_frames, witnesses, near, far, measured, model.device)
+    sweeps = None if witnesses is None else KeySweeps(views, key_frames, witnesses, near, far, measured, model.device, encoded.brought)
     groups = [together(int(key), neighbours) for key, neighbours in zip(key_frames.indices, key_frames.neighbours, strict=True)]
     for done, key in enumerate(key_frames.indices):
         progress.check()

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture.types import Views
+from toolkit.gpu import asks_freely
 from toolkit.keyframes import KeyFrames
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.matching import describe
@@ -29,6 +30,7 @@ LEAST_OVERLAP = 0.1  # either way
 WIDEST = 60.0  # degrees of parallax: two that look at a place from either side say little about each other
 KEPT = 32  # sweeps kept for key frames to come, 13 MB each at most, and as much again until they are asked for
 KEPT_DESCRIPTORS = 16  # pictures, 6 MB each at most
+KEPT_PICTURES = 48  # on a device of its own, as bytes
 T = TypeVar("T")
 
 
@@ -61,12 +63,14 @@ class KeySweeps:
         far: float,
         measured: bool = False,
         device: torch.device | str = "cpu",
+        pictures: Callable[[int], Tensor] | None = None,
     ) -> None:
         """
         Args:
             witnesses: for each key frame, as `beside` gives them; none: its sweep alone.
             near, far: depths along z, working units; one of them known.
             measured: the depth that a sensor measured goes into a key frame's sweep.
+            pictures: gives a view's picture (1, 3, H, W) on the device; None: it is brought there.
 
         Raises:
             ValueError: neither depth is known.
@@ -75,6 +79,7 @@ class KeySweeps:
             raise ValueError("sweeps need a nearest or a farthest depth")
         self.views, self.keys, self.witnesses = views, keys, witnesses
         self.near, self.far, self.measured, self.device = near, far, measured, device
+        self._picture = pictures or (lambda index: picture(views, index, device))
         self._described: Recent[Tensor] = Recent(KEPT_DESCRIPTORS)
         self._made: Recent[tuple[Compared | None, Witness, Tensor]] = Recent(KEPT)
 
@@ -91,16 +96,32 @@ class KeySweeps:
         group = together(int(self.keys.indices[at]), self.keys.neighbours[at])
         poses = self.views.world_from_camera[group]
         cameras = Cameras.of([self.views.intrinsics[index] for index in group], poses, self.device)
+        new = [index for index in group if index not in self._described]
+        if len(new) > 1 and not asks_freely(torch.device(self.device)) and len({self.views.images[index].shape for index in new}) == 1:
+            # Together they take as many launches as one.
+            for index, made in zip(new, describe(torch.cat([self._picture(index) for index in new])), strict=True):
+                self._described.put(index, made)
         compared = compare([self._described.get(index, self._describe) for index in group], cameras, self.near, self.far)
         alone = decide(compared)
         depth = self._depth(at)
         return compared, witness(alone if depth is None else decide(compared, depth)), certain(compared, alone)
 
     def _describe(self, index: int) -> Tensor:
-        return describe(picture(self.views, index, self.device))[0]
+        return describe(self._picture(index))[0]
 
     def _depth(self, at: int) -> Tensor | None:
         return sensed(self.views, int(self.keys.indices[at]), self.device) if self.measured else None
+
+
+class Brought:
+    """Pictures of views on a device, the most recently asked of kept there: call with an index for (1, 3, H, W) RGB in [0, 1]."""
+
+    def __init__(self, views: Views, device: torch.device) -> None:
+        self.views, self.device = views, device
+        self._kept: Recent[Tensor] = Recent(KEPT_PICTURES)
+
+    def __call__(self, index: int) -> Tensor:
+        return shown(self._kept.get(index, lambda index: pixels(self.views, index, self.device)))
 
 
 class Recent(Generic[T]):
@@ -134,12 +155,22 @@ def together(key: int, neighbours: Array) -> list[int]:
     return list(dict.fromkeys([key, *(int(n) for n in neighbours)]))
 
 
+def pixels(views: Views, index: int, device: torch.device | str) -> Tensor:
+    """(H, W, 3) uint8 of a view, on a device."""
+    values = torch.from_numpy(np.ascontiguousarray(views.images[index]))
+    if torch.device(device).type == "cuda":  # from memory that stays in place, which nobody has to wait for
+        values = values.pin_memory().to(device, non_blocking=True)
+    return values.to(device)
+
+
+def shown(values: Tensor) -> Tensor:
+    """(H, W, 3) uint8 → (1, 3, H, W) RGB in [0, 1]."""
+    return values.permute(2, 0, 1)[None].float() / 255
+
+
 def picture(views: Views, index: int, device: torch.device | str) -> Tensor:
     """(1, 3, H, W) RGB in [0, 1]."""
-    pixels = torch.from_numpy(np.ascontiguousarray(views.images[index]))
-    if torch.device(device).type == "cuda":  # from memory that stays in place, which nobody has to wait for
-        pixels = pixels.pin_memory().to(device, non_blocking=True)
-    return pixels.to(device).permute(2, 0, 1)[None].float() / 255
+    return shown(pixels(views, index, device))
 
 
 def sensed(views: Views, index: int, device: torch.device | str) -> Tensor | None:

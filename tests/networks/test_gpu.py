@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,21 +16,42 @@ if importlib.util.find_spec("triton") is None or torch.cuda.is_available():
     pytest.skip("needs Triton, interpreting; with a CUDA device see test_gpu_device.py", allow_module_level=True)
 os.environ.setdefault("TRITON_INTERPRET", "1")
 
-from tests.networks.made import SMALL as SIZES  # noqa: E402
-from tests.networks.made import cameras, lattice, pictures, small_model  # noqa: E402
-from tests.networks.test_compiled import everything, places  # noqa: E402
-from tests.networks.test_compiled_gru import trained, volumes  # noqa: E402
-from toolkit.networks import compiled, compiled_lookup, gpu  # noqa: E402
-from toolkit.networks.block_conv import block_conv3d  # noqa: E402
-from toolkit.networks.cull import all_blocks  # noqa: E402
-from toolkit.networks.lattice import cells  # noqa: E402
-from toolkit.networks.matching import LARGE, SMALL, distribution, semi_global  # noqa: E402
-from toolkit.networks.sweep import _table  # noqa: E402
-from toolkit.networks.unproject import look_up, project  # noqa: E402
-from toolkit.render.march import MarchGrid, march  # noqa: E402
-from toolkit.volume.edit import corner_nodes, split  # noqa: E402
-from toolkit.volume.space import Space  # noqa: E402
-from toolkit.volume.topology import Topology  # noqa: E402
+from tests.networks.made import SMALL as SIZES
+from tests.networks.made import cameras, lattice, pictures, small_model
+from tests.networks.test_compiled import everything
+from tests.networks.test_compiled_gru import trained, volumes
+from toolkit import gpu
+from toolkit.networks import compiled, compiled_lookup
+from toolkit.networks.block_conv import block_conv3d
+from toolkit.networks.cull import all_blocks
+from toolkit.networks.gpu import convolution, lookup, matching, observe, reading
+from toolkit.networks.gpu import gru as compiled_rows
+from toolkit.networks.lattice import cells
+from toolkit.networks.matching import distribution, semi_global
+from toolkit.networks.sweep import _table
+from toolkit.networks.unproject import look_up, project
+from toolkit.render.march import MarchGrid, march
+from toolkit.volume import blocks_gpu
+from toolkit.volume.edit import corner_nodes, split
+from toolkit.volume.space import Space
+from toolkit.volume.topology import Topology
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(autouse=True)
+def large_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The interpreter takes as long for a tile of four as for one of a thousand."""
+    monkeypatch.setattr(matching, "TILE", (1024, 32))
+    monkeypatch.setattr(matching, "PLANES", 16)
+    monkeypatch.setattr(matching, "PIXELS", 1024)
+    monkeypatch.setattr(reading, "TILE", (1024, 32))
+    for module, names in ((reading, ("BLOCK",)), (lookup, ("BLOCK",)), (observe, ("BLOCK",)), (compiled_rows, ("BLOCK",))):
+        for name in names:
+            monkeypatch.setattr(module, name, 2048)
+    for module, names in ((convolution, ("TILE", "SLOPES")), (blocks_gpu, ("TILE",))):
+        for name in names:
+            monkeypatch.setattr(module, name, 512)
 
 
 def forced(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,7 +60,7 @@ def forced(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpu, "fits", lambda *values: True)
 
 
-@pytest.mark.parametrize("shape", [(40, 7, 9), (33, 5, 4), (3, 6, 1), (64, 1, 5)])
+@pytest.mark.parametrize("shape", [(40, 5, 6), (3, 6, 1), (64, 1, 3)])
 def test_matching(shape: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     cost = torch.rand(shape, generator=torch.Generator().manual_seed(0))
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
@@ -50,8 +74,10 @@ def test_matching(shape: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch) 
     assert made.stride() == table.stride()
 
 
-@pytest.mark.parametrize("views", [1, 2, 4])
-def test_a_sweep_and_its_witnesses(views: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sweep_and_its_witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = 3
+    monkeypatch.setattr("toolkit.networks.sweep.SPACING", 9)  # the interpreter is slow
+    monkeypatch.setattr("toolkit.networks.sweep.PLANES", (8, 16))
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
     slow = everything(views, 1000)
     forced(monkeypatch)
@@ -59,10 +85,10 @@ def test_a_sweep_and_its_witnesses(views: int, monkeypatch: pytest.MonkeyPatch) 
         torch.testing.assert_close(quick, slow[name], atol=2e-4, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
 
 
-@pytest.mark.parametrize(("inside", "outside"), [(4, 8), (16, 16), (32, 8)])
+@pytest.mark.parametrize(("inside", "outside"), [(4, 8), (32, 16)])
 def test_convolution_and_its_gradients(inside: int, outside: int, monkeypatch: pytest.MonkeyPatch) -> None:
     generator = torch.Generator().manual_seed(0)
-    topology = Topology(torch.tensor([[0, 0, 0], [1, 0, 0], [1, 1, 0], [5, 0, 2]]))
+    topology = Topology(torch.tensor([[0, 0, 0], [1, 0, 0], [1, 1, 0]]))
     rows = torch.randn(topology.zero_row + 1, inside, generator=generator)
     occupied = torch.rand(topology.zero_row, generator=generator) < 0.6
     rows[:-1] *= occupied[:, None]
@@ -157,9 +183,9 @@ def test_a_step_of_the_gru(busy: int, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_finer_lattice(believed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where keys are believed to be what they are, and nothing is asked of the device."""
     generator = torch.Generator().manual_seed(0)
-    keys = torch.tensor([[0, 0, 0], [1, 0, 0], [1, 1, 0], [3, 0, 2]])
+    keys = torch.tensor([[1, 0, 2]])
     topology = Topology(keys)
-    occupied = torch.rand(topology.zero_row, generator=generator) < 0.05
+    occupied = torch.rand(topology.zero_row, generator=generator) < 0.01
     rows = torch.cat([torch.rand(topology.zero_row, 5, generator=generator), torch.zeros(1, 5)])
     slow, inside, (values,) = split(topology, occupied, [rows])
     nodes = corner_nodes(slow, inside)
@@ -197,3 +223,14 @@ def test_coarse_steps_of_rays(monkeypatch: pytest.MonkeyPatch) -> None:
         assert torch.equal(getattr(quick, name), getattr(slow, name))
     for name in ("distance", "span", "length", "place", "inside"):
         torch.testing.assert_close(getattr(quick, name), getattr(slow, name), atol=1e-4, rtol=1e-4)
+
+
+def test_kernels_are_compiled_a_few_times_whatever_the_sizes() -> None:
+    """Each takes seconds: a new one for other pictures or key frames would cost more than the kernels save."""
+    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.networks.gpu_ahead"], env=environment, cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    counts = {name: int(count) for name, count, _ in map(str.split, done.stdout.splitlines())}
+    assert len(counts) == 25 and max(counts.values()) <= 4, counts

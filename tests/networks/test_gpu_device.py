@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from toolkit.networks import gpu
+from toolkit import gpu
 
 if not torch.cuda.is_available():
     pytest.skip("needs a CUDA device", allow_module_level=True)
@@ -34,7 +35,7 @@ def timed(name: str, work: Callable[[], Any]) -> Any:
     for _ in range(5):
         out = work()
     torch.cuda.synchronize()
-    print(f"{name}: {200 * (time.perf_counter() - start):.3f} ms")
+    sys.stdout.write(f"{name}: {200 * (time.perf_counter() - start):.3f} ms\n")
     return out
 
 

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from toolkit.networks import gpu
+from toolkit import gpu
 from toolkit.volume.topology import BLOCK, HALO, VOXELS, Topology
 
 DEFAULT_CHUNK = 64  # blocks at a time: 4 MB of halo at 16 channels in float32

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from toolkit.gpu import asks_freely
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.lattice import Lattice
 from toolkit.volume.topology import BLOCK
-from toolkit.volume.waiting import asks_freely
 
 SLACK = 1.25  # balls grow by this much: views tell of a voxel beside their pictures, and blocks of the contracted shell are bent
 
@@ -56,7 +56,7 @@ def visible_blocks(centres: Tensor, radii: Tensor, cameras: Cameras, near: float
 
 
 def _planes(cameras: Cameras, near: float, far: float) -> tuple[Tensor, Tensor]:
-    """(K · 6, 3) unit normals of the frusta's planes, inwards, working frame, and (K · 6,) offsets: n · x + offset is how far inside x lies.
+    """(K · 6, 3) unit normals of the frusta's planes, inwards, working frame, and (K · 6,) offsets: x lies n · x + offset inside.
 
     Args:
         cameras: on the CPU.

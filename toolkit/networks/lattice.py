@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from toolkit.networks import gpu
+from toolkit import gpu
+from toolkit.gpu import asks_freely
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK, VOXELS, Bounds, Topology
-from toolkit.volume.waiting import asks_freely
 
 CHUNK = 1024  # blocks at a time
 
@@ -137,7 +137,7 @@ def cells(topology: Topology, corners: Tensor, every: bool) -> Tensor:
         (M · 512,) bool: cells whose lowest corner is that row. Corners of absent blocks count as not set.
     """
     if gpu.there(corners):
-        from toolkit.networks.gpu import blocks
+        from toolkit.volume import blocks_gpu as blocks
 
         return blocks.pooled(topology, corners, 0, 2, every)
     padded = torch.cat([corners, corners.new_zeros(1)])

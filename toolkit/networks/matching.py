@@ -10,7 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from toolkit.networks import compiled, gpu
+from toolkit import gpu
+from toolkit.networks import compiled
 
 SIDE = 256  # pixels of the long side at which pictures are compared (docs/measured/few_views.md) …
 SIDE_WITHIN = 448  # … and where silhouettes leave a part of them

@@ -21,7 +21,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from toolkit.networks import gpu
+from toolkit import gpu
+from toolkit.gpu import asks_freely
 from toolkit.networks.aggregate import CUES, FLAGS, aggregate, agreement, direction_spread, evidence
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.compiled import fits
@@ -39,7 +40,6 @@ from toolkit.networks.refine import with_blocks
 from toolkit.networks.sweep import Empty, Sighted, Sweep, sweep
 from toolkit.networks.unproject import COLOURED, EncodedView, look_up, project
 from toolkit.volume.topology import VOXELS, Topology
-from toolkit.volume.waiting import asks_freely
 
 CHUNK = 2**15  # voxels at a time: what the views show of them is many times larger than what is kept
 AT_ONCE = 2**19  # where there is memory for that: 0.4 kB a voxel and view
@@ -179,7 +179,7 @@ class NerfusionModel(nn.Module):
         self, lattice: Lattice, topology: Topology, where: Tensor, projected: Tensor, starts: Tensor, counts: Tensor, weights: Tensor
     ) -> LocalVolume:
         """The rest of `local_volume` on CUDA without gradients: the device is asked once which blocks are worked on."""
-        from toolkit.networks.gpu import blocks
+        from toolkit.volume import blocks_gpu as blocks
 
         channels, threshold = self.config.channels, _latent_of(FREE)
         laid = blocks.lay(topology.blocks, where, projected, starts, counts, weights, channels, threshold)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from toolkit.networks import gpu
+from toolkit import gpu
 from toolkit.networks.lattice import LatentVolume, cells
 from toolkit.volume.edit import corner_nodes, split
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
@@ -73,7 +73,7 @@ def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
     """A copy of some blocks of a volume; where it has no such block, nothing is known."""
     slots = volume.topology.slots_of(topology)
     if volume.topology.blocks and gpu.fits(volume.rows):
-        from toolkit.networks.gpu import blocks
+        from toolkit.volume import blocks_gpu as blocks
 
         return LatentVolume(volume.lattice, topology, *blocks.take(volume.rows, volume.count, slots))
     place = (slots.clamp_min(0)[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)

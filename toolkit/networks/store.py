@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from toolkit.networks import gpu
+from toolkit import gpu
+from toolkit.gpu import asks_freely
 from toolkit.networks.lattice import LatentVolume, Lattice
 from toolkit.networks.refine import part
 from toolkit.volume.topology import VOXELS, Topology
-from toolkit.volume.waiting import asks_freely
 
 GROWTH = 1.5  # a buffer that must grow gets at least this much more room
 
@@ -40,7 +40,7 @@ class GlobalStore:
         """Take over the corners `changed` (M · 512,) of some blocks."""
         slots = self._slots(values.topology)
         if gpu.fits(self._rows, values.rows):
-            from toolkit.networks.gpu import blocks
+            from toolkit.volume import blocks_gpu as blocks
 
             blocks.put(self._rows, self._count, slots, values.rows, values.count, changed)
             return

@@ -17,7 +17,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from toolkit.networks import compiled, gpu
+from toolkit import gpu
+from toolkit.networks import compiled
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.matching import COLOUR_GAIN, UNKNOWN, difference, distribution, together
 

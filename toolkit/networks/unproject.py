@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from toolkit.networks import compiled_lookup, gpu
+from toolkit import gpu
+from toolkit.networks import compiled_lookup
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.pyramid import Pyramid
 

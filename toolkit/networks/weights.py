@@ -16,6 +16,7 @@ from toolkit.files import atomic_path
 from toolkit.networks.encoder import TRUNKS
 from toolkit.networks.model import ModelConfig, NerfusionModel
 
+SHIPPED = Path(__file__).parent / "weights" / "nerfusion.safetensors"
 METADATA_KEY = "fieldfuse.networks"
 VERSION = 5  # 1: other normalisation in the encoder; 2: without agreement; 3: without the sweep; 4: density changed without bounds
 MAX_BYTES = 10 * 2**20

@@ -15,7 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from toolkit.networks import compiled, compiled_witness, gpu
+from toolkit import gpu
+from toolkit.networks import compiled, compiled_witness
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.sweep import Compared, Sweep
 

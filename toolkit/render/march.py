@@ -13,7 +13,7 @@ from functools import cached_property
 import torch
 import torch.nn.functional as F
 
-from toolkit.networks import gpu
+from toolkit import gpu
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
 

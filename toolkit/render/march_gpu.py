@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """The coarse steps of rays beyond the region of interest on CUDA, in one launch (`march._coarse_distances` in tensors)."""
 
 from __future__ import annotations
@@ -6,17 +7,20 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from toolkit.gpu import kernel
+
 BLOCK = 64
 
 
-@triton.jit
+@kernel("out")
 def _walk(
     origins, directions, jitter, out, rays, columns, near, step, far, shell, extent, MOST: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip
     n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     some = n < rays
     ox, oy, oz = tl.load(origins + 3 * n, some, 0.0), tl.load(origins + 3 * n + 1, some, 0.0), tl.load(origins + 3 * n + 2, some, 0.0)
-    dx, dy, dz = tl.load(directions + 3 * n, some, 1.0), tl.load(directions + 3 * n + 1, some, 0.0), tl.load(directions + 3 * n + 2, some, 0.0)
+    dx, dy = tl.load(directions + 3 * n, some, 1.0), tl.load(directions + 3 * n + 1, some, 0.0)
+    dz = tl.load(directions + 3 * n + 2, some, 0.0)
     square = dx * dx + dy * dy + dz * dz
     speed = tl.sqrt(square)
     along = (ox * dx + oy * dy + oz * dz) / square
@@ -44,6 +48,6 @@ def walk(
     if len(origins):
         origins, directions, jitter = origins.contiguous(), directions.contiguous(), jitter.contiguous()
         _walk[(triton.cdiv(len(origins), BLOCK),)](
-            origins, directions, jitter, out, len(origins), columns, near, step, far, shell, extent, MOST=most, BLOCK=BLOCK
+            origins, directions, jitter, out, len(origins), columns, float(near), step, far, shell, extent, MOST=most, BLOCK=BLOCK
         )
     return out

@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from toolkit.networks import gpu
+from toolkit import gpu
 from toolkit.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids
 
 Tensor = torch.Tensor

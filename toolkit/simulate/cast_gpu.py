@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """First hits of rays on convex solids on CUDA: every ray meets every solid, in one launch (`cast.py` in tensors). Imported only there."""
 
 from __future__ import annotations
@@ -7,6 +8,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from toolkit.gpu import kernel
 from toolkit.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids
 
 BLOCK = 128
@@ -68,7 +70,7 @@ def _met(centre, half, rotation, solid, ox, oy, oz, dx, dy, dz, KIND: tl.constex
     return tl.where(hit & (enter > NEAREST), enter, FAR)
 
 
-@triton.jit
+@kernel("directions", "distance", "number")
 def _cast(
     origins, directions, centre, half, rotation, distance, number, rays, boxes, rooms, balls, solids,
     SHARED: tl.constexpr, FAR: tl.constexpr, NEAREST: tl.constexpr, BLOCK: tl.constexpr,

@@ -88,7 +88,7 @@ def take(scene: Scenery, eye: Eye, poses: Array) -> Picture:
 
 
 def take_all(scene: Scenery, eye: Eye, poses: Array) -> list[Picture]:
-    """Pictures of a scene from poses (B, 4, 4), as `take` makes them, all rays at once: on a device of its own that takes fewer launches."""
+    """Pictures of a scene from poses (B, 4, 4), as `take` makes them, all rays at once: that is fewer launches on a device."""
     count, height, width = len(poses), eye.intrinsics.height, eye.intrinsics.width
     pixels, spread = height * width, 1 / eye.intrinsics.fx
     device = eye.directions.device

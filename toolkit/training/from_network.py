@@ -37,7 +37,7 @@ from toolkit.training.start import colour_behind, space_of
 from toolkit.volume.space import Space
 from toolkit.volume.topology import BLOCK
 
-SHIPPED = Path(weights.__file__).parent / "weights" / "nerfusion.safetensors"
+SHIPPED = weights.SHIPPED
 # Voxels that make up the median depth at least, on the finer of two lattices. One lattice of 24 alone loses 1.5 to 2.5 dB, while 104
 # gain 0.25 dB for about three times the seconds (docs/measured/few_views.md), so none need be smaller than some pixels; a larger one shows.
 VOXELS_TO_MEDIAN, LEVELS = 48.0, 2

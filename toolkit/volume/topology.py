@@ -13,7 +13,7 @@ from functools import cached_property, lru_cache
 import torch
 from torch import Tensor
 
-from toolkit.volume.waiting import asks_freely
+from toolkit.gpu import asks_freely
 
 BLOCK = 8
 VOXELS = BLOCK**3

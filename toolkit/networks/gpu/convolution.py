@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """The block-sparse 3×3×3 convolution on CUDA in one launch, which reads neighbours where they lie (`block_conv.py` in tensors)."""
 
 from __future__ import annotations
@@ -7,16 +8,22 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from toolkit.gpu import kernel
 from toolkit.volume.topology import VOXELS
 
-TILE = 128  # voxels of a block at a time: two of its layers
+TILE = 128  # voxels of a block at a time: two of its layers …
+SLOPES = 64  # … and where the kernel's gradient is summed
 
 
-@triton.jit
+def _wide(channels: int) -> int:
+    """As many as a product of matrices takes at least."""
+    return max(16, int(triton.next_power_of_2(channels)))
+
+
+@kernel("rows", "around", "weight", "out")
 def _convolve(
-    rows, around, weight, bias, occupied, out, blocks,
-    CIN: tl.constexpr, COUT: tl.constexpr, BIN: tl.constexpr, BOUT: tl.constexpr, BIASED: tl.constexpr, MASKED: tl.constexpr,
-    RELU: tl.constexpr, EXACT: tl.constexpr, TILE: tl.constexpr,
+    rows, around, weight, bias, occupied, out, biased, masked, floor,
+    CIN: tl.constexpr, COUT: tl.constexpr, BIN: tl.constexpr, BOUT: tl.constexpr, TILE: tl.constexpr,
 ):  # fmt: skip
     parts: tl.constexpr = 512 // TILE
     block = tl.program_id(0) // parts
@@ -30,25 +37,17 @@ def _convolve(
         row = slot * 512 + (nz % 8 * 8 + ny % 8) * 8 + nx % 8
         there = (slot >= 0)[:, None] & (c < CIN)[None, :]
         values = tl.load(rows + row[:, None] * CIN + c[None, :], there, 0.0)
-        if RELU:
-            values = tl.maximum(values, 0.0).to(rows.dtype.element_ty)
-        kernel = tl.load(weight + (tap * CIN + c[:, None]) * COUT + o[None, :], (c < CIN)[:, None] & (o < COUT)[None, :], 0.0)
-        if EXACT:
-            total = tl.dot(values, kernel, total, input_precision="tf32x3")
-        else:
-            total = tl.dot(values, kernel, total)
-    if BIASED:
-        total += tl.load(bias + o, o < COUT, 0.0).to(tl.float32)[None, :]
+        values = tl.maximum(values, floor).to(rows.dtype.element_ty)
+        taps = tl.load(weight + (tap * CIN + c[:, None]) * COUT + o[None, :], (c < CIN)[:, None] & (o < COUT)[None, :], 0.0)
+        total = tl.dot(values, taps, total, input_precision="tf32x3")
+    total += tl.load(bias + o, (o < COUT) & (biased != 0), 0.0).to(tl.float32)[None, :]
     place = tl.cast(block, tl.int64) * 512 + voxel
-    if MASKED:
-        kept = tl.load(occupied + place) != 0
-        total = tl.where(kept[:, None], total, 0.0)
+    kept = tl.load(occupied + place, (voxel < 512) & (masked != 0), 1) != 0
+    total = tl.where(kept[:, None], total, 0.0)
     tl.store(out + place[:, None] * COUT + o[None, :], total.to(out.dtype.element_ty), (o < COUT)[None, :] & (voxel < 512)[:, None])
 
 
-def convolve(
-    rows: Tensor, around: Tensor, weight: Tensor, bias: Tensor | None, occupied: Tensor | None, relu: bool = False
-) -> Tensor:
+def convolve(rows: Tensor, around: Tensor, weight: Tensor, bias: Tensor | None, occupied: Tensor | None, relu: bool = False) -> Tensor:
     """Convolve rows of blocks.
 
     Args:
@@ -65,19 +64,20 @@ def convolve(
     out = rows.new_empty((blocks * VOXELS + 1, outside))
     out[-1:].zero_()
     if blocks:
-        kernel = weight.permute(2, 3, 4, 1, 0).contiguous()
+        taps = weight.permute(2, 3, 4, 1, 0).contiguous()
+        mask = around.view(torch.uint8) if occupied is None else occupied.view(torch.uint8)
         _convolve[(blocks * (VOXELS // TILE),)](
-            rows.contiguous(), around, kernel, kernel if bias is None else bias, out if occupied is None else occupied.view(torch.uint8),
-            out, blocks, CIN=inside, COUT=outside, BIN=max(16, triton.next_power_of_2(inside)), BOUT=max(16, triton.next_power_of_2(outside)),
-            BIASED=bias is not None, MASKED=occupied is not None, RELU=relu, EXACT=rows.dtype == torch.float32, TILE=TILE,
+            rows.contiguous(), around, taps, taps if bias is None else bias, mask,
+            out, int(bias is not None), int(occupied is not None), 0.0 if relu else -3e38,
+            CIN=inside, COUT=outside, BIN=_wide(inside), BOUT=_wide(outside), TILE=TILE,
         )  # fmt: skip
     return out
 
 
-@triton.jit
+@kernel("rows", "around", "gradient", "out")
 def _weigh(
     rows, around, gradient, out, blocks, share,
-    CIN: tl.constexpr, COUT: tl.constexpr, BIN: tl.constexpr, BOUT: tl.constexpr, EXACT: tl.constexpr, TILE: tl.constexpr,
+    CIN: tl.constexpr, COUT: tl.constexpr, BIN: tl.constexpr, BOUT: tl.constexpr, TILE: tl.constexpr,
 ):  # fmt: skip
     """Products of what lies at one of the 27 places beside voxels with their gradients, summed over a share of the blocks."""
     tap, part = tl.program_id(0), tl.program_id(1)
@@ -94,10 +94,7 @@ def _weigh(
         values = tl.load(rows + row[None, :] * CIN + c[:, None], (slot >= 0)[None, :] & (c < CIN)[:, None], 0.0)
         place = tl.cast(block, tl.int64) * 512 + voxel
         slopes = tl.load(gradient + place[:, None] * COUT + o[None, :], (o < COUT)[None, :] & (voxel < 512)[:, None], 0.0)
-        if EXACT:
-            total = tl.dot(values, slopes, total, input_precision="tf32x3")
-        else:
-            total = tl.dot(values, slopes, total)
+        total = tl.dot(values, slopes, total, input_precision="tf32x3")
         tile += 1
     at = ((part * 27 + tap) * CIN + c[:, None]) * COUT + o[None, :]
     tl.store(out + at, total, (c < CIN)[:, None] & (o < COUT)[None, :])
@@ -111,7 +108,7 @@ def weight_gradient(rows: Tensor, around: Tensor, gradient: Tensor) -> Tensor:
     out = rows.new_empty((parts, 27, inside, outside), dtype=torch.float32)
     _weigh[(27, parts)](
         rows.contiguous(), around, gradient.contiguous(), out, blocks, share,
-        CIN=inside, COUT=outside, BIN=max(16, triton.next_power_of_2(inside)), BOUT=max(16, triton.next_power_of_2(outside)),
-        EXACT=rows.dtype == torch.float32, TILE=64,
+        CIN=inside, COUT=outside, BIN=_wide(inside), BOUT=_wide(outside),
+        TILE=SLOPES,
     )  # fmt: skip
     return out.sum(0).view(3, 3, 3, inside, outside).permute(4, 3, 0, 1, 2).contiguous()

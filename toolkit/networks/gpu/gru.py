@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """What the GRU does between its convolutions on CUDA, a launch each (`FusionGRU.forward` in tensors, `compiled_gru.py` on the CPU)."""
 
 from __future__ import annotations
@@ -7,6 +8,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from toolkit.gpu import kernel
 from toolkit.networks.lattice import LatentVolume, LocalVolume
 
 BLOCK = 64  # rows at a time
@@ -17,7 +19,7 @@ def _tanh(x):
     return 2 / (1 + tl.exp(-2 * tl.minimum(tl.maximum(x, -15.0), 15.0))) - 1
 
 
-@triton.jit
+@kernel("state", "local", "out")
 def _average(state, count, local, weight, seen, out, rows, least, most, CHANNELS: tl.constexpr, WIDE: tl.constexpr, BLOCK: tl.constexpr):
     """The weighted running mean where the key frame sees, zero elsewhere."""
     n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
@@ -33,7 +35,7 @@ def _average(state, count, local, weight, seen, out, rows, least, most, CHANNELS
     tl.store(out + at, value, (n <= rows)[:, None] & (c < CHANNELS))
 
 
-@triton.jit
+@kernel("state", "local", "both")
 def _beside(
     place, state, count, local, seen, reset, both, rows,
     FORGET: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, BLOCK: tl.constexpr,
@@ -56,7 +58,7 @@ def _beside(
         tl.store(out + CHANNELS, value.to(both.dtype.element_ty), mask)
 
 
-@triton.jit
+@kernel("state", "raw", "update", "candidate", "out")
 def _step(
     place, state, count, raw, weight, seen, update, candidate, out, rows, least, most, held, change,
     CHANNELS: tl.constexpr, WIDE: tl.constexpr, BLOCK: tl.constexpr,
@@ -115,6 +117,5 @@ class Step:
     def update(self, update: Tensor, candidate: Tensor, channel: int, change: float, rows: Tensor) -> None:
         """H' into `rows` (M · 512 + 1, C), in place; see `compiled_gru.Step.update`."""
         given = self.place, self.state, self.count, self.raw, self.weight, self.seen
-        _step[self._grid](
-            *given, update.contiguous(), candidate.contiguous(), rows, len(self.place), self.least, self.most, channel, change, **self._sizes
-        )
+        learned = update.contiguous(), candidate.contiguous()
+        _step[self._grid](*given, *learned, rows, len(self.place), self.least, self.most, channel, change, **self._sizes)

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """What views show at voxels on CUDA, a launch a view (`Pyramid.lookup` and `unproject.look_up` in tensors)."""
 
 from __future__ import annotations
@@ -11,15 +12,17 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from toolkit.gpu import kernel
+
 BLOCK = 64  # voxels at a time
 
 
 @triton.jit
-def corners(x, y, footprint, height, width, STRIDE: tl.constexpr, LEVELS: tl.constexpr):
+def corners(x, y, footprint, height, width, levels, STRIDE: tl.constexpr):
     """Rows of the four cells about pixels in the level whose cells are nearest to a footprint, and their weights."""
-    level = tl.minimum(tl.floor(tl.log2(tl.maximum(footprint / STRIDE, 1.0)) + 0.5), LEVELS - 1.0).to(tl.int32)
+    level = tl.minimum(tl.floor(tl.log2(tl.maximum(footprint / STRIDE, 1.0)) + 0.5), levels - 1.0).to(tl.int32)
     first = tl.zeros_like(level)
-    for k in tl.static_range(LEVELS - 1):
+    for k in range(6):  # more levels than there are
         first += tl.where(level > k, (height >> k) * (width >> k), 0)
     tall, wide = height >> level, width >> level
     scale = 1.0 / (STRIDE * (1 << level).to(tl.float32))
@@ -46,35 +49,34 @@ def _read(table, out, stride, column, n, some, corner, right, below, w0, w1, w2,
     tl.store(out + n[:, None] * stride + column + c, value, mask)
 
 
-@triton.jit
+@kernel("features")
 def _shown(
-    pixels, step, footprint, features, colours, out, count, height, width, across, down, part,
-    CHANNELS: tl.constexpr, WIDE: tl.constexpr, COLOURS: tl.constexpr, FINE: tl.constexpr, FINE_LEVELS: tl.constexpr,
-    STRIDE: tl.constexpr, LEVELS: tl.constexpr, BLOCK: tl.constexpr,
+    pixels, step, footprint, features, colours, out, count, height, width, levels, down, across, fine_levels, part,
+    CHANNELS: tl.constexpr, WIDE: tl.constexpr, COLOURS: tl.constexpr, FINE: tl.constexpr, STRIDE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     some = n < count
     x, y = tl.load(pixels + 2 * n, some, 0.0), tl.load(pixels + 2 * n + 1, some, 0.0)
     size, cell = tl.load(step + n, some, 1.0), tl.load(footprint + n, some, 1.0)
     stride: tl.constexpr = CHANNELS + 2 * COLOURS
-    corner, right, below, w0, w1, w2, w3 = corners(x, y, size, height, width, STRIDE, LEVELS)
+    corner, right, below, w0, w1, w2, w3 = corners(x, y, size, height, width, levels, STRIDE)
     _read(features, out, stride, 0, n, some, corner, right, below, w0, w1, w2, w3, CHANNELS, WIDE)
-    corner, right, below, w0, w1, w2, w3 = corners(x, y, size, down, across, FINE, FINE_LEVELS)
+    corner, right, below, w0, w1, w2, w3 = corners(x, y, size, down, across, fine_levels, FINE)
     _read(colours, out, stride, CHANNELS, n, some, corner, right, below, w0, w1, w2, w3, COLOURS, 4)
-    corner, right, below, w0, w1, w2, w3 = corners(x, y, part * cell, down, across, FINE, FINE_LEVELS)
+    corner, right, below, w0, w1, w2, w3 = corners(x, y, part * cell, down, across, fine_levels, FINE)
     _read(colours, out, stride, CHANNELS + COLOURS, n, some, corner, right, below, w0, w1, w2, w3, COLOURS, 4)
 
 
-@triton.jit
+@kernel("total")
 def _spread(
-    pixels, step, slopes, total, count, height, width, stride,
-    CHANNELS: tl.constexpr, WIDE: tl.constexpr, STRIDE: tl.constexpr, LEVELS: tl.constexpr, BLOCK: tl.constexpr,
+    pixels, step, slopes, total, count, height, width, levels, stride,
+    CHANNELS: tl.constexpr, WIDE: tl.constexpr, STRIDE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Add the gradients of what was read to the rows that it was read from."""
     n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     some = n < count
     x, y, size = tl.load(pixels + 2 * n, some, 0.0), tl.load(pixels + 2 * n + 1, some, 0.0), tl.load(step + n, some, 1.0)
-    corner, right, below, w0, w1, w2, w3 = corners(x, y, size, height, width, STRIDE, LEVELS)
+    corner, right, below, w0, w1, w2, w3 = corners(x, y, size, height, width, levels, STRIDE)
     c = tl.arange(0, WIDE)[None, :]
     mask = some[:, None] & (c < CHANNELS)
     slope = tl.load(slopes + n[:, None] * stride + c, mask, 0.0)
@@ -89,9 +91,7 @@ class _Shown(torch.autograd.Function):
     """`_look_up` with gradients for the features' rows, which are summed in no fixed order."""
 
     @staticmethod
-    def forward(
-        ctx: Any, views: Sequence[Any], pixels: Tensor, step: Tensor, footprint: Tensor, part: float, *rows: Tensor
-    ) -> Tensor:
+    def forward(ctx: Any, views: Sequence[Any], pixels: Tensor, step: Tensor, footprint: Tensor, part: float, *rows: Tensor) -> Tensor:
         ctx.save_for_backward(pixels, step)
         ctx.shapes = [(one.features.rows.shape, one.features.sizes, one.features.stride) for one in views]
         return _look_up(views, pixels, step, footprint, part)
@@ -106,8 +106,8 @@ class _Shown(torch.autograd.Function):
             total = gradient.new_zeros(shape)
             if len(step):
                 _spread[(triton.cdiv(len(step), BLOCK),)](
-                    pixels[number], step, gradient[number], total, len(step), *sizes[0], gradient.shape[2],
-                    CHANNELS=shape[1], WIDE=triton.next_power_of_2(shape[1]), STRIDE=stride, LEVELS=len(sizes), BLOCK=BLOCK,
+                    pixels[number], step, gradient[number], total, len(step), *sizes[0], len(sizes), gradient.shape[2],
+                    CHANNELS=shape[1], WIDE=triton.next_power_of_2(shape[1]), STRIDE=stride, BLOCK=BLOCK,
                 )  # fmt: skip
             totals.append(total)
         return None, None, None, None, None, *totals
@@ -133,8 +133,8 @@ def _look_up(views: Sequence[Any], pixels: Tensor, step: Tensor, footprint: Tens
         fine = view.colours
         _shown[(triton.cdiv(count, BLOCK),)](
             pixels[number], step, footprint[number], view.features.rows, fine.rows, out[number], count,
-            *view.features.sizes[0], fine.sizes[0][1], fine.sizes[0][0], part,
-            CHANNELS=channels, WIDE=triton.next_power_of_2(channels), COLOURS=colours, FINE=fine.stride, FINE_LEVELS=len(fine.sizes),
-            STRIDE=view.features.stride, LEVELS=len(view.features.sizes), BLOCK=BLOCK,
+            *view.features.sizes[0], len(view.features.sizes), *fine.sizes[0], len(fine.sizes), part,
+            CHANNELS=channels, WIDE=triton.next_power_of_2(channels), COLOURS=colours, FINE=fine.stride, STRIDE=view.features.stride,
+            BLOCK=BLOCK,
         )  # fmt: skip
     return out

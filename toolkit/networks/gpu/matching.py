@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """The plane sweep on CUDA: costs of planes, semi-global matching, likelihoods and their table, a launch each (`compiled.py` on the CPU).
 
 Volumes are (P, D), pixel by pixel with the planes next to each other in memory, since all that follows goes along planes. Results equal
@@ -11,14 +12,19 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from toolkit.gpu import kernel
+
 CHANNELS = 21  # of a descriptor, colours first
 COLOURS = 3
+TILE = (32, 16)  # pixels and planes that are compared at once
+PLANES = 256  # of a pixel at least, with those that there are not: more planes are compiled for once more
+PIXELS = 4  # whose planes are summed at once
 
 
-@triton.jit
+@kernel("total", "least", "count", "out")
 def _cost(
-    own, rays, inverses, picture, intrinsics, sizes, poses, view, total, least, count, out, pixels, planes, height, width, gain, unknown,
-    FIRST: tl.constexpr, LAST: tl.constexpr, CHANNELS: tl.constexpr, COLOURS: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr,
+    own, rays, inverses, picture, intrinsics, sizes, poses, view, views, total, least, count, out, pixels, planes, height, width, gain,
+    unknown, CHANNELS: tl.constexpr, COLOURS: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr,
 ):  # fmt: skip
     """One other view: what differs at planes, added up; the last one makes the cost of all."""
     p = tl.program_id(0) * BP + tl.arange(0, BP)
@@ -72,17 +78,15 @@ def _cost(
     place = p[:, None] * planes + d[None, :]
     inside = is_pixel[:, None] & is_plane[None, :]
     added, lowest, looked = tl.where(seen, differs, 0.0), tl.where(seen, differs, 1.0), seen.to(tl.float32)
-    if not FIRST:
-        added += tl.load(total + place, inside, 0.0)
-        lowest = tl.minimum(lowest, tl.load(least + place, inside, 1.0))
-        looked += tl.load(count + place, inside, 0.0)
-    if LAST:
-        both = 0.5 * (added / tl.maximum(looked, 1.0) + lowest)
-        tl.store(out + place, tl.where(looked > 0, both, unknown), inside)
-    else:
-        tl.store(total + place, added, inside)
-        tl.store(least + place, lowest, inside)
-        tl.store(count + place, looked, inside)
+    later, last, more = inside & (view > 1), inside & (view + 1 == views), inside & (view + 1 < views)
+    added += tl.load(total + place, later, 0.0)
+    lowest = tl.minimum(lowest, tl.load(least + place, later, 1.0))
+    looked += tl.load(count + place, later, 0.0)
+    both = 0.5 * (added / tl.maximum(looked, 1.0) + lowest)
+    tl.store(out + place, tl.where(looked > 0, both, unknown), last)
+    tl.store(total + place, added, more)
+    tl.store(least + place, lowest, more)
+    tl.store(count + place, looked, more)
 
 
 def costs(
@@ -98,23 +102,21 @@ def costs(
     pixels, planes = len(rays), len(inverses)
     intrinsics, sizes, poses, rays, own = (values.contiguous() for values in (intrinsics, sizes, poses, rays, own))
     out = rays.new_empty((pixels, planes))
-    last = len(described) - 1
-    total, least, count = (rays.new_empty((pixels, planes)) if last > 1 else out for _ in range(3))
+    views = len(described)
+    total, least, count = (rays.new_empty((pixels, planes)) if views > 2 else out for _ in range(3))
     if pixels == 0:
         return out
-    bp, bd = 32, 16
-    grid = (triton.cdiv(pixels, bp), triton.cdiv(planes, bd))
-    for view in range(1, last + 1):
+    grid = (triton.cdiv(pixels, TILE[0]), triton.cdiv(planes, TILE[1]))
+    for view in range(1, views):
         picture = described[view].contiguous()
         _cost[grid](
-            own, rays, inverses, picture, intrinsics, sizes, poses, view, total, least, count, out, pixels, planes,
-            picture.shape[1], picture.shape[2], gain, unknown,
-            FIRST=view == 1, LAST=view == last, CHANNELS=CHANNELS, COLOURS=COLOURS, BP=bp, BD=bd,
+            own, rays, inverses, picture, intrinsics, sizes, poses, view, views, total, least, count, out, pixels, planes,
+            picture.shape[1], picture.shape[2], gain, unknown, CHANNELS=CHANNELS, COLOURS=COLOURS, BP=TILE[0], BD=TILE[1],
         )  # fmt: skip
     return out
 
 
-@triton.jit
+@kernel("cost", "out")
 def _path(cost, out, height, width, planes, small, large, BD: tl.constexpr):
     """The cheapest paths along one line of pixels in one of four directions."""
     line, way = tl.program_id(0), tl.program_id(1)
@@ -150,7 +152,7 @@ def _path(cost, out, height, width, planes, small, large, BD: tl.constexpr):
             i += 1
 
 
-@triton.jit
+@kernel("paths", "out")
 def _likely(paths, out, pixels, planes, scale, BP: tl.constexpr, BD: tl.constexpr):
     """The four ways' mean, and its softmax along planes."""
     p = (tl.program_id(0) * BP + tl.arange(0, BP)).to(tl.int64)
@@ -165,14 +167,17 @@ def _likely(paths, out, pixels, planes, scale, BP: tl.constexpr, BD: tl.constexp
     tl.store(out + place, likely / tl.where(p < pixels, tl.sum(likely, 1), 1.0)[:, None], inside)
 
 
+def wide(planes: int) -> int:
+    """A power of two that holds the planes, the same for nearly all."""
+    return max(PLANES, int(triton.next_power_of_2(planes)))
+
+
 def _paths(volume: Tensor, small: float, large: float) -> Tensor:
     """(h, w, D), contiguous → (4, h, w, D): down, up, right, left."""
     height, width, planes = volume.shape
     paths = volume.new_empty((4, height, width, planes))
     # One warp a line: what goes from plane to plane stays within it.
-    _path[(max(height, width), 4)](
-        volume, paths, height, width, planes, small, large, BD=max(32, triton.next_power_of_2(planes)), num_warps=1
-    )
+    _path[(max(height, width), 4)](volume, paths, height, width, planes, small, large, BD=wide(planes), num_warps=1)
     return paths
 
 
@@ -187,13 +192,12 @@ def distribution(cost: Tensor, small: float, large: float, temperature: float) -
     volume = cost.permute(1, 2, 0).contiguous()
     height, width, planes = volume.shape
     paths, out = _paths(volume, small, large), torch.empty_like(volume)
-    bd = triton.next_power_of_2(planes)
-    bp = max(1, 1024 // bd)
-    _likely[(triton.cdiv(height * width, bp),)](paths, out, height * width, planes, -1 / temperature, BP=bp, BD=bd)
+    grid = (triton.cdiv(height * width, PIXELS),)
+    _likely[grid](paths, out, height * width, planes, -1 / temperature, BP=PIXELS, BD=wide(planes))
     return out.permute(2, 0, 1)
 
 
-@triton.jit
+@kernel("likely", "out")
 def _tabled(likely, out, pixels, planes, step, window: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr):
     """How likely the surface is nearer, the integral of that, and the most that lies about one depth."""
     p = (tl.program_id(0) * BP + tl.arange(0, BP)).to(tl.int64)
@@ -220,7 +224,6 @@ def table(likely: Tensor, step: float, peak: int) -> Tensor:
     volume = likely.permute(1, 2, 0).contiguous()
     height, width, planes = volume.shape
     out = volume.new_empty((height, width, planes, 3))
-    bd = triton.next_power_of_2(planes)
-    bp = max(1, 1024 // bd)
-    _tabled[(triton.cdiv(height * width, bp),)](volume, out, height * width, planes, step, min(2 * peak + 1, planes), BP=bp, BD=bd)
+    grid = (triton.cdiv(height * width, PIXELS),)
+    _tabled[grid](volume, out, height * width, planes, step, min(2 * peak + 1, planes), BP=PIXELS, BD=wide(planes))
     return out.permute(3, 2, 0, 1)

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """From corners of a lattice to the local network's first rows on CUDA, without gradients: two launches (`model._observe` in tensors)."""
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from toolkit.gpu import kernel
 from toolkit.networks.gpu.lookup import corners
 from toolkit.networks.gpu.reading import local, sighted
 
@@ -47,7 +49,7 @@ def _seen(x, y, z, size, poses, lenses, sizes, view, near, far):
     return tl.where(visible, u, 0.0), tl.where(visible, v, 0.0), visible, tl.where(visible, footprint, 1.0)
 
 
-@triton.jit
+@kernel("rows", "keys", "table", "out")
 def _choose(
     rows, keys, poses, lenses, sizes, table, out, count, height, width, planes, lowest, step,
     voxel, extent, half, cx, cy, cz, shell, bx, by, bz, near, far, truncation, hidden,
@@ -77,7 +79,10 @@ def _fetch(table, corner, right, below, w0, w1, w2, w3, mask, CHANNELS: tl.const
 
 
 @triton.jit
-def _projected(mean, variance, several, weight, first, whole, INPUTS: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, HIDDEN: tl.constexpr):
+def _projected(
+    mean, variance, several, weight, first, whole,
+    INPUTS: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, HIDDEN: tl.constexpr,
+):  # fmt: skip
     """What a group of channels (BLOCK, WIDE), whose first one is `first` of `whole`, adds to the local network's first rows."""
     c, h = tl.arange(0, WIDE)[:, None], tl.arange(0, HIDDEN)[None, :]
     here = c < CHANNELS
@@ -95,24 +100,25 @@ def _atanh(x):
     return 0.5 * tl.log((1 + x) / (1 - x))
 
 
-@triton.jit
+@kernel("rows", "keys", "table", "features", "projected", "start", "counts", "weights")
 def _observe(
     rows, keys, poses, lenses, sizes, table, features, colours, weight, bias, projected, start, counts, weights,
-    count, height, width, planes, lowest, step, voxel, extent, half, cx, cy, cz, shell, near, far, truncation, hidden, blind,
-    tall, wide, cells, down, across, pixels, part, gain,
-    VIEWS: tl.constexpr, SHELL: tl.constexpr, VARIANCE: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, SAMPLED: tl.constexpr,
-    STRIDE: tl.constexpr, LEVELS: tl.constexpr, FINE: tl.constexpr, FINE_LEVELS: tl.constexpr, HIDDEN: tl.constexpr, BLOCK: tl.constexpr,
+    views_of, count, height, width, planes, lowest, step, voxel, extent, half, cx, cy, cz, shell, near, far, truncation, hidden, blind,
+    tall, wide, levels, cells, down, across, fine_levels, pixels, part, gain,
+    SHELL: tl.constexpr, VARIANCE: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, SAMPLED: tl.constexpr,
+    STRIDE: tl.constexpr, FINE: tl.constexpr, HIDDEN: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """All that is known of corners: projected evidence, what latents start from, how many views see them, and how much that weighs."""
     n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     some = n < count
     row = tl.load(rows + n, some, 0)
-    u, v, w, x, y, z, size = _corner(row, keys, voxel, extent, half, cx, cy, cz, shell, some, SHELL)
+    _, _, _, x, y, z, size = _corner(row, keys, voxel, extent, half, cx, cy, cz, shell, some, SHELL)
     signed, clear, sure = sighted(x, y, z, truncation * size, table, poses, lenses, sizes, height, width, planes, lowest, step, some)
     # How many views see it, how large it is there, and how far their directions lie apart.
     views, mark = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
     mx, my, mz = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
-    for k in tl.static_range(VIEWS):
+    k = 0
+    while k < views_of:  # not unrolled: compiling that takes a quarter of a minute
         _, _, visible, footprint = _seen(x, y, z, size, poses, lenses, sizes, k, near, far)
         dx, dy, dz = x - tl.load(poses + 16 * k + 3), y - tl.load(poses + 16 * k + 7), z - tl.load(poses + 16 * k + 11)
         length = tl.maximum(tl.sqrt(dx * dx + dy * dy + dz * dz), 1e-12)
@@ -121,15 +127,18 @@ def _observe(
         mx += tl.where(visible, dx / length, 0.0)
         my += tl.where(visible, dy / length, 0.0)
         mz += tl.where(visible, dz / length, 0.0)
+        k += 1
     share = 1 / tl.maximum(views, 1.0)
     mx, my, mz = mx * share, my * share, mz * share
     apart = tl.zeros((BLOCK,), tl.float32)
-    for k in tl.static_range(VIEWS):
-        _, _, visible, footprint = _seen(x, y, z, size, poses, lenses, sizes, k, near, far)
+    k = 0
+    while k < views_of:
+        _, _, visible, _ = _seen(x, y, z, size, poses, lenses, sizes, k, near, far)
         dx, dy, dz = x - tl.load(poses + 16 * k + 3), y - tl.load(poses + 16 * k + 7), z - tl.load(poses + 16 * k + 11)
         length = tl.maximum(tl.sqrt(dx * dx + dy * dy + dz * dz), 1e-12)
         gx, gy, gz = dx / length - mx, dy / length - my, dz / length - mz
         apart += tl.where(visible, (gx * gx + gy * gy + gz * gz) * share, 0.0)
+        k += 1
     footprint_mean = tl.exp(mark * share)
     move = footprint_mean * tl.sqrt(tl.where(views == 1, 0.0, apart))
     several = (views >= 2).to(tl.float32)
@@ -137,17 +146,19 @@ def _observe(
     mean, deep = tl.zeros((BLOCK, WIDE), tl.float32), tl.zeros((BLOCK, WIDE), tl.float32)
     fine, fine_deep = tl.zeros((BLOCK, 16), tl.float32), tl.zeros((BLOCK, 16), tl.float32)
     whole, whole_deep = tl.zeros((BLOCK, 16), tl.float32), tl.zeros((BLOCK, 16), tl.float32)
-    for k in tl.static_range(2 * VIEWS):
-        px, py, visible, footprint = _seen(x, y, z, size, poses, lenses, sizes, k % VIEWS, near, far)
+    k = 0
+    while k < 2 * views_of:
+        view = k % views_of
+        px, py, visible, footprint = _seen(x, y, z, size, poses, lenses, sizes, view, near, far)
         visible = visible & some
         each = tl.where(visible, share, 0.0)[:, None]
-        corner, right, below, w0, w1, w2, w3 = corners(px, py, move, tall, wide, STRIDE, LEVELS)
-        shown = _fetch(features + (k % VIEWS) * cells, corner, right, below, w0, w1, w2, w3, visible, CHANNELS, WIDE)
-        corner, right, below, w0, w1, w2, w3 = corners(px, py, move, down, across, FINE, FINE_LEVELS)
-        shown_fine = _fetch(colours + (k % VIEWS) * pixels, corner, right, below, w0, w1, w2, w3, visible, 3, 16)
-        corner, right, below, w0, w1, w2, w3 = corners(px, py, part * footprint, down, across, FINE, FINE_LEVELS)
-        shown_whole = _fetch(colours + (k % VIEWS) * pixels, corner, right, below, w0, w1, w2, w3, visible, 3, 16)
-        if k < VIEWS:
+        corner, right, below, w0, w1, w2, w3 = corners(px, py, move, tall, wide, levels, STRIDE)
+        shown = _fetch(features + view * cells, corner, right, below, w0, w1, w2, w3, visible, CHANNELS, WIDE)
+        corner, right, below, w0, w1, w2, w3 = corners(px, py, move, down, across, fine_levels, FINE)
+        shown_fine = _fetch(colours + view * pixels, corner, right, below, w0, w1, w2, w3, visible, 3, 16)
+        corner, right, below, w0, w1, w2, w3 = corners(px, py, part * footprint, down, across, fine_levels, FINE)
+        shown_whole = _fetch(colours + view * pixels, corner, right, below, w0, w1, w2, w3, visible, 3, 16)
+        if k < views_of:
             mean += shown * each
             fine += shown_fine * each
             whole += shown_whole * each
@@ -155,6 +166,7 @@ def _observe(
             deep += (shown - mean) * (shown - mean) * each
             fine_deep += (shown_fine - fine) * (shown_fine - fine) * each
             whole_deep += (shown_whole - whole) * (shown_whole - whole) * each
+        k += 1
     kept = (views != 1)[:, None] & VARIANCE
     deep, fine_deep, whole_deep = tl.where(kept, deep, 0.0), tl.where(kept, fine_deep, 0.0), tl.where(kept, whole_deep, 0.0)
     total: tl.constexpr = CHANNELS + 6
@@ -196,12 +208,12 @@ class Observer:
         )
         self.table = swept.table.permute(2, 3, 1, 0).contiguous()
         self.swept, self.views, self.numbers = swept, views, numbers
-        self.near, self.far = max(near, 0.0), far
+        self.near, self.far = float(max(near, 0.0)), float(far)
         self.features, self.colours = (torch.stack(rows) for rows in zip(*((v.features.rows, v.colours.rows) for v in views), strict=True))
 
     def _space(self, lattice: Any) -> tuple[float, ...]:
         space = lattice.space
-        return lattice.voxel, space.extent, space.half, *space.centre, space.shell
+        return tuple(float(value) for value in (lattice.voxel, space.extent, space.half, *space.centre, space.shell))
 
     def choose(self, lattice: Any, keys: Tensor, rows: Tensor | None) -> Tensor:
         """(N,) int64, of the corners `rows` of blocks (M, 3), None: all, those that the key frame sees and that may be open."""
@@ -229,11 +241,11 @@ class Observer:
             truncation, least, blind, gain, part = self.numbers
             _observe[(triton.cdiv(count, BLOCK),)](
                 rows, keys, self.poses, self.lenses, self.sizes, self.table, self.features, self.colours, layer.weight, layer.bias,
-                projected, start, counts, weights, count, *self.table.shape[:3], self.swept.lowest, self.swept.step, *self._space(lattice),
-                self.near, self.far, truncation, least, blind, *coarse.sizes[0], self.features[0].numel(), *fine.sizes[0],
-                self.colours[0].numel(), part, gain,
-                VIEWS=len(self.views), SHELL=lattice.space.shell > 0, VARIANCE=variance, CHANNELS=channels,
-                WIDE=max(16, triton.next_power_of_2(channels)), SAMPLED=sampled, STRIDE=coarse.stride, LEVELS=len(coarse.sizes),
-                FINE=fine.stride, FINE_LEVELS=len(fine.sizes), HIDDEN=hidden, BLOCK=BLOCK,
+                projected, start, counts, weights, len(self.views), count, *self.table.shape[:3], self.swept.lowest,
+                self.swept.step, *self._space(lattice), self.near, self.far, truncation, least, blind,
+                *coarse.sizes[0], len(coarse.sizes), self.features[0].numel(), *fine.sizes[0], len(fine.sizes), self.colours[0].numel(),
+                part, gain,
+                SHELL=lattice.space.shell > 0, VARIANCE=variance, CHANNELS=channels, WIDE=max(16, triton.next_power_of_2(channels)),
+                SAMPLED=sampled, STRIDE=coarse.stride, FINE=fine.stride, HIDDEN=hidden, BLOCK=BLOCK,
             )  # fmt: skip
         return projected, start, counts, weights

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """What sweeps and witnesses are asked on CUDA: tables read between pixels and planes (`Sweep.look`, `witness.py` in tensors)."""
 
 from __future__ import annotations
@@ -10,7 +11,11 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from toolkit.gpu import kernel
+from toolkit.networks.gpu import matching
+
 BLOCK = 128
+TILE = (16, 32)  # rays and planes at once
 
 
 @triton.jit
@@ -75,7 +80,7 @@ def sighted(x, y, z, truncation, table, pose, lens, size, height, width, planes,
     return signed, tl.minimum(tl.maximum(1 - hidden, 0.0), 1.0), tl.minimum(tl.maximum(sure, 0.0), 1.0)
 
 
-@triton.jit
+@kernel("points", "table", "out")
 def _look(points, truncation, table, pose, lens, size, out, count, height, width, planes, lowest, step, BLOCK: tl.constexpr):
     n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     some = n < count
@@ -118,7 +123,7 @@ def _asked(x, y, z, says, pose, lens, size, height, width, planes, lowest, step,
     return _between(says, left, right, fx, top, below, fy, low, high, fz, width, planes, seen, 1), seen
 
 
-@triton.jit
+@kernel("points", "says")
 def _confirmed(points, says, pose, lens, size, out, count, height, width, planes, lowest, step, BLOCK: tl.constexpr):
     """Sums of what is said of places and of how many are seen, one pair a block. Places that are not numbers are not seen."""
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -129,10 +134,10 @@ def _confirmed(points, says, pose, lens, size, out, count, height, width, planes
     tl.store(out + 2 * tl.program_id(0) + 1, tl.sum(seen.to(tl.float32), 0))
 
 
-@triton.jit
+@kernel("says", "total", "count")
 def _add(
-    rays, inverses, origin, says, pose, lens, size, belief, total, count, rows, asked, height, width, planes, lowest, step,
-    FIRST: tl.constexpr, LAST: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr,
+    rays, inverses, origin, says, pose, lens, size, beliefs, number, witnesses, total, count, rows, asked, height, width, planes, lowest,
+    step, BP: tl.constexpr, BD: tl.constexpr,
 ):  # fmt: skip
     """One more witness's part of what is said along rays; the last one makes it the mean."""
     p = tl.program_id(0) * BP + tl.arange(0, BP)
@@ -145,15 +150,11 @@ def _add(
     z = tl.load(rays + 3 * p + 2, is_row, 0.0)[:, None] * far + tl.load(origin + 2)
     said, seen = _asked(x, y, z, says, pose, lens, size, height, width, planes, lowest, step, inside)
     place = p[:, None] * asked + d[None, :]
-    added, looked = tl.where(seen, said * tl.load(belief), 0.0), seen.to(tl.float32)
-    if not FIRST:
-        added += tl.load(total + place, inside, 0.0)
-        looked += tl.load(count + place, inside, 0.0)
-    if LAST:
-        tl.store(total + place, added / tl.maximum(looked, 1.0), inside)
-    else:
-        tl.store(total + place, added, inside)
-        tl.store(count + place, looked, inside)
+    added, looked = tl.where(seen, said * tl.load(beliefs + number), 0.0), seen.to(tl.float32)
+    added += tl.load(total + place, inside & (number > 0), 0.0)
+    looked += tl.load(count + place, inside & (number > 0), 0.0)
+    tl.store(total + place, tl.where(number + 1 == witnesses, added / tl.maximum(looked, 1.0), added), inside)
+    tl.store(count + place, looked, inside)
 
 
 def _of(witness: Any) -> tuple[Any, ...]:
@@ -178,18 +179,17 @@ def mean(rays: Tensor, inverses: Tensor, origin: Tensor, witnesses: Sequence[Any
     total = rays.new_empty((len(rays), len(inverses)))
     count = torch.empty_like(total)
     rays, origin, beliefs = rays.contiguous(), origin.contiguous(), beliefs.contiguous()
-    bp, bd = 16, 32
-    grid = (triton.cdiv(len(rays), bp), triton.cdiv(len(inverses), bd))
+    grid = (triton.cdiv(len(rays), TILE[0]), triton.cdiv(len(inverses), TILE[1]))
     for number, one in enumerate(witnesses):
         says, pose, lens, size, shape = _of(one)
         _add[grid](
-            rays, inverses, origin, says, pose, lens, size, beliefs[number:], total, count, len(rays), len(inverses), *shape,
-            one.lowest, one.step, FIRST=number == 0, LAST=number + 1 == len(witnesses), BP=bp, BD=bd,
+            rays, inverses, origin, says, pose, lens, size, beliefs, number, len(witnesses), total, count, len(rays), len(inverses), *shape,
+            one.lowest, one.step, BP=TILE[0], BD=TILE[1],
         )  # fmt: skip
     return total
 
 
-@triton.jit
+@kernel("table", "out")
 def _witness(table, out, pixels, planes, gain, against, ABOUT: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr):
     p = (tl.program_id(0) * BP + tl.arange(0, BP)).to(tl.int64)[:, None]
     d = tl.arange(0, BD)[None, :]
@@ -205,13 +205,13 @@ def says(table: Tensor, gain: float, against: float, about: int) -> Tensor:
     rows = table.permute(2, 3, 1, 0).contiguous()
     height, width, planes = rows.shape[:3]
     out = rows.new_empty((height, width, planes))
-    bd = triton.next_power_of_2(planes)
-    bp = max(1, 1024 // bd)
-    _witness[(triton.cdiv(height * width, bp),)](rows, out, height * width, planes, gain, against, ABOUT=about, BP=bp, BD=bd)
+    grid = (triton.cdiv(height * width, matching.PIXELS),)
+    sizes = {"ABOUT": about, "BP": matching.PIXELS, "BD": matching.wide(planes)}
+    _witness[grid](rows, out, height * width, planes, gain, against, **sizes)
     return out.permute(2, 0, 1)
 
 
-@triton.jit
+@kernel("table", "rays", "out")
 def _surest(table, rays, inverses, origin, out, pixels, planes, least, BP: tl.constexpr, BD: tl.constexpr):
     p = tl.program_id(0) * BP + tl.arange(0, BP)
     d = tl.arange(0, BD)[None, :]
@@ -232,7 +232,6 @@ def surest(table: Tensor, rays: Tensor, inverses: Tensor, origin: Tensor, least:
     rows, rays, origin = table.permute(2, 3, 1, 0).contiguous(), rays.contiguous(), origin.contiguous()
     planes = rows.shape[2]
     out = torch.empty_like(rays)
-    bd = triton.next_power_of_2(planes)
-    bp = max(1, 1024 // bd)
-    _surest[(triton.cdiv(len(rays), bp),)](rows, rays, inverses, origin, out, len(rays), planes, least, BP=bp, BD=bd)
+    sizes = {"BP": matching.PIXELS, "BD": matching.wide(planes)}
+    _surest[(triton.cdiv(len(rays), matching.PIXELS),)](rows, rays, inverses, origin, out, len(rays), planes, least, **sizes)
     return out

@@ -102,7 +102,7 @@ class TrainSettings:
     threads: int | None = None
     reuse: int = 4  # steps that one scene serves
     window: int = 8  # scenes that take turns
-    start_from: str | None = None  # weights (safetensors) to start from
+    start_from: str | None = None  # weights (safetensors) to start from; shipped: those that come with the toolkit
     pretrained: bool = False  # ImageNet start of the encoder; wants model: {encoder: lite0} and the package that holds the weights
     model: dict[str, Any] = default(default_factory=dict)  # what differs from the networks' own defaults
     sources: list[SourceSettings] = default(default_factory=lambda: [SourceSettings()])

@@ -10,7 +10,7 @@ import torch
 
 from toolkit.errors import InputError
 from toolkit.networks.model import NerfusionModel
-from toolkit.networks.weights import config_from, load_model, save_model
+from toolkit.networks.weights import SHIPPED, config_from, load_model, save_model
 from toolkit.progress import SILENT, Progress
 from toolkit.training.nerfusion.average import Average
 from toolkit.training.nerfusion.caution import MOST, Caution, where_not_finite
@@ -35,7 +35,7 @@ def make_model(settings: TrainSettings) -> NerfusionModel:
         InputError: a setting of the networks is not known, or the weights cannot be read.
     """
     if settings.start_from is not None:
-        return load_model(settings.start_from).train()
+        return load_model(SHIPPED if settings.start_from == "shipped" else settings.start_from).train()
     try:
         config = config_from(dict(settings.model))
     except ValueError as error:

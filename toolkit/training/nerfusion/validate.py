@@ -39,13 +39,12 @@ class Predicted:
 
 
 @torch.no_grad()
-def predict(
-    model: NerfusionModel, case: Case, device: torch.device, prune: bool, levels: int = 1, witnesses: bool = False
-) -> Predicted:
+def predict(model: NerfusionModel, case: Case, device: torch.device, prune: bool, levels: int = 1, witnesses: bool = False) -> Predicted:
     """Direct inference of one case: the local volume of the nearest key frame, and the volumes of all key frames fused.
 
-    With `witnesses` key frames are each other's. Returns numbers `psnr_local`, `psnr_fused` (coarsest level), `psnr_fused_1` (half its voxel size), `psnr_nearest` (the nearest
-    training picture shown unchanged), and with true depth `depth_error` (median, relative) and `depth_likelihood` of the finest one.
+    With `witnesses` key frames are each other's. Numbers are `psnr_local`, `psnr_fused` (coarsest level), `psnr_fused_1` (half its voxel
+    size), `psnr_nearest` (the nearest training picture shown unchanged), and with true depth `depth_error` (median, relative) and
+    `depth_likelihood` of the finest one.
     """
     sample = case.sample.to(device)
     target = int(sample.targets[0, 0])

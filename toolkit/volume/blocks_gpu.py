@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
 """Masks and rows of blocks on CUDA: what lies about lattice corners, and values on a finer lattice (`volume/edit.py` in tensors)."""
 
 from __future__ import annotations
@@ -9,10 +10,13 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from toolkit.gpu import kernel
 from toolkit.volume.topology import VOXELS, Topology
 
+TILE = 128  # voxels of a block at a time
 
-@triton.jit
+
+@kernel("mask", "around", "out")
 def _pool(mask, around, out, FIRST: tl.constexpr, WIDTH: tl.constexpr, EVERY: tl.constexpr):
     """Whether any, or every, row among the offsets FIRST … FIRST + WIDTH − 1 along each axis is set; one block."""
     block = tl.program_id(0)
@@ -37,7 +41,7 @@ def pooled(topology: Topology, mask: Tensor, first: int, width: int, every: bool
     return out
 
 
-@triton.jit
+@kernel("rows", "table", "out")
 def _resample(
     rows, nodes, table, keys, out, ox, oy, oz, sx, sy, sz, scale, CHANNELS: tl.constexpr, WIDE: tl.constexpr, TILE: tl.constexpr
 ):  # fmt: skip
@@ -82,14 +86,14 @@ def resample(topology: Topology, nodes: Tensor, rows: Sequence[Tensor], new_keys
         made = flat.new_empty((len(keys) * VOXELS + 1, flat.shape[1]))
         made[-1:].zero_()
         if len(keys):
-            sizes = {"CHANNELS": flat.shape[1], "WIDE": triton.next_power_of_2(flat.shape[1]), "TILE": 128}
+            sizes = {"CHANNELS": flat.shape[1], "WIDE": triton.next_power_of_2(flat.shape[1]), "TILE": TILE}
             ends = *topology.table_origin, *topology.table_size
-            _resample[(len(keys) * 4,)](flat, nodes, table, keys, made, *ends, scale, **sizes)
+            _resample[(len(keys) * (VOXELS // TILE),)](flat, nodes, table, keys, made, *ends, scale, **sizes)
         out.append(made.view(-1, *values.shape[1:]))
     return out
 
 
-@triton.jit
+@kernel("rows", "out")
 def _take(rows, count, slots, out, out_count, CHANNELS: tl.constexpr, WIDE: tl.constexpr, TILE: tl.constexpr):
     """Rows and counts of one block, zero where there is none."""
     parts: tl.constexpr = 512 // TILE
@@ -109,12 +113,12 @@ def take(rows: Tensor, count: Tensor, slots: Tensor) -> tuple[Tensor, Tensor]:
     out, out_count = rows.new_empty((len(slots) * VOXELS + 1, channels)), rows.new_empty(len(slots) * VOXELS)
     out[-1:].zero_()
     if len(slots):
-        sizes = {"CHANNELS": channels, "WIDE": triton.next_power_of_2(channels), "TILE": 128}
-        _take[(len(slots) * 4,)](rows.contiguous(), count, slots, out, out_count, **sizes)
+        sizes = {"CHANNELS": channels, "WIDE": triton.next_power_of_2(channels), "TILE": TILE}
+        _take[(len(slots) * (VOXELS // TILE),)](rows.contiguous(), count, slots, out, out_count, **sizes)
     return out, out_count
 
 
-@triton.jit
+@kernel("rows", "values")
 def _put(rows, count, slots, values, values_count, changed, CHANNELS: tl.constexpr, WIDE: tl.constexpr, TILE: tl.constexpr):
     """Rows and counts of one block, where they have changed, to where they are kept."""
     parts: tl.constexpr = 512 // TILE
@@ -131,12 +135,12 @@ def _put(rows, count, slots, values, values_count, changed, CHANNELS: tl.constex
 def put(rows: Tensor, count: Tensor, slots: Tensor, values: Tensor, values_count: Tensor, changed: Tensor) -> None:
     """The way back of `take`, of the corners `changed` (M · 512,) alone, in place."""
     if len(slots):
-        sizes = {"CHANNELS": rows.shape[1], "WIDE": triton.next_power_of_2(rows.shape[1]), "TILE": 128}
+        sizes = {"CHANNELS": rows.shape[1], "WIDE": triton.next_power_of_2(rows.shape[1]), "TILE": TILE}
         given = values.contiguous(), values_count.contiguous(), changed.contiguous().view(torch.uint8)
-        _put[(len(slots) * 4,)](rows, count, slots, *given, **sizes)
+        _put[(len(slots) * (VOXELS // TILE),)](rows, count, slots, *given, **sizes)
 
 
-@triton.jit
+@kernel("projected", "starts", "latent", "start")
 def _lay(
     where, projected, starts, counts, weights, latent, start, count, weight, marks, corners, threshold,
     HIDDEN: tl.constexpr, BELOW: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, BLOCK: tl.constexpr,
