@@ -1,8 +1,8 @@
 """The engine of a fit on CUDA: a step is some thirty launches whose shapes are known beforehand, recorded once and replayed.
 
-What `Optimiser._deferred` does with flat lists of samples is done here ray by ray (`triton_march` and the other modules of that name); the decoder's
-layers are products of matrices. Nothing waits for the GPU but a look at every `LOOK`-th step for what was not finite: such a step moves
-nothing.
+What `Optimiser._deferred` does with flat lists of samples is done here ray by ray (`triton_march` and the other modules of that name);
+the decoder's layers are products of matrices. Nothing waits for the GPU but a look at every `LOOK`-th step for what was not finite: such
+a step moves nothing.
 """
 
 from __future__ import annotations
