@@ -164,10 +164,10 @@ def _torch() -> Check:
 
     threads = f"{torch.get_num_threads()} threads"
     if torch.cuda.is_available():
-        from toolkit.render.on_cuda import runs_triton
+        from toolkit.gpu import runs_kernels
 
         seen = f"CUDA, {torch.cuda.get_device_name(0)}; CPU with {threads}"
-        if runs_triton(torch.device("cuda")):
+        if runs_kernels(torch.device("cuda")):
             return Check("torch device", OK, seen)
         return Check("torch device", WARN, f"{seen}; without Triton for it fits take forty times as long", "pip install triton")
     return Check("torch device", OK, f"CPU with {threads}")

@@ -16,6 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+OLDEST = 7  # compute capability
+
 
 @cache
 def _there() -> bool:
@@ -25,6 +27,11 @@ def _there() -> bool:
 def there(values: Tensor) -> bool:
     """Whether values of any kind lie where the kernels are."""
     return values.is_cuda and _there()
+
+
+def runs_kernels(device: torch.device) -> bool:
+    """Whether kernels run on `device`: on CUDA, on a card that is no older than Triton's oldest."""
+    return device.type == "cuda" and _there() and torch.cuda.get_device_capability(device)[0] >= OLDEST
 
 
 def fits(*values: Tensor) -> bool:

@@ -1,4 +1,4 @@
-"""What the engines of a machine reach: fits of one capture within seconds of the clock, and the time of a ray of a step and of a picture."""
+"""What the engines of a machine reach: fits within seconds of the clock, and the time of a ray of a step and of a picture."""
 
 from __future__ import annotations
 
@@ -94,7 +94,8 @@ def picture_milliseconds(field: Field, lens: Intrinsics, pose: Array, engine: st
 
 def engine_table(rows: list[dict[str, Any]]) -> str:
     """The rows in Markdown."""
-    lines = ["| engine | budget | PSNR | SSIM | LPIPS | steps | million rays | voxels | µs a ray | picture of 640×480 |", "| --- " * 10 + "|"]
+    names = "engine | budget | PSNR | SSIM | LPIPS | steps | million rays | voxels | µs a ray | picture of 640×480"
+    lines = [f"| {names} |", "| --- " * 10 + "|"]
     for row in rows:
         scores = [f"{row['psnr']:.2f}", *("" if row[name] is None else f"{row[name]:.3f}" for name in ("ssim", "lpips"))]
         counts = [f"{row['steps']:,}", f"{row['rays'] / 1e6:.1f}", f"{row['voxels']:,}"]

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from toolkit.camera import Array, Intrinsics, pixel_grid, rays
+from toolkit.gpu import runs_kernels
 from toolkit.networks.decoder import Deferred
 from toolkit.render.field import Field
-from toolkit.render.on_cuda import runs_triton
 from toolkit.render.rays import RayValues, render_rays
 from toolkit.render.sky import on_sky
 
@@ -42,7 +42,7 @@ def make_renderer(field: Field, engine: str = "auto") -> View:
     Args:
         engine: auto | numba | triton | torch. Numba runs on the CPU alone, Triton on CUDA alone.
     """
-    if engine in ("auto", "triton") and isinstance(field.decoder, Deferred) and runs_triton(field.device):
+    if engine in ("auto", "triton") and isinstance(field.decoder, Deferred) and runs_kernels(field.device):
         from toolkit.render.triton_field import TritonRenderer
 
         return TritonRenderer(field)

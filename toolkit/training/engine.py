@@ -12,10 +12,10 @@ from typing import Protocol
 import torch
 
 from toolkit.config import Settings
+from toolkit.gpu import runs_kernels
 from toolkit.networks.decoder import Deferred
 from toolkit.progress import Progress
 from toolkit.render.field import Field
-from toolkit.render.on_cuda import runs_triton
 from toolkit.render.rays import render_rays
 from toolkit.training.adam import LazyAdam
 from toolkit.training.importance import Errors
@@ -97,7 +97,7 @@ def chosen_engine(settings: Settings, device: torch.device) -> str:
     """numba, triton or torch: the first runs on the CPU, the second on CUDA and where a ray is decoded once."""
     if device.type == "cpu":
         return "torch" if settings.engine == "torch" else "numba"
-    fast = settings.engine in ("auto", "triton") and settings.field.decoder == "deferred" and runs_triton(device)
+    fast = settings.engine in ("auto", "triton") and settings.field.decoder == "deferred" and runs_kernels(device)
     return "triton" if fast else "torch"
 
 
