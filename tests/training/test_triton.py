@@ -157,6 +157,14 @@ def test_what_is_not_finite_moves_nothing() -> None:
     assert not torch.equal(before[1], engine.field.feature_rows)
 
 
+def test_a_fit_that_cannot_begin_is_told_at_its_first_step() -> None:
+    """Later ones are looked at now and then; whether there was a good one at all decides what is said."""
+    engine = engine_of(field_of(0.0, keep=0.05))
+    engine.field.feature_rows[:-1] = float("nan")
+    with pytest.raises(NotFiniteError):
+        engine.step(RAYS, RATES)
+
+
 def test_the_skipped_distance_is_that_to_the_nearest_brick() -> None:
     bricks = torch.zeros(9, 9, 9, dtype=torch.bool)
     bricks[2, 3, 4] = bricks[7, 7, 1] = True

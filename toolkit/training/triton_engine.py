@@ -30,7 +30,7 @@ from toolkit.training.view import blind
 
 Tensor = torch.Tensor
 SLOTS = 128  # samples of a ray that can get a gradient; lattices so fine that more exceed the threshold come when space is thin no more
-LOOK = 16  # steps from one look at what was not finite to the next; also how far launches may run ahead
+LOOK = 16  # steps from one look at what was not finite to the next, after the first, which are all looked at; launches run ahead so far
 DECAY, EPSILON = 0.99, 1e-10  # of both optimisers, as in `LazyAdam`; the decoder's first moment:
 FIRST = 0.9
 ROWS = {"cuda": 64, "cpu": 4096}  # of a program of `move`; Triton's interpreter, which tests use on the CPU, likes few programs
@@ -135,7 +135,7 @@ class TritonOptimiser:
             self._learn(rays, remember=True)
             self._made += 1
         self.steps += 1
-        return (self._look() if self.steps % LOOK == 0 else math.nan), 0
+        return (self._look() if self.steps <= LOOK or self.steps % LOOK == 0 else math.nan), 0
 
     def step_on(self, batch: Batch, rates: Rates, jitter: Tensor, behind: Tensor | None = None) -> float:
         """One step on rays that are given, as `Optimiser.step`: jitter (B,), and (B, 3) what is behind each, where it is not the
@@ -190,7 +190,7 @@ class TritonOptimiser:
             *(self.buffers[0], self.tiles, self.inputs, self.state, self.rates),
             *(pool.colour, pool.places, pool.starts, pool.distance, pool.camera, pool.pose, self.tile_density, self.field.background),
             *(self.limit, rays, rays, self.inputs.shape[1], self.field.feature_rows.shape[1], len(pool.pose)),
-            *(self.high, self.wide, self.seed * 1_000_003),
+            *(self.high, self.wide, self.seed * 1_000_003 % 2**31),
             SOME=len(pool.places) > 0,
             KNOWN=len(pool.distance) > 0,
             B=128,
