@@ -16,6 +16,7 @@ from toolkit.evaluate.depth import depth_metrics
 from toolkit.evaluate.images import psnr, ssim
 from toolkit.evaluate.selftest import compositing, edit, lookup, metrics, network, place, rays, rays_background, volume
 from toolkit.evaluate.selftest.cameras import LENS, POSE, lens_errors, of_fov, projection_errors
+from toolkit.evaluate.selftest.case import by_size
 from toolkit.evaluate.selftest.compositing_more import distortion_errors
 from toolkit.volume.topology import Topology
 
@@ -42,6 +43,12 @@ def test_distortion(data: st.DataObject, count: int) -> None:
     errors = distortion_errors([([weight / total for weight in weights], places, lengths)])
     assert errors["values that are not finite"] == 0 and errors["negative losses"] == 0
     assert errors["gradient"] < 1e-6 and errors["loss"] < 1e-6
+
+
+def test_a_loss_too_small_for_float32_is_compared_as_it_is() -> None:
+    """A weight of 1e-38 costs 1e-77, which is 0 there; a loss that is wrong is told all the same."""
+    errors = distortion_errors([([1.1754943508222875e-38], [0.0], [1.0])])
+    assert errors["loss"] < 1e-30 and by_size(torch.tensor([0.5]), [1e-77]) == 0.5
 
 
 @QUICK

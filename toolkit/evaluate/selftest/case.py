@@ -39,6 +39,7 @@ MODULES = (
     "metrics",
     "fits",
 )
+SMALLEST = float(torch.finfo(torch.float32).tiny)  # that float32 holds in full
 Run = Callable[[Path], "list[Measure]"]
 
 
@@ -155,10 +156,11 @@ def relative(got: Any, wanted: Any, floor: float = 0.0) -> float:
 
 
 def by_size(got: Any, wanted: Any) -> float:
-    """Largest difference by the largest entry of the reference: what a sum of many terms can promise."""
+    """Largest difference by the largest entry of the reference: what a sum of many terms can promise. Where that entry is smaller than any
+    number that float32 holds in full, the difference itself."""
     _, second = _pair(got, wanted)
     size = float(second.abs().max()) if second.numel() else 1.0
-    return absolute(got, wanted) / (size if size > 0 else 1.0)
+    return absolute(got, wanted) / (size if size >= SMALLEST else 1.0)
 
 
 def not_finite(*values: Any) -> float:
