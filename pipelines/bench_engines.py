@@ -26,12 +26,15 @@ def engines(
     quiet: Quiet = False,
 ) -> None:
     """Held-out quality of fits by each engine, and the time of a picture of 640×480 pixels."""
+    from pipelines.job import check_engine
     from toolkit.evaluate.engines import engine_rows, engine_table
 
     seconds, names = numbers(budgets, "budgets"), named(engines)
     options = gather(None, config, pairs, image_size=image_size, seed=seed, threads=threads, device=device)
     rows: list[dict[str, Any]] = []
     with opened(source, out, options, quiet) as (job, posed, corrections):
+        for name in names:
+            check_engine(name, job.settings.device)
         ground = ground_of(job, posed, None, corrections)
         job.progress.begin("fits")
         for row in engine_rows(ground, names, seconds, job.progress):

@@ -70,7 +70,7 @@ def open_job(
         check_places(target, path)
         settings = read_settings(options)
         set_threads(settings.threads)
-        settings.device = choose_device(settings.device)
+        settings.device = choose_device(settings.device, settings.engine)
     with RunFolder(path) as folder, progress.listening():
         source = target.absolute()
         other = other_network = False
@@ -79,7 +79,7 @@ def open_job(
             source = Path(about["source"])
             settings = read_settings(options, about["settings"])
             set_threads(settings.threads)
-            settings.device = choose_device(settings.device)
+            settings.device = choose_device(settings.device, settings.engine)
             before = read_settings({}, about["settings"])
             other = settings.field != before.field or settings.fit.finetune != before.fit.finetune
             other_network = settings.network != before.network or settings.field.background != before.field.background
@@ -139,12 +139,33 @@ def set_threads(threads: int | None) -> None:
         cv2.setNumThreads(threads)
 
 
-def choose_device(wanted: str) -> str:
+def choose_device(wanted: str, engine: str = "auto") -> str:
     """`auto` → `cuda` when there is one, else `cpu`.
 
     Raises:
-        InputError: `cuda` is asked for and there is none.
+        InputError: `cuda` is asked for and there is none, or an engine that cannot run on the device.
     """
+    device = _device(wanted)
+    check_engine(engine, device)
+    return device
+
+
+def check_engine(engine: str, device: str) -> None:
+    """Refuse the engine for CUDA where its kernels cannot run.
+
+    Raises:
+        InputError: saying why.
+    """
+    import torch
+
+    from toolkit.gpu import runs_kernels
+
+    if engine == "triton" and not runs_kernels(torch.device(device)):
+        why = "Triton for it is not installed, or it is too old" if device == "cuda" else f"the device is {device!r}"
+        raise InputError(f"engine is 'triton', which runs on CUDA alone, and {why}; leave --engine at auto")
+
+
+def _device(wanted: str) -> str:
     import torch
 
     if wanted == "auto":

@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from pipelines.few_views import numbers, part_of, wanted
 from pipelines.steps_network import uses_network
@@ -226,3 +227,11 @@ def test_engines_are_measured_side_by_side(room: Path, tmp_path: Path, capsys: C
 def test_an_unknown_engine_is_told(room: Path, tmp_path: Path, capsys: Capsys) -> None:
     answer = call(capsys, "bench", "engines", room, "--out", tmp_path / "engines", "--engines", "auto,steam")
     assert answer.code == 2 and "there is no 'steam'; known are auto, numba, triton, torch" in answer.err
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="Triton's engine runs here")
+@pytest.mark.parametrize("command_line", [("run", "--engine"), ("bench", "engines", "--engines")])
+def test_the_engine_for_cuda_is_refused_without_it(command_line: tuple[str, ...], room: Path, tmp_path: Path, capsys: Capsys) -> None:
+    *words, flag = command_line
+    answer = call(capsys, *words, room, "--out", tmp_path / "out", flag, "triton", "--set", "effects=off")
+    assert answer.code == 2 and "runs on CUDA alone, and the device is 'cpu'; leave --engine at auto" in answer.err

@@ -33,6 +33,7 @@ OPACITY, MEDIAN, SUMS = 0, 2, 4  # layers of `sums` (SUMS, N): those of C_OPACIT
 C_JITTER, C_STOP, C_SOLID, C_OPAQUE, C_STRETCH = (tl.constexpr(v) for v in (JITTER, STOP, SOLID, OPAQUE, MAX_STRETCH))
 C_FX, C_FY, C_FZ, C_WEIGHT, C_AFTER, C_SLOPE, C_DISTANCE, C_PLACE, C_PULL = (tl.constexpr(v) for v in range(9))
 C_OPACITY, C_MOMENT, C_MEDIAN, C_G_OPACITY = (tl.constexpr(v) for v in range(4))
+C_RED, C_COUNTS, C_TARGET, C_BEHIND = (tl.constexpr(v) for v in (RED, COUNTS, TARGET, BEHIND))
 C_FLOOR = tl.constexpr(1e-6)  # rays.OPACITY_FLOOR
 
 
@@ -190,6 +191,17 @@ def walk(
 
 
 @triton.jit
+def noted_at(cells, notes, at, layer, mask):
+    """Voxel, place within it and weight of noted samples `at` (slot · N + ray); `layer`: numbers from one layer of `notes` to the next."""
+    cell = tl.load(cells + at, mask=mask, other=0)
+    fx = tl.load(notes + C_FX * layer + at, mask=mask, other=0.0)
+    fy = tl.load(notes + C_FY * layer + at, mask=mask, other=0.0)
+    fz = tl.load(notes + C_FZ * layer + at, mask=mask, other=0.0)
+    weight = tl.load(notes + C_WEIGHT * layer + at, mask=mask, other=0.0)
+    return cell, fx, fy, fz, weight
+
+
+@triton.jit
 def gathered(features, cell, fx, fy, fz, lookup, channel, C: tl.constexpr, mask, wanted):
     """(B, P) trilinear features of voxels `cell` (B,)."""
     value = tl.zeros([cell.shape[0], channel.shape[0]], tl.float32)
@@ -217,11 +229,7 @@ def composite(
     while slot < most:
         mask = slot < noted
         at = slot * stride + ray
-        cell = tl.load(cells + at, mask=mask, other=0)
-        fx = tl.load(notes + (C_FX * SLOTS) * stride + at, mask=mask, other=0.0)
-        fy = tl.load(notes + (C_FY * SLOTS) * stride + at, mask=mask, other=0.0)
-        fz = tl.load(notes + (C_FZ * SLOTS) * stride + at, mask=mask, other=0.0)
-        weight = tl.load(notes + (C_WEIGHT * SLOTS) * stride + at, mask=mask, other=0.0)
+        cell, fx, fy, fz, weight = noted_at(cells, notes, at, SLOTS * stride, mask)
         wanted = mask[:, None] & (channel < C)[None, :]
         total += weight[:, None] * gathered(features, cell, fx, fy, fz, lookup, channel, C, mask, wanted)
         slot += 1

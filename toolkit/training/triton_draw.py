@@ -6,6 +6,7 @@ import triton
 import triton.language as tl
 
 from toolkit.networks.encoding import SH
+from toolkit.render.triton_march import C_BEHIND, C_COUNTS, C_JITTER, C_RED, C_TARGET
 from toolkit.training.importance import TILE, TOP
 from toolkit.training.triton_rates import R_RANDOM
 
@@ -96,12 +97,12 @@ def draw(
     wild = tl.load(rates + R_RANDOM) > 0
     for k in tl.static_range(3):
         level = tl.load(colour + pick.to(tl.int64) * 3 + k, mask=on, other=0).to(tl.float32) / 255
-        tl.store(rays + (6 + k) * stride + ray, level, mask=on)
+        tl.store(rays + (C_RED + k) * stride + ray, level, mask=on)
         behind = tl.where(wild, tl.rand(key, number + 56 + k), tl.load(background + k))
-        tl.store(rays + (12 + k) * stride + ray, behind, mask=on)
-    tl.store(rays + 9 * stride + ray, 1 / (density * count), mask=on)
+        tl.store(rays + (C_BEHIND + k) * stride + ray, behind, mask=on)
+    tl.store(rays + C_COUNTS * stride + ray, 1 / (density * count), mask=on)
     target = density * 0
     if KNOWN:
         target = tl.load(distance + pick, mask=on, other=0.0)
-    tl.store(rays + 10 * stride + ray, target, mask=on)
-    tl.store(rays + 11 * stride + ray, tl.rand(key, number + 60), mask=on)
+    tl.store(rays + C_TARGET * stride + ray, target, mask=on)
+    tl.store(rays + C_JITTER * stride + ray, tl.rand(key, number + 60), mask=on)

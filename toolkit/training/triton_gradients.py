@@ -11,19 +11,20 @@ import triton.language as tl
 from toolkit.render.triton_lookup import corner, share
 from toolkit.render.triton_march import (
     C_AFTER,
+    C_BEHIND,
+    C_COUNTS,
     C_DISTANCE,
     C_FLOOR,
-    C_FX,
-    C_FY,
-    C_FZ,
     C_G_OPACITY,
     C_MOMENT,
     C_OPACITY,
     C_PLACE,
     C_PULL,
+    C_RED,
     C_SLOPE,
-    C_WEIGHT,
+    C_TARGET,
     gathered,
+    noted_at,
 )
 from toolkit.training.depth import REACH
 from toolkit.training.importance import KEEP
@@ -41,13 +42,13 @@ def judge(
     ray = tl.program_id(0) * B + tl.arange(0, B)
     on = ray < count
     opacity = tl.load(sums + C_OPACITY * stride + ray, mask=on, other=0.0)
-    part = tl.load(rays + 9 * stride + ray, mask=on, other=0.0)
+    part = tl.load(rays + C_COUNTS * stride + ray, mask=on, other=0.0)
     g_opacity = -(1 - opacity) * (2 * tl.load(rates + R_OPACITY) * part)
     squared = opacity * 0
     for k in tl.static_range(3):
         colour = 1 / (1 + tl.exp(-tl.load(logits + ray * 3 + k, mask=on, other=0.0)))
-        behind = tl.load(rays + (12 + k) * stride + ray, mask=on, other=0.0)
-        residual = opacity * colour + (1 - opacity) * behind - tl.load(rays + (6 + k) * stride + ray, mask=on, other=0.0)
+        behind = tl.load(rays + (C_BEHIND + k) * stride + ray, mask=on, other=0.0)
+        residual = opacity * colour + (1 - opacity) * behind - tl.load(rays + (C_RED + k) * stride + ray, mask=on, other=0.0)
         squared += residual * residual / 3
         g_mixed = residual * (2.0 / 3.0) * part
         tl.store(g_logits + ray * 3 + k, g_mixed * opacity * colour * (1 - colour), mask=on)
@@ -75,8 +76,8 @@ def spread(
     most = tl.max(noted, 0)
     opacity = tl.load(sums + C_OPACITY * stride + ray, mask=on, other=0.0)
     moment = tl.load(sums + C_MOMENT * stride + ray, mask=on, other=0.0)
-    part = tl.load(rays + 9 * stride + ray, mask=on, other=0.0)
-    target = tl.load(rays + 10 * stride + ray, mask=on, other=0.0)
+    part = tl.load(rays + C_COUNTS * stride + ray, mask=on, other=0.0)
+    target = tl.load(rays + C_TARGET * stride + ray, mask=on, other=0.0)
     both = on[:, None] & (channel < C)[None, :]
     mean = tl.load(inputs + ray[:, None] * columns + channel[None, :], mask=both, other=0.0)
     g_mean = tl.load(g_inputs + ray[:, None] * C + channel[None, :], mask=both, other=0.0)
@@ -92,11 +93,7 @@ def spread(
     while slot < most:
         mask = slot < noted
         at = slot * stride + ray
-        cell = tl.load(cells + at, mask=mask, other=0)
-        fx = tl.load(notes + (C_FX * SLOTS) * stride + at, mask=mask, other=0.0)
-        fy = tl.load(notes + (C_FY * SLOTS) * stride + at, mask=mask, other=0.0)
-        fz = tl.load(notes + (C_FZ * SLOTS) * stride + at, mask=mask, other=0.0)
-        weight = tl.load(notes + (C_WEIGHT * SLOTS) * stride + at, mask=mask, other=0.0)
+        cell, fx, fy, fz, weight = noted_at(cells, notes, at, SLOTS * stride, mask)
         away = tl.load(notes + (C_DISTANCE * SLOTS) * stride + at, mask=mask, other=0.0)
         place = tl.load(notes + (C_PLACE * SLOTS) * stride + at, mask=mask, other=0.0)
         wanted = mask[:, None] & (channel < C)[None, :]
@@ -118,11 +115,7 @@ def spread(
     while slot < most:
         mask = slot < noted
         at = slot * stride + ray
-        cell = tl.load(cells + at, mask=mask, other=0)
-        fx = tl.load(notes + (C_FX * SLOTS) * stride + at, mask=mask, other=0.0)
-        fy = tl.load(notes + (C_FY * SLOTS) * stride + at, mask=mask, other=0.0)
-        fz = tl.load(notes + (C_FZ * SLOTS) * stride + at, mask=mask, other=0.0)
-        weight = tl.load(notes + (C_WEIGHT * SLOTS) * stride + at, mask=mask, other=0.0)
+        cell, fx, fy, fz, weight = noted_at(cells, notes, at, SLOTS * stride, mask)
         after = tl.load(notes + (C_AFTER * SLOTS) * stride + at, mask=mask, other=0.0)
         slope = tl.load(notes + (C_SLOPE * SLOTS) * stride + at, mask=mask, other=0.0)
         away = tl.load(notes + (C_DISTANCE * SLOTS) * stride + at, mask=mask, other=0.0)
