@@ -18,16 +18,16 @@ from torch import Tensor
 
 from toolkit.capture.types import Views
 from toolkit.errors import InputError
-from toolkit.gpu import asks_freely
+from toolkit.gpu import asks_freely, sent
 from toolkit.key_sweeps import Brought, KeySweeps, Recent, picture, sensed, together
 from toolkit.keyframes import KeyFrames
 from toolkit.networks.cameras import Cameras
-from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
+from toolkit.networks.cull import all_blocks, block_balls, visible_at_once, visible_blocks
 from toolkit.networks.lattice import LatentVolume, Lattice
 from toolkit.networks.matching import SIDE, SIDE_WITHIN
 from toolkit.networks.model import NerfusionModel
 from toolkit.networks.precision import FLOAT32, computing
-from toolkit.networks.refine import adopt, children, merged, part, solid_cells, split_volume, surface_cells
+from toolkit.networks.refine import children, merged, solid_cells, split_volume
 from toolkit.networks.store import GlobalStore
 from toolkit.networks.sweep import Empty, Sweep
 from toolkit.networks.unproject import EncodedView
@@ -120,7 +120,7 @@ class Fusion:
         self.stores = [
             GlobalStore(Lattice(lattice.space, lattice.resolution >> step), model.config.channels, model.device) for step in steps
         ]
-        self._keys = all_blocks(self.stores[0].lattice, model.device)
+        self._keys = all_blocks(self.stores[0].lattice)  # the processor knows them all, and need not ask the device which are seen
         self._balls = block_balls(self.stores[0].lattice, self._keys)
 
     @torch.no_grad()
@@ -132,24 +132,30 @@ class Fusion:
             swept: of the key frame, where it was made already (`KeySweeps`), depth and all; None: made here.
         """
         options = self.options
-        keys = self._keys[visible_blocks(*self._balls, cameras[0], options.near, options.far)]
-        topology, finer = Topology(keys, bounds=self.stores[0].lattice.bounds(keys.device)), None
+        topology, finer = self._visible(cameras), None
         bounded = options.near > 0 or math.isfinite(options.far)
         if swept is None and bounded:
             swept = self.model.sweep(views, cameras, options.near, options.far, depth, self.empty)
         for level, store in enumerate(self.stores):
             wanted = None if finer is None else finer.known
             local = self.model.local_volume(views, cameras, store.lattice, topology, wanted, options.near, options.far, swept)
-            before = store.part(local.topology)
-            if finer is not None:
-                before = adopt(before, part(finer, local.topology))
+            before, seen = store.part(local.topology, finer), local.known
             after = self.model.fuse_part(before, local)
-            store.write(after, local.known)
+            store.write(after, seen)
             if level + 1 < options.levels:
                 # What was known before but is not seen now still makes cells whole.
-                here = merged(before, after, local.known)
-                finer = split_volume(here, surface_cells(here, local.known, self.model.thickness(here), options.gamma))
+                here = merged(before, after, seen)
+                finer = split_volume(here, self.model.surface_cells(here, seen, options.gamma))
                 topology = finer.topology
+
+    def _visible(self, cameras: Cameras) -> Topology:
+        """Blocks of the coarsest lattice in the frustum of the key frame."""
+        near, far, device = self.options.near, self.options.far, self.model.device
+        bounds = self.stores[0].lattice.bounds(device)
+        if asks_freely(device):
+            return Topology(self._keys[visible_blocks(*self._balls, cameras[0], near, far)], bounds=bounds)
+        kept = self._keys.numpy()[visible_at_once(self._balls[0].numpy(), self._balls[1].numpy(), cameras[0], near, far)]
+        return Topology(sent(kept, device), bounds=bounds, host=kept)
 
     @property
     def volume(self) -> LatentVolume:

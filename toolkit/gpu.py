@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable
-from functools import cache
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from importlib import util
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 OLDEST = 7  # compute capability
@@ -50,7 +52,56 @@ def asks_freely(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
-def kernel(*aligned: str) -> Callable[[Callable[..., Any]], Any]:
+def sent(values: NDArray[Any], device: torch.device) -> Tensor:
+    """The same numbers on a device; on CUDA from memory that stays in place, so that nobody has to wait for the copy."""
+    tensor = torch.from_numpy(np.ascontiguousarray(values))
+    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor.to(device)
+
+
+class Kernel:
+    """A Triton kernel, launched as `kernel[grid](…)`.
+
+    Triton looks at every number and tensor of a launch to know which variant is meant, and asks its hooks; most of what a small launch
+    costs. Here a short key finds what the first launch of its kind had compiled, which is then launched directly.
+
+    Args:
+        jitted: the kernel as Triton made it.
+        names: of all that it is given, in order.
+        constants: places of `tl.constexpr` among them.
+        aligned: see `kernel`.
+    """
+
+    def __init__(self, jitted: Any, names: Sequence[str], constants: Sequence[int], aligned: Sequence[str]) -> None:
+        self.jitted, self.names, self.aligned = jitted, tuple(names), tuple(aligned)
+        self._constants = frozenset(constants)
+        self._aligned = tuple(self.names.index(name) for name in aligned)
+        self._compiled: dict[Any, Any] = {}
+
+    def __getitem__(self, grid: tuple[int, ...]) -> Callable[..., None]:
+        return partial(self._launch, grid)
+
+    def _launch(self, grid: tuple[int, ...], *given: Any, **named: Any) -> None:
+        constants = self._constants
+        kinds = [value if place in constants else _kind(value) for place, value in enumerate(given)]
+        ends = [given[place].data_ptr() % 16 for place in self._aligned]
+        key = (given[0].get_device(), *kinds, *ends, *named.items())
+        compiled = self._compiled.get(key)
+        if compiled is None:
+            compiled = self.jitted[grid](*given, **named)
+            if hasattr(compiled, "function"):  # neither the interpreter nor what stands in for it in tests
+                self._compiled[key] = compiled
+        else:
+            compiled[(*grid, 1, 1)[:3]](*given, *[named[name] for name in self.names[len(given) :]])
+
+
+def _kind(value: Any) -> Any:
+    """What Triton compiles anew for."""
+    if isinstance(value, Tensor):
+        return value.dtype
+    return "long" if type(value) is int and not -(2**31) <= value < 2**31 else type(value)
+
+
+def kernel(*aligned: str) -> Callable[[Callable[..., Any]], Kernel]:
     """A decorator: a Triton kernel that is compiled once for each set of its `tl.constexpr` values and of its tensors' types.
 
     Triton would compile anew for numbers that are 1 or divisible by 16, and for tensors that do not start at multiples of 16 bytes: in the
@@ -61,13 +112,13 @@ def kernel(*aligned: str) -> Callable[[Callable[..., Any]], Any]:
     """
     import triton
 
-    def made(function: Callable[..., Any]) -> Any:
+    def made(function: Callable[..., Any]) -> Kernel:
         given = inspect.signature(function).parameters
-        names = [name for name, of in given.items() if "constexpr" not in str(of.annotation)]
+        constants = [place for place, of in enumerate(given.values()) if "constexpr" in str(of.annotation)]
+        names = [name for place, name in enumerate(given) if place not in constants]
         if unknown := set(aligned) - set(names):
             raise ValueError(f"{function.__name__} has no tensor {', '.join(sorted(unknown))}")
-        out = triton.jit(function, do_not_specialize=[name for name in names if name not in aligned])
-        out.aligned = aligned
-        return out
+        jitted = triton.jit(function, do_not_specialize=[name for name in names if name not in aligned])
+        return Kernel(jitted, list(given), constants, aligned)
 
     return made

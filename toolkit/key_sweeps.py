@@ -22,7 +22,7 @@ from toolkit.keyframes import KeyFrames
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.matching import describe
 from toolkit.networks.sweep import Compared, Sweep, compare, decide
-from toolkit.networks.witness import Witness, certain, evidence, witness
+from toolkit.networks.witness import Witness, alone, evidence, witness
 from toolkit.poses.overlap import overlap, parallax
 
 MOST = 8  # witnesses of a key frame
@@ -102,9 +102,9 @@ class KeySweeps:
             for index, made in zip(new, describe(torch.cat([self._picture(index) for index in new])), strict=True):
                 self._described.put(index, made)
         compared = compare([self._described.get(index, self._describe) for index in group], cameras, self.near, self.far)
-        alone = decide(compared)
+        says, surface = alone(compared)
         depth = self._depth(at)
-        return compared, witness(alone if depth is None else decide(compared, depth)), certain(compared, alone)
+        return compared, says if depth is None else witness(decide(compared, depth)), surface
 
     def _describe(self, index: int) -> Tensor:
         return describe(self._picture(index))[0]
@@ -157,15 +157,12 @@ def together(key: int, neighbours: Array) -> list[int]:
 
 def pixels(views: Views, index: int, device: torch.device | str) -> Tensor:
     """(H, W, 3) uint8 of a view, on a device."""
-    values = torch.from_numpy(np.ascontiguousarray(views.images[index]))
-    if torch.device(device).type == "cuda":  # from memory that stays in place, which nobody has to wait for
-        values = values.pin_memory().to(device, non_blocking=True)
-    return values.to(device)
+    return _brought(views.images[index], device)
 
 
 def shown(values: Tensor) -> Tensor:
     """(H, W, 3) uint8 → (1, 3, H, W) RGB in [0, 1]."""
-    return values.permute(2, 0, 1)[None].float() / 255
+    return values.permute(2, 0, 1)[None] / 255
 
 
 def picture(views: Views, index: int, device: torch.device | str) -> Tensor:
@@ -176,4 +173,12 @@ def picture(views: Views, index: int, device: torch.device | str) -> Tensor:
 def sensed(views: Views, index: int, device: torch.device | str) -> Tensor | None:
     """(H, W) of a view's depth along z in working units, None where it has none."""
     depth = views.depths[index] if views.depths else None
-    return None if depth is None else torch.from_numpy(np.ascontiguousarray(depth, np.float32)).to(device)
+    return None if depth is None else _brought(np.asarray(depth, np.float32), device)
+
+
+def _brought(values: Array, device: torch.device | str) -> Tensor:
+    """Values on a device."""
+    found = torch.from_numpy(np.ascontiguousarray(values))
+    if torch.device(device).type == "cuda":  # from memory that stays in place, which nobody has to wait for
+        found = found.pin_memory().to(device, non_blocking=True)
+    return found.to(device)

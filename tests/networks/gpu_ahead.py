@@ -13,6 +13,7 @@ from collections import Counter, defaultdict
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 import triton
 from triton.backends.compiler import GPUTarget
@@ -21,16 +22,18 @@ from triton.compiler import ASTSource
 from tests.networks.made import SMALL as SIZES
 from tests.networks.made import cameras, lattice, pictures, small_model
 from toolkit.networks.cull import all_blocks
-from toolkit.networks.gpu import convolution, lookup, matching, reading
+from toolkit.networks.gpu import convolution, describe, lookup, matching, measured, reading
+from toolkit.networks.gpu import volumes as volumes_gpu
 from toolkit.networks.gpu.gru import Step
 from toolkit.networks.gpu.observe import Observer
+from toolkit.networks.head import FieldHead
 from toolkit.networks.lattice import LatentVolume, LocalVolume
 from toolkit.networks.sweep import Sweep
 from toolkit.networks.witness import Witness
 from toolkit.render import march_gpu
 from toolkit.simulate import cast_gpu
 from toolkit.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids, upright
-from toolkit.volume import blocks_gpu
+from toolkit.volume import blocks_gpu, split_gpu, tables_gpu
 from toolkit.volume.topology import Topology
 
 TYPES = {torch.float32: "*fp32", torch.int32: "*i32", torch.int64: "*i64", torch.uint8: "*u8", torch.bfloat16: "*bf16"}
@@ -66,45 +69,57 @@ def sweeps(views: int, planes: int, height: int, width: int, count: int) -> None
     """A sweep and its witnesses."""
     whole = torch.rand(views, 21, height, width)
     seen_by = cameras(views)
-    rays, own = torch.rand(height * width, 3), torch.rand(height * width, 21)
-    lenses = seen_by.intrinsics, seen_by.size, seen_by.world_from_camera
-    inverses = torch.linspace(0.1, 1.0, planes)
-    matching.costs(list(whole), *lenses, inverses, rays, own, 8.0, 0.6)
-    cost = torch.rand(planes, height, width)
+    describe.describe(torch.rand(views, 3, height, width), (0.3, 0.6, 0.1), 0.03)
+    rays, own, inverses = describe.pixels(whole[0], seen_by, (height, width), planes, 0.1, 1.0)
+    matching.costs(list(whole), seen_by, inverses, rays, own, 8.0, 0.6)
+    cost = torch.rand(height, width, planes).permute(2, 0, 1)
     matching.semi_global(cost, 0.1, 0.8)
     table = matching.table(matching.distribution(cost, 0.1, 0.8, 0.05), 0.01, 2)
+    depth = torch.rand(2 * height, width + 3)
+    measured.measured(cost, inverses, depth, (2 * height, 2 * width), [(0, 2 * height), (0.5, width)], 0.01, 0.01, 0.98, 2)
+    for said in (None, cost):
+        matching.decided(cost, said, 0.1, 0.8, 0.05, 0.01, 2)
     reading.look(torch.rand(count, 3), torch.rand(count), table, seen_by[views - 1], 0.1, 0.01)
     one = Witness(seen_by[0], reading.says(table, 4.0, 0.1, 2), 0.1, 0.01)
-    others = [replace(one, camera=seen_by[k % views]) for k in range(views)]
     surface = reading.surest(table, rays, inverses, seen_by.positions[0], 0.7)
-    reading.confirmed(others, surface)
-    reading.mean(rays, inverses, seen_by.positions[0], others, torch.rand(views))
+    matching.alone(cost, rays, inverses, seen_by[views - 1], 0.1, 0.01, (0.1, 0.8, 0.05), 2, (4.0, 0.1, 2), 0.7)
+    asked = reading.Asked([replace(one, camera=seen_by[k % views]) for k in range(views)])
+    for sums in (None, asked.confirmed(surface)):
+        asked.mean(rays, inverses, seen_by[views - 1], (height, width), ((height + 1) // 2, (width + 1) // 2), sums, 1.0, 0.3)
 
 
-def volumes(blocks: int, count: int) -> None:
+def volumes(blocks: int) -> None:
     """What is done with blocks."""
     topology = Topology(torch.stack([torch.arange(blocks), torch.zeros(blocks), torch.ones(blocks)], 1).int())
     rows, mask = torch.rand(topology.zero_row + 1, 16), torch.rand(topology.zero_row) < 0.5
     for inside, outside in ((16, 16), (32, 8)):
         values, weight, bias = torch.rand(topology.zero_row + 1, inside), torch.rand(outside, inside, 3, 3, 3), torch.rand(outside)
-        convolution.convolve(values, topology.around, weight, bias, mask, True)
-        convolution.convolve(values, topology.around, weight, None, None)
+        taps = convolution.taps_of(weight)
+        convolution.convolve(values, topology.around, taps, bias, mask, True)
+        convolution.convolve(values, topology.around, taps, None, None)
         convolution.weight_gradient(values, topology.around, torch.rand(topology.zero_row + 1, outside))
+    side_by_side = convolution.taps_of(torch.rand(8, 8, 3, 3, 3), torch.rand(8, 8, 3, 3, 3))
+    convolution.convolve(torch.rand(topology.zero_row + 1, 16), topology.around, side_by_side, torch.rand(16), mask, True)
+    table, cells = tables_gpu.table(topology.keys, topology.table_origin, topology.table_size)
+    tables_gpu.around(table, cells)
     blocks_gpu.pooled(topology, mask, 0, 2, True)
     blocks_gpu.resample(topology, mask, [rows], topology.keys.long(), 0.5)
-    slots = torch.arange(blocks)
-    taken = blocks_gpu.take(rows, torch.rand(topology.zero_row), slots)
-    blocks_gpu.put(rows, torch.rand(topology.zero_row), slots, *taken, mask)
-    given = torch.rand(count, 16), torch.rand(count, 4), torch.rand(count), torch.rand(count)
-    blocks_gpu.lay(blocks, torch.arange(count) % topology.zero_row, *given, 16, 0.5)
-    part = LatentVolume(lattice(), topology, rows, torch.rand(topology.zero_row))
-    local = LocalVolume(lattice(), topology, rows, torch.ones(topology.zero_row), rows, torch.rand(topology.zero_row), topology, slots)
+    slots, count = torch.arange(blocks, dtype=torch.int32), torch.rand(topology.zero_row)
+    taken = blocks_gpu.take(rows, count, slots, topology)
+    blocks_gpu.take(rows, count, slots, topology, (rows, count, topology))
+    blocks_gpu.put(rows, count, slots, *taken, mask)
+    split_gpu.split(topology, mask, rows, ((-1, -1, -1), (2 * blocks, 3, 3)), 0.25)
+    volumes_gpu.settle(rows, rows, slots)
+    volumes_gpu.merge(rows, count, rows, count, mask)
+    volumes_gpu.surface_cells(topology, rows, count, mask, FieldHead(16, 32, 16), -3.0)
+    part = LatentVolume(lattice(), topology, rows, count)
+    local = LocalVolume(lattice(), topology, rows, torch.ones(topology.zero_row), rows, count, topology, slots)
     for kind in (torch.float32, torch.bfloat16):
-        step = Step(torch.arange(topology.zero_row), part, local, 0.1, 16)
+        step = Step(part, local, 0.1, 16)
         step.average()
-        both = step.beside(kind)
-        step.forget(torch.rand(len(both), 16).to(kind), both)
-        step.update(torch.rand(len(both), 16).to(kind), torch.rand(len(both), 16).to(kind), 3, 0.5, rows)
+        both, _ = step.beside(kind)
+        step.forget(torch.rand(len(both), 32).to(kind), both)
+        step.update(torch.rand(len(both), 32).to(kind), torch.rand(len(both), 16).to(kind), 3, 0.5, rows)
 
 
 def corners(views: int, side: int, planes: int) -> None:
@@ -116,11 +131,11 @@ def corners(views: int, side: int, planes: int) -> None:
     for shell in (0.0, 1.0):
         space = lattice(16, shell)
         keys = all_blocks(space)[:2]
-        observer = Observer(encoded, seen_by, 0.1, 4.0, swept, (2.0, 0.02, 0.1, 4.0, 0.35))
-        rows = observer.choose(space, keys, None)
-        rows = torch.arange(planes)
-        observer.choose(space, keys, rows)
-        observer.observe(space, keys, rows, model.local.project, SIZES.sampled, True)
+        observer = Observer(encoded, seen_by, 0.1, 4.0, swept, (2.0, 0.02, 0.1, 4.0, 0.35, 0.9))
+        observer.choose(space, keys, None)
+        found = observer.choose(space, keys, torch.ones(2 * 512, dtype=torch.bool))
+        found = replace(found, rows=torch.arange(planes), filled=np.ones(2, bool), busy=np.ones(2, bool))
+        observer.observe(space, keys, found, torch.zeros(4, dtype=torch.int32), model.local.project, SIZES.sampled, True, SIZES.channels)
     step = torch.rand(planes)
     for table in (True, False):
         rows = encoded[0].features.rows.detach().requires_grad_(table)
@@ -142,7 +157,7 @@ if __name__ == "__main__":
     triton.runtime.jit.JITFunction.run = compiled
     for odd, even in ((1, 16), (3, 32), (2, 17)):
         sweeps(odd + 1, 32 + even, even, 6 + odd, 100 * even + odd)
-        volumes(even, 16 * even + odd)
+        volumes(even)
         corners(odd, 16 * (1 + odd), 32 + even)
         scenes(odd, even)
     for name in sorted(variants):

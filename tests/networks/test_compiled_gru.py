@@ -14,7 +14,7 @@ from tests.networks.test_gru import inputs
 from toolkit.evaluate.speed import pinned
 from toolkit.networks import compiled_gru, model
 from toolkit.networks.lattice import LatentVolume, LocalVolume
-from toolkit.volume.topology import VOXELS, Topology
+from toolkit.volume.topology import Topology
 
 SIDE = 3
 
@@ -28,10 +28,9 @@ def volumes(seed: int, busy: int = 8, seen: float = 0.6) -> tuple[LatentVolume, 
     topology = blocks()
     given = inputs(topology, seed, seen, SMALL.channels)
     views = given["inside"].float() * torch.randint(1, 4, (topology.zero_row,), generator=torch.Generator().manual_seed(seed))
-    place = torch.cat([torch.arange(busy * VOXELS), torch.tensor([topology.zero_row])])
     part = LatentVolume(lattice(), topology, given["state"], given["count"])
     few = Topology(topology.keys[:busy])
-    return part, LocalVolume(lattice(), topology, given["local"], views, given["raw"], given["weight"], few, place)
+    return part, LocalVolume(lattice(), topology, given["local"], views, given["raw"], given["weight"], few, torch.arange(busy))
 
 
 def trained(seed: int = 0) -> model.NerfusionModel:

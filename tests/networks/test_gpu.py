@@ -8,7 +8,9 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -18,20 +20,25 @@ os.environ.setdefault("TRITON_INTERPRET", "1")
 
 from tests.networks.made import SMALL as SIZES
 from tests.networks.made import cameras, lattice, pictures, small_model
-from tests.networks.test_compiled import everything
+from tests.networks.test_compiled import FAR, NEAR, boxed, everything
 from tests.networks.test_compiled_gru import trained, volumes
+from tests.networks.test_sweep import wall
 from toolkit import gpu
+from toolkit.fusion import Fusion, FusionOptions
 from toolkit.networks import compiled, compiled_lookup
-from toolkit.networks.block_conv import block_conv3d
+from toolkit.networks.block_conv import BlockConv3d, Prepared, block_conv3d
 from toolkit.networks.cull import all_blocks
 from toolkit.networks.gpu import convolution, lookup, matching, observe, reading
+from toolkit.networks.gpu import describe as describing
 from toolkit.networks.gpu import gru as compiled_rows
-from toolkit.networks.lattice import cells
-from toolkit.networks.matching import distribution, semi_global
-from toolkit.networks.sweep import _table
+from toolkit.networks.gpu import volumes as volumes_gpu
+from toolkit.networks.lattice import LatentVolume, cells, rows_of
+from toolkit.networks.matching import describe, distribution, semi_global
+from toolkit.networks.sweep import _table, compare, decide
 from toolkit.networks.unproject import look_up, project
+from toolkit.networks.witness import alone, evidence, witness
 from toolkit.render.march import MarchGrid, march
-from toolkit.volume import blocks_gpu
+from toolkit.volume import blocks_gpu, split_gpu, tables_gpu
 from toolkit.volume.edit import corner_nodes, split
 from toolkit.volume.space import Space
 from toolkit.volume.topology import Topology
@@ -46,10 +53,10 @@ def large_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(matching, "PLANES", 16)
     monkeypatch.setattr(matching, "PIXELS", 1024)
     monkeypatch.setattr(reading, "TILE", (1024, 32))
-    for module, names in ((reading, ("BLOCK",)), (lookup, ("BLOCK",)), (observe, ("BLOCK",)), (compiled_rows, ("BLOCK",))):
-        for name in names:
-            monkeypatch.setattr(module, name, 2048)
-    for module, names in ((convolution, ("TILE", "SLOPES")), (blocks_gpu, ("TILE",))):
+    monkeypatch.setattr(describing, "BLOCK", 1024)
+    for module in (reading, lookup, observe, compiled_rows, volumes_gpu, tables_gpu):
+        monkeypatch.setattr(module, "BLOCK", 2048)
+    for module, names in ((convolution, ("TILE", "SLOPES")), (blocks_gpu, ("TILE",)), (split_gpu, ("TILE",)), (observe, ("PART",))):
         for name in names:
             monkeypatch.setattr(module, name, 512)
 
@@ -85,6 +92,82 @@ def test_a_sweep_and_its_witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
         torch.testing.assert_close(quick, slow[name], atol=2e-4, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
 
 
+@pytest.mark.parametrize(("size", "last"), [((40, 30), False), ((40, 30), True), ((280, 2), True)])
+def test_what_pictures_are_compared_by(size: tuple[int, int], last: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also of pictures whose colours lie next to each other in memory, and of such that are made smaller first."""
+    images = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0))
+    images = images.contiguous(memory_format=torch.channels_last) if last else images
+    slow = describe(images)
+    forced(monkeypatch)
+    quick = describe(images)
+    assert quick.is_contiguous()
+    torch.testing.assert_close(quick, slow, atol=1e-5, rtol=0)
+
+
+def test_pictures_of_several_sizes_and_silhouettes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("toolkit.networks.sweep.WITHIN", 7)
+    monkeypatch.setattr("toolkit.networks.sweep.PLANES", (8, 16))
+    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    described, seen_by = wall(3)
+    described = [described[0], described[1][:, ::2].contiguous(), described[2][:, :, ::3]]
+
+    def everything() -> list[torch.Tensor]:
+        compared = compare(described, seen_by, NEAR, FAR, boxed)
+        assert compared.empty is not None
+        return [compared.rays, compared.inverses, compared.cost, compared.empty.float(), decide(compared).table]
+
+    slow = everything()
+    forced(monkeypatch)
+    for quick, expected in zip(everything(), slow, strict=True):
+        torch.testing.assert_close(quick, expected, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("within", [False, True])
+def test_what_a_sensor_measured(within: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("toolkit.networks.sweep.SPACING", 8)
+    monkeypatch.setattr("toolkit.networks.sweep.WITHIN", 7)
+    monkeypatch.setattr("toolkit.networks.sweep.PLANES", (8, 16))
+    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    described, seen_by = wall(2)
+    depth = 1.5 + torch.rand(31, 45, generator=torch.Generator().manual_seed(0))
+    depth[::3], depth[1, ::2], depth[2, ::3], depth[4, 5], depth[5, 7] = 0, torch.inf, torch.nan, 0.1, 99.0
+
+    def made() -> torch.Tensor:
+        return decide(compare(described, seen_by, NEAR, FAR, boxed if within else None), depth).table
+
+    slow = made()
+    forced(monkeypatch)
+    torch.testing.assert_close(made(), slow, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+def test_what_witnesses_say_together(order: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of their own pictures alone and not, from elsewhere, with other planes, and on a grid with an odd number of rows."""
+    monkeypatch.setattr("toolkit.networks.sweep.SPACING", 8)
+    monkeypatch.setattr("toolkit.networks.sweep.PLANES", (8, 16))
+    monkeypatch.setattr("toolkit.networks.witness.SURE", 0.4)
+    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    monkeypatch.setattr(reading, "BLOCK", 32)
+    monkeypatch.setattr(reading, "PARTS", 2)
+    described, seen_by = wall(3)
+
+    def everything() -> list[torch.Tensor]:
+        compared = compare(described, seen_by, NEAR, FAR)
+        mine, surface = alone(compared)
+        other = witness(decide(compare([described[1], described[0]], seen_by[[1, 0]], NEAR, 2 * FAR)))
+        theirs = [mine, other, replace(mine, camera=seen_by[2])]
+        believed, weighed = (evidence(compared, [theirs[k] for k in order], at) for at in (None, surface))
+        assert believed is not None and weighed is not None
+        sure = surface[surface.isfinite().all(1)]
+        return [mine.says, sure, believed, weighed, decide(compared, said=weighed).table]
+
+    slow = everything()
+    assert len(slow[1]) and slow[2].shape[1] % 2 == 1
+    forced(monkeypatch)
+    for quick, expected in zip(everything(), slow, strict=True):
+        torch.testing.assert_close(quick, expected, atol=2e-4, rtol=1e-4)
+
+
 @pytest.mark.parametrize(("inside", "outside"), [(4, 8), (32, 16)])
 def test_convolution_and_its_gradients(inside: int, outside: int, monkeypatch: pytest.MonkeyPatch) -> None:
     generator = torch.Generator().manual_seed(0)
@@ -106,6 +189,23 @@ def test_convolution_and_its_gradients(inside: int, outside: int, monkeypatch: p
     monkeypatch.setattr(gpu, "takes", lambda values: True)
     for quick, expected in zip(everything(), slow, strict=True):
         torch.testing.assert_close(quick, expected, atol=2e-3, rtol=1e-4)
+
+
+def test_convolutions_side_by_side() -> None:
+    """Each of its own channels, or all of the same ones; and again when a parameter has changed."""
+    topology = Topology(torch.tensor([[0, 0, 0], [0, 0, 1]]))
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.cat([torch.randn(topology.zero_row, 8, generator=generator), torch.zeros(1, 8)])
+    seen = torch.rand(topology.zero_row, generator=generator) < 0.6
+    for shared, inside in ((False, 4), (True, 8)):
+        layers, prepared = [BlockConv3d(inside, 3), BlockConv3d(inside, 3)], Prepared()
+        for _ in range(2):
+            parts = [rows, rows] if shared else [part.contiguous() for part in rows.chunk(2, 1)]
+            with torch.no_grad():
+                expected = torch.cat([layer(part, topology, seen, True) for layer, part in zip(layers, parts, strict=True)], 1)
+                found = prepared.convolve(layers, rows, topology, seen, True, shared)
+                layers[1].weight.mul_(-2.0)
+            torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
 
 def test_lookup(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,28 +241,91 @@ def test_the_gradient_of_lookup(monkeypatch: pytest.MonkeyPatch) -> None:
         torch.testing.assert_close(quick, expected, atol=1e-4, rtol=1e-4)
 
 
+def convolved(
+    rows: torch.Tensor, around: torch.Tensor, taps: torch.Tensor, bias: torch.Tensor, occupied: torch.Tensor, relu: bool = False
+) -> torch.Tensor:
+    """`convolution.convolve` in tensors: in the interpreter the kernel, which has tests of its own, takes a minute for what follows."""
+    groups, _, inside, outside = taps.shape
+    given = SimpleNamespace(around=around, zero_row=len(around) * 512, device=around.device)
+    halo = Topology._rows(given, 0, len(around), -1, 10)  # type: ignore[arg-type]
+    cubes = (torch.relu(rows) if relu else rows)[halo.long()].view(-1, 10, 10, 10, rows.shape[1]).permute(0, 4, 1, 2, 3)
+    weight = taps.view(groups, 3, 3, 3, inside, outside).permute(0, 5, 4, 1, 2, 3).flatten(0, 1)
+    out = torch.nn.functional.conv3d(cubes, weight, bias, groups=groups).permute(0, 2, 3, 4, 1).reshape(-1, groups * outside)
+    return torch.cat([out * occupied[:, None], out.new_zeros(1, groups * outside)])
+
+
+def on_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of what tensors on CUDA make different, but for the convolution."""
+    forced(monkeypatch)
+    monkeypatch.setattr(convolution, "convolve", convolved)
+    monkeypatch.setattr(gpu, "takes", lambda values: True)
+    monkeypatch.setattr(gpu, "there", lambda values: True)
+    monkeypatch.setattr("toolkit.networks.gru.on_cpu", lambda device: False)
+    for module in ("fusion", "networks.lattice", "networks.store", "networks.model", "volume.topology", "volume.edit", "networks.cull"):
+        monkeypatch.setattr(f"toolkit.{module}.asks_freely", lambda device: False)
+    for module in ("networks.compiled_lookup", "networks.model"):
+        monkeypatch.setattr(f"toolkit.{module}.fits", lambda *values: False)
+
+
+def same(one: LatentVolume, other: LatentVolume, names: tuple[str, ...]) -> None:
+    """The same blocks, in any order, of the same numbers."""
+    place = one.topology.find(other.topology.keys)
+    assert one.topology.blocks == other.topology.blocks > 0 and bool((place >= 0).all())
+    assert np.array_equal(one.topology.host, one.topology.keys.numpy())
+    rows = rows_of(place, one.topology.zero_row)
+    for name in names:
+        mine, expected = getattr(one, name), getattr(other, name)
+        torch.testing.assert_close(
+            mine[rows[: len(expected)]], expected, atol=2e-4, rtol=2e-4, msg=lambda text, name=name: f"{name}: {text}"
+        )
+
+
 @pytest.mark.parametrize(("shell", "variance", "count"), [(0.0, True, 3), (1.0, True, 2), (1.0, False, 1)])
-def test_what_corners_are_seen_to_be(shell: float, variance: bool, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_local_volume(shell: float, variance: bool, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     model = small_model(config=replace(SIZES, hidden=16, variance=variance))
     seen_by, space = cameras(count), lattice(16, shell)
-    monkeypatch.setattr(compiled, "fits", lambda *values: False)
-    monkeypatch.setattr(compiled_lookup, "fits", lambda *values: False)
     with torch.no_grad():
-        for parameter in model.local.project.parameters():
-            parameter.normal_(generator=torch.Generator().manual_seed(1))
+        for parameter in model.local.parameters():
+            parameter.normal_(0, 0.2, generator=torch.Generator().manual_seed(1))
         views = model.encode(pictures(count), seen_by)
         swept = model.sweep(views, seen_by, 0.8, 4.0)
-        topology = Topology(all_blocks(space)[:3])
-        given = views, seen_by, space, topology
-        few = torch.rand(topology.zero_row, generator=torch.Generator().manual_seed(2)) < 0.4
+        keys = all_blocks(space)[:3]
+        few = torch.rand(len(keys) * 512, generator=torch.Generator().manual_seed(2)) < 0.4
         for wanted in (None, few):
-            slow = model._seen(*given, wanted, 0.1, 4.0, swept)
+            slow = model.local_volume(views, seen_by, space, Topology(keys), wanted, 0.1, 4.0, swept)
             with monkeypatch.context() as patch:
-                patch.setattr(gpu, "fits", lambda *values: True)
-                quick = model._seen(*given, wanted, 0.1, 4.0, swept)
-            assert torch.equal(quick[0], slow[0]) and len(slow[0])
-            for mine, expected in zip(quick[1:], slow[1:], strict=True):
-                torch.testing.assert_close(mine, expected, atol=2e-4, rtol=2e-4)
+                on_device(patch)
+                topology = Topology(keys, bounds=space.bounds("cpu"))
+                quick = model.local_volume(views, seen_by, space, topology, wanted, 0.1, 4.0, swept)
+                assert quick.busy.blocks == slow.busy.blocks > 0
+                same(quick, slow, ("rows", "count", "raw", "weight"))
+
+
+def test_key_frames_are_fused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two of them on two lattices, and what is left of them when blocks are forgotten."""
+    model = small_model(config=replace(SIZES, hidden=16))
+    seen_by, space = cameras(4), lattice(16, 0.0)
+    with torch.no_grad():
+        for parameter in (*model.local.parameters(), *model.fusion.parameters()):
+            parameter.add_(0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(parameter.numel())))
+        views = model.encode(pictures(4), seen_by)
+        swept = [model.sweep([views[k] for k in group], seen_by[group], 0.8, 4.0) for group in ([0, 1, 2], [3, 2, 1])]
+
+    def fused() -> Fusion:
+        fusion = Fusion(model, space, FusionOptions(2, 0.1, 4.0))
+        for group, sweep in zip(([0, 1, 2], [3, 2, 1]), swept, strict=True):
+            fusion.add([views[k] for k in group], seen_by[group], None, sweep)
+        return fusion
+
+    slow = fused()
+    with monkeypatch.context() as patch:
+        on_device(patch)
+        quick = fused()
+        for mine, expected in zip(quick.stores, slow.stores, strict=True):
+            same(mine.volume(), expected.volume(), ("rows", "count"))
+        quick.prune()
+    slow.prune()
+    same(quick.volume, slow.volume, ("rows", "count"))
 
 
 @pytest.mark.parametrize("busy", [0, 1, 8])
@@ -233,4 +396,4 @@ def test_kernels_are_compiled_a_few_times_whatever_the_sizes() -> None:
     )
     assert done.returncode == 0, done.stderr[-2000:]
     counts = {name: int(count) for name, count, _ in map(str.split, done.stdout.splitlines())}
-    assert len(counts) == 25 and max(counts.values()) <= 4, counts
+    assert len(counts) == 37 and max(counts.values()) <= 4, counts

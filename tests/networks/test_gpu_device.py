@@ -18,9 +18,10 @@ if not torch.cuda.is_available():
 from tests.networks.made import cameras, pictures, small_model
 from tests.networks.test_sweep import wall
 from toolkit.networks.block_conv import block_conv3d
-from toolkit.networks.matching import distribution, semi_global
+from toolkit.networks.matching import describe, distribution, semi_global
 from toolkit.networks.sweep import _table, compare, decide, sweep
 from toolkit.networks.unproject import EncodedView, look_up, project
+from toolkit.networks.witness import alone as by_itself
 from toolkit.networks.witness import certain, evidence, witness
 from toolkit.volume.topology import Topology
 
@@ -61,6 +62,7 @@ def test_a_sweep_and_its_witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
     described, seen_by = wall(3)
     described, seen_by = [one.to(DEVICE) for one in described], seen_by.to(DEVICE)
     points = (torch.rand((100_000, 3), generator=torch.Generator().manual_seed(0)) * 8 - 3).to(DEVICE)
+    depth = (torch.rand((72, 96), generator=torch.Generator().manual_seed(1)) * 8 - 1).to(DEVICE)
 
     def everything() -> dict[str, torch.Tensor]:
         compared = compare(described, seen_by, 0.8, 6.0)
@@ -70,12 +72,20 @@ def test_a_sweep_and_its_witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
         assert said is not None
         made = decide(compared, said=said)
         read = made.look(points, torch.full((len(points),), 0.1, device=DEVICE))
-        out = {"cost": compared.cost, "alone": alone.table, "said": said, "table": made.table}
+        out = {"cost": compared.cost, "alone": alone.table, "said": said, "table": made.table, "says": by_itself(compared)[0].says}
+        out["measured"] = decide(compared, depth).table
         return out | {"signed": read.signed, "open": read.open, "sure": read.sure}
 
     quick, slow = both("sweep and witnesses", everything, monkeypatch)
     for name, expected in slow.items():
         torch.testing.assert_close(quick[name], expected, atol=2e-3, rtol=1e-3, msg=lambda text, name=name: f"{name}: {text}")
+
+
+@pytest.mark.parametrize("size", [(144, 192), (480, 640)])
+def test_what_pictures_are_compared_by(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    images = torch.rand(3, *size, 3, generator=torch.Generator().manual_seed(0)).to(DEVICE).permute(0, 3, 1, 2)
+    quick, slow = both(f"descriptors of {size[0]} x {size[1]}", lambda: describe(images), monkeypatch)
+    torch.testing.assert_close(quick, slow, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.bfloat16])

@@ -7,6 +7,7 @@ which is exact and needs no scatter.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -39,6 +40,7 @@ class BlockConv3d(nn.Module):
         self.weight = nn.Parameter(torch.empty(out_channels, in_channels, 3, 3, 3))
         self.bias = nn.Parameter(torch.empty(out_channels)) if bias else None
         self.chunk = chunk
+        self._prepared = Prepared()
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
@@ -48,10 +50,49 @@ class BlockConv3d(nn.Module):
 
     def forward(self, rows: Tensor, topology: Topology, occupied: Tensor | None = None, relu: bool = False) -> Tensor:
         """See `block_conv3d`."""
+        if not torch.is_grad_enabled() and gpu.takes(rows):
+            return self._prepared.convolve([self], rows, topology, occupied, relu)
         return block_conv3d(rows, topology, self.weight, self.bias, occupied, self.chunk, relu)
 
     def extra_repr(self) -> str:
         return f"{self.weight.shape[1]}, {self.weight.shape[0]}, bias={self.bias is not None}"
+
+
+class Prepared:
+    """What convolutions on CUDA without gradients read of one layer, or of several side by side: kernels in the order of their loop, and
+    biases, in the numbers that are computed in. Laid out anew when a parameter has changed."""
+
+    def __init__(self) -> None:
+        self._key: Any = None
+        self._laid: tuple[Tensor, Tensor | None] | None = None
+
+    def convolve(
+        self,
+        layers: Sequence[BlockConv3d],
+        rows: Tensor,
+        topology: Topology,
+        occupied: Tensor | None = None,
+        relu: bool = False,
+        shared: bool = False,
+    ) -> Tensor:
+        """`block_conv3d` of one or several layers, alike in shape and all with a bias or none, in one launch.
+
+        Args:
+            rows: (M · 512 + 1, C), of several layers: each its own C / layers of them, or, where they are `shared`, all the same.
+
+        Returns:
+            (M · 512 + 1, C'), one layer's channels after the other's.
+        """
+        from toolkit.networks.gpu import convolution
+
+        kind = rows.device.type
+        numbers = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else rows.dtype
+        weights, biases = [one.weight for one in layers], [one.bias for one in layers if one.bias is not None]
+        key = numbers, shared, *[(one.data_ptr(), one._version) for one in (*weights, *biases)]
+        if self._laid is None or key != self._key:
+            taps = convolution.taps_of(*([torch.cat(list(weights))] if shared else weights))
+            self._key, self._laid = key, (taps.to(numbers), torch.cat(list(biases)).to(numbers) if biases else None)
+        return convolution.convolve(rows.to(numbers), topology.around, *self._laid, occupied, relu)
 
 
 def block_conv3d(
@@ -90,8 +131,8 @@ def block_conv3d(
         from toolkit.networks.gpu import convolution
 
         numbers = reduced or rows.dtype
-        given = rows.to(numbers), topology.around, weight.to(numbers), None if bias is None else bias.to(numbers)
-        out = convolution.convolve(*given, occupied, relu)
+        taps, added = convolution.taps_of(weight.to(numbers)), None if bias is None else bias.to(numbers)
+        out = convolution.convolve(rows.to(numbers), topology.around, taps, added, occupied, relu)
         return out if len(rows) > topology.zero_row else out[:-1]
     if relu:
         rows = torch.relu(rows)
@@ -128,7 +169,7 @@ def _convolve(rows: Tensor, weight: Tensor, bias: Tensor | None, topology: Topol
     if gpu.takes(rows):
         from toolkit.networks.gpu import convolution
 
-        return convolution.convolve(rows, topology.around, weight, bias, occupied)
+        return convolution.convolve(rows, topology.around, convolution.taps_of(weight), bias, occupied)
     out = rows.new_empty((topology.zero_row + 1, len(weight)))
     out[-1] = 0
     chunk = min(chunk, topology.blocks)

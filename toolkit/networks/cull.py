@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from toolkit.gpu import asks_freely
+from toolkit.camera import Array
+from toolkit.gpu import asks_freely, sent
 from toolkit.networks.cameras import Cameras
 from toolkit.networks.lattice import Lattice
 from toolkit.volume.topology import BLOCK
@@ -39,8 +41,7 @@ def block_balls(lattice: Lattice, keys: Tensor) -> tuple[Tensor, Tensor]:
 def visible_blocks(centres: Tensor, radii: Tensor, cameras: Cameras, near: float, far: float) -> Tensor:
     """(M,) bool: a part of the ball lies in at least one camera's frustum between the depths `near` and `far` (never too few)."""
     if not asks_freely(centres.device):
-        normals, offsets = _planes(cameras.to("cpu"), near, far)
-        normals, offsets = (values.to(centres.device, non_blocking=True) for values in (normals, offsets))
+        normals, offsets = (sent(values, centres.device) for values in _planes(cameras.to("cpu"), near, far))
         apart = torch.addmm(offsets, centres, normals.T) + radii[:, None]  # (M, K · 6)
         return (apart > 0).view(len(centres), -1, 6).all(2).any(1)
     local = cameras.local(centres)  # (K, M, 3)
@@ -55,18 +56,28 @@ def visible_blocks(centres: Tensor, radii: Tensor, cameras: Cameras, near: float
     return inside.any(0)
 
 
-def _planes(cameras: Cameras, near: float, far: float) -> tuple[Tensor, Tensor]:
+def visible_at_once(centres: Array, radii: Array, cameras: Cameras, near: float, far: float) -> Array:
+    """`visible_blocks` in the processor's memory, where each operation on a few numbers costs more than on all blocks."""
+    normals, offsets = _planes(cameras.to("cpu"), near, far)
+    apart = centres @ normals.T + offsets + radii[:, None]  # (M, K · 6)
+    return np.any(np.all(apart.reshape(len(centres), -1, 6) > 0, axis=2), axis=1)
+
+
+def _planes(cameras: Cameras, near: float, far: float) -> tuple[Array, Array]:
     """(K · 6, 3) unit normals of the frusta's planes, inwards, working frame, and (K · 6,) offsets: x lies n · x + offset inside.
 
     Args:
         cameras: on the CPU.
     """
-    fx, fy, cx, cy = cameras.intrinsics.unbind(1)
-    width, height = cameras.size.unbind(1)
-    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    sides = [(fx, zero, cx), (-fx, zero, width - cx), (zero, fy, cy), (zero, -fy, height - cy)]
-    local = torch.stack([torch.stack(plane, 1) for plane in [*sides, (zero, zero, one), (zero, zero, -one)]], 1)  # (K, 6, 3)
-    world = torch.nn.functional.normalize(local, dim=2) @ cameras.world_from_camera[:, :3, :3].transpose(1, 2)
-    ends = torch.tensor([0.0, 0.0, 0.0, 0.0, -near, min(far, 1e30)])
-    offsets = ends - (world * cameras.positions[:, None]).sum(2)
-    return world.reshape(-1, 3), offsets.reshape(-1)
+    lens, size, poses = cameras.intrinsics.numpy(), cameras.size.numpy(), cameras.world_from_camera.numpy()
+    local = np.zeros((len(lens), 6, 3), np.float32)
+    low, high = lens[:, 2:], size - lens[:, 2:]
+    for axis in (0, 1):
+        local[:, 2 * axis, axis], local[:, 2 * axis, 2] = lens[:, axis], low[:, axis]
+        local[:, 2 * axis + 1, axis], local[:, 2 * axis + 1, 2] = -lens[:, axis], high[:, axis]
+    local[:, 4, 2], local[:, 5, 2] = 1, -1
+    local /= np.linalg.norm(local, axis=2, keepdims=True)
+    world = local @ poses[:, :3, :3].transpose(0, 2, 1)
+    ends = np.array([0, 0, 0, 0, -near, min(far, 1e30)], np.float32)
+    offsets = ends - (world * poses[:, None, :3, 3]).sum(2)
+    return world.reshape(-1, 3), offsets.reshape(-1).astype(np.float32)

@@ -14,12 +14,11 @@ for ever: it is always a mixture of values of tanh.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from toolkit.networks.block_conv import BlockConv3d, block_conv3d
+from toolkit.networks.block_conv import BlockConv3d, Prepared, block_conv3d
 from toolkit.networks.compiled_gru import Step
 from toolkit.networks.lattice import LatentVolume, LocalVolume
 from toolkit.networks.local import CHANGE, INSIDE, held
@@ -43,9 +42,13 @@ class _Gate(nn.Module):
 
     @property
     def first(self) -> BlockConv3d:
-        first = self.convolutions[0]
-        assert isinstance(first, BlockConv3d)
-        return first
+        return self.layer(0)
+
+    def layer(self, depth: int) -> BlockConv3d:
+        """One of the convolutions."""
+        found = self.convolutions[depth]
+        assert isinstance(found, BlockConv3d)
+        return found
 
     def forward(self, rows: Tensor, topology: Topology, inside: Tensor, begun: Tensor | None = None) -> Tensor:
         """`begun`: what the first convolution gives for `rows`, if that is known already."""
@@ -66,6 +69,7 @@ class FusionGRU(nn.Module):
         super().__init__()
         self.update, self.reset, self.candidate = (_Gate(channels, hidden, layers) for _ in range(3))
         self.most = most
+        self._side_by_side = [Prepared() for _ in range(layers)]
 
     def forward(
         self, state: Tensor, count: Tensor, local: Tensor, raw: Tensor, weight: Tensor, topology: Topology, inside: Tensor
@@ -89,26 +93,42 @@ class FusionGRU(nn.Module):
         candidate = torch.tanh(raw + held(self.candidate(_beside(r * state, local), topology, inside)))
         return torch.lerp(state, candidate, z)
 
-    def compiled(self, part: LatentVolume, local: LocalVolume) -> Tensor:
+    def compiled(self, part: LatentVolume, local: LocalVolume) -> tuple[Tensor, Tensor]:
         """The running mean on all rows of `part` (the global volume on the local one's blocks) and `forward` on those of busy blocks,
         without gradients, by kernels (float32; convolutions in what autocast says).
 
         Returns:
-            (M · 512 + 1, C), zero outside the local volume.
+            (M · 512 + 1, C), zero outside the local volume, and (M · 512,) weights so far, likewise.
         """
-        place, busy, kind = local.place[:-1], local.busy, part.rows.device.type
-        maker: Any = Step
+        kind, busy = part.rows.device.type, local.busy
+        numbers = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
         if not on_cpu(part.rows.device):
-            from toolkit.networks.gpu.gru import Step as maker
-        step = maker(place, part, local, LEAST, self.most)
+            return self._on_device(part, local, numbers)
+        step = Step(local.place[:-1], part, local, LEAST, self.most)
         rows = step.average()
         if busy.blocks:
-            inside = local.known[place]
-            both = step.beside(torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32)
+            inside = local.known[local.place[:-1]]
+            both = step.beside(numbers)
             update, reset = self._gates(both, busy, inside)
             step.forget(reset, both)
             step.update(update, self.candidate(both, busy, inside), INSIDE, CHANGE, rows)
-        return rows
+        return rows, part.count * local.known + local.weight
+
+    def _on_device(self, part: LatentVolume, local: LocalVolume, numbers: torch.dtype) -> tuple[Tensor, Tensor]:
+        """`compiled` on CUDA: both gates' convolutions go side by side."""
+        from toolkit.networks.gpu import gru
+
+        step, busy = gru.Step(part, local, LEAST, self.most), local.busy
+        rows, count = step.average()
+        if busy.blocks:
+            both, inside = step.beside(numbers)
+            gates = both
+            for depth, prepared in enumerate(self._side_by_side):
+                layers = [self.update.layer(depth), self.reset.layer(depth)]
+                gates = prepared.convolve(layers, gates, busy, inside, depth > 0, shared=depth == 0)
+            step.forget(gates, both)
+            step.update(gates, self.candidate(both, busy, inside), INSIDE, CHANGE, rows)
+        return rows, count
 
     def _gates(self, both: Tensor, topology: Topology, inside: Tensor) -> list[Tensor]:
         """M_z and M_r of [H, V]; their first convolutions are one, which costs as much as either alone."""

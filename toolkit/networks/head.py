@@ -39,6 +39,11 @@ class FieldHead(nn.Module):
             self.skip.weight[:, :].fill_diagonal_(1.0)
             self.skip.weight[:3].mul_(COLOUR_SCALE)
 
+    @property
+    def numbers(self) -> tuple[float, float, float]:
+        """Start, gain and most that may be learned of the thickness, for what computes it elsewhere."""
+        return START, SCALE, CHANGE
+
     def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         hidden = self.body(latent)
         return self._thickness(latent, hidden), self.features(hidden) + self.skip(latent)

@@ -7,6 +7,7 @@ produce is a field at once and can be refined as one.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -108,16 +109,27 @@ class LocalVolume(LatentVolume):
     Attributes:
         weight: (M · 512,) in (0, 1] where the corner is known: how much the key frame can say of it.
         busy: blocks about surfaces. The networks work on these alone; the others hold what the known terms say.
-        place: (M' · 512 + 1,) rows of the busy blocks, the zero row last (the same way back).
+        among: (M',) int64 slots of the busy blocks.
     """
 
     raw: Tensor  # (M · 512 + 1, C)
     weight: Tensor
     busy: Topology
-    place: Tensor
+    among: Tensor
+
+    @cached_property
+    def place(self) -> Tensor:
+        """(M' · 512 + 1,) rows of the busy blocks, the zero row last (the same way back)."""
+        return rows_of(self.among, self.topology.zero_row)
 
     def detached(self) -> LocalVolume:
         return replace(self, rows=self.rows.detach(), raw=self.raw.detach())
+
+
+def rows_of(blocks: Tensor, zero_row: int) -> Tensor:
+    """(M,) slots → (M · 512 + 1,) int64 rows of these blocks, the zero row last."""
+    rows = (blocks[:, None] * VOXELS + torch.arange(VOXELS, device=blocks.device)).view(-1)
+    return torch.cat([rows, rows.new_full((1,), zero_row)])
 
 
 def empty_volume(lattice: Lattice, channels: int, device: torch.device | str = "cpu") -> LatentVolume:

@@ -74,6 +74,10 @@ class LocalReconstruction(nn.Module):
         Returns:
             (M · 512 + 1, channels), zero where nothing is seen.
         """
+        return held(self.learned(rows, topology, seen)) + start
+
+    def learned(self, rows: Tensor, topology: Topology, seen: Tensor) -> Tensor:
+        """(M · 512 + 1, channels) what the convolutions give, before it is `held` and added to the start."""
         for number, convolution in enumerate(self.convolutions):
             rows = convolution(rows, topology, seen, number > 0)
-        return held(rows) + start
+        return rows

@@ -30,6 +30,10 @@ def describe(images: Tensor, side: int = SIDE) -> Tensor:
     if long > side:
         size = [max(1, round(length * side / long)) for length in images.shape[-2:]]
         images = F.interpolate(images, size, mode="bilinear", antialias=True)
+    if gpu.fits(images):
+        from toolkit.networks.gpu import describe as kernels
+
+        return kernels.describe(images, GREY, CONTRAST)
     red, green, blue = images.split(1, 1)
     grey = GREY[0] * red + GREY[1] * green + GREY[2] * blue
     return torch.cat([images, _patches(grey, 1), _patches(grey, 2)], 1)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import torch
 import torch.nn.functional as F
@@ -29,14 +29,15 @@ from toolkit.networks.compiled import fits
 from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
 from toolkit.networks.decoder import make_decoder
 from toolkit.networks.direction import DirectionCode
-from toolkit.networks.encoder import STRIDE, ImageEncoder, Sampled, padded
+from toolkit.networks.encoder import DEEPEST, STRIDE, ImageEncoder, Sampled, padded
 from toolkit.networks.gru import FusionGRU, RunningMean, mean_gate
 from toolkit.networks.head import FieldHead
-from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume, empty_volume
+from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume, empty_volume, rows_of
 from toolkit.networks.local import INSIDE, LocalReconstruction, colour_latent, inside_latent
 from toolkit.networks.matching import SIDE, describe
-from toolkit.networks.pyramid import pyramids
-from toolkit.networks.refine import with_blocks
+from toolkit.networks.pyramid import Pyramid, levelled, middles, sizes_of
+from toolkit.networks.recorded import Recorded
+from toolkit.networks.refine import least_thickness, surface_cells, with_blocks
 from toolkit.networks.sweep import Empty, Sighted, Sweep, sweep
 from toolkit.networks.unproject import COLOURED, EncodedView, look_up, project
 from toolkit.volume.topology import VOXELS, Topology
@@ -45,6 +46,7 @@ CHUNK = 2**15  # voxels at a time: what the views show of them is many times lar
 AT_ONCE = 2**19  # where there is memory for that: 0.4 kB a voxel and view
 COLOURS = 3
 COLOUR_GAIN = 4.0  # pictures' RGB as numbers of about unit deviation
+RECORDED = 2**23  # numbers in pictures up to which encoding them is recorded on CUDA: recordings keep the memory that they need
 LEVELS = 3  # of the feature maps
 COLOUR_LEVELS = 5
 SIGHTED = 3  # numbers that the plane sweep says of a voxel
@@ -87,6 +89,7 @@ class NerfusionModel(nn.Module):
         self.fusion: FusionGRU | RunningMean = FusionGRU(config.channels, config.gru_hidden) if config.fusion == "gru" else RunningMean()
         self.to_field = FieldHead(config.channels, config.head_hidden, config.features)
         self.decoder = make_decoder(config.decoder, config.features, config.decoder_hidden)
+        self._recorded = Recorded()
 
     @property
     def device(self) -> torch.device:
@@ -103,15 +106,39 @@ class NerfusionModel(nn.Module):
             cameras: V cameras for exactly these pictures.
             side: pixels of the long side at which they are compared; None: they are not (their sweep is made elsewhere).
         """
+        given = images, cameras.intrinsics, cameras.size, cameras.world_from_camera
+        if self._repeats(images):
+            features, colours, described = self._recorded(partial(self._shown, side=side), (side, self._state()), *given)
+        else:
+            features, colours, described = self._shown(*given, side=side)
+        height, width = (length + -length % DEEPEST for length in images.shape[2:])
+        sizes, fine = sizes_of(height // STRIDE, width // STRIDE, LEVELS), sizes_of(height, width, COLOUR_LEVELS)
+        return [
+            EncodedView(Pyramid(feature, sizes, STRIDE), Pyramid(colour, fine, 1), of)
+            for feature, colour, of in zip(features, colours, described, strict=True)
+        ]
+
+    def _shown(self, images: Tensor, intrinsics: Tensor, size: Tensor, poses: Tensor, side: int | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Rows of `encode`'s pyramids (V, R, C) and (V, R', 3), and what pictures are compared by (V, …)."""
+        cameras = Cameras(intrinsics, size, poses)
         maps = self.sample(*self.encoder.maps(images)).float()  # variances are looked for in them
         whole = padded((images - 0.5) * COLOUR_GAIN)
         described = images.new_zeros((len(images), 0, 0, 0)) if side is None else describe(images, side)
-        features, colours = pyramids(maps, STRIDE, LEVELS), pyramids(whole, 1, COLOUR_LEVELS)
+        features, colours = levelled(maps, LEVELS), levelled(whole, COLOUR_LEVELS)
         if self.direction is not None:
-            pixels = features[0].pixels()
+            pixels = middles(sizes_of(maps.shape[2], maps.shape[3], LEVELS), STRIDE, features.device, features.dtype)
             codes = self.direction(torch.stack([cameras.directions(index, pixels) for index in range(len(images))]))
-            features = [one.with_columns(code.to(one.rows.dtype)) for one, code in zip(features, codes, strict=True)]
-        return [EncodedView(*parts) for parts in zip(features, colours, described, strict=True)]
+            features = torch.cat([features, codes.to(features.dtype)], 2)
+        return features.contiguous(), colours.contiguous(), described
+
+    def _repeats(self, images: Tensor) -> bool:
+        """Whether encoding such pictures is worth recording: hundreds of launches, of which the processor makes one that way."""
+        free = not torch.is_grad_enabled() and not torch.is_autocast_enabled(images.device.type)
+        return free and images.is_cuda and images.numel() <= RECORDED
+
+    def _state(self) -> tuple[int, ...]:
+        """Where parameters of encoding lie, which recordings read there; all are moved together."""
+        return tuple(next(part.parameters()).data_ptr() for part in (self.encoder, self.sample, self.direction) if part is not None)
 
     def sweep(
         self,
@@ -156,9 +183,13 @@ class NerfusionModel(nn.Module):
         if swept is None:
             bounded = near > 0 or math.isfinite(far)
             swept = self.sweep(views, cameras, *((near, far) if bounded else _depths(lattice, topology, cameras)))
+        if self._on_device(views, swept):
+            from toolkit.networks.gpu.local import local_volume
+
+            numbers = TRUNCATION, HIDDEN, BLIND, COLOUR_GAIN, COLOURED, FREE
+            sizes = self.config.sampled, self.config.variance, self.config.channels
+            return local_volume(self.local, views, cameras, lattice, topology, wanted, near, far, swept, numbers, sizes)
         where, projected, starts, counts, weights = self._seen(views, cameras, lattice, topology, wanted, near, far, swept)
-        if not torch.is_grad_enabled() and starts.shape[1] == INSIDE + 1 and gpu.fits(projected):
-            return self._laid(lattice, topology, where, projected, starts, counts, weights)
         topology, where = _without_empty_blocks(topology, where)
         config, size = self.config, topology.zero_row
         count = torch.zeros(size, device=topology.device).index_copy(0, where, counts)
@@ -171,42 +202,14 @@ class NerfusionModel(nn.Module):
         # One more block takes those that are free: to choose the others would be to wait for the device.
         active = active.index_fill(0, torch.where(busy_rows, slots, topology.blocks), True)[:-1]
         latent = projected.new_zeros((size + 1, config.hidden)).index_copy(0, where, projected)
-        busy, place = _blocks(topology, active)
+        busy, among, place = _blocks(topology, active)
         raw = start.index_copy(0, place, self.local(latent[place], start[place], busy, count[place[:-1]] > 0))
-        return LocalVolume(lattice, topology, torch.tanh(raw), count, raw, weight, busy, place)
+        return LocalVolume(lattice, topology, torch.tanh(raw), count, raw, weight, busy, among)
 
-    def _laid(
-        self, lattice: Lattice, topology: Topology, where: Tensor, projected: Tensor, starts: Tensor, counts: Tensor, weights: Tensor
-    ) -> LocalVolume:
-        """The rest of `local_volume` on CUDA without gradients: the device is asked once which blocks are worked on."""
-        from toolkit.volume import blocks_gpu as blocks
-
-        channels, threshold = self.config.channels, _latent_of(FREE)
-        laid = blocks.lay(topology.blocks, where, projected, starts, counts, weights, channels, threshold)
-        marks = laid[-1].cpu().bool()
-        filled, busy = marks[:, 0].nonzero().view(-1), marks[:, 1].nonzero().view(-1)
-        both = torch.cat([filled, busy]).to(where.device, non_blocking=True)
-        kept, active = both[: len(filled)], both[len(filled) :]
-        size = len(filled) * VOXELS
-
-        def of(values: Tensor, some: Tensor, more: int) -> Tensor:
-            """Rows of some of the blocks, and `more` zero rows."""
-            rows = values[: topology.zero_row].view(topology.blocks, -1)[some].view(-1, *values.shape[1:])
-            return F.pad(rows, (0, 0, 0, more)) if more else rows
-
-        latent, start, count, weight = laid[:4]
-        small = topology.alike(topology.keys[active])
-        learned = self.local(of(latent, active, 1), of(start, active, 1), small, of(count, active, 0) > 0)
-        if len(filled) < topology.blocks:
-            start, count, weight = of(start, kept, 1), of(count, kept, 0), of(weight, kept, 0)
-            among = (torch.cumsum(marks[:, 0], 0) - 1)[busy].to(where.device, non_blocking=True)
-            topology = topology.alike(topology.keys[kept])
-        else:
-            among = active
-        place = (among[:, None] * VOXELS + torch.arange(VOXELS, device=among.device)).view(-1)
-        place = torch.cat([place, place.new_full((1,), size)])
-        raw = start.index_copy(0, place, learned)
-        return LocalVolume(lattice, topology, torch.tanh(raw), count, raw, weight, small, place)
+    def _on_device(self, views: Sequence[EncodedView], swept: Sweep) -> bool:
+        """Whether kernels on CUDA make local volumes."""
+        wide = self.config.hidden in (16, 32) and self.config.channels > INSIDE
+        return not torch.is_grad_enabled() and wide and gpu.fits(swept.table, *(view.features.rows for view in views))
 
     def _seen(
         self,
@@ -220,15 +223,7 @@ class NerfusionModel(nn.Module):
         swept: Sweep,
     ) -> tuple[Tensor, ...]:
         """`_observe` of all corners that are `wanted`, None: of all."""
-        rows = None if wanted is None else wanted.nonzero().view(-1)
-        if not torch.is_grad_enabled() and self.config.hidden in (16, 32) and gpu.fits(swept.table, *(v.features.rows for v in views)):
-            from toolkit.networks.gpu.observe import Observer
-
-            observer = Observer(views, cameras, near, far, swept, (TRUNCATION, HIDDEN, BLIND, COLOUR_GAIN, COLOURED))
-            rows = observer.choose(lattice, topology.keys, rows)
-            return rows, *observer.observe(lattice, topology.keys, rows, self.local.project, self.config.sampled, self.config.variance)
-        if rows is None:
-            rows = torch.arange(topology.zero_row, device=topology.device)
+        rows = torch.arange(topology.zero_row, device=topology.device) if wanted is None else wanted.nonzero().view(-1)
         few = CHUNK if asks_freely(rows.device) else AT_ONCE
         parts = [self._observe(views, cameras, lattice, topology, part, near, far, swept) for part in rows.split(few)]
         return tuple(torch.cat(values) for values in zip(*parts, strict=True))
@@ -290,7 +285,8 @@ class NerfusionModel(nn.Module):
         """One step of the recurrence on the blocks of a local volume alone: `part` is the global volume there."""
         known = part.rows, part.count, local.rows, local.raw
         if isinstance(self.fusion, FusionGRU) and not torch.is_grad_enabled() and (fits(*known) or gpu.fits(*known)):
-            return replace(part, rows=self.fusion.compiled(part, local), count=part.count * local.known + local.weight)
+            rows, count = self.fusion.compiled(part, local)
+            return replace(part, rows=rows, count=count)
         inside = local.known
         count = part.count * inside
         mask = torch.cat([count > 0, inside.new_zeros(1)])[:, None]
@@ -300,6 +296,14 @@ class NerfusionModel(nn.Module):
         busy, place, inner = local.busy, local.place, local.place[:-1]
         after = self.fusion(before[place], count[inner], local.rows[place], local.raw[place], local.weight[inner], busy, inside[inner])
         return replace(part, rows=rows.index_copy(0, place, after), count=count + local.weight)
+
+    def surface_cells(self, volume: LatentVolume, seen: Tensor, gamma: float) -> Tensor:
+        """`refine.surface_cells` of what the head says."""
+        if not torch.is_grad_enabled() and self.config.channels > INSIDE and gpu.fits(volume.rows):
+            from toolkit.networks.gpu import volumes
+
+            return volumes.surface_cells(volume.topology, volume.rows, volume.count, seen, self.to_field, least_thickness(gamma))
+        return surface_cells(volume, seen, self.thickness(volume), gamma)
 
     def thickness(self, volume: LatentVolume) -> Tensor:
         """(M · 512 + 1,) the first of what `head` gives, alone."""
@@ -345,11 +349,10 @@ def _depths(lattice: Lattice, topology: Topology, cameras: Cameras) -> tuple[flo
     return max(float((depth - radii).amin()), 0.0), max(float((depth + radii).amax()), 1e-6)
 
 
-def _blocks(topology: Topology, kept: Tensor) -> tuple[Topology, Tensor]:
-    """The blocks of the mask (M,) alone, and their rows, the zero row last (the same way back)."""
+def _blocks(topology: Topology, kept: Tensor) -> tuple[Topology, Tensor, Tensor]:
+    """The blocks of the mask (M,) alone, their slots, and their rows, the zero row last (the same way back)."""
     blocks = kept.nonzero().view(-1)
-    rows = (blocks[:, None] * VOXELS + torch.arange(VOXELS, device=blocks.device)).view(-1)
-    return topology.alike(topology.keys[blocks]), torch.cat([rows, rows.new_full((1,), topology.zero_row)])
+    return topology.alike(topology.keys[blocks]), blocks, rows_of(blocks, topology.zero_row)
 
 
 def _without_empty_blocks(topology: Topology, rows: Tensor) -> tuple[Topology, Tensor]:

@@ -37,14 +37,6 @@ class Pyramid:
         """(C, h, w), the first level → a pyramid by averaging 2×2 cells, as long as both sides are even."""
         return pyramids(image[None], stride, levels)[0]
 
-    def with_columns(self, columns: Tensor) -> Pyramid:
-        """More channels (R, C') beside these."""
-        return Pyramid(torch.cat([self.rows, columns], 1), self.sizes, self.stride)
-
-    def pixels(self) -> Tensor:
-        """(R, 2) the pixel of the picture (centres at +0.5) at the middle of each cell."""
-        return _middles(self.sizes, self.stride, self.rows.device, self.rows.dtype)
-
     def lookup(self, pixels: Tensor, footprint: Tensor) -> Tensor:
         """Bilinear values.
 
@@ -78,17 +70,30 @@ class Pyramid:
 
 def pyramids(images: Tensor, stride: int, levels: int) -> list[Pyramid]:
     """(V, C, h, w), first levels → pyramids by averaging 2×2 cells, as long as both sides are even."""
-    maps = [images]
-    while len(maps) < levels and maps[-1].shape[2] % 2 == 0 and maps[-1].shape[3] % 2 == 0:
-        maps.append(F.avg_pool2d(maps[-1], 2))
-    rows = torch.cat([level.flatten(2).transpose(1, 2) for level in maps], 1)
-    sizes = tuple((level.shape[2], level.shape[3]) for level in maps)
+    rows = levelled(images, levels)
+    sizes = sizes_of(images.shape[2], images.shape[3], levels)
     return [Pyramid(one, sizes, stride) for one in rows.contiguous()]
 
 
+def levelled(images: Tensor, levels: int) -> Tensor:
+    """(V, C, h, w), first levels → (V, R, C) rows of pyramids."""
+    maps = [images]
+    for _ in sizes_of(images.shape[2], images.shape[3], levels)[1:]:
+        maps.append(F.avg_pool2d(maps[-1], 2))
+    return torch.cat([level.flatten(2).transpose(1, 2) for level in maps], 1)
+
+
+def sizes_of(height: int, width: int, levels: int) -> tuple[tuple[int, int], ...]:
+    """(height, width) of each level."""
+    out = [(height, width)]
+    while len(out) < levels and out[-1][0] % 2 == 0 and out[-1][1] % 2 == 0:
+        out.append((out[-1][0] // 2, out[-1][1] // 2))
+    return tuple(out)
+
+
 @lru_cache(maxsize=8)
-def _middles(sizes: tuple[tuple[int, int], ...], stride: int, device: torch.device, kind: torch.dtype) -> Tensor:
-    """(R, 2) see `Pyramid.pixels`; pictures of a capture share them."""
+def middles(sizes: tuple[tuple[int, int], ...], stride: int, device: torch.device, kind: torch.dtype) -> Tensor:
+    """(R, 2) the pixel of the picture (centres at +0.5) at the middle of each cell; pictures of a capture share them."""
     parts = []
     for level, (height, width) in enumerate(sizes):
         v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")

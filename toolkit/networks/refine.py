@@ -10,7 +10,7 @@ from torch import Tensor
 
 from toolkit import gpu
 from toolkit.networks.lattice import LatentVolume, cells
-from toolkit.volume.edit import corner_nodes, split
+from toolkit.volume.edit import corner_nodes, doubled, split
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
 
 INHERITED = 0.25  # weight of a latent taken over from the coarse volume
@@ -18,7 +18,12 @@ INHERITED = 0.25  # weight of a latent taken over from the coarse volume
 
 def solid(thickness: Tensor, gamma: float) -> Tensor:
     """(M · 512 + 1,) logarithm of a voxel's optical thickness → (M · 512,) bool: exp(−thickness) ≤ γ (the paper's pruning rule)."""
-    return thickness[:-1].detach() >= math.log(-math.log(gamma))
+    return thickness[:-1].detach() >= least_thickness(gamma)
+
+
+def least_thickness(gamma: float) -> float:
+    """Logarithm of the optical thickness of a voxel with exp(−thickness) = γ."""
+    return math.log(-math.log(gamma))
 
 
 def solid_cells(volume: LatentVolume, thickness: Tensor, gamma: float | None) -> Tensor:
@@ -49,6 +54,11 @@ def split_volume(volume: LatentVolume, kept: Tensor) -> LatentVolume:
 
     Known are exactly the corners of the kept cells' children. They count little, so that what is seen finer prevails.
     """
+    if volume.topology.bounds is not None and gpu.fits(volume.rows):
+        from toolkit.volume import split_gpu
+
+        given = volume.topology, kept, volume.rows.detach(), doubled(*volume.topology.bounds), INHERITED
+        return LatentVolume(volume.lattice.finer(), *split_gpu.split(*given))
     topology, occupied, (rows,) = split(volume.topology, kept, [volume.rows.detach()])
     return LatentVolume(volume.lattice.finer(), topology, rows, corner_nodes(topology, occupied).float() * INHERITED)
 
@@ -75,7 +85,7 @@ def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
     if volume.topology.blocks and gpu.fits(volume.rows):
         from toolkit.volume import blocks_gpu as blocks
 
-        return LatentVolume(volume.lattice, topology, *blocks.take(volume.rows, volume.count, slots))
+        return LatentVolume(volume.lattice, topology, *blocks.take(volume.rows, volume.count, slots.int(), topology))
     place = (slots.clamp_min(0)[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
     here = (slots >= 0).repeat_interleave(VOXELS)
     if volume.topology.blocks == 0:
@@ -87,6 +97,11 @@ def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
 
 def merged(before: LatentVolume, after: LatentVolume, changed: Tensor) -> LatentVolume:
     """`after` where `changed` (M · 512,), else `before`; both have the same blocks."""
+    if gpu.fits(before.rows, after.rows):
+        from toolkit.networks.gpu import volumes
+
+        rows, count = volumes.merge(before.rows, before.count, after.rows, after.count, changed)
+        return replace(before, rows=rows, count=count)
     return replace(before, rows=torch.where(_mask(changed), after.rows, before.rows), count=torch.where(changed, after.count, before.count))
 
 

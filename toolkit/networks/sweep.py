@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -20,7 +19,8 @@ from torch import Tensor
 from toolkit import gpu
 from toolkit.networks import compiled
 from toolkit.networks.cameras import Cameras
-from toolkit.networks.matching import COLOUR_GAIN, UNKNOWN, difference, distribution, together
+from toolkit.networks.matching import COLOUR_GAIN, LARGE, SMALL, TEMPERATURE, UNKNOWN, difference, distribution, together
+from toolkit.networks.movement import movement
 
 SPACING = 2  # pixels of the compared pictures between those whose depth is asked for …
 WITHIN = 1  # … and where silhouettes bound it: fine things then stand alone, and most pixels meet nothing
@@ -153,13 +153,21 @@ def compare(described: Sequence[Tensor], cameras: Cameras, near: float, far: flo
 
 def _compared(described: Sequence[Tensor], cameras: Cameras, near: float, far: float, empty: Empty | None) -> Compared:
     """`compare`, with both ends known."""
-    scale = [view.shape[2] for view in described]
-    ladder = torch.linspace(1 / far, 1 / near, _planes(scale, cameras.to("cpu"), near, far))  # without asking the device
-    lowest, step = float(ladder[0]), float(ladder[1] - ladder[0])
-    inverses = ladder.to(cameras.intrinsics.device, non_blocking=True)
+    count = _planes([view.shape[2] for view in described], cameras.to("cpu"), near, far)
+    ladder = torch.linspace(1 / far, 1 / near, count)
+    first, second = ladder.numpy()[:2]  # without asking the device
+    lowest, step = float(first), float(second - first)
     spacing = SPACING if empty is None else WITHIN
-    rays, own, shape = _pixels(described[0], cameras, spacing)
-    world = rays @ cameras.world_from_camera[0, :3, :3].T
+    shape = _shape(described[0], spacing)
+    if gpu.fits(cameras.intrinsics, *described):
+        from toolkit.networks.gpu.describe import pixels
+
+        world, own, inverses = pixels(described[0], cameras, shape, count, 1 / far, 1 / near)
+        rays = world  # the kernel takes them in working axes
+    else:
+        inverses = ladder.to(cameras.intrinsics.device, non_blocking=True)
+        rays, own = _pixels(described[0], cameras, shape)
+        world = rays @ cameras.world_from_camera[0, :3, :3].T
     if empty is None:
         return Compared(cameras[0], world, inverses, lowest, step, _volume(_costs(described, cameras, inverses, rays, own), shape))
     depths, origin = (1 / inverses)[:, None], cameras.positions[0]
@@ -194,7 +202,7 @@ def _span(wanted: Tensor) -> tuple[int, int]:
 
 
 def _costs(described: Sequence[Tensor], cameras: Cameras, inverses: Tensor, rays: Tensor, own: Tensor) -> Tensor:
-    """(P, D) of pixels of the first view, with rays (P, 3) in its axes and descriptors (P, 21)."""
+    """(P, D) of pixels of the first view, with rays (P, 3) in its axes, on CUDA in working axes, and descriptors (P, 21)."""
     if len(cameras) == 1:
         return rays.new_zeros((len(rays), len(inverses)))
     if compiled.fits(rays, *described):
@@ -202,12 +210,10 @@ def _costs(described: Sequence[Tensor], cameras: Cameras, inverses: Tensor, rays
         for view in range(1, len(cameras)):
             comparison.add(described[view], *_way(cameras, view), cameras.lens(view))
         return comparison.result(UNKNOWN)
-    if gpu.fits(rays, *described):
+    if gpu.fits(cameras.intrinsics, *described):
         from toolkit.networks.gpu import matching
 
-        world = rays @ cameras.world_from_camera[0, :3, :3].T
-        lenses = cameras.intrinsics, cameras.size, cameras.world_from_camera
-        return matching.costs(list(described), *lenses, inverses, world, own, COLOUR_GAIN, UNKNOWN)
+        return matching.costs(described, cameras, inverses, rays, own, COLOUR_GAIN, UNKNOWN)
     parts = []
     for ray, mine in zip(rays.split(AT_ONCE), own.split(AT_ONCE), strict=True):
         found = [_warped(described[view], cameras, view, ray, inverses) for view in range(1, len(cameras))]
@@ -229,9 +235,20 @@ def decide(compared: Compared, depth: Tensor | None = None, said: Tensor | None 
         depth: (H, W) of the key view along z in working units, where a sensor measured it; 0 or not finite where it did not.
         said: (D, h, w) that makes planes likelier, in units of the cost (`witness.evidence`).
     """
+    if compared.empty is None and depth is None and gpu.fits(compared.cost):
+        from toolkit.networks.gpu import matching
+
+        table = matching.decided(compared.cost, said, SMALL, LARGE, TEMPERATURE, compared.step, PEAK)
+        return Sweep(compared.camera, table, compared.lowest, compared.step)
     likely = distribution(compared.cost if said is None else compared.cost - said)
     if compared.empty is not None:
         likely = carved(likely, compared.empty)
+    if depth is not None and gpu.fits(likely, compared.inverses, depth):
+        from toolkit.networks.gpu.measured import measured as table_of
+
+        asked = _asked(likely, depth, compared.spacing, compared.window)
+        table = table_of(likely, compared.inverses, depth, *asked, compared.step, NOISE, TRUST, PEAK)
+        return Sweep(compared.camera, table, compared.lowest, compared.step)
     if depth is not None:
         likely = measured(likely, compared.inverses, depth, compared.spacing, compared.window)
     return Sweep(compared.camera, _table(likely, compared.step), compared.lowest, compared.step)
@@ -279,9 +296,7 @@ def measured(
     Returns:
         (D, h', w') at all pixels of the compared pictures: a depth sensor tells edges better than patches do.
     """
-    left, upper, right, lower = window
-    spans = [(low * most, (high - low) * most) for low, high, most in ((upper, lower, depth.shape[0]), (left, right, depth.shape[1]))]
-    shape = [max(1, min(spacing * side, round(length))) for side, (_, length) in zip(likely.shape[1:], spans, strict=True)]
+    shape, spans = _asked(likely, depth, spacing, window)
     # Depth is picked and not averaged: between two surfaces there is nothing.
     rows, columns = (
         (first + (torch.arange(n, device=depth.device) + 0.5) * (length / n)).long()
@@ -294,6 +309,15 @@ def measured(
     near = torch.softmax(-0.5 * ((inverses[:, None, None] - inverse) / width).square(), 0)
     told = F.interpolate(likely[None], shape, mode="bilinear", align_corners=False)[0]
     return torch.where(known, TRUST * near + (1 - TRUST) * told, told)
+
+
+def _asked(
+    likely: Tensor, depth: Tensor, spacing: int, window: tuple[float, float, float, float]
+) -> tuple[list[int], list[tuple[float, float]]]:
+    """Rows and columns of what `measured` gives, and where in the depth they begin and how many pixels of it they cover."""
+    left, upper, right, lower = window
+    spans = [(low * most, (high - low) * most) for low, high, most in ((upper, lower, depth.shape[0]), (left, right, depth.shape[1]))]
+    return [max(1, min(spacing * side, round(length))) for side, (_, length) in zip(likely.shape[1:], spans, strict=True)], spans
 
 
 def _table(likely: Tensor, step: float) -> Tensor:
@@ -324,10 +348,14 @@ def _bounded(near: float, far: float) -> tuple[float, float]:
     return near, far
 
 
-def _pixels(described: Tensor, cameras: Cameras, spacing: int) -> tuple[Tensor, Tensor, tuple[int, int]]:
-    """Rays (P, 3) of unit depth through every `spacing`-th pixel of the first view, their descriptors (P, 21), and the grid's shape."""
+def _shape(described: Tensor, spacing: int) -> tuple[int, int]:
+    """Rows and columns of every `spacing`-th pixel."""
     height, width = described.shape[1:]
-    shape = (max(1, height // spacing), max(1, width // spacing))
+    return max(1, height // spacing), max(1, width // spacing)
+
+
+def _pixels(described: Tensor, cameras: Cameras, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Rays (P, 3) of unit depth through a grid of pixels of the first view, in its axes, and their descriptors (P, 21)."""
     # Cells of equal size cover the picture, so that reading the table needs its borders alone.
     v = (torch.arange(shape[0], device=described.device) + 0.5) / shape[0] * 2 - 1
     u = (torch.arange(shape[1], device=described.device) + 0.5) / shape[1] * 2 - 1
@@ -335,7 +363,7 @@ def _pixels(described: Tensor, cameras: Cameras, spacing: int) -> tuple[Tensor, 
     own = F.grid_sample(described[None], grid[None], padding_mode="border", align_corners=False)[0].flatten(1).T
     focal, middle = cameras.intrinsics[0, :2], cameras.intrinsics[0, 2:]
     flat = ((grid.view(-1, 2) + 1) / 2 * cameras.size[0] - middle) / focal
-    return torch.cat([flat, torch.ones_like(flat[:, :1])], 1), own, shape
+    return torch.cat([flat, torch.ones_like(flat[:, :1])], 1), own
 
 
 def _way(cameras: Cameras, view: int) -> tuple[Tensor, Tensor]:
@@ -358,26 +386,5 @@ def _warped(described: Tensor, cameras: Cameras, view: int, rays: Tensor, invers
 
 
 def _planes(widths: Sequence[int], cameras: Cameras, near: float, far: float) -> int:
-    """How many planes: pictures of the view that moves most move by `STEP` from one to the next at nine places of the first.
-
-    Args:
-        widths: K, of the pictures that are compared.
-        cameras: on the CPU.
-    """
-    numbers = [values.numpy() for values in (cameras.intrinsics, cameras.size, cameras.world_from_camera)]
-    lenses, sizes, poses = numbers
-    spots = np.array([[u, v, 1.0] for u in (0.1, 0.5, 0.9) for v in (0.1, 0.5, 0.9)], dtype=np.float32)
-    rays = spots.copy()
-    rays[:, :2] = (spots[:, :2] * sizes[0] - lenses[0, 2:]) / lenses[0, :2]
-    most = 0.0
-    for view in range(1, len(cameras)):
-        axes = poses[view, :3, :3]
-        turn, shift = poses[0, :3, :3].T @ axes, (poses[0, :3, 3] - poses[view, :3, 3]) @ axes
-        one, two = (rays @ turn + shift / np.float32(depth) for depth in (near, far))
-        front = (one[:, 2] > 0.05) & (two[:, 2] > 0.05)
-        if not front.any():
-            continue
-        one, two = (end[front, :2] / end[front, 2:] * lenses[view, :2] for end in (one, two))
-        moved = np.sort(np.linalg.norm(one - two, axis=1))
-        most = max(most, float(moved[(len(moved) - 1) // 2]) * widths[view] / float(sizes[view, 0]))
-    return int(min(max(math.ceil(most / STEP) + 1, PLANES[0]), PLANES[1]))
+    """How many planes: pictures of the view that moves most (`movement`) move by `STEP` from one to the next."""
+    return int(min(max(math.ceil(movement(widths, cameras, near, far) / STEP) + 1, PLANES[0]), PLANES[1]))

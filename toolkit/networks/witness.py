@@ -9,7 +9,7 @@ witnesses say on average goes into the cost before it is smoothed, so that it sp
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 import torch.nn.functional as F
@@ -18,7 +18,8 @@ from torch import Tensor
 from toolkit import gpu
 from toolkit.networks import compiled, compiled_witness
 from toolkit.networks.cameras import Cameras
-from toolkit.networks.sweep import Compared, Sweep
+from toolkit.networks.matching import LARGE, SMALL, TEMPERATURE
+from toolkit.networks.sweep import PEAK, Compared, Sweep, decide
 
 FOR = 4.0  # times as likely as where it is hidden, where the witness is sure of surface
 AGAINST = 0.1  # times as likely where it is sure of free space: it may err
@@ -43,6 +44,15 @@ class Witness:
     says: Tensor
     lowest: float
     step: float
+    _numbers: list[Tensor] = field(default_factory=list, init=False, compare=False, repr=False)
+
+    def numbers(self) -> Tensor:
+        """(23,) that kernels for CUDA ask it by (`gpu/reading.py`), put together once."""
+        if not self._numbers:
+            from toolkit.networks.gpu import reading
+
+            self._numbers.append(reading.numbers(self.camera, self.says, self.lowest, self.step))
+        return self._numbers[0]
 
     def ask(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 3) points of the working frame → (N,) what is said, 0 where the witness does not look, and (N,) bool where it does."""
@@ -91,6 +101,26 @@ def certain(compared: Compared, swept: Sweep) -> Tensor:
     return places[swept.table[2, 0].flatten() > SURE]
 
 
+def alone(compared: Compared) -> tuple[Witness, Tensor]:
+    """The `witness` that a key frame's pictures alone make it, and the places that they are `certain` of."""
+    if compared.empty is None and gpu.fits(compared.cost):
+        return _alone_on_device(compared)
+    swept = decide(compared)
+    return witness(swept), certain(compared, swept)
+
+
+@torch.no_grad()
+def _alone_on_device(compared: Compared) -> tuple[Witness, Tensor]:
+    from toolkit.networks.gpu import matching
+
+    weights = (SMALL, LARGE, TEMPERATURE), PEAK, (FOR, AGAINST, ABOUT), SURE
+    given = compared.cost, compared.rays, compared.inverses, compared.camera, compared.lowest, compared.step
+    says, surface, numbers = matching.alone(*given, *weights)
+    one = Witness(compared.camera, says, compared.lowest, compared.step)
+    one._numbers.append(numbers)
+    return one, surface
+
+
 def credit(one: Witness, surface: Tensor) -> float:
     """In [0, 1]: how far a witness is to be believed, by what it says of places that another one is sure of; 1 if it sees none of them."""
     said, seen = one.ask(surface)
@@ -112,6 +142,9 @@ def evidence(compared: Compared, witnesses: Sequence[Witness], surface: Tensor |
         return None
     planes, height, width = compared.cost.shape
     coarse = [-(-side // SPACING) for side in (height, width)]
+    if gpu.fits(compared.rays, *[one.says for one in witnesses]):
+        mean = _mean_on_device(compared, (height, width), (coarse[0], coarse[1]), witnesses, surface)
+        return F.interpolate(mean[None].permute(0, 3, 1, 2), (height, width), mode="bilinear")[0]
     rays = F.interpolate(compared.rays.T.view(1, 3, height, width), coarse, mode="bilinear").view(3, -1).T.contiguous()
     mean = SHARE * _mean(rays, compared.inverses, compared.camera.positions[0], witnesses, surface)
     return F.interpolate(mean.view(1, *coarse, planes).permute(0, 3, 1, 2), (height, width), mode="bilinear")[0]
@@ -120,8 +153,6 @@ def evidence(compared: Compared, witnesses: Sequence[Witness], surface: Tensor |
 def _mean(rays: Tensor, inverses: Tensor, origin: Tensor, witnesses: Sequence[Witness], surface: Tensor | None) -> Tensor:
     """(P, D) what witnesses that look there say in the mean, each by how far it is believed (`credit`), along rays (P, 3) at (D,)."""
     volumes = [one.says for one in witnesses]
-    if gpu.fits(rays, inverses, *volumes):
-        return _mean_on_device(rays, inverses, origin, witnesses, surface)
     beliefs = [1.0 if surface is None else credit(one, surface) for one in witnesses]
     if compiled.fits(rays, inverses, *volumes):
         asked = compiled_witness.Question(rays, inverses, origin)
@@ -136,13 +167,12 @@ def _mean(rays: Tensor, inverses: Tensor, origin: Tensor, witnesses: Sequence[Wi
     return (total / count.clamp_min(1)).view(len(rays), -1)
 
 
-def _mean_on_device(rays: Tensor, inverses: Tensor, origin: Tensor, witnesses: Sequence[Witness], surface: Tensor | None) -> Tensor:
-    """`_mean` without waiting for CUDA: how far witnesses are believed stays there."""
+def _mean_on_device(
+    compared: Compared, grid: tuple[int, int], coarse: tuple[int, int], witnesses: Sequence[Witness], surface: Tensor | None
+) -> Tensor:
+    """(h', w', D): a share of the mean, without waiting for CUDA: how far witnesses are believed stays there."""
     from toolkit.networks.gpu import reading
 
-    if surface is None:
-        beliefs = rays.new_ones(len(witnesses))
-    else:
-        said, count = reading.confirmed(witnesses, surface).unbind(1)
-        beliefs = torch.where(count > 0, (said / count.clamp_min(1) / BELIEVED).clamp(0, 1), 1.0)
-    return reading.mean(rays, inverses, origin, witnesses, beliefs)
+    asked = reading.Asked(witnesses)
+    sums = None if surface is None else asked.confirmed(surface)
+    return asked.mean(compared.rays, compared.inverses, compared.camera, grid, coarse, sums, BELIEVED, SHARE)

@@ -93,28 +93,57 @@ def resample(topology: Topology, nodes: Tensor, rows: Sequence[Tensor], new_keys
     return out
 
 
-@kernel("rows", "out")
-def _take(rows, count, slots, out, out_count, CHANNELS: tl.constexpr, WIDE: tl.constexpr, TILE: tl.constexpr):
-    """Rows and counts of one block, zero where there is none."""
+@kernel("rows", "below", "out")
+def _take(
+    rows, count, slots, below, below_count, table, cells, out, out_count, blocks,
+    INHERITS: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, TILE: tl.constexpr,
+):  # fmt: skip
+    """Rows and counts of one block, zero where there is none; corners of which nothing is known are as below."""
     parts: tl.constexpr = 512 // TILE
     block = (tl.program_id(0) // parts).to(tl.int64)
     voxel = (tl.program_id(0) % parts) * TILE + tl.arange(0, TILE)
     c = tl.arange(0, WIDE)[None, :]
-    slot = tl.load(slots + block)
+    slot = tl.load(slots + block).to(tl.int64)
     here = (voxel < 512) & (slot >= 0)
+    known = tl.load(count + slot * 512 + voxel, here, 0.0)
     value = tl.load(rows + (slot * 512 + voxel)[:, None] * CHANNELS + c, here[:, None] & (c < CHANNELS), 0.0)
+    if INHERITS:
+        slot = tl.load(table + tl.load(cells + block)).to(tl.int64)
+        new = (voxel < 512) & (slot >= 0) & (known == 0)
+        inherited = tl.load(below_count + slot * 512 + voxel, new, 0.0)
+        new = new & (inherited > 0)
+        value = tl.where(
+            new[:, None], tl.load(below + (slot * 512 + voxel)[:, None] * CHANNELS + c, new[:, None] & (c < CHANNELS), 0.0), value
+        )
+        known = tl.where(new, inherited, known)
     tl.store(out + (block * 512 + voxel)[:, None] * CHANNELS + c, value, (voxel < 512)[:, None] & (c < CHANNELS))
-    tl.store(out_count + block * 512 + voxel, tl.load(count + slot * 512 + voxel, here, 0.0), voxel < 512)
+    tl.store(out_count + block * 512 + voxel, known, voxel < 512)
+    # The zero row, by whoever comes first.
+    last = (voxel == 0) & (tl.program_id(0) == 0)
+    nothing = tl.zeros((TILE, WIDE), tl.float32)
+    tl.store(out + (blocks.to(tl.int64) * 512 + voxel)[:, None] * CHANNELS + c, nothing, last[:, None] & (c < CHANNELS))
 
 
-def take(rows: Tensor, count: Tensor, slots: Tensor) -> tuple[Tensor, Tensor]:
-    """(N, C) rows and (N,) counts of all blocks → (M · 512 + 1, C) and (M · 512,) of those at `slots` (M,), zero where a slot is −1."""
-    channels = rows.shape[1]
-    out, out_count = rows.new_empty((len(slots) * VOXELS + 1, channels)), rows.new_empty(len(slots) * VOXELS)
-    out[-1:].zero_()
-    if len(slots):
-        sizes = {"CHANNELS": channels, "WIDE": triton.next_power_of_2(channels), "TILE": TILE}
-        _take[(len(slots) * (VOXELS // TILE),)](rows.contiguous(), count, slots, out, out_count, **sizes)
+def take(
+    rows: Tensor, count: Tensor, slots: Tensor, topology: Topology, below: tuple[Tensor, Tensor, Topology] | None = None
+) -> tuple[Tensor, Tensor]:
+    """(N, C) rows and (N,) counts of all blocks → (M · 512 + 1, C) and (M · 512,) of those at `slots` (M,) int32, zero where one is −1.
+
+    Args:
+        topology: the blocks that are taken.
+        below: rows, counts and blocks of a volume with the same bounds, taken at corners whose count is zero here.
+    """
+    channels, blocks = rows.shape[1], slots.shape[0]
+    if not blocks:
+        return rows.new_zeros((1, channels)), rows.new_zeros(0)
+    out, out_count = rows.new_empty((blocks * VOXELS + 1, channels)), rows.new_empty(blocks * VOXELS)
+    other, other_count, place = below or (rows, count, topology)
+    table = slots if below is None else place.table
+    cells = slots if below is None else topology.own_cells
+    sizes = {"CHANNELS": channels, "WIDE": triton.next_power_of_2(channels), "TILE": TILE}
+    _take[(blocks * (VOXELS // TILE),)](
+        rows, count, slots, other, other_count, table, cells, out, out_count, blocks, INHERITS=below is not None, **sizes
+    )
     return out, out_count
 
 
@@ -125,7 +154,7 @@ def _put(rows, count, slots, values, values_count, changed, CHANNELS: tl.constex
     block = (tl.program_id(0) // parts).to(tl.int64)
     voxel = (tl.program_id(0) % parts) * TILE + tl.arange(0, TILE)
     c = tl.arange(0, WIDE)[None, :]
-    at, to = block * 512 + voxel, tl.load(slots + block) * 512 + voxel
+    at, to = block * 512 + voxel, tl.load(slots + block).to(tl.int64) * 512 + voxel
     new = tl.load(changed + at, voxel < 512, 0) != 0
     mask = new[:, None] & (c < CHANNELS)
     tl.store(rows + to[:, None] * CHANNELS + c, tl.load(values + at[:, None] * CHANNELS + c, mask, 0.0), mask)
@@ -138,42 +167,3 @@ def put(rows: Tensor, count: Tensor, slots: Tensor, values: Tensor, values_count
         sizes = {"CHANNELS": rows.shape[1], "WIDE": triton.next_power_of_2(rows.shape[1]), "TILE": TILE}
         given = values.contiguous(), values_count.contiguous(), changed.contiguous().view(torch.uint8)
         _put[(len(slots) * (VOXELS // TILE),)](rows, count, slots, *given, **sizes)
-
-
-@kernel("projected", "starts", "latent", "start")
-def _lay(
-    where, projected, starts, counts, weights, latent, start, count, weight, marks, corners, threshold,
-    HIDDEN: tl.constexpr, BELOW: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """What is seen at corners to their rows; marks of their blocks: 1 where something is seen, and 1 where it may be a surface."""
-    n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
-    some = n < corners
-    row = tl.load(where + n, some, 0)
-    h, c = tl.arange(0, HIDDEN)[None, :], tl.arange(0, WIDE)[None, :]
-    tl.store(latent + row[:, None] * HIDDEN + h, tl.load(projected + n[:, None] * HIDDEN + h, some[:, None], 0.0), some[:, None])
-    value = tl.load(starts + 4 * n[:, None] + c, some[:, None] & (c < 4), 0.0)
-    tl.store(start + row[:, None] * CHANNELS + c, value, some[:, None] & (c < BELOW))
-    tl.store(count + row, tl.load(counts + n, some, 0.0), some)
-    tl.store(weight + row, tl.load(weights + n, some, 0.0), some)
-    slot = row // 512
-    tl.store(marks + 2 * slot, tl.full((BLOCK,), 1, tl.uint8), some)
-    tl.store(marks + 2 * slot + 1, tl.full((BLOCK,), 1, tl.uint8), some & (tl.load(starts + 4 * n + 3, some, 0.0) > threshold))
-
-
-def lay(
-    blocks: int, where: Tensor, projected: Tensor, starts: Tensor, counts: Tensor, weights: Tensor, channels: int, threshold: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """What is seen at corners `where` (N,) of blocks: first rows (M · 512 + 1, H), start (M · 512 + 1, channels), count and weight
-    (M · 512,), zero elsewhere, and (M, 2) uint8, blocks of which something is seen and those in which the fourth of `starts` (N, 4) lies
-    beyond `threshold`."""
-    size, hidden = blocks * VOXELS, projected.shape[1]
-    # One piece of memory is cleared at once.
-    whole = projected.new_zeros((size + 1) * (hidden + channels) + 2 * size)
-    parts = whole.split([(size + 1) * hidden, (size + 1) * channels, size, size])
-    latent, start, count, weight = parts[0].view(-1, hidden), parts[1].view(-1, channels), parts[2], parts[3]
-    marks = torch.zeros((blocks, 2), dtype=torch.uint8, device=where.device)
-    if len(where):
-        sizes = {"HIDDEN": hidden, "BELOW": min(4, channels), "CHANNELS": channels, "WIDE": 4, "BLOCK": 128}
-        given = projected.contiguous(), starts.contiguous(), counts, weights
-        _lay[(triton.cdiv(len(where), 128),)](where, *given, latent, start, count, weight, marks, len(where), threshold, **sizes)
-    return latent, start, count, weight, marks

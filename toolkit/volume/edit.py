@@ -187,7 +187,7 @@ def split(topology: Topology, occupied: Tensor, rows: Sequence[Tensor], mode: st
     for axis in (1, 2, 3):
         child = child.repeat_interleave(2, axis)
     keys = topology.keys[parent].long() * 2 + octants[octant]
-    bounds = None if topology.bounds is None else _doubled(*topology.bounds)
+    bounds = None if topology.bounds is None else doubled(*topology.bounds)
     new_topology, new_occupied = with_corner_blocks(Topology(keys, bounds=bounds), child.reshape(-1))
     out = resample(topology, occupied, rows, new_topology.keys, 0.5, mode)
     unused = ~corner_nodes(new_topology, new_occupied)
@@ -202,7 +202,7 @@ def _cleared(values: Tensor, unused: Tensor) -> Tensor:
     return values
 
 
-def _doubled(low: tuple[int, int, int], high: tuple[int, int, int]) -> Bounds:
+def doubled(low: tuple[int, int, int], high: tuple[int, int, int]) -> Bounds:
     """Bounds of the blocks' children, and of the blocks that hold corners of these."""
     (ax, ay, az), (bx, by, bz) = low, high
     return (2 * ax, 2 * ay, 2 * az), (2 * bx + 2, 2 * by + 2, 2 * bz + 2)

@@ -10,9 +10,12 @@ from __future__ import annotations
 import math
 from functools import cached_property, lru_cache
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from toolkit import gpu
 from toolkit.gpu import asks_freely
 
 BLOCK = 8
@@ -35,6 +38,7 @@ class Topology:
             this many cells; otherwise `find` searches sorted codes and `table` is None.
         bounds: lowest and highest key that there can be, each (x, y, z). Keys are then believed to lie within and to differ, the table
             covers all of these (where it is small enough), and nothing is asked of the device that holds the keys.
+        host: the same keys in the processor's memory, where they came from there.
 
     Attributes:
         keys: (M, 3) int32.
@@ -47,14 +51,23 @@ class Topology:
         ValueError: wrong shape, keys beyond int32, a key twice, or too many blocks for int32 rows.
     """
 
-    def __init__(self, keys: Tensor, max_table_cells: int = MAX_TABLE_CELLS, bounds: Bounds | None = None) -> None:
+    def __init__(
+        self,
+        keys: Tensor,
+        max_table_cells: int = MAX_TABLE_CELLS,
+        bounds: Bounds | None = None,
+        host: NDArray[np.int32] | None = None,
+    ) -> None:
         if keys.ndim != 2 or keys.shape[1] != 3 or keys.is_floating_point():
             raise ValueError(f"block keys must be an integer (M, 3) tensor, not {keys.dtype} {tuple(keys.shape)}")
         if len(keys) > MAX_BLOCKS:
             raise ValueError(f"{len(keys)} blocks are more than int32 rows can number ({MAX_BLOCKS})")
         if bounds is not None and math.prod(high - low + 3 for low, high in zip(*bounds, strict=True)) > max_table_cells:
             bounds = None
-        self.bounds = bounds
+        self.bounds, self._host = bounds, host
+        if bounds is not None and gpu.there(keys):
+            self._believe(keys, bounds, max_table_cells)
+            return
         wide = keys.to(torch.int64)
         if bounds is None and len(keys) and bool(((wide < KEY_LOW) | (wide > KEY_HIGH)).any()):
             raise ValueError("block keys must fit into int32")
@@ -68,25 +81,57 @@ class Topology:
         self.table_origin = (low[0] - 1, low[1] - 1, low[2] - 1)
         self.table_size = (high[0] - low[0] + 3, high[1] - low[1] + 3, high[2] - low[2] + 3)
         sx, sy, sz = self.table_size
-        self.table: Tensor | None = None
+        table: Tensor | None = None
         self._codes: _Codes | None = None
         if sx * sy * sz <= max_table_cells:
             slots = torch.arange(len(keys), dtype=torch.int32, device=keys.device)
             flat = torch.full((sx * sy * sz,), -1, dtype=torch.int32, device=keys.device)
-            self.own_cells = cells = self._cells(wide)
+            cells = self._cells(wide)
             flat[cells] = slots
             unique = bounds is not None or bool((flat[cells] == slots).all())
-            self.table = flat.view(sz, sy, sx)
+            table = flat.view(sz, sy, sx)
+            self._placed = table, cells
         else:
             self._codes = _Codes(wide)
             unique = self._codes.unique
         if not unique:
             raise ValueError("block keys must be unique")
+        self._dense = table is not None
+
+    def _believe(self, keys: Tensor, bounds: Bounds, max_table_cells: int) -> None:
+        """The rest of the making of one whose keys are believed, on CUDA: the table is made when it is first asked for."""
+        self.keys, self._max_table_cells, self._codes, self._dense = keys.to(torch.int32).contiguous(), max_table_cells, None, True
+        (ax, ay, az), (bx, by, bz) = bounds
+        self.table_origin, self.table_size = (ax - 1, ay - 1, az - 1), (bx - ax + 3, by - ay + 3, bz - az + 3)
+
+    @cached_property
+    def _placed(self) -> tuple[Tensor, Tensor]:
+        """The table and the cells of its own blocks; elsewhere than on CUDA already known."""
+        from toolkit.volume import tables_gpu
+
+        return tables_gpu.table(self.keys, self.table_origin, self.table_size)
+
+    @property
+    def table(self) -> Tensor | None:
+        """See the class."""
+        return self._placed[0] if self._dense else None
+
+    @property
+    def own_cells(self) -> Tensor:
+        """See the class."""
+        return self._placed[1]
+
+    @property
+    def host(self) -> NDArray[np.int32]:
+        """(M, 3) the keys in the processor's memory; the device is asked where they did not come from there."""
+        if self._host is None:
+            self._host = self.keys.cpu().numpy()
+        return self._host
 
     @property
     def blocks(self) -> int:
         """M, the number of blocks."""
-        return len(self.keys)
+        return self.keys.shape[0]
 
     @property
     def zero_row(self) -> int:
@@ -97,9 +142,9 @@ class Topology:
     def device(self) -> torch.device:
         return self.keys.device
 
-    def alike(self, keys: Tensor) -> Topology:
+    def alike(self, keys: Tensor, host: NDArray[np.int32] | None = None) -> Topology:
         """Other blocks of the same lattice, as much believed as these."""
-        return Topology(keys, self._max_table_cells, self.bounds)
+        return Topology(keys, self._max_table_cells, self.bounds, host)
 
     def to(self, device: torch.device | str) -> Topology:
         """The same blocks in the same order on another device (self when already there)."""
@@ -138,6 +183,10 @@ class Topology:
         if self.table is None:
             return self.find(self.keys.to(torch.int64)[:, None] + torch.tensor(shifts, device=self.device))
         sx, sy, _ = self.table_size
+        if self.bounds is not None and gpu.there(self.keys):
+            from toolkit.volume import tables_gpu
+
+            return tables_gpu.around(self.table, self.own_cells)
         # The margin keeps every step inside the table.
         steps = constant(tuple((dz * sy + dy) * sx + dx for dx, dy, dz in shifts), self.device)
         return self.table.view(-1)[self.own_cells[:, None] + steps].to(torch.int64)

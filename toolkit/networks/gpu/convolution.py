@@ -20,57 +20,72 @@ def _wide(channels: int) -> int:
     return max(16, int(triton.next_power_of_2(channels)))
 
 
-@kernel("rows", "around", "weight", "out")
+@kernel("rows", "around", "taps", "out")
 def _convolve(
-    rows, around, weight, bias, occupied, out, biased, masked, floor,
-    CIN: tl.constexpr, COUT: tl.constexpr, BIN: tl.constexpr, BOUT: tl.constexpr, TILE: tl.constexpr,
+    rows, around, taps, bias, occupied, out, blocks, biased, masked, floor,
+    CIN: tl.constexpr, COUT: tl.constexpr, BIN: tl.constexpr, BOUT: tl.constexpr, GROUPS: tl.constexpr, TILE: tl.constexpr,
 ):  # fmt: skip
     parts: tl.constexpr = 512 // TILE
-    block = tl.program_id(0) // parts
+    block, group = tl.program_id(0) // parts, tl.program_id(1)
     voxel = (tl.program_id(0) % parts) * TILE + tl.arange(0, TILE)
     z, y, x = voxel // 64, (voxel // 8) % 8, voxel % 8
     c, o = tl.arange(0, BIN), tl.arange(0, BOUT)
+    rows += group * CIN
+    taps += group * (27 * CIN * COUT)
     total = tl.zeros((TILE, BOUT), tl.float32)
     for tap in range(27):
         nz, ny, nx = z + tap // 9 + 7, y + (tap // 3) % 3 + 7, x + tap % 3 + 7  # of the 3 × 3 × 3 blocks, 0 to 23
         slot = tl.load(around + block * 27 + (nz // 8 * 3 + ny // 8) * 3 + nx // 8)
         row = slot * 512 + (nz % 8 * 8 + ny % 8) * 8 + nx % 8
         there = (slot >= 0)[:, None] & (c < CIN)[None, :]
-        values = tl.load(rows + row[:, None] * CIN + c[None, :], there, 0.0)
+        values = tl.load(rows + row[:, None] * (GROUPS * CIN) + c[None, :], there, 0.0)
         values = tl.maximum(values, floor).to(rows.dtype.element_ty)
-        taps = tl.load(weight + (tap * CIN + c[:, None]) * COUT + o[None, :], (c < CIN)[:, None] & (o < COUT)[None, :], 0.0)
-        total = tl.dot(values, taps, total, input_precision="tf32x3")
-    total += tl.load(bias + o, (o < COUT) & (biased != 0), 0.0).to(tl.float32)[None, :]
+        weight = tl.load(taps + (tap * CIN + c[:, None]) * COUT + o[None, :], (c < CIN)[:, None] & (o < COUT)[None, :], 0.0)
+        total = tl.dot(values, weight, total, input_precision="tf32x3")
+    total += tl.load(bias + group * COUT + o, (o < COUT) & (biased != 0), 0.0).to(tl.float32)[None, :]
     place = tl.cast(block, tl.int64) * 512 + voxel
     kept = tl.load(occupied + place, (voxel < 512) & (masked != 0), 1) != 0
     total = tl.where(kept[:, None], total, 0.0)
-    tl.store(out + place[:, None] * COUT + o[None, :], total.to(out.dtype.element_ty), (o < COUT)[None, :] & (voxel < 512)[:, None])
+    out += group * COUT + o[None, :]
+    tl.store(out + place[:, None] * (GROUPS * COUT), total.to(out.dtype.element_ty), (o < COUT)[None, :] & (voxel < 512)[:, None])
+    # The zero row, by whoever comes first.
+    last = tl.cast(blocks, tl.int64) * 512 + voxel
+    nothing = tl.zeros((TILE, BOUT), out.dtype.element_ty)
+    first = (tl.program_id(0) == 0) & (voxel == 0)
+    tl.store(out + last[:, None] * (GROUPS * COUT), nothing, (o < COUT)[None, :] & first[:, None])
 
 
-def convolve(rows: Tensor, around: Tensor, weight: Tensor, bias: Tensor | None, occupied: Tensor | None, relu: bool = False) -> Tensor:
-    """Convolve rows of blocks.
+def taps_of(*weights: Tensor) -> Tensor:
+    """Kernels (C', C, 3, 3, 3) of a group each, all of one shape → (groups, 27, C, C'), as the convolution reads them."""
+    return torch.stack([weight.permute(2, 3, 4, 1, 0).flatten(0, 2) for weight in weights])
+
+
+def convolve(
+    rows: Tensor, around: Tensor, taps: Tensor, bias: Tensor | None, occupied: Tensor | None, relu: bool = False
+) -> Tensor:
+    """Convolve rows of blocks, groups of channels each by themselves.
 
     Args:
-        rows: (M · 512 or more, C); what lies beyond the blocks' own is not read.
+        rows: (M · 512 or more, groups · C); what lies beyond the blocks' own is not read.
         around: (M, 27) int64, `Topology.around`.
-        weight: (C', C, 3, 3, 3); bias: (C',); both of the rows' type.
+        taps: (groups, 27, C, C') of `taps_of`; bias: (groups · C',); both of the rows' type.
         occupied: (M · 512,) bool; None: every voxel.
         relu: of the rows, before.
 
     Returns:
-        (M · 512 + 1, C'), zero at unoccupied voxels and in the last row.
+        (M · 512 + 1, groups · C'), zero at unoccupied voxels and in the last row.
     """
-    blocks, outside, inside = len(around), len(weight), weight.shape[1]
-    out = rows.new_empty((blocks * VOXELS + 1, outside))
-    out[-1:].zero_()
-    if blocks:
-        taps = weight.permute(2, 3, 4, 1, 0).contiguous()
-        mask = around.view(torch.uint8) if occupied is None else occupied.view(torch.uint8)
-        _convolve[(blocks * (VOXELS // TILE),)](
-            rows.contiguous(), around, taps, taps if bias is None else bias, mask,
-            out, int(bias is not None), int(occupied is not None), 0.0 if relu else -3e38,
-            CIN=inside, COUT=outside, BIN=_wide(inside), BOUT=_wide(outside), TILE=TILE,
-        )  # fmt: skip
+    groups, _, inside, outside = taps.shape
+    blocks = around.shape[0]
+    if not blocks:
+        return rows.new_zeros((1, groups * outside))
+    out = rows.new_empty((blocks * VOXELS + 1, groups * outside))
+    mask = around.view(torch.uint8) if occupied is None else occupied.view(torch.uint8)
+    _convolve[(blocks * (VOXELS // TILE), groups)](
+        rows.contiguous(), around, taps, taps if bias is None else bias, mask,
+        out, blocks, int(bias is not None), int(occupied is not None), 0.0 if relu else -3e38,
+        CIN=inside, COUT=outside, BIN=_wide(inside), BOUT=_wide(outside), GROUPS=groups, TILE=TILE,
+    )  # fmt: skip
     return out
 
 

@@ -7,6 +7,9 @@ those of the tensors to rounding.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import torch
 import triton
 import triton.language as tl
@@ -21,104 +24,113 @@ PLANES = 256  # of a pixel at least, with those that there are not: more planes 
 PIXELS = 4  # whose planes are summed at once
 
 
-@kernel("total", "least", "count", "out")
-def _cost(
-    own, rays, inverses, picture, intrinsics, sizes, poses, view, views, total, least, count, out, pixels, planes, height, width, gain,
-    unknown, CHANNELS: tl.constexpr, COLOURS: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr,
-):  # fmt: skip
-    """One other view: what differs at planes, added up; the last one makes the cost of all."""
-    p = tl.program_id(0) * BP + tl.arange(0, BP)
-    d = tl.program_id(1) * BD + tl.arange(0, BD)
-    is_pixel, is_plane = p < pixels, d < planes
-    pose = poses + 16 * view
-    lens = intrinsics + 4 * view
-    across, down = tl.load(sizes + 2 * view), tl.load(sizes + 2 * view + 1)
-    rx = tl.load(rays + 3 * p, is_pixel, 0.0)
-    ry = tl.load(rays + 3 * p + 1, is_pixel, 0.0)
-    rz = tl.load(rays + 3 * p + 2, is_pixel, 1.0)
-    r00, r01, r02 = tl.load(pose), tl.load(pose + 1), tl.load(pose + 2)
-    r10, r11, r12 = tl.load(pose + 4), tl.load(pose + 5), tl.load(pose + 6)
-    r20, r21, r22 = tl.load(pose + 8), tl.load(pose + 9), tl.load(pose + 10)
-    gx = tl.load(poses + 3) - tl.load(pose + 3)
-    gy = tl.load(poses + 7) - tl.load(pose + 7)
-    gz = tl.load(poses + 11) - tl.load(pose + 11)
-    inverse = tl.load(inverses + d, is_plane, 1.0)[None, :]
-    x = (rx * r00 + ry * r10 + rz * r20)[:, None] + inverse * (gx * r00 + gy * r10 + gz * r20)
-    y = (rx * r01 + ry * r11 + rz * r21)[:, None] + inverse * (gx * r01 + gy * r11 + gz * r21)
-    z = (rx * r02 + ry * r12 + rz * r22)[:, None] + inverse * (gx * r02 + gy * r12 + gz * r22)
-    deep = z > 1e-4
-    z = tl.where(deep, z, 1.0)
-    u = (x / z * tl.load(lens) + tl.load(lens + 2)) / across * 2 - 1
-    v = (y / z * tl.load(lens + 1) + tl.load(lens + 3)) / down * 2 - 1
-    seen = deep & (tl.abs(u) <= 1) & (tl.abs(v) <= 1)
-    u = tl.minimum(tl.maximum(((tl.minimum(tl.maximum(u, -2.0), 2.0) + 1) * width - 1) * 0.5, 0.0), width - 1.0)
-    v = tl.minimum(tl.maximum(((tl.minimum(tl.maximum(v, -2.0), 2.0) + 1) * height - 1) * 0.5, 0.0), height - 1.0)
+@triton.jit
+def picture_at(pictures, view):
+    """Where a picture lies, its height and its width, of `noted`."""
+    row = pictures + 3 * view
+    return tl.load(row).to(tl.pointer_type(tl.float32)), tl.load(row + 1).to(tl.int32), tl.load(row + 2).to(tl.int32)
+
+
+@triton.jit
+def corners(u, v, height, width):
+    """The four pixels about places in [−1, 1] of a picture, and their shares; beyond its border the border counts."""
+    u = tl.minimum(tl.maximum(((u + 1) * width - 1) * 0.5, 0.0), width - 1.0)
+    v = tl.minimum(tl.maximum(((v + 1) * height - 1) * 0.5, 0.0), height - 1.0)
     left, top = tl.floor(u), tl.floor(v)
     u, v = u - left, v - top
     column, row = left.to(tl.int32), top.to(tl.int32)
     right, below = tl.minimum(column + 1, width - 1), tl.minimum(row + 1, height - 1)
-    corner = row * width + column
-    corner_right, corner_below, corner_both = row * width + right, below * width + column, below * width + right
-    weight, weight_right, weight_below, weight_both = (1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v
-    here = seen & is_pixel[:, None] & is_plane[None, :]
-    colour = tl.zeros((BP, BD), tl.float32)
-    patch = tl.zeros((BP, BD), tl.float32)
-    mine = own + (p * CHANNELS)[:, None]
-    for c in range(CHANNELS):
-        channel = picture + c * height * width
-        found = tl.load(channel + corner, here, 0.0) * weight + tl.load(channel + corner_right, here, 0.0) * weight_right
-        found += tl.load(channel + corner_below, here, 0.0) * weight_below + tl.load(channel + corner_both, here, 0.0) * weight_both
-        apart = found - tl.load(mine + c, is_pixel[:, None], 0.0)
-        is_colour = c < COLOURS
-        colour += tl.where(is_colour, tl.abs(apart), 0.0)
-        patch += tl.where(is_colour, 0.0, apart * apart)
-    colour = tl.minimum(colour * (gain / COLOURS), 1.0)
-    patch = tl.minimum(patch * (0.5 / (CHANNELS - COLOURS)), 1.0)
-    differs = 0.5 * (colour + patch)
-    place = p[:, None] * planes + d[None, :]
+    upper, lower = row * width, below * width
+    return upper + column, upper + right, lower + column, lower + right, (1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v
+
+
+@kernel("own", "rays", "inverses", "out")
+def _cost(
+    own, rays, inverses, pictures, poses, intrinsics, sizes, views, out, pixels, planes, gain, unknown, CHANNELS: tl.constexpr,
+    COLOURS: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr,
+):  # fmt: skip
+    """What all other views differ by at planes, and the cost of it."""
+    p = tl.program_id(0) * BP + tl.arange(0, BP)
+    d = tl.program_id(1) * BD + tl.arange(0, BD)
+    is_pixel, is_plane = p < pixels, d < planes
     inside = is_pixel[:, None] & is_plane[None, :]
-    added, lowest, looked = tl.where(seen, differs, 0.0), tl.where(seen, differs, 1.0), seen.to(tl.float32)
-    later, last, more = inside & (view > 1), inside & (view + 1 == views), inside & (view + 1 < views)
-    added += tl.load(total + place, later, 0.0)
-    lowest = tl.minimum(lowest, tl.load(least + place, later, 1.0))
-    looked += tl.load(count + place, later, 0.0)
-    both = 0.5 * (added / tl.maximum(looked, 1.0) + lowest)
-    tl.store(out + place, tl.where(looked > 0, both, unknown), last)
-    tl.store(total + place, added, more)
-    tl.store(least + place, lowest, more)
-    tl.store(count + place, looked, more)
+    rx = tl.load(rays + 3 * p, is_pixel, 0.0)
+    ry = tl.load(rays + 3 * p + 1, is_pixel, 0.0)
+    rz = tl.load(rays + 3 * p + 2, is_pixel, 1.0)
+    inverse = tl.load(inverses + d, is_plane, 1.0)[None, :]
+    mine = own + (p * CHANNELS)[:, None]
+    total, looked = tl.zeros((BP, BD), tl.float32), tl.zeros((BP, BD), tl.float32)
+    least = total + 1.0
+    view = 1
+    while view < views:
+        picture, height, width = picture_at(pictures, view)
+        pose, lens = poses + 16 * view, intrinsics + 4 * view
+        across, down = tl.load(sizes + 2 * view), tl.load(sizes + 2 * view + 1)
+        r00, r01, r02 = tl.load(pose), tl.load(pose + 1), tl.load(pose + 2)
+        r10, r11, r12 = tl.load(pose + 4), tl.load(pose + 5), tl.load(pose + 6)
+        r20, r21, r22 = tl.load(pose + 8), tl.load(pose + 9), tl.load(pose + 10)
+        gx = tl.load(poses + 3) - tl.load(pose + 3)
+        gy = tl.load(poses + 7) - tl.load(pose + 7)
+        gz = tl.load(poses + 11) - tl.load(pose + 11)
+        x = (rx * r00 + ry * r10 + rz * r20)[:, None] + inverse * (gx * r00 + gy * r10 + gz * r20)
+        y = (rx * r01 + ry * r11 + rz * r21)[:, None] + inverse * (gx * r01 + gy * r11 + gz * r21)
+        z = (rx * r02 + ry * r12 + rz * r22)[:, None] + inverse * (gx * r02 + gy * r12 + gz * r22)
+        deep = z > 1e-4
+        z = tl.where(deep, z, 1.0)
+        u = (x / z * tl.load(lens) + tl.load(lens + 2)) / across * 2 - 1
+        v = (y / z * tl.load(lens + 1) + tl.load(lens + 3)) / down * 2 - 1
+        seen = deep & (tl.abs(u) <= 1) & (tl.abs(v) <= 1)
+        u, v = tl.minimum(tl.maximum(u, -2.0), 2.0), tl.minimum(tl.maximum(v, -2.0), 2.0)
+        one, two, three, four, of_one, of_two, of_three, of_four = corners(u, v, height, width)
+        here = seen & inside
+        colour, patch = tl.zeros((BP, BD), tl.float32), tl.zeros((BP, BD), tl.float32)
+        for c in range(CHANNELS):
+            channel = picture + c * height * width
+            found = tl.load(channel + one, here, 0.0) * of_one + tl.load(channel + two, here, 0.0) * of_two
+            found += tl.load(channel + three, here, 0.0) * of_three + tl.load(channel + four, here, 0.0) * of_four
+            apart = found - tl.load(mine + c, is_pixel[:, None], 0.0)
+            is_colour = c < COLOURS
+            colour += tl.where(is_colour, tl.abs(apart), 0.0)
+            patch += tl.where(is_colour, 0.0, apart * apart)
+        colour = tl.minimum(colour * (gain / COLOURS), 1.0)
+        patch = tl.minimum(patch * (0.5 / (CHANNELS - COLOURS)), 1.0)
+        differs = 0.5 * (colour + patch)
+        total += tl.where(seen, differs, 0.0)
+        least = tl.minimum(least, tl.where(seen, differs, 1.0))
+        looked += seen.to(tl.float32)
+        view += 1
+    both = 0.5 * (total / tl.maximum(looked, 1.0) + least)
+    tl.store(out + p[:, None] * planes + d[None, :], tl.where(looked > 0, both, unknown), inside)
 
 
-def costs(
-    described: list[Tensor], intrinsics: Tensor, sizes: Tensor, poses: Tensor, inverses: Tensor, rays: Tensor, own: Tensor,
-    gain: float, unknown: float,
-) -> Tensor:  # fmt: skip
+def noted(pictures: Sequence[Tensor]) -> Tensor:
+    """(K, 3) int64 on the device of (C, h, w) pictures, contiguous: where each lies, its height and its width."""
+    rows = [(picture.data_ptr(), *picture.shape[1:]) for picture in pictures]
+    return torch.tensor(rows, dtype=torch.int64).to(pictures[0].device, non_blocking=True)
+
+
+def costs(described: Sequence[Tensor], cameras: Any, inverses: Tensor, rays: Tensor, own: Tensor, gain: float, unknown: float) -> Tensor:
     """(P, D) of pixels of the first view.
 
     Args:
-        described: K ≥ 2 times (21, h, w); intrinsics (K, 4), sizes (K, 2) and poses (K, 4, 4) of their cameras.
-        inverses: (D,); rays: (P, 3), working axes; own: (P, 21), contiguous.
+        described: K ≥ 2 times (21, h, w), of any sizes; cameras: K.
+        inverses: (D,); rays: (P, 3), working axes; own: (P, 21); all contiguous.
     """
     pixels, planes = len(rays), len(inverses)
-    intrinsics, sizes, poses, rays, own = (values.contiguous() for values in (intrinsics, sizes, poses, rays, own))
+    described = [picture.contiguous() for picture in described]
     out = rays.new_empty((pixels, planes))
-    views = len(described)
-    total, least, count = (rays.new_empty((pixels, planes)) if views > 2 else out for _ in range(3))
-    if pixels == 0:
-        return out
-    grid = (triton.cdiv(pixels, TILE[0]), triton.cdiv(planes, TILE[1]))
-    for view in range(1, views):
-        picture = described[view].contiguous()
+    if pixels:
+        grid = (parts(pixels, TILE[0]), parts(planes, TILE[1]))
         _cost[grid](
-            own, rays, inverses, picture, intrinsics, sizes, poses, view, views, total, least, count, out, pixels, planes,
-            picture.shape[1], picture.shape[2], gain, unknown, CHANNELS=CHANNELS, COLOURS=COLOURS, BP=TILE[0], BD=TILE[1],
+            own, rays, inverses, noted(described), *lens(cameras), len(described), out, pixels, planes, gain, unknown,
+            CHANNELS=CHANNELS, COLOURS=COLOURS, BP=TILE[0], BD=TILE[1],
         )  # fmt: skip
     return out
 
 
-@kernel("cost", "out")
-def _path(cost, out, height, width, planes, small, large, BD: tl.constexpr):
-    """The cheapest paths along one line of pixels in one of four directions."""
+@kernel("cost", "said", "out")
+def _path(cost, said, is_said, out, height, width, planes, small, large, BD: tl.constexpr):
+    """The cheapest paths along one line of pixels in one of four directions, of the cost less what is said where anything is."""
     line, way = tl.program_id(0), tl.program_id(1)
     upright = way < 2
     lines = tl.where(upright, width, height)
@@ -131,17 +143,21 @@ def _path(cost, out, height, width, planes, small, large, BD: tl.constexpr):
         step = tl.where(back, -step, step)
         d = tl.arange(0, BD)
         inside = d < planes
+        heard = inside & (is_said > 0)
         to_left, to_right = tl.maximum(d - 1, 0), tl.minimum(d + 1, BD - 1)
         never = float("inf")
-        before = tl.load(cost + first.to(tl.int64) * planes + d, inside, never)
+        place = first.to(tl.int64)
+        before = tl.load(cost + place * planes + d, inside, never) - tl.load(said + place * planes + d, heard, 0.0)
         out += way.to(tl.int64) * height * width * planes
-        tl.store(out + first.to(tl.int64) * planes + d, before, inside)
-        place = first.to(tl.int64) + step
+        tl.store(out + place * planes + d, before, inside)
+        place += step
         coming = tl.load(cost + place * planes + d, inside & (length > 1), never)
+        comes = tl.load(said + place * planes + d, heard & (length > 1), 0.0)
         i = 1
         while i < length:
-            now = coming
+            now = coming - comes
             coming = tl.load(cost + (place + step) * planes + d, inside & (i + 1 < length), never)  # asked for early: it takes a while
+            comes = tl.load(said + (place + step) * planes + d, heard & (i + 1 < length), 0.0)
             best = tl.min(before, 0)
             left = tl.where(d > 0, tl.gather(before, to_left, 0), never)
             right = tl.where(d < BD - 1, tl.gather(before, to_right, 0), never)
@@ -152,11 +168,9 @@ def _path(cost, out, height, width, planes, small, large, BD: tl.constexpr):
             i += 1
 
 
-@kernel("paths", "out")
-def _likely(paths, out, pixels, planes, scale, BP: tl.constexpr, BD: tl.constexpr):
-    """The four ways' mean, and its softmax along planes."""
-    p = (tl.program_id(0) * BP + tl.arange(0, BP)).to(tl.int64)
-    d = tl.arange(0, BD)
+@triton.jit
+def likelihood(paths, p, d, pixels, planes, scale):
+    """The four ways' mean, and its softmax along planes; nothing where there are no pixels or planes."""
     inside = (p < pixels)[:, None] & (d < planes)[None, :]
     place = p[:, None] * planes + d[None, :]
     volume = tl.cast(pixels, tl.int64) * planes
@@ -164,66 +178,186 @@ def _likely(paths, out, pixels, planes, scale, BP: tl.constexpr, BD: tl.constexp
     other = tl.load(paths + 2 * volume + place, inside, 0.0) + tl.load(paths + 3 * volume + place, inside, 0.0)
     along = tl.where(inside, (one + other) * 0.25 * scale, -float("inf"))
     likely = tl.exp(along - tl.where(p < pixels, tl.max(along, 1), 0.0)[:, None])
-    tl.store(out + place, likely / tl.where(p < pixels, tl.sum(likely, 1), 1.0)[:, None], inside)
+    return likely / tl.where(p < pixels, tl.sum(likely, 1), 1.0)[:, None]
+
+
+@triton.jit
+def beside(values, by, other, BP: tl.constexpr, BD: tl.constexpr):
+    """Of each plane what another one has that lies `by` farther on, `other` where there is none."""
+    to = tl.arange(0, BD)[None, :] + by + tl.zeros((BP, BD), tl.int32)
+    return tl.where((to >= 0) & (to < BD), tl.gather(values, tl.minimum(tl.maximum(to, 0), BD - 1), 1), other)
+
+
+@triton.jit
+def peak(likely, d, planes, window: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr):
+    """The most of each pixel that lies about one depth."""
+    about = likely
+    for k in tl.static_range(1, window):
+        about += beside(likely, k, 0.0, BP, BD)
+    return tl.max(tl.where((d <= planes - window)[None, :], about, 0.0), 1)
+
+
+@kernel("paths", "out")
+def _likely(paths, out, pixels, planes, scale, BP: tl.constexpr, BD: tl.constexpr):
+    p = (tl.program_id(0) * BP + tl.arange(0, BP)).to(tl.int64)
+    d = tl.arange(0, BD)
+    inside = (p < pixels)[:, None] & (d < planes)[None, :]
+    tl.store(out + p[:, None] * planes + d[None, :], likelihood(paths, p, d, pixels, planes, scale), inside)
 
 
 def wide(planes: int) -> int:
     """A power of two that holds the planes, the same for nearly all."""
-    return max(PLANES, int(triton.next_power_of_2(planes)))
+    return max(PLANES, 1 << (planes - 1).bit_length())
 
 
-def _paths(volume: Tensor, small: float, large: float) -> Tensor:
-    """(h, w, D), contiguous → (4, h, w, D): down, up, right, left."""
+def parts(count: int, at_once: int) -> int:
+    """How many launches' tiles hold all; Triton's own takes longer to ask."""
+    return -(-count // at_once)
+
+
+def _paths(volume: Tensor, small: float, large: float, said: Tensor | None = None) -> Tensor:
+    """(h, w, D), contiguous → (4, h, w, D): down, up, right, left; of costs less what is `said`, as large."""
     height, width, planes = volume.shape
     paths = volume.new_empty((4, height, width, planes))
+    told = volume if said is None else said
     # One warp a line: what goes from plane to plane stays within it.
-    _path[(max(height, width), 4)](volume, paths, height, width, planes, small, large, BD=wide(planes), num_warps=1)
+    _path[(max(height, width), 4)](
+        volume, told, int(said is not None), paths, height, width, planes, small, large, BD=wide(planes), num_warps=1
+    )
     return paths
+
+
+def lens(camera: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """A camera's pose, intrinsics and size as kernels read them."""
+    return camera.world_from_camera.contiguous(), camera.intrinsics.contiguous(), camera.size.contiguous()
+
+
+def rows(volume: Tensor) -> Tensor:
+    """(D, h, w) → (h, w, D), planes of a pixel next to each other, as they are wherever kernels made them."""
+    return volume.permute(1, 2, 0).contiguous()
 
 
 def semi_global(cost: Tensor, small: float, large: float) -> Tensor:
     """(D, h, w) → the same smoothed along four directions, see `matching.semi_global`."""
-    paths = _paths(cost.permute(1, 2, 0).contiguous(), small, large)
-    return ((paths[0] + paths[1]) + (paths[2] + paths[3])).div_(4).permute(2, 0, 1)
+    return _paths(rows(cost), small, large).mean(0).permute(2, 0, 1)
 
 
 def distribution(cost: Tensor, small: float, large: float, temperature: float) -> Tensor:
     """(D, h, w) costs → likelihoods, see `matching.distribution`; planes of a pixel lie next to each other."""
-    volume = cost.permute(1, 2, 0).contiguous()
+    volume = rows(cost)
     height, width, planes = volume.shape
     paths, out = _paths(volume, small, large), torch.empty_like(volume)
-    grid = (triton.cdiv(height * width, PIXELS),)
+    grid = (parts(height * width, PIXELS),)
     _likely[grid](paths, out, height * width, planes, -1 / temperature, BP=PIXELS, BD=wide(planes))
     return out.permute(2, 0, 1)
 
 
-@kernel("likely", "out")
-def _tabled(likely, out, pixels, planes, step, window: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr):
+@triton.jit
+def table_of(likely, out, p, d, pixels, planes, step, window: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr):
     """How likely the surface is nearer, the integral of that, and the most that lies about one depth."""
-    p = (tl.program_id(0) * BP + tl.arange(0, BP)).to(tl.int64)
-    d = tl.arange(0, BD)
-    is_pixel = (p < pixels)[:, None]
-    inside = is_pixel & (d < planes)[None, :]
+    inside = (p < pixels)[:, None] & (d < planes)[None, :]
     row = p[:, None] * planes + d[None, :]
-    here = tl.load(likely + row, inside, 0.0)
-    before = tl.load(likely + row - 1, inside & (d > 0)[None, :], 0.0)
-    rest = tl.cumsum(here, 1, reverse=True)
-    nearer = rest - 0.5 * here
-    middle = tl.where((d > 0)[None, :], 0.5 * (nearer + (rest + 0.5 * before)) * step, 0.0)
-    peak = tl.zeros((BP, BD), tl.float32)
-    for k in range(window):
-        peak += tl.load(likely + row + k, is_pixel & (d + k < planes)[None, :], 0.0)
-    sure = tl.max(tl.where((d <= planes - window)[None, :], peak, 0.0), 1)[:, None] + tl.zeros((BP, BD), tl.float32)
+    rest = tl.cumsum(likely, 1, reverse=True)
+    nearer = rest - 0.5 * likely
+    middle = tl.where((d > 0)[None, :], 0.5 * (nearer + (rest + 0.5 * beside(likely, -1, 0.0, BP, BD))) * step, 0.0)
+    sure = peak(likely, d, planes, window, BP, BD)[:, None] + tl.zeros((BP, BD), tl.float32)
     tl.store(out + 3 * row, nearer, inside)
     tl.store(out + 3 * row + 1, tl.cumsum(middle, 1), inside)
     tl.store(out + 3 * row + 2, sure, inside)
 
 
+@kernel("likely", "out")
+def _tabled(likely, out, pixels, planes, step, window: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr):
+    p = (tl.program_id(0) * BP + tl.arange(0, BP)).to(tl.int64)
+    d = tl.arange(0, BD)
+    inside = (p < pixels)[:, None] & (d < planes)[None, :]
+    table_of(tl.load(likely + p[:, None] * planes + d[None, :], inside, 0.0), out, p, d, pixels, planes, step, window, BP, BD)
+
+
+@kernel("paths", "out")
+def _decided(paths, out, pixels, planes, scale, step, window: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr):
+    p = (tl.program_id(0) * BP + tl.arange(0, BP)).to(tl.int64)
+    d = tl.arange(0, BD)
+    table_of(likelihood(paths, p, d, pixels, planes, scale), out, p, d, pixels, planes, step, window, BP, BD)
+
+
+def window_of(peak: int, planes: int) -> int:
+    """Planes that count as one depth."""
+    return min(2 * peak + 1, planes)
+
+
 def table(likely: Tensor, step: float, peak: int) -> Tensor:
     """(D, h, w) likelihoods, farthest first → (3, D, h, w) of `Sweep`; a voxel's three numbers lie next to each other."""
-    volume = likely.permute(1, 2, 0).contiguous()
+    volume = rows(likely)
     height, width, planes = volume.shape
     out = volume.new_empty((height, width, planes, 3))
-    grid = (triton.cdiv(height * width, PIXELS),)
-    _tabled[grid](volume, out, height * width, planes, step, min(2 * peak + 1, planes), BP=PIXELS, BD=wide(planes))
+    grid = (parts(height * width, PIXELS),)
+    _tabled[grid](volume, out, height * width, planes, step, window=window_of(peak, planes), BP=PIXELS, BD=wide(planes))
     return out.permute(3, 2, 0, 1)
+
+
+def decided(cost: Tensor, said: Tensor | None, small: float, large: float, temperature: float, step: float, peak: int) -> Tensor:
+    """`table` of the `distribution` of (D, h, w) costs less what is `said`, as large, in two launches."""
+    volume = rows(cost)
+    height, width, planes = volume.shape
+    paths = _paths(volume, small, large, None if said is None else rows(said))
+    out = volume.new_empty((height, width, planes, 3))
+    grid = (parts(height * width, PIXELS),)
+    _decided[grid](paths, out, height * width, planes, -1 / temperature, step, window=window_of(peak, planes), BP=PIXELS, BD=wide(planes))
+    return out.permute(3, 2, 0, 1)
+
+
+@kernel("paths", "rays", "inverses", "says", "places", "row")
+def _alone(
+    paths, rays, inverses, pose, lens, size, says, places, row, height, width, planes, scale, lowest, step, gain, against, least,
+    window: tl.constexpr, ABOUT: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr,
+):  # fmt: skip
+    """What a key frame says for and against surface, where it is sure of it, and what it is asked by."""
+    pixels = height * width
+    p = (tl.program_id(0) * BP + tl.arange(0, BP)).to(tl.int64)
+    d = tl.arange(0, BD)
+    some = p < pixels
+    likely = likelihood(paths, p, d, pixels, planes, scale)
+    nearer = tl.cumsum(likely, 1, reverse=True) - 0.5 * likely
+    hidden, not_free = beside(nearer, ABOUT, 0.0, BP, BD), beside(nearer, -ABOUT, 1.0, BP, BD)
+    told = tl.log(gain * tl.maximum(not_free - hidden, 0.0) + hidden + against)
+    tl.store(says + p[:, None] * planes + d[None, :], told, some[:, None] & (d < planes)[None, :])
+    between = nearer - beside(nearer, 1, 0.0, BP, BD)
+    best = tl.argmax(tl.where((d + 1 < planes)[None, :], between, -1.0), 1)
+    middle = 0.5 * (tl.load(inverses + best) + tl.load(inverses + best + 1))
+    sure = peak(likely, d, planes, window, BP, BD) > least
+    for axis in range(3):
+        place = tl.load(rays + 3 * p + axis, some, 0.0) / middle + tl.load(pose + 4 * axis + 3)
+        tl.store(places + 3 * p + axis, tl.where(sure, place, float("nan")), some)
+    if tl.program_id(0) == 0:
+        k = tl.arange(0, 32)
+        seen_by = tl.load(pose + k, k < 12, 0.0) + tl.load(lens + k - 12, (k >= 12) & (k < 16), 0.0)
+        seen_by += tl.load(size + k - 16, (k >= 16) & (k < 18), 0.0)
+        spaced = tl.where(k == 18, lowest, tl.where(k == 19, step, seen_by))
+        shape = tl.where(k == 20, height, tl.where(k == 21, width, planes)).to(tl.float32)
+        tl.store(row + k, tl.where(k < 20, spaced, shape), k < 23)
+
+
+def alone(
+    cost: Tensor, rays: Tensor, inverses: Tensor, camera: Any, lowest: float, step: float, smoothing: tuple[float, float, float],
+    peak: int, weights: tuple[float, float, int], least: float,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """What a key frame's pictures say alone, without the table that nobody reads.
+
+    Args:
+        cost: (D, h, w) at planes (D,) along rays (h · w, 3).
+        smoothing: penalties and temperature of `distribution`.
+        weights: of `reading.says`; least: of `reading.surest`.
+
+    Returns:
+        (D, h, w) of `reading.says`, (h · w, 3) of `reading.surest`, and (23,) of `reading.numbers`.
+    """
+    volume = rows(cost)
+    height, width, planes = volume.shape
+    paths = _paths(volume, *smoothing[:2])
+    says, places, row = torch.empty_like(volume), rays.new_empty((height * width, 3)), rays.new_empty(23)
+    _alone[(parts(height * width, PIXELS),)](
+        paths, rays.contiguous(), inverses, *lens(camera), says, places, row, height, width, planes, -1 / smoothing[2], lowest, step,
+        *weights[:2], least, window=window_of(peak, planes), ABOUT=weights[2], BP=PIXELS, BD=wide(planes),
+    )  # fmt: skip
+    return says.permute(2, 0, 1), places, row

@@ -1,21 +1,26 @@
 # mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
-"""From corners of a lattice to the local network's first rows on CUDA, without gradients: two launches (`model._observe` in tensors)."""
+"""From corners of a lattice to the local network's first rows on CUDA, without gradients: two launches, and the device is asked once in
+between (`model._observe` in tensors)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 import triton
 import triton.language as tl
+from numpy.typing import NDArray
 from torch import Tensor
 
-from toolkit.gpu import kernel
+from toolkit.gpu import kernel, sent
 from toolkit.networks.gpu.lookup import corners
 from toolkit.networks.gpu.reading import local, sighted
 
 BLOCK = 32
+PART = 128  # corners of a block that are looked at at once
 
 
 @triton.jit
@@ -49,22 +54,28 @@ def _seen(x, y, z, size, poses, lenses, sizes, view, near, far):
     return tl.where(visible, u, 0.0), tl.where(visible, v, 0.0), visible, tl.where(visible, footprint, 1.0)
 
 
-@kernel("rows", "keys", "table", "out")
+@kernel("keys", "table", "rows")
 def _choose(
-    rows, keys, poses, lenses, sizes, table, out, count, height, width, planes, lowest, step,
-    voxel, extent, half, cx, cy, cz, shell, bx, by, bz, near, far, truncation, hidden,
+    wanted, keys, poses, lenses, sizes, table, rows, found, count, height, width, planes, lowest, step,
+    voxel, extent, half, cx, cy, cz, shell, bx, by, bz, near, far, truncation, hidden, free,
     ALL: tl.constexpr, SHELL: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Corners that the key frame sees and that are not for sure hidden."""
+    """Corners that the key frame sees and that are not for sure hidden, and what there is in each part of a block."""
     n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     some = n < count
-    row = n if ALL else tl.load(rows + n, some, 0)
-    u, v, w, x, y, z, size = _corner(row, keys, voxel, extent, half, cx, cy, cz, shell, some, SHELL)
+    if not ALL:
+        some = some & (tl.load(wanted + n, some, 0) != 0)
+    u, v, w, x, y, z, size = _corner(n, keys, voxel, extent, half, cx, cy, cz, shell, some, SHELL)
     _, _, seen, _ = _seen(x, y, z, size, poses, lenses, sizes, 0, near, far)
     if not SHELL:
         seen = seen & (tl.abs(u) <= bx) & (tl.abs(v) <= by) & (tl.abs(w) <= bz)
-    _, clear, _ = sighted(x, y, z, truncation * size, table, poses, lenses, sizes, height, width, planes, lowest, step, some)
-    tl.store(out + n, (seen & (clear > hidden)).to(tl.uint8), some)
+    signed, clear, _ = sighted(x, y, z, truncation * size, table, poses, lenses, sizes, height, width, planes, lowest, step, some)
+    chosen = seen & (clear > hidden) & some
+    kept = chosen.to(tl.int32)
+    busy = tl.max((chosen & (signed < free)).to(tl.int32), 0)
+    tl.store(found + 1 + tl.program_id(0), tl.max(kept, 0) + 2 * busy)
+    first = tl.atomic_add(found, tl.sum(kept, 0))
+    tl.store(rows + first + tl.cumsum(kept, 0) - 1, n, chosen)
 
 
 @triton.jit
@@ -100,15 +111,16 @@ def _atanh(x):
     return 0.5 * tl.log((1 + x) / (1 - x))
 
 
-@kernel("rows", "keys", "table", "features", "projected", "start", "counts", "weights")
+@kernel("rows", "keys", "table", "latent", "start", "counts", "weights")
 def _observe(
-    rows, keys, poses, lenses, sizes, table, features, colours, weight, bias, projected, start, counts, weights,
+    rows, keys, slots, poses, lenses, sizes, table, pictures, weight, bias, latent, start, counts, weights, shown_at, channels, blocks,
     views_of, count, height, width, planes, lowest, step, voxel, extent, half, cx, cy, cz, shell, near, far, truncation, hidden, blind,
-    tall, wide, levels, cells, down, across, fine_levels, pixels, part, gain,
+    tall, wide, levels, down, across, fine_levels, part, gain,
     SHELL: tl.constexpr, VARIANCE: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, SAMPLED: tl.constexpr,
     STRIDE: tl.constexpr, FINE: tl.constexpr, HIDDEN: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """All that is known of corners: projected evidence, what latents start from, how many views see them, and how much that weighs."""
+    """All that is known of corners, into rows of the blocks that are kept: projected evidence where a block is busy, what latents start
+    from, how many views see them, and how much that weighs."""
     n = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     some = n < count
     row = tl.load(rows + n, some, 0)
@@ -153,11 +165,15 @@ def _observe(
         visible = visible & some
         each = tl.where(visible, share, 0.0)[:, None]
         corner, right, below, w0, w1, w2, w3 = corners(px, py, move, tall, wide, levels, STRIDE)
-        shown = _fetch(features + view * cells, corner, right, below, w0, w1, w2, w3, visible, CHANNELS, WIDE)
+        features = tl.load(pictures + 2 * view).to(tl.pointer_type(tl.float32))
+        colours = tl.load(pictures + 2 * view + 1).to(tl.pointer_type(tl.float32))
+        if CHANNELS % 4 == 0:
+            features = tl.multiple_of(features, 16)
+        shown = _fetch(features, corner, right, below, w0, w1, w2, w3, visible, CHANNELS, WIDE)
         corner, right, below, w0, w1, w2, w3 = corners(px, py, move, down, across, fine_levels, FINE)
-        shown_fine = _fetch(colours + view * pixels, corner, right, below, w0, w1, w2, w3, visible, 3, 16)
+        shown_fine = _fetch(colours, corner, right, below, w0, w1, w2, w3, visible, 3, 16)
         corner, right, below, w0, w1, w2, w3 = corners(px, py, part * footprint, down, across, fine_levels, FINE)
-        shown_whole = _fetch(colours + view * pixels, corner, right, below, w0, w1, w2, w3, visible, 3, 16)
+        shown_whole = _fetch(colours, corner, right, below, w0, w1, w2, w3, visible, 3, 16)
         if k < views_of:
             mean += shown * each
             fine += shown_fine * each
@@ -186,20 +202,58 @@ def _observe(
     agree = tl.sum(tl.where(c < 3, fine_deep, 0.0), 1) / 3
     out += ((tl.log(agree + 1e-4) / 4 + 1) * several)[:, None] * tl.load(at + 5)
     out += signed[:, None] * tl.load(at + 6) + clear[:, None] * tl.load(at + 7) + sure[:, None] * tl.load(at + 8)
-    tl.store(projected + n[:, None] * HIDDEN + h, tl.maximum(out, 0.0), some[:, None])
+    slot, inner = row // 512, row % 512
+    filled, busy = tl.load(slots + slot, some, 0), tl.load(slots + blocks + slot, some, -1)
+    place = busy.to(tl.int64) * 512 + inner
+    works = some & (busy >= 0)
+    tl.store(latent + place[:, None] * HIDDEN + h, tl.maximum(out, 0.0), works[:, None])
+    tl.store(shown_at + place, tl.full((BLOCK,), 1, tl.uint8), works)
+    place = filled.to(tl.int64) * 512 + inner
     shade = tl.minimum(tl.maximum(whole / gain + 0.5, 1e-4), 1 - 1e-4)
-    latent = _atanh(tl.log(shade / (1 - shade)) / 4)
-    tl.store(start + 4 * n[:, None] + c, latent, some[:, None] & (c < 3))
-    tl.store(start + 4 * n + 3, _atanh(-signed), some)
-    tl.store(counts + n, views, some)
-    tl.store(weights + n, tl.maximum(clear, hidden) * (blind + (1 - blind) * sure), some)
+    colour = _atanh(tl.log(shade / (1 - shade)) / 4)
+    tl.store(start + place[:, None] * channels + c, colour, some[:, None] & (c < 3) & (c < channels))
+    tl.store(start + place * channels + 3, _atanh(-signed), some & (channels > 3))
+    tl.store(counts + place, views, some)
+    tl.store(weights + place, tl.maximum(clear, hidden) * (blind + (1 - blind) * sure), some)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Corners that a key frame sees and that may be open.
+
+    Attributes:
+        rows: (N,) int64, in no particular order.
+        filled: (M,) bool, blocks that own one of them; busy: those of which one may be near a surface.
+    """
+
+    rows: Tensor
+    filled: NDArray[np.bool_]
+    busy: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of corners, in rows of F filled blocks, B of them busy; zero where nothing is seen.
+
+    Attributes:
+        latent: (B · 512 + 1, H) first rows of the local network.
+        seen: (B · 512,) bool, where it has any.
+        start: (F · 512 + 1, C) what latents start from.
+        count, weight: (F · 512,) views that see a corner, and how much that weighs.
+    """
+
+    latent: Tensor
+    seen: Tensor
+    start: Tensor
+    count: Tensor
+    weight: Tensor
 
 
 class Observer:
     """The networks' sight of a key frame and its neighbours (K ≥ 1), without gradients.
 
     Args:
-        numbers: truncation, hidden, blind and the colours' gain of `model`, and `unproject.COLOURED`.
+        numbers: truncation, hidden, blind and the colours' gain of `model`, `unproject.COLOURED`, and `model`'s limit of free space.
     """
 
     def __init__(self, views: Sequence[Any], cameras: Any, near: float, far: float, swept: Any, numbers: tuple[float, ...]) -> None:
@@ -209,43 +263,57 @@ class Observer:
         self.table = swept.table.permute(2, 3, 1, 0).contiguous()
         self.swept, self.views, self.numbers = swept, views, numbers
         self.near, self.far = float(max(near, 0.0)), float(far)
-        self.features, self.colours = (torch.stack(rows) for rows in zip(*((v.features.rows, v.colours.rows) for v in views), strict=True))
 
     def _space(self, lattice: Any) -> tuple[float, ...]:
         space = lattice.space
         return tuple(float(value) for value in (lattice.voxel, space.extent, space.half, *space.centre, space.shell))
 
-    def choose(self, lattice: Any, keys: Tensor, rows: Tensor | None) -> Tensor:
-        """(N,) int64, of the corners `rows` of blocks (M, 3), None: all, those that the key frame sees and that may be open."""
-        count = len(keys) * 512 if rows is None else len(rows)
-        out = torch.empty(count, dtype=torch.uint8, device=keys.device)
+    def choose(self, lattice: Any, keys: Tensor, wanted: Tensor | None) -> Found:
+        """Of the corners `wanted` (M · 512,) of blocks (M, 3), None: all, those that the key frame sees. The device is asked once."""
+        blocks, device = keys.shape[0], keys.device
+        count, parts = 512 * blocks, 512 // PART
+        rows = torch.empty(count, dtype=torch.int64, device=device)
+        found = torch.zeros(1 + blocks * parts, dtype=torch.int32, device=device)
         if count:
-            given = keys if rows is None else rows, keys, self.poses, self.lenses, self.sizes, self.table, out, count
+            given = found if wanted is None else wanted.view(torch.uint8), keys, self.poses, self.lenses, self.sizes, self.table
             box = tuple(side + 1.01 * lattice.voxel for side in lattice.space.box)
-            truncation, hidden = self.numbers[:2]
-            _choose[(triton.cdiv(count, 128),)](
-                *given, *self.table.shape[:3], self.swept.lowest, self.swept.step, *self._space(lattice), *box, self.near, self.far,
-                truncation, hidden, ALL=rows is None, SHELL=lattice.space.shell > 0, BLOCK=128,
+            truncation, hidden, free = self.numbers[0], self.numbers[1], self.numbers[5]
+            _choose[(blocks * parts,)](
+                *given, rows, found, count, *self.table.shape[:3], self.swept.lowest, self.swept.step, *self._space(lattice), *box,
+                self.near, self.far, truncation, hidden, free, ALL=wanted is None, SHELL=lattice.space.shell > 0, BLOCK=PART,
             )  # fmt: skip
-        kept = out.nonzero().view(-1)
-        return kept if rows is None else rows[kept]
+        told = found.cpu().numpy()
+        marks = np.bitwise_or.reduce(told[1:].reshape(blocks, parts), axis=1)
+        return Found(rows[: told[0]], (marks & 1) > 0, (marks & 2) > 0)
 
-    def observe(self, lattice: Any, keys: Tensor, rows: Tensor, layer: Any, sampled: int, variance: bool) -> tuple[Tensor, ...]:
-        """Of corners `rows` (N,): evidence through `layer` and a ReLU, what latents start from (N, 4), view count and weight (N,)."""
-        count, hidden = len(rows), len(layer.weight)
-        projected, start = self.poses.new_empty((count, hidden)), self.poses.new_empty((count, 4))
-        counts, weights = self.poses.new_empty(count), self.poses.new_empty(count)
+    def observe(
+        self, lattice: Any, keys: Tensor, found: Found, slots: Tensor, layer: Any, sampled: int, variance: bool, channels: int
+    ) -> Evidence:
+        """What is known of corners.
+
+        Args:
+            slots: (2 · M,) int32, of each block among the filled and among the busy ones, −1 where it is not.
+            layer: that evidence goes through, with a ReLU.
+            channels: of latents.
+        """
+        hidden, count = layer.weight.shape[0], found.rows.shape[0]
+        filled, busy = 512 * int(found.filled.sum()), 512 * int(found.busy.sum())
+        sizes = [(busy + 1) * hidden, (filled + 1) * channels, filled, filled, busy // 4]
+        parts = self.poses.new_zeros(sum(sizes)).split(sizes)  # one piece of memory is cleared at once
+        latent, start, counts, weights = parts[0].view(-1, hidden), parts[1].view(-1, channels), parts[2], parts[3]
+        seen = parts[4].view(torch.uint8)
         if count:
             fine, coarse = self.views[0].colours, self.views[0].features
-            channels = self.features.shape[2]
-            truncation, least, blind, gain, part = self.numbers
+            rows = [(view.features.rows.contiguous(), view.colours.rows.contiguous()) for view in self.views]
+            pictures = sent(np.array([of.data_ptr() for pair in rows for of in pair], np.int64), keys.device)
+            wide = coarse.rows.shape[1]
+            truncation, least, blind, gain, part, _ = self.numbers
             _observe[(triton.cdiv(count, BLOCK),)](
-                rows, keys, self.poses, self.lenses, self.sizes, self.table, self.features, self.colours, layer.weight, layer.bias,
-                projected, start, counts, weights, len(self.views), count, *self.table.shape[:3], self.swept.lowest,
+                found.rows, keys, slots, self.poses, self.lenses, self.sizes, self.table, pictures, layer.weight, layer.bias, latent, start,
+                counts, weights, seen, channels, keys.shape[0], len(self.views), count, *self.table.shape[:3], self.swept.lowest,
                 self.swept.step, *self._space(lattice), self.near, self.far, truncation, least, blind,
-                *coarse.sizes[0], len(coarse.sizes), self.features[0].numel(), *fine.sizes[0], len(fine.sizes), self.colours[0].numel(),
-                part, gain,
-                SHELL=lattice.space.shell > 0, VARIANCE=variance, CHANNELS=channels, WIDE=max(16, triton.next_power_of_2(channels)),
+                *coarse.sizes[0], len(coarse.sizes), *fine.sizes[0], len(fine.sizes), part, gain,
+                SHELL=lattice.space.shell > 0, VARIANCE=variance, CHANNELS=wide, WIDE=max(16, triton.next_power_of_2(wide)),
                 SAMPLED=sampled, STRIDE=coarse.stride, FINE=fine.stride, HIDDEN=hidden, BLOCK=BLOCK,
             )  # fmt: skip
-        return projected, start, counts, weights
+        return Evidence(latent, seen.view(torch.bool), start, counts, weights)

@@ -16,6 +16,7 @@ from toolkit.networks.gpu import matching
 
 BLOCK = 128
 TILE = (16, 32)  # rays and planes at once
+PARTS = 128  # sums that are added at once
 
 
 @triton.jit
@@ -102,7 +103,7 @@ def look(points: Tensor, truncation: Tensor, table: Tensor, camera: Any, lowest:
         points, truncation, pose, lens, size = (
             values.contiguous() for values in (points, truncation, camera.world_from_camera, camera.intrinsics, camera.size)
         )
-        _look[(triton.cdiv(count, BLOCK),)](
+        _look[(matching.parts(count, BLOCK),)](
             points, truncation, rows, pose, lens, size, out, count, height, width, planes, lowest, step, BLOCK=BLOCK
         )
     return out
@@ -123,70 +124,133 @@ def _asked(x, y, z, says, pose, lens, size, height, width, planes, lowest, step,
     return _between(says, left, right, fx, top, below, fy, low, high, fz, width, planes, seen, 1), seen
 
 
-@kernel("points", "says")
-def _confirmed(points, says, pose, lens, size, out, count, height, width, planes, lowest, step, BLOCK: tl.constexpr):
-    """Sums of what is said of places and of how many are seen, one pair a block. Places that are not numbers are not seen."""
+@triton.jit
+def _witness_at(addresses, number):
+    """Where a witness's volume and its `numbers` lie, its height, width and planes, its lowest plane, and from one to the next."""
+    says = tl.load(addresses + 2 * number).to(tl.pointer_type(tl.float32))
+    row = tl.load(addresses + 2 * number + 1).to(tl.pointer_type(tl.float32))
+    height, width, planes = tl.load(row + 20).to(tl.int32), tl.load(row + 21).to(tl.int32), tl.load(row + 22).to(tl.int32)
+    return says, row, height, width, planes, tl.load(row + 18), tl.load(row + 19)
+
+
+@kernel("points", "out")
+def _confirmed(points, addresses, out, count, blocks, BLOCK: tl.constexpr):
+    """Sums of what a witness says of places and of how many it sees, one pair a block. Places that are not numbers are not seen."""
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    number = tl.program_id(1)
     some = n < count
     x, y, z = tl.load(points + 3 * n, some, 0.0), tl.load(points + 3 * n + 1, some, 0.0), tl.load(points + 3 * n + 2, some, 0.0)
-    said, seen = _asked(x, y, z, says, pose, lens, size, height, width, planes, lowest, step, some)
-    tl.store(out + 2 * tl.program_id(0), tl.sum(tl.where(seen, said, 0.0), 0))
-    tl.store(out + 2 * tl.program_id(0) + 1, tl.sum(seen.to(tl.float32), 0))
+    says, row, height, width, planes, lowest, step = _witness_at(addresses, number)
+    said, seen = _asked(x, y, z, says, row, row + 12, row + 16, height, width, planes, lowest, step, some)
+    place = 2 * (number * blocks + tl.program_id(0))
+    tl.store(out + place, tl.sum(tl.where(seen, said, 0.0), 0))
+    tl.store(out + place + 1, tl.sum(seen.to(tl.float32), 0))
 
 
-@kernel("says", "total", "count")
-def _add(
-    rays, inverses, origin, says, pose, lens, size, beliefs, number, witnesses, total, count, rows, asked, height, width, planes, lowest,
-    step, BP: tl.constexpr, BD: tl.constexpr,
+@triton.jit
+def _belief(sums, number, blocks, believed, PARTS: tl.constexpr):
+    """How far a witness is to be believed, by what it says of places on average; in full where it sees none of them."""
+    said, count = tl.zeros((PARTS,), tl.float32), tl.zeros((PARTS,), tl.float32)
+    first = 0
+    while first < blocks:
+        block = first + tl.arange(0, PARTS)
+        place = sums + 2 * (number * blocks + block)
+        said += tl.load(place, block < blocks, 0.0)
+        count += tl.load(place + 1, block < blocks, 0.0)
+        first += PARTS
+    seen = tl.sum(count, 0)
+    belief = tl.minimum(tl.maximum(tl.sum(said, 0) / tl.maximum(seen, 1.0) / believed, 0.0), 1.0)
+    return tl.where(seen > 0, belief, 1.0)
+
+
+@triton.jit
+def _ray(rays, axis, corner, right, below, both, fx, fy, mask):
+    """One axis of rays of the pixels' grid, read between them."""
+    upper = tl.load(rays + 3 * corner + axis, mask, 0.0) * (1 - fx) + tl.load(rays + 3 * right + axis, mask, 0.0) * fx
+    lower = tl.load(rays + 3 * below + axis, mask, 0.0) * (1 - fx) + tl.load(rays + 3 * both + axis, mask, 0.0) * fx
+    return (upper * (1 - fy) + lower * fy)[:, None]
+
+
+@kernel("rays", "inverses", "sums", "out")
+def _mean(
+    rays, inverses, pose, addresses, sums, out, witnesses, blocks, height, width, down, across, asked, believed, share,
+    BP: tl.constexpr, BD: tl.constexpr, PARTS: tl.constexpr,
 ):  # fmt: skip
-    """One more witness's part of what is said along rays; the last one makes it the mean."""
+    """What all witnesses say along some of the rays in the mean."""
     p = tl.program_id(0) * BP + tl.arange(0, BP)
     d = tl.program_id(1) * BD + tl.arange(0, BD)
-    is_row = p < rows
+    is_row = p < down * across
     inside = is_row[:, None] & (d < asked)[None, :]
+    left, right, fx = _bounded((p % across + 0.5) * (width * 1.0 / across) - 0.5, width)
+    top, below, fy = _bounded((p // across + 0.5) * (height * 1.0 / down) - 0.5, height)
+    one, two, three, four = top * width + left, top * width + right, below * width + left, below * width + right
     far = 1 / tl.load(inverses + d, d < asked, 1.0)[None, :]
-    x = tl.load(rays + 3 * p, is_row, 0.0)[:, None] * far + tl.load(origin)
-    y = tl.load(rays + 3 * p + 1, is_row, 0.0)[:, None] * far + tl.load(origin + 1)
-    z = tl.load(rays + 3 * p + 2, is_row, 0.0)[:, None] * far + tl.load(origin + 2)
-    said, seen = _asked(x, y, z, says, pose, lens, size, height, width, planes, lowest, step, inside)
-    place = p[:, None] * asked + d[None, :]
-    added, looked = tl.where(seen, said * tl.load(beliefs + number), 0.0), seen.to(tl.float32)
-    added += tl.load(total + place, inside & (number > 0), 0.0)
-    looked += tl.load(count + place, inside & (number > 0), 0.0)
-    tl.store(total + place, tl.where(number + 1 == witnesses, added / tl.maximum(looked, 1.0), added), inside)
-    tl.store(count + place, looked, inside)
+    x = _ray(rays, 0, one, two, three, four, fx, fy, is_row) * far + tl.load(pose + 3)
+    y = _ray(rays, 1, one, two, three, four, fx, fy, is_row) * far + tl.load(pose + 7)
+    z = _ray(rays, 2, one, two, three, four, fx, fy, is_row) * far + tl.load(pose + 11)
+    total, looked = tl.zeros((BP, BD), tl.float32), tl.zeros((BP, BD), tl.float32)
+    number = 0
+    while number < witnesses:
+        says, row, tall, wide, planes, lowest, step = _witness_at(addresses, number)
+        said, seen = _asked(x, y, z, says, row, row + 12, row + 16, tall, wide, planes, lowest, step, inside)
+        total += tl.where(seen, said * _belief(sums, number, blocks, believed, PARTS), 0.0)
+        looked += seen.to(tl.float32)
+        number += 1
+    tl.store(out + p[:, None] * asked + d[None, :], total / tl.maximum(looked, 1.0) * share, inside)
 
 
-def _of(witness: Any) -> tuple[Any, ...]:
-    """A witness's numbers (h, w, D), camera and shape."""
-    says = witness.says.permute(1, 2, 0).contiguous()
-    camera = witness.camera
-    return says, camera.world_from_camera.contiguous(), camera.intrinsics.contiguous(), camera.size.contiguous(), says.shape
+def numbers(camera: Any, says: Tensor, lowest: float, step: float) -> Tensor:
+    """(23,) that a witness is asked by: its pose (12), lens (4) and size (2), its planes' lowest and step, and h, w and D."""
+    rest = torch.tensor([lowest, step, says.shape[1], says.shape[2], says.shape[0]]).to(says.device, non_blocking=True)
+    return torch.cat([camera.world_from_camera[0, :3].reshape(12), camera.intrinsics[0], camera.size[0], rest])
 
 
-def confirmed(witnesses: Sequence[Any], points: Tensor) -> Tensor:
-    """(W, 2): for each witness the sum of what it says of places (N, 3), and how many of them it sees."""
-    blocks = max(1, triton.cdiv(len(points), BLOCK))
-    out, points = points.new_empty((len(witnesses), blocks, 2)), points.contiguous()
-    for number, one in enumerate(witnesses):
-        says, pose, lens, size, shape = _of(one)
-        _confirmed[(blocks,)](points, says, pose, lens, size, out[number], len(points), *shape, one.lowest, one.step, BLOCK=BLOCK)
-    return out.sum(1)
+class Asked:
+    """Witnesses that are asked together, in one launch.
 
+    Args:
+        witnesses: W ≥ 1.
+    """
 
-def mean(rays: Tensor, inverses: Tensor, origin: Tensor, witnesses: Sequence[Any], beliefs: Tensor) -> Tensor:
-    """(P, D) what witnesses that look there say in the mean, times how far each is believed (W,), along rays (P, 3) at (D,)."""
-    total = rays.new_empty((len(rays), len(inverses)))
-    count = torch.empty_like(total)
-    rays, origin, beliefs = rays.contiguous(), origin.contiguous(), beliefs.contiguous()
-    grid = (triton.cdiv(len(rays), TILE[0]), triton.cdiv(len(inverses), TILE[1]))
-    for number, one in enumerate(witnesses):
-        says, pose, lens, size, shape = _of(one)
-        _add[grid](
-            rays, inverses, origin, says, pose, lens, size, beliefs, number, len(witnesses), total, count, len(rays), len(inverses), *shape,
-            one.lowest, one.step, BP=TILE[0], BD=TILE[1],
+    def __init__(self, witnesses: Sequence[Any]) -> None:
+        self.count = len(witnesses)
+        # Kept until kernels that go to their addresses are on their way.
+        self._kept = [(matching.rows(one.says), one.numbers()) for one in witnesses]
+        places = torch.tensor([(says.data_ptr(), row.data_ptr()) for says, row in self._kept], dtype=torch.int64)
+        self._addresses = places.to(self._kept[0][0].device, non_blocking=True)
+
+    def confirmed(self, points: Tensor) -> Tensor:
+        """(W, B, 2): for each witness the sum of what it says of places (N, 3), and how many of them it sees, in B parts."""
+        blocks = max(1, matching.parts(len(points), BLOCK))
+        out = points.new_empty((self.count, blocks, 2))
+        _confirmed[(blocks, self.count)](points.contiguous(), self._addresses, out, len(points), blocks, BLOCK=BLOCK)
+        return out
+
+    def mean(
+        self, rays: Tensor, inverses: Tensor, camera: Any, grid: tuple[int, int], coarse: tuple[int, int], sums: Tensor | None,
+        believed: float, share: float,
+    ) -> Tensor:  # fmt: skip
+        """What witnesses that look there say in the mean, each by how far it is believed.
+
+        Args:
+            rays: (h · w, 3) from the camera, through the pixels of a grid (h, w).
+            inverses: (D,) inverse depths along each.
+            coarse: (h', w') of the grid at which they are asked.
+            sums: of `confirmed`; None: each is believed in full.
+            believed: mean of what is said from which on a witness is.
+            share: of the mean that is given.
+
+        Returns:
+            (h', w', D).
+        """
+        out = rays.new_empty((*coarse, len(inverses)))
+        blocks = 0 if sums is None else sums.shape[1]
+        tiles = (matching.parts(coarse[0] * coarse[1], TILE[0]), matching.parts(len(inverses), TILE[1]))
+        _mean[tiles](
+            rays.contiguous(), inverses, matching.lens(camera)[0], self._addresses, out if sums is None else sums, out, self.count, blocks,
+            *grid, *coarse, len(inverses), believed, share, BP=TILE[0], BD=TILE[1], PARTS=PARTS,
         )  # fmt: skip
-    return total
+        return out
 
 
 @kernel("table", "out")
@@ -205,7 +269,7 @@ def says(table: Tensor, gain: float, against: float, about: int) -> Tensor:
     rows = table.permute(2, 3, 1, 0).contiguous()
     height, width, planes = rows.shape[:3]
     out = rows.new_empty((height, width, planes))
-    grid = (triton.cdiv(height * width, matching.PIXELS),)
+    grid = (matching.parts(height * width, matching.PIXELS),)
     sizes = {"ABOUT": about, "BP": matching.PIXELS, "BD": matching.wide(planes)}
     _witness[grid](rows, out, height * width, planes, gain, against, **sizes)
     return out.permute(2, 0, 1)
@@ -233,5 +297,5 @@ def surest(table: Tensor, rays: Tensor, inverses: Tensor, origin: Tensor, least:
     planes = rows.shape[2]
     out = torch.empty_like(rays)
     sizes = {"BP": matching.PIXELS, "BD": matching.wide(planes)}
-    _surest[(triton.cdiv(len(rays), matching.PIXELS),)](rows, rays, inverses, origin, out, len(rays), planes, least, **sizes)
+    _surest[(matching.parts(len(rays), matching.PIXELS),)](rows, rays, inverses, origin, out, len(rays), planes, least, **sizes)
     return out

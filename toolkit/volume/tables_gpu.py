@@ -1,0 +1,55 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
+"""Which block lies where, on CUDA: the table of a `Topology` and the slots about its blocks, a launch each."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from toolkit.gpu import kernel
+
+BLOCK = 256
+
+
+@kernel("keys", "table")
+def _table(keys, table, cells, count, ox, oy, oz, sx, sy, BLOCK: tl.constexpr):
+    n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    some = n < count
+    x, y, z = tl.load(keys + 3 * n, some, 0) - ox, tl.load(keys + 3 * n + 1, some, 0) - oy, tl.load(keys + 3 * n + 2, some, 0) - oz
+    cell = (z.to(tl.int64) * sy + y) * sx + x
+    tl.store(cells + n, cell, some)
+    tl.store(table + cell, n, some)
+
+
+def table(keys: Tensor, origin: tuple[int, int, int], size: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
+    """`Topology.table` of keys (M, 3) int32, and (M,) int64 cells of them."""
+    sx, sy, sz = size
+    out = torch.full((sz, sy, sx), -1, dtype=torch.int32, device=keys.device)
+    count = keys.shape[0]
+    cells = torch.empty(count, dtype=torch.int64, device=keys.device)
+    if count:
+        _table[(triton.cdiv(count, BLOCK),)](keys, out, cells, count, *origin, sx, sy, BLOCK=BLOCK)
+    return out, cells
+
+
+@kernel("table", "cells", "out")
+def _around(table, cells, out, count, sx, sy, BLOCK: tl.constexpr):
+    n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    some = n < count
+    k = n % 27
+    step = ((k // 9 - 1) * sy + (k // 3) % 3 - 1) * sx + k % 3 - 1
+    # The margin keeps every step inside the table.
+    slot = tl.load(table + tl.load(cells + n // 27, some, 0) + step, some, -1)
+    tl.store(out + n, slot.to(tl.int64), some)
+
+
+def around(table: Tensor, cells: Tensor) -> Tensor:
+    """`Topology.around` from its table and the cells of its blocks."""
+    _, sy, sx = table.shape
+    count = 27 * cells.shape[0]
+    out = torch.empty((cells.shape[0], 27), dtype=torch.int64, device=cells.device)
+    if count:
+        _around[(triton.cdiv(count, BLOCK),)](table, cells, out, count, sx, sy, BLOCK=BLOCK)
+    return out
