@@ -68,17 +68,22 @@ class Fused:
 
     Attributes:
         frame: index of the key frame's picture.
-        volume: the finest global volume; shares memory with the loop, valid until it goes on.
         seconds: spent on this key frame.
         encode_seconds: of these, on encoding pictures.
+        look: finds `volume`.
         judge: finds `allowed`.
     """
 
     frame: int
-    volume: LatentVolume
     seconds: float
     encode_seconds: float
+    look: Callable[[], LatentVolume]
     judge: Callable[[], Tensor]
+
+    @cached_property
+    def volume(self) -> LatentVolume:
+        """The finest global volume, when it is first asked for; shares memory with the loop, valid until it goes on."""
+        return self.look()
 
     @cached_property
     def allowed(self) -> Tensor:
@@ -261,5 +266,5 @@ def fuse_views(
         if (done + 1) % fusion.options.prune_every == 0:
             fusion.prune()
         seconds = time.perf_counter() - begin
-        yield Fused(int(key), fusion.volume, seconds, encode_seconds, fusion.allowed)
-        progress.update(done + 1, len(key_frames.indices), f"{fusion.volume.topology.blocks} blocks")
+        yield Fused(int(key), seconds, encode_seconds, fusion.stores[-1].volume, fusion.allowed)
+        progress.update(done + 1, len(key_frames.indices), f"{fusion.stores[-1].blocks} blocks")

@@ -52,6 +52,16 @@ def asks_freely(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
+def pieces(count: int, size: int) -> int:
+    """How many pieces of a size cover a count."""
+    return -(-count // size)
+
+
+def power_of_two(least: int) -> int:
+    """The smallest one that is not below `least` ≥ 1."""
+    return 1 << (least - 1).bit_length()
+
+
 def sent(values: NDArray[Any], device: torch.device) -> Tensor:
     """The same numbers on a device; on CUDA from memory that stays in place, so that nobody has to wait for the copy."""
     tensor = torch.from_numpy(np.ascontiguousarray(values))
@@ -61,8 +71,9 @@ def sent(values: NDArray[Any], device: torch.device) -> Tensor:
 class Kernel:
     """A Triton kernel, launched as `kernel[grid](…)`.
 
-    Triton looks at every number and tensor of a launch to know which variant is meant, and asks its hooks; most of what a small launch
-    costs. Here a short key finds what the first launch of its kind had compiled, which is then launched directly.
+    Triton looks at every number and tensor of a launch to know which variant is meant, and asks its hooks: most of what a small launch
+    costs. Here a short key finds what the first launch of its kind had compiled, which is then launched directly. Whole numbers are of
+    32 bits: a kernel that is given a longer one is compiled for it if it comes first, else refuses it.
 
     Args:
         jitted: the kernel as Triton made it.
@@ -73,32 +84,31 @@ class Kernel:
 
     def __init__(self, jitted: Any, names: Sequence[str], constants: Sequence[int], aligned: Sequence[str]) -> None:
         self.jitted, self.names, self.aligned = jitted, tuple(names), tuple(aligned)
-        self._constants = frozenset(constants)
+        self._constants = tuple(constants)
         self._aligned = tuple(self.names.index(name) for name in aligned)
+        self._tensors: tuple[int, ...] = ()
         self._compiled: dict[Any, Any] = {}
 
     def __getitem__(self, grid: tuple[int, ...]) -> Callable[..., None]:
         return partial(self._launch, grid)
 
     def _launch(self, grid: tuple[int, ...], *given: Any, **named: Any) -> None:
-        constants = self._constants
-        kinds = [value if place in constants else _kind(value) for place, value in enumerate(given)]
-        ends = [given[place].data_ptr() % 16 for place in self._aligned]
-        key = (given[0].get_device(), *kinds, *ends, *named.items())
+        if not self._tensors:  # a place always holds one, or never
+            self._tensors = tuple(place for place, value in enumerate(given) if isinstance(value, Tensor))
+        device = given[self._tensors[0]].get_device()
+        kinds = [given[place].dtype for place in self._tensors]
+        ends = [given[place].data_ptr() & 15 for place in self._aligned]
+        # By name a launch gives constants and options, in the same order each time; a few give constants by place.
+        constants = [given[place] for place in self._constants if place < len(given)]
+        key = (device, *kinds, *ends, *constants, *map(type, given), *named.values())
         compiled = self._compiled.get(key)
         if compiled is None:
             compiled = self.jitted[grid](*given, **named)
             if hasattr(compiled, "function"):  # neither the interpreter nor what stands in for it in tests
                 self._compiled[key] = compiled
-        else:
-            compiled[(*grid, 1, 1)[:3]](*given, *[named[name] for name in self.names[len(given) :]])
-
-
-def _kind(value: Any) -> Any:
-    """What Triton compiles anew for."""
-    if isinstance(value, Tensor):
-        return value.dtype
-    return "long" if type(value) is int and not -(2**31) <= value < 2**31 else type(value)
+            return
+        rest = [named[name] for name in self.names[len(given) :]]
+        compiled[(*grid, 1, 1)[:3]](*given, *rest, stream=torch._C._cuda_getCurrentRawStream(device))
 
 
 def kernel(*aligned: str) -> Callable[[Callable[..., Any]], Kernel]:

@@ -192,20 +192,18 @@ def test_convolution_and_its_gradients(inside: int, outside: int, monkeypatch: p
 
 
 def test_convolutions_side_by_side() -> None:
-    """Each of its own channels, or all of the same ones; and again when a parameter has changed."""
+    """Two of the same channels, then two of their own each; and again when a parameter has changed."""
     topology = Topology(torch.tensor([[0, 0, 0], [0, 0, 1]]))
     generator = torch.Generator().manual_seed(0)
-    rows = torch.cat([torch.randn(topology.zero_row, 8, generator=generator), torch.zeros(1, 8)])
+    rows = torch.cat([torch.randn(topology.zero_row, 4, generator=generator), torch.zeros(1, 4)])
     seen = torch.rand(topology.zero_row, generator=generator) < 0.6
-    for shared, inside in ((False, 4), (True, 8)):
-        layers, prepared = [BlockConv3d(inside, 3), BlockConv3d(inside, 3)], Prepared()
-        for _ in range(2):
-            parts = [rows, rows] if shared else [part.contiguous() for part in rows.chunk(2, 1)]
-            with torch.no_grad():
-                expected = torch.cat([layer(part, topology, seen, True) for layer, part in zip(layers, parts, strict=True)], 1)
-                found = prepared.convolve(layers, rows, topology, seen, True, shared)
-                layers[1].weight.mul_(-2.0)
-            torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+    stages, prepared = [[BlockConv3d(4, 3) for _ in range(2)], [BlockConv3d(3, 2) for _ in range(2)]], Prepared()
+    for _ in range(2):
+        with torch.no_grad():
+            parts = [second(first(rows, topology, seen), topology, seen, True) for first, second in zip(*stages, strict=True)]
+            found = prepared.convolve(stages, rows, topology, seen)
+            stages[1][1].weight.mul_(-2.0)
+        torch.testing.assert_close(found, torch.cat(parts, 1), atol=1e-4, rtol=1e-4)
 
 
 def test_lookup(monkeypatch: pytest.MonkeyPatch) -> None:

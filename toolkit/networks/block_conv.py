@@ -51,34 +51,34 @@ class BlockConv3d(nn.Module):
     def forward(self, rows: Tensor, topology: Topology, occupied: Tensor | None = None, relu: bool = False) -> Tensor:
         """See `block_conv3d`."""
         if not torch.is_grad_enabled() and gpu.takes(rows):
-            return self._prepared.convolve([self], rows, topology, occupied, relu)
+            return self._prepared.convolve([[self]], rows, topology, occupied, relu)
         return block_conv3d(rows, topology, self.weight, self.bias, occupied, self.chunk, relu)
 
     def extra_repr(self) -> str:
         return f"{self.weight.shape[1]}, {self.weight.shape[0]}, bias={self.bias is not None}"
 
 
+Stage = Sequence[BlockConv3d]  # one convolution, or several that go side by side
+
+
 class Prepared:
-    """What convolutions on CUDA without gradients read of one layer, or of several side by side: kernels in the order of their loop, and
-    biases, in the numbers that are computed in. Laid out anew when a parameter has changed."""
+    """What convolutions on CUDA without gradients read of layers that follow each other: kernels in the order of their loop, and biases, in
+    the numbers that are computed in. Laid out anew when a parameter has changed."""
 
     def __init__(self) -> None:
         self._key: Any = None
-        self._laid: tuple[Tensor, Tensor | None] | None = None
+        self._laid: list[tuple[Tensor, Tensor | None]] = []
 
     def convolve(
-        self,
-        layers: Sequence[BlockConv3d],
-        rows: Tensor,
-        topology: Topology,
-        occupied: Tensor | None = None,
-        relu: bool = False,
-        shared: bool = False,
+        self, stages: Sequence[Stage], rows: Tensor, topology: Topology, occupied: Tensor | None = None, relu: bool = False
     ) -> Tensor:
-        """`block_conv3d` of one or several layers, alike in shape and all with a bias or none, in one launch.
+        """`block_conv3d` of one stage after the other, with a ReLU between them, a launch each.
 
         Args:
-            rows: (M · 512 + 1, C), of several layers: each its own C / layers of them, or, where they are `shared`, all the same.
+            stages: layers of one stage are alike in shape, and have all a bias or none. Those of the first read the same rows, those of
+                later ones each its own part of the channels.
+            rows: (M · 512 + 1, C).
+            relu: of the rows, before.
 
         Returns:
             (M · 512 + 1, C'), one layer's channels after the other's.
@@ -87,12 +87,26 @@ class Prepared:
 
         kind = rows.device.type
         numbers = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else rows.dtype
-        weights, biases = [one.weight for one in layers], [one.bias for one in layers if one.bias is not None]
-        key = numbers, shared, *[(one.data_ptr(), one._version) for one in (*weights, *biases)]
-        if self._laid is None or key != self._key:
-            taps = convolution.taps_of(*([torch.cat(list(weights))] if shared else weights))
-            self._key, self._laid = key, (taps.to(numbers), torch.cat(list(biases)).to(numbers) if biases else None)
-        return convolution.convolve(rows.to(numbers), topology.around, *self._laid, occupied, relu)
+        rows, around = rows if rows.dtype == numbers else rows.to(numbers), topology.around
+        for taps, bias in self._parameters(stages, numbers):
+            rows = convolution.convolve(rows, around, taps, bias, occupied, relu)
+            relu = True
+        return rows
+
+    def _parameters(self, stages: Sequence[Stage], numbers: torch.dtype) -> list[tuple[Tensor, Tensor | None]]:
+        from toolkit.networks.gpu import convolution
+
+        known = [[(one.weight, one.bias) for one in stage] for stage in stages]
+        key = [numbers, *[(w.data_ptr(), w._version, b is not None and (b.data_ptr(), b._version)) for stage in known for w, b in stage]]
+        if key != self._key:
+            self._laid = []
+            for stage in known:
+                weights: list[Tensor] = [weight for weight, _ in stage]
+                biases: list[Tensor] = [bias for _, bias in stage if bias is not None]
+                taps = convolution.taps_of(*(weights if self._laid else [torch.cat(weights)]))
+                self._laid.append((taps.to(numbers), torch.cat(biases).to(numbers) if biases else None))
+            self._key = key
+        return self._laid
 
 
 def block_conv3d(

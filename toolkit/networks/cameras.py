@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from toolkit.camera import Array, Intrinsics
+from toolkit.gpu import sent
 
 
 @dataclass(frozen=True)
@@ -31,10 +32,21 @@ class Cameras:
     @classmethod
     def of(cls, intrinsics: Sequence[Intrinsics], world_from_camera: Array, device: torch.device | str = "cpu") -> Cameras:
         """From the toolkit's cameras; lenses are not looked at (pictures are undistorted before)."""
-        inner = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in intrinsics], dtype=torch.float32)
-        size = torch.tensor([[c.width, c.height] for c in intrinsics], dtype=torch.float32)
-        poses = torch.from_numpy(np.asarray(world_from_camera, dtype=np.float32))
-        return cls(inner.view(-1, 4), size.view(-1, 2), poses.view(-1, 4, 4)).to(device)
+        inner = [(c.fx, c.fy, c.cx, c.cy) for c in intrinsics]
+        parts = inner, [(c.width, c.height) for c in intrinsics], world_from_camera
+        return cls._laid(np.concatenate([np.asarray(part, dtype=np.float32).reshape(-1) for part in parts]), torch.device(device))
+
+    @classmethod
+    def _laid(cls, whole: Array, device: torch.device) -> Cameras:
+        """Cameras of (22 · K,) float32: all intrinsics, then all sizes, then all poses; sent to the device in one piece."""
+        count = len(whole) // 22
+
+        def split(values: Tensor, host: Cameras | None) -> Cameras:
+            inner, size, poses = values.split([4 * count, 2 * count, 16 * count])
+            return cls(inner.view(-1, 4), size.view(-1, 2), poses.view(-1, 4, 4), host)
+
+        host = split(torch.from_numpy(whole), None)
+        return host if device.type == "cpu" else split(sent(whole, device), host)
 
     @classmethod
     def same_size(cls, intrinsics: Tensor, world_from_camera: Tensor, width: int, height: int) -> Cameras:
@@ -56,7 +68,9 @@ class Cameras:
         """All of them in one bundle."""
         hosts = [part.host for part in parts if part.host is not None]
         if hosts and len(hosts) == len(parts):
-            return cls.together(hosts).to(parts[0].intrinsics.device)
+            groups = zip(*((one.intrinsics, one.size, one.world_from_camera) for one in hosts), strict=True)
+            whole = np.concatenate([one.numpy().reshape(-1) for group in groups for one in group])
+            return cls._laid(whole, parts[0].intrinsics.device)
         return cls(
             torch.cat([part.intrinsics for part in parts]),
             torch.cat([part.size for part in parts]),
@@ -71,11 +85,11 @@ class Cameras:
         if device.type == "cpu" and self.host is not None:
             return self.host
         parts = self.intrinsics, self.size, self.world_from_camera
-        whole = torch.cat([part.reshape(-1) for part in parts])
-        # What comes back is waited for; what goes there is not.
-        moved = whole.to(device, non_blocking=device.type != "cpu").split([part.numel() for part in parts])
-        inner, size, poses = (new.view(old.shape) for new, old in zip(moved, parts, strict=True))
-        return Cameras(inner, size, poses, self if self.intrinsics.device.type == "cpu" else None)
+        if self.intrinsics.device.type == "cpu":
+            return self._laid(np.concatenate([part.numpy().reshape(-1) for part in parts]), device)
+        # What comes back is waited for.
+        moved = torch.cat([part.reshape(-1) for part in parts]).to(device).split([part.numel() for part in parts])
+        return Cameras(*(new.view(old.shape) for new, old in zip(moved, parts, strict=True)))
 
     @property
     def positions(self) -> Tensor:

@@ -41,14 +41,12 @@ class _Gate(nn.Module):
             last.weight.mul_(0.1)
 
     @property
-    def first(self) -> BlockConv3d:
-        return self.layer(0)
+    def layers(self) -> list[BlockConv3d]:
+        return [layer for layer in self.convolutions if isinstance(layer, BlockConv3d)]
 
-    def layer(self, depth: int) -> BlockConv3d:
-        """One of the convolutions."""
-        found = self.convolutions[depth]
-        assert isinstance(found, BlockConv3d)
-        return found
+    @property
+    def first(self) -> BlockConv3d:
+        return self.layers[0]
 
     def forward(self, rows: Tensor, topology: Topology, inside: Tensor, begun: Tensor | None = None) -> Tensor:
         """`begun`: what the first convolution gives for `rows`, if that is known already."""
@@ -69,7 +67,7 @@ class FusionGRU(nn.Module):
         super().__init__()
         self.update, self.reset, self.candidate = (_Gate(channels, hidden, layers) for _ in range(3))
         self.most = most
-        self._side_by_side = [Prepared() for _ in range(layers)]
+        self._gates_prepared, self._candidate_prepared = Prepared(), Prepared()
 
     def forward(
         self, state: Tensor, count: Tensor, local: Tensor, raw: Tensor, weight: Tensor, topology: Topology, inside: Tensor
@@ -122,12 +120,10 @@ class FusionGRU(nn.Module):
         rows, count = step.average()
         if busy.blocks:
             both, inside = step.beside(numbers)
-            gates = both
-            for depth, prepared in enumerate(self._side_by_side):
-                layers = [self.update.layer(depth), self.reset.layer(depth)]
-                gates = prepared.convolve(layers, gates, busy, inside, depth > 0, shared=depth == 0)
+            gates = self._gates_prepared.convolve(list(zip(self.update.layers, self.reset.layers, strict=True)), both, busy, inside)
             step.forget(gates, both)
-            step.update(gates, self.candidate(both, busy, inside), INSIDE, CHANGE, rows)
+            candidate = self._candidate_prepared.convolve([[layer] for layer in self.candidate.layers], both, busy, inside)
+            step.update(gates, candidate, INSIDE, CHANGE, rows)
         return rows, count
 
     def _gates(self, both: Tensor, topology: Topology, inside: Tensor) -> list[Tensor]:

@@ -7,7 +7,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from toolkit.networks.block_conv import BlockConv3d
+from toolkit import gpu
+from toolkit.networks.block_conv import BlockConv3d, Prepared
 from toolkit.volume.topology import Topology
 
 COLOUR_SCALE = 4.0  # a latent colour of ±1 is a colour logit of ±4
@@ -56,6 +57,7 @@ class LocalReconstruction(nn.Module):
         nn.init.zeros_(self.project.bias)
         widths = [hidden] * layers + [channels]
         self.convolutions = nn.ModuleList(BlockConv3d(a, b) for a, b in pairwise(widths))
+        self._prepared = Prepared()
         last = self.convolutions[-1]
         assert isinstance(last, BlockConv3d)
         nn.init.kaiming_normal_(last.weight, nonlinearity="linear")
@@ -78,6 +80,8 @@ class LocalReconstruction(nn.Module):
 
     def learned(self, rows: Tensor, topology: Topology, seen: Tensor) -> Tensor:
         """(M · 512 + 1, channels) what the convolutions give, before it is `held` and added to the start."""
+        if not torch.is_grad_enabled() and gpu.takes(rows):
+            return self._prepared.convolve([[layer] for layer in self.convolutions if isinstance(layer, BlockConv3d)], rows, topology, seen)
         for number, convolution in enumerate(self.convolutions):
             rows = convolution(rows, topology, seen, number > 0)
         return rows

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from toolkit import gpu
-from toolkit.camera import Array
 from toolkit.gpu import asks_freely, sent
 from toolkit.networks.lattice import LatentVolume, Lattice
 from toolkit.networks.refine import adopt, part
@@ -22,10 +21,25 @@ class GlobalStore:
 
     def __init__(self, lattice: Lattice, channels: int, device: torch.device | str = "cpu") -> None:
         self.lattice = lattice
-        self.topology = Topology(torch.zeros((0, 3), dtype=torch.int32, device=device), bounds=lattice.bounds(device))
+        self._topology: Topology | None = Topology(torch.zeros((0, 3), dtype=torch.int32, device=device), bounds=lattice.bounds(device))
+        self._keys = np.zeros((0, 3), np.int32)  # of the next topology, where there is none
         self._rows = torch.zeros((VOXELS + 1, channels), device=device)
         self._count = torch.zeros(VOXELS, device=device)
-        self._known: dict[int, int] | None = None  # slots by code, on CUDA
+        self._known: dict[int, int] | None = None  # slots by code, on CUDA …
+        self._asked: tuple[Topology, Tensor] | None = None  # … and those of the blocks that were last asked for
+
+    @property
+    def topology(self) -> Topology:
+        """The blocks; on CUDA brought there when they are asked for."""
+        if self._topology is None:
+            bounds, device = self.lattice.bounds(self._rows.device), self._rows.device
+            self._topology = Topology(sent(self._keys, device), bounds=bounds, host=self._keys)
+        return self._topology
+
+    @property
+    def blocks(self) -> int:
+        """How many there are."""
+        return len(self._keys) if self._topology is None else self._topology.blocks
 
     @property
     def bytes(self) -> int:
@@ -37,11 +51,12 @@ class GlobalStore:
         return LatentVolume(self.lattice, self.topology, self._rows[: self.topology.zero_row + 1], self._count[: self.topology.zero_row])
 
     def part(self, topology: Topology, inherited: LatentVolume | None = None) -> LatentVolume:
-        """A copy of some blocks; corners of which nothing is known here are as `inherited`, a volume that has at least these blocks."""
+        """A copy of some blocks, to be written next; corners of which nothing is known here are as `inherited`, a volume that has at least
+        these blocks."""
         if gpu.fits(self._rows):
             from toolkit.volume import blocks_gpu as blocks
 
-            slots = sent(self._places(topology), self._rows.device)
+            slots = self._places(topology)  # may grow
             below = None if inherited is None else (inherited.rows, inherited.count, inherited.topology)
             return LatentVolume(self.lattice, topology, *blocks.take(self._rows, self._count, slots, topology, below))
         here = part(self.volume(), topology)
@@ -52,7 +67,7 @@ class GlobalStore:
         if gpu.fits(self._rows, values.rows):
             from toolkit.volume import blocks_gpu as blocks
 
-            slots = sent(self._made(values.topology), self._rows.device)
+            slots = self._places(values.topology)
             blocks.put(self._rows, self._count, slots, values.rows, values.count, changed)
             return
         slots = self._slots(values.topology)
@@ -74,33 +89,23 @@ class GlobalStore:
         self._rows[: self.topology.zero_row] = 0
         self._count[: self.topology.zero_row] = 0
         self._rows[: len(rows)], self._count[: len(count)] = rows, count
-        self.topology = self.topology.alike(self.topology.keys[kept])
-        self._known = None
+        self._topology = self.topology.alike(self.topology.keys[kept])
+        self._known = self._asked = None
 
-    def _codes(self, topology: Topology) -> list[int]:
-        """One number for each block."""
-        return (topology.host.astype(np.int64) @ CODE).tolist()
-
-    def _places(self, topology: Topology) -> Array:
-        """(M,) int32 slots of blocks, −1 where missing: found by the processor, which knows the keys, without asking the device."""
-        if self._known is None:
-            self._known = {code: slot for slot, code in enumerate(self._codes(self.topology))}
-        find = self._known.get
-        return np.array([find(code, -1) for code in self._codes(topology)], np.int32)
-
-    def _made(self, topology: Topology) -> Array:
-        """`_places`, made where missing."""
-        slots = self._places(topology)
-        missing = np.flatnonzero(slots < 0)
-        if len(missing):
-            assert self._known is not None
-            before, fresh = self.topology.blocks, topology.host[missing]
-            slots[missing] = before + np.arange(len(missing), dtype=np.int32)
-            self._known.update(zip((fresh.astype(np.int64) @ CODE).tolist(), slots[missing].tolist(), strict=True))
-            keys = np.concatenate([self.topology.host, fresh])
-            self.topology = self.topology.alike(sent(keys, self._rows.device), keys)
-            self._grow()
-        return slots
+    def _places(self, topology: Topology) -> Tensor:
+        """(M,) int32 slots of blocks on CUDA, made where missing: the processor knows the keys, and does not ask the device."""
+        if self._asked is None or self._asked[0] is not topology:
+            if self._known is None:
+                self._keys = self.topology.host
+                self._known = {code: slot for slot, code in enumerate((self._keys.astype(np.int64) @ CODE).tolist())}
+            known, codes = self._known, (topology.host.astype(np.int64) @ CODE).tolist()
+            before = len(known)
+            slots = np.array([known.setdefault(code, len(known)) for code in codes], np.int32)
+            if len(known) > before:
+                self._keys, self._topology = np.concatenate([self._keys, topology.host[slots >= before]]), None
+                self._grow()
+            self._asked = topology, sent(slots, self._rows.device)
+        return self._asked[1]
 
     def _slots(self, topology: Topology) -> Tensor:
         """(M,) slots of blocks, made where missing."""
@@ -109,13 +114,13 @@ class GlobalStore:
         if len(missing) == 0:
             return slots
         fresh, before = topology.keys[missing], self.topology.blocks
-        self.topology = self.topology.alike(torch.cat([self.topology.keys, fresh.to(torch.int32)]))
+        self._topology = self.topology.alike(torch.cat([self.topology.keys, fresh.to(torch.int32)]))
         self._grow()
         return slots.index_copy(0, missing, before + torch.arange(len(missing), device=slots.device))
 
     def _grow(self) -> None:
         """Room for all blocks."""
-        needed = self.topology.zero_row
+        needed = self.blocks * VOXELS
         if needed > len(self._count):
             room = max(needed, int(GROWTH * len(self._count) / VOXELS) * VOXELS)
             rows, count = self._rows.new_zeros((room + 1, self._rows.shape[1])), self._count.new_zeros(room)

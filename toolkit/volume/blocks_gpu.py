@@ -6,11 +6,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-import triton
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel
+from toolkit.gpu import kernel, power_of_two
 from toolkit.volume.topology import VOXELS, Topology
 
 TILE = 128  # voxels of a block at a time
@@ -86,7 +85,7 @@ def resample(topology: Topology, nodes: Tensor, rows: Sequence[Tensor], new_keys
         made = flat.new_empty((len(keys) * VOXELS + 1, flat.shape[1]))
         made[-1:].zero_()
         if len(keys):
-            sizes = {"CHANNELS": flat.shape[1], "WIDE": triton.next_power_of_2(flat.shape[1]), "TILE": TILE}
+            sizes = {"CHANNELS": flat.shape[1], "WIDE": power_of_two(flat.shape[1]), "TILE": TILE}
             ends = *topology.table_origin, *topology.table_size
             _resample[(len(keys) * (VOXELS // TILE),)](flat, nodes, table, keys, made, *ends, scale, **sizes)
         out.append(made.view(-1, *values.shape[1:]))
@@ -140,7 +139,7 @@ def take(
     other, other_count, place = below or (rows, count, topology)
     table = slots if below is None else place.table
     cells = slots if below is None else topology.own_cells
-    sizes = {"CHANNELS": channels, "WIDE": triton.next_power_of_2(channels), "TILE": TILE}
+    sizes = {"CHANNELS": channels, "WIDE": power_of_two(channels), "TILE": TILE}
     _take[(blocks * (VOXELS // TILE),)](
         rows, count, slots, other, other_count, table, cells, out, out_count, blocks, INHERITS=below is not None, **sizes
     )
@@ -164,6 +163,6 @@ def _put(rows, count, slots, values, values_count, changed, CHANNELS: tl.constex
 def put(rows: Tensor, count: Tensor, slots: Tensor, values: Tensor, values_count: Tensor, changed: Tensor) -> None:
     """The way back of `take`, of the corners `changed` (M · 512,) alone, in place."""
     if len(slots):
-        sizes = {"CHANNELS": rows.shape[1], "WIDE": triton.next_power_of_2(rows.shape[1]), "TILE": TILE}
+        sizes = {"CHANNELS": rows.shape[1], "WIDE": power_of_two(rows.shape[1]), "TILE": TILE}
         given = values.contiguous(), values_count.contiguous(), changed.contiguous().view(torch.uint8)
         _put[(len(slots) * (VOXELS // TILE),)](rows, count, slots, *given, **sizes)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 import triton
@@ -10,10 +12,11 @@ import triton.language as tl
 from numpy.typing import NDArray
 from torch import Tensor
 
-from toolkit.gpu import kernel, sent
+from toolkit.gpu import kernel, power_of_two, sent
 from toolkit.volume.blocks_gpu import pooled
 from toolkit.volume.topology import VOXELS, Bounds, Topology
 
+FEW = 2**21  # block keys that there can be, up to which all are marked
 TILE = 128  # voxels of a block at a time
 OCTANTS = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.int32)  # also steps to blocks that hold corners
 
@@ -91,16 +94,25 @@ def children(topology: Topology, reach: NDArray[np.uint8]) -> NDArray[np.int32]:
     Args:
         reach: (M, 8) of `_reach`.
     """
-    parent, octant = np.nonzero(reach & 1)
+    parent, octant = np.divmod(np.flatnonzero(reach & 1), 8)
     keys = topology.host[parent] * 2 + OCTANTS[octant]
-    bits = reach[parent, octant]
-    more = [keys[(bits >> step) & 1 == 1] + OCTANTS[step] for step in range(1, 8)]
     # One number for each key, in the order of the table.
-    beside = np.concatenate(more)
-    size = 2 * np.array(topology.table_size, np.int64) + 2
-    first = 2 * np.array(topology.table_origin, np.int64)
-    code = np.array([1, size[0], size[0] * size[1]])
-    new = np.setdiff1d((beside - first) @ code, (keys - first) @ code)
+    size = 2 * np.array(topology.table_size, np.int32) + 2
+    first = 2 * np.array(topology.table_origin, np.int32)
+    code = np.array([1, size[0], size[0] * size[1]], np.int32)
+    own = (keys - first) @ code
+    steps = OCTANTS @ code
+    bits = np.unpackbits(reach[parent, octant][:, None], axis=1, bitorder="little")
+    bits[:, 0] = 0
+    which, step = np.divmod(np.flatnonzero(bits), 8)
+    reached = own[which] + steps[step]
+    if (cells := math.prod(size.tolist())) <= FEW:
+        marks = np.zeros(cells, bool)
+        marks[reached] = True
+        marks[own] = False
+        new = np.flatnonzero(marks)
+    else:
+        new = np.setdiff1d(reached, own)
     corners = np.stack([new % size[0], new // size[0] % size[1], new // code[2]], 1) + first
     return np.concatenate([keys, corners.astype(np.int32)])
 
@@ -127,7 +139,7 @@ def split(topology: Topology, kept: Tensor, rows: Tensor, bounds: Bounds, weight
         return fine, rows.new_zeros((1, channels)), rows.new_zeros(0)
     out, count = rows.new_empty((fine.zero_row + 1, channels)), rows.new_empty(fine.zero_row)
     nodes = pooled(topology, kept, -1, 2).view(torch.uint8)
-    sizes = {"CHANNELS": channels, "WIDE": triton.next_power_of_2(channels), "TILE": TILE}
+    sizes = {"CHANNELS": channels, "WIDE": power_of_two(channels), "TILE": TILE}
     _refine[(fine.blocks * (VOXELS // TILE),)](
         rows, nodes, mask, topology.table, fine.keys, out, count, fine.blocks, weight, *topology.table_origin, *topology.table_size, **sizes
     )

@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 import torch
-import triton
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel
+from toolkit.gpu import kernel, pieces
 
 BLOCK = 256
 
@@ -30,7 +29,7 @@ def table(keys: Tensor, origin: tuple[int, int, int], size: tuple[int, int, int]
     count = keys.shape[0]
     cells = torch.empty(count, dtype=torch.int64, device=keys.device)
     if count:
-        _table[(triton.cdiv(count, BLOCK),)](keys, out, cells, count, *origin, sx, sy, BLOCK=BLOCK)
+        _table[(pieces(count, BLOCK),)](keys, out, cells, count, *origin, sx, sy, BLOCK=BLOCK)
     return out, cells
 
 
@@ -51,5 +50,5 @@ def around(table: Tensor, cells: Tensor) -> Tensor:
     count = 27 * cells.shape[0]
     out = torch.empty((cells.shape[0], 27), dtype=torch.int64, device=cells.device)
     if count:
-        _around[(triton.cdiv(count, BLOCK),)](table, cells, out, count, sx, sy, BLOCK=BLOCK)
+        _around[(pieces(count, BLOCK),)](table, cells, out, count, sx, sy, BLOCK=BLOCK)
     return out

@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 import torch
-import triton
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel
+from toolkit.gpu import kernel, pieces, power_of_two
 from toolkit.volume.topology import VOXELS
 
 TILE = 128  # voxels of a block at a time: two of its layers …
@@ -17,7 +16,7 @@ SLOPES = 64  # … and where the kernel's gradient is summed
 
 def _wide(channels: int) -> int:
     """As many as a product of matrices takes at least."""
-    return max(16, int(triton.next_power_of_2(channels)))
+    return max(16, power_of_two(channels))
 
 
 @kernel("rows", "around", "taps", "out")
@@ -119,7 +118,7 @@ def weight_gradient(rows: Tensor, around: Tensor, gradient: Tensor) -> Tensor:
     """(C', C, 3, 3, 3) float32, from rows (M · 512 or more, C) and the result's gradient (M · 512 or more, C'), of one type."""
     blocks, inside, outside = len(around), rows.shape[1], gradient.shape[1]
     parts = max(1, min(32, blocks // 4))
-    share = triton.cdiv(blocks, parts)
+    share = pieces(blocks, parts)
     out = rows.new_empty((parts, 27, inside, outside), dtype=torch.float32)
     _weigh[(27, parts)](
         rows.contiguous(), around, gradient.contiguous(), out, blocks, share,

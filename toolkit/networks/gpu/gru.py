@@ -8,7 +8,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel
+from toolkit.gpu import kernel, pieces, power_of_two
 from toolkit.networks.lattice import LatentVolume, LocalVolume
 from toolkit.volume.topology import VOXELS
 
@@ -103,14 +103,14 @@ class Step:
         self.least, self.most = least, float(most)
         self.channels = self.state.shape[1]
         self.rows = local.among.shape[0] * VOXELS
-        self._sizes = {"CHANNELS": self.channels, "WIDE": triton.next_power_of_2(self.channels), "BLOCK": BLOCK}
-        self._grid = (triton.cdiv(self.rows + 1, BLOCK),)
+        self._sizes = {"CHANNELS": self.channels, "WIDE": power_of_two(self.channels), "BLOCK": BLOCK}
+        self._grid = (pieces(self.rows + 1, BLOCK),)
 
     def average(self) -> tuple[Tensor, Tensor]:
         """(M · 512 + 1, C) the weighted running mean of the local volumes, and (M · 512,) weights so far."""
         out, count, rows = torch.empty_like(self.state), torch.empty_like(self.count), self.count.shape[0]
         given = self.state, self.count, self.local, self.weight, self.seen
-        _average[(triton.cdiv(rows + 1, BLOCK),)](*given, out, count, rows, self.least, self.most, **self._sizes)
+        _average[(pieces(rows + 1, BLOCK),)](*given, out, count, rows, self.least, self.most, **self._sizes)
         return out, count
 
     def beside(self, kind: torch.dtype) -> tuple[Tensor, Tensor]:

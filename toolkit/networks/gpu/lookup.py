@@ -12,7 +12,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from toolkit.gpu import kernel
+from toolkit.gpu import kernel, pieces, power_of_two
 
 BLOCK = 64  # voxels at a time
 
@@ -105,9 +105,9 @@ class _Shown(torch.autograd.Function):
         for number, (shape, sizes, stride) in enumerate(ctx.shapes):
             total = gradient.new_zeros(shape)
             if len(step):
-                _spread[(triton.cdiv(len(step), BLOCK),)](
+                _spread[(pieces(len(step), BLOCK),)](
                     pixels[number], step, gradient[number], total, len(step), *sizes[0], len(sizes), gradient.shape[2],
-                    CHANNELS=shape[1], WIDE=triton.next_power_of_2(shape[1]), STRIDE=stride, BLOCK=BLOCK,
+                    CHANNELS=shape[1], WIDE=power_of_two(shape[1]), STRIDE=stride, BLOCK=BLOCK,
                 )  # fmt: skip
             totals.append(total)
         return None, None, None, None, None, *totals
@@ -131,10 +131,10 @@ def _look_up(views: Sequence[Any], pixels: Tensor, step: Tensor, footprint: Tens
     pixels, step, footprint = pixels.contiguous(), step.contiguous(), footprint.contiguous()
     for number, view in enumerate(views):
         fine = view.colours
-        _shown[(triton.cdiv(count, BLOCK),)](
+        _shown[(pieces(count, BLOCK),)](
             pixels[number], step, footprint[number], view.features.rows, fine.rows, out[number], count,
             *view.features.sizes[0], len(view.features.sizes), *fine.sizes[0], len(fine.sizes), part,
-            CHANNELS=channels, WIDE=triton.next_power_of_2(channels), COLOURS=colours, FINE=fine.stride, STRIDE=view.features.stride,
+            CHANNELS=channels, WIDE=power_of_two(channels), COLOURS=colours, FINE=fine.stride, STRIDE=view.features.stride,
             BLOCK=BLOCK,
         )  # fmt: skip
     return out

@@ -15,7 +15,7 @@ import triton.language as tl
 from numpy.typing import NDArray
 from torch import Tensor
 
-from toolkit.gpu import kernel, sent
+from toolkit.gpu import kernel, pieces, power_of_two, sent
 from toolkit.networks.gpu.lookup import corners
 from toolkit.networks.gpu.reading import local, sighted
 
@@ -308,12 +308,12 @@ class Observer:
             pictures = sent(np.array([of.data_ptr() for pair in rows for of in pair], np.int64), keys.device)
             wide = coarse.rows.shape[1]
             truncation, least, blind, gain, part, _ = self.numbers
-            _observe[(triton.cdiv(count, BLOCK),)](
+            _observe[(pieces(count, BLOCK),)](
                 found.rows, keys, slots, self.poses, self.lenses, self.sizes, self.table, pictures, layer.weight, layer.bias, latent, start,
                 counts, weights, seen, channels, keys.shape[0], len(self.views), count, *self.table.shape[:3], self.swept.lowest,
                 self.swept.step, *self._space(lattice), self.near, self.far, truncation, least, blind,
                 *coarse.sizes[0], len(coarse.sizes), *fine.sizes[0], len(fine.sizes), part, gain,
-                SHELL=lattice.space.shell > 0, VARIANCE=variance, CHANNELS=wide, WIDE=max(16, triton.next_power_of_2(wide)),
+                SHELL=lattice.space.shell > 0, VARIANCE=variance, CHANNELS=wide, WIDE=max(16, power_of_two(wide)),
                 SAMPLED=sampled, STRIDE=coarse.stride, FINE=fine.stride, HIDDEN=hidden, BLOCK=BLOCK,
             )  # fmt: skip
         return Evidence(latent, seen.view(torch.bool), start, counts, weights)

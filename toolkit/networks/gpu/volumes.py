@@ -10,7 +10,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel
+from toolkit.gpu import kernel, pieces, power_of_two
 from toolkit.networks.local import CHANGE, INSIDE
 from toolkit.volume.topology import VOXELS, Topology
 
@@ -49,8 +49,8 @@ def settle(start: Tensor, learned: Tensor, busy: Tensor) -> tuple[Tensor, Tensor
     """
     raw, out = torch.empty_like(start), torch.empty_like(start)
     rows, channels = busy.shape[0] * VOXELS, start.shape[1]
-    sizes = {"CHANNELS": channels, "WIDE": triton.next_power_of_2(channels), "BLOCK": BLOCK}
-    _settle[(triton.cdiv(rows + 1, BLOCK),)](start, learned, busy, raw, out, rows, INSIDE, CHANGE, **sizes)
+    sizes = {"CHANNELS": channels, "WIDE": power_of_two(channels), "BLOCK": BLOCK}
+    _settle[(pieces(rows + 1, BLOCK),)](start, learned, busy, raw, out, rows, INSIDE, CHANGE, **sizes)
     return raw, out
 
 
@@ -73,8 +73,8 @@ def merge(before: Tensor, before_count: Tensor, after: Tensor, after_count: Tens
     """Rows (M · 512 + 1, C) and counts (M · 512,) after where `changed` (M · 512,) bool, else before."""
     out, count = torch.empty_like(before), torch.empty_like(before_count)
     rows, channels = count.shape[0], before.shape[1]
-    sizes = {"CHANNELS": channels, "WIDE": triton.next_power_of_2(channels), "BLOCK": BLOCK}
-    _merge[(triton.cdiv(rows + 1, BLOCK),)](
+    sizes = {"CHANNELS": channels, "WIDE": power_of_two(channels), "BLOCK": BLOCK}
+    _merge[(pieces(rows + 1, BLOCK),)](
         before, before_count, after, after_count, changed.view(torch.uint8), out, count, rows, **sizes
     )
     return out, count
@@ -136,10 +136,10 @@ def surface_cells(topology: Topology, rows: Tensor, count: Tensor, seen: Tensor,
         solid = torch.empty(size, dtype=torch.uint8, device=rows.device)
         first = head.body[0]
         start, scale, change = head.numbers
-        _solid[(triton.cdiv(size, BLOCK),)](
+        _solid[(pieces(size, BLOCK),)](
             rows, count, first.weight, first.bias, head.density.weight, head.density.bias, head.steep, solid, size, start, scale, change,
-            INSIDE, least, CHANNELS=channels, WIDE=max(16, triton.next_power_of_2(channels)), HIDDEN=hidden,
-            LAYER=max(16, triton.next_power_of_2(hidden)), BLOCK=BLOCK,
+            INSIDE, least, CHANNELS=channels, WIDE=max(16, power_of_two(channels)), HIDDEN=hidden,
+            LAYER=max(16, power_of_two(hidden)), BLOCK=BLOCK,
         )  # fmt: skip
         _surface[(topology.blocks,)](count, solid, seen.view(torch.uint8), topology.around, out.view(torch.uint8))
     return out
