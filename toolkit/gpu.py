@@ -62,10 +62,59 @@ def power_of_two(least: int) -> int:
     return 1 << (least - 1).bit_length()
 
 
+class _Outbox:
+    """Memory that stays in place, from which small things go to a device without anybody waiting for the copy. It is filled round and round
+    in two halves, neither of which is written to before the device has read what was there."""
+
+    HALF = 2**20  # bytes
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self._memory = torch.empty(2 * self.HALF, dtype=torch.uint8, pin_memory=device.type == "cuda")
+        self._bytes = self._memory.numpy()
+        self._next = 0
+        self._read: list[torch.cuda.Event | None] = [None, None]
+
+    def send(self, values: NDArray[Any]) -> Tensor:
+        first = self._room(values.nbytes)
+        last = first + values.nbytes
+        self._bytes[first:last] = values.reshape(-1).view(np.uint8)
+        whole = self._memory[first:last].to(self.device, non_blocking=True)
+        return whole.view(_TYPES[values.dtype.char]).view(values.shape)
+
+    def _room(self, size: int) -> int:
+        """Where there is room for so many bytes."""
+        half = self._next // self.HALF
+        if self._next + size > (half + 1) * self.HALF:
+            if self._memory.is_pinned():
+                event = self._read[half] = torch.cuda.Event()
+                event.record()
+            half = 1 - half
+            if (read := self._read[half]) is not None:
+                read.synchronize()
+            self._next = half * self.HALF
+        first = self._next
+        self._next = min(first + size + -size % 16, (half + 1) * self.HALF - 1)
+        return first
+
+
+_TYPES = {"i": torch.int32, "l": torch.int64, "f": torch.float32}
+
+
+@cache
+def _outbox(device: torch.device, _stream: int) -> _Outbox:
+    return _Outbox(device)
+
+
 def sent(values: NDArray[Any], device: torch.device) -> Tensor:
     """The same numbers on a device; on CUDA from memory that stays in place, so that nobody has to wait for the copy."""
-    tensor = torch.from_numpy(np.ascontiguousarray(values))
-    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor.to(device)
+    if device.type != "cuda":
+        return torch.from_numpy(np.ascontiguousarray(values)).to(device)
+    values = np.ascontiguousarray(values)
+    if 0 < values.nbytes <= _Outbox.HALF and values.dtype.char in _TYPES:
+        index = torch.cuda.current_device() if device.index is None else device.index
+        return _outbox(device, torch._C._cuda_getCurrentRawStream(index)).send(values)
+    return torch.from_numpy(values).pin_memory().to(device, non_blocking=True)
 
 
 class Kernel:
@@ -99,16 +148,36 @@ class Kernel:
         kinds = [given[place].dtype for place in self._tensors]
         ends = [given[place].data_ptr() & 15 for place in self._aligned]
         # By name a launch gives constants and options, in the same order each time; a few give constants by place.
-        constants = [given[place] for place in self._constants if place < len(given)]
+        count = len(given)
+        constants = [given[place] for place in self._constants if place < count]
         key = (device, *kinds, *ends, *constants, *map(type, given), *named.values())
-        compiled = self._compiled.get(key)
-        if compiled is None:
+        launch = self._compiled.get(key)
+        if launch is None:
             compiled = self.jitted[grid](*given, **named)
             if hasattr(compiled, "function"):  # neither the interpreter nor what stands in for it in tests
-                self._compiled[key] = compiled
+                self._compiled[key] = _launcher(compiled)
             return
-        rest = [named[name] for name in self.names[len(given) :]]
-        compiled[(*grid, 1, 1)[:3]](*given, *rest, stream=torch._C._cuda_getCurrentRawStream(device))
+        first, second, third = (*grid, 1, 1)[:3]
+        stream = torch._C._cuda_getCurrentRawStream(device)
+        launch(first, second, third, stream, *given, *[named[name] for name in self.names[count:]])
+
+
+def _launcher(compiled: Any) -> Callable[..., None]:
+    """What launches a compiled kernel: given its grid, a stream, and all that it takes."""
+    import triton
+
+    if triton.__version__.startswith("3.6."):  # by the way that is inside of what follows, without its hooks
+        run, function, packed = compiled.run, compiled.function, compiled.packed_metadata
+
+        def short(first: int, second: int, third: int, stream: int, *given: Any) -> None:
+            run(first, second, third, stream, function, packed, None, None, None, *given)
+
+        return short
+
+    def launch(first: int, second: int, third: int, stream: int, *given: Any) -> None:
+        compiled[first, second, third](*given, stream=stream)
+
+    return launch
 
 
 def kernel(*aligned: str) -> Callable[[Callable[..., Any]], Kernel]:

@@ -102,6 +102,7 @@ def volumes(blocks: int) -> None:
     convolution.convolve(torch.rand(topology.zero_row + 1, 16), topology.around, side_by_side, torch.rand(16), mask, True)
     table, cells = tables_gpu.table(topology.keys, topology.table_origin, topology.table_size)
     tables_gpu.around(table, cells)
+    tables_gpu.around(table, cells, torch.arange(blocks, dtype=torch.int32), torch.arange(blocks, dtype=torch.int32))
     blocks_gpu.pooled(topology, mask, 0, 2, True)
     blocks_gpu.resample(topology, mask, [rows], topology.keys.long(), 0.5)
     slots, count = torch.arange(blocks, dtype=torch.int32), torch.rand(topology.zero_row)

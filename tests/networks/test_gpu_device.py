@@ -126,3 +126,24 @@ def test_lookup(monkeypatch: pytest.MonkeyPatch) -> None:
         projection = project(points * 2 - 1, sizes * 0.4, seen_by, 0.0, 9.0)
         quick, slow = both("lookup", lambda: look_up(views, projection, 6 * step), monkeypatch)
     torch.testing.assert_close(quick, slow, atol=1e-4, rtol=1e-4)
+
+
+def test_encoding_is_recorded() -> None:
+    """What is repeated equals what is launched one by one, also when other pictures come and parameters change in place."""
+    model, seen_by = small_model().to(DEVICE), cameras(3).to(DEVICE)
+
+    @torch.no_grad()
+    def rows(seed: int) -> list[torch.Tensor]:
+        return [of for view in model.encode(pictures(3, seed).to(DEVICE), seen_by) for of in (view.features.rows, view.colours.rows)]
+
+    for _ in range(3):
+        rows(0)
+    for seed in (1, 2):
+        found = rows(seed)
+        model._recorded = type(model._recorded)()
+        for one, expected in zip(found, rows(seed), strict=True):
+            torch.testing.assert_close(one, expected, atol=1e-5, rtol=1e-5)
+        for _ in range(2):
+            rows(seed)
+        with torch.no_grad():
+            next(model.encoder.parameters()).mul_(1.5)

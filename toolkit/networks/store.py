@@ -7,13 +7,34 @@ import torch
 from torch import Tensor
 
 from toolkit import gpu
+from toolkit.camera import Array
 from toolkit.gpu import asks_freely, sent
 from toolkit.networks.lattice import LatentVolume, Lattice
 from toolkit.networks.refine import adopt, part
 from toolkit.volume.topology import VOXELS, Topology
 
 CODE = np.array([1, 2**21, 2**42], np.int64)  # keys of lattices are small
+NONE = np.iinfo(np.int64).min  # no block's code
 GROWTH = 1.5  # a buffer that must grow gets at least this much more room
+
+
+class _Slots:
+    """Slots by the code of a block's key, in the processor's memory."""
+
+    def __init__(self) -> None:
+        self._codes, self._slots = np.zeros(0, np.int64), np.zeros(0, np.int32)  # by code
+
+    def find(self, codes: Array) -> tuple[Array, Array]:
+        """(M,) int64 → (M,) int32 slots, −1 where missing, and the places of those that are."""
+        place = np.searchsorted(self._codes, codes)
+        here = np.append(self._codes, NONE)[place] == codes
+        return np.where(here, np.append(self._slots, -1)[place], np.int32(-1)), np.flatnonzero(~here)
+
+    def add(self, codes: Array, slots: Array) -> None:
+        """Some that are missing."""
+        order = np.argsort(codes)
+        place = np.searchsorted(self._codes, codes[order])
+        self._codes, self._slots = np.insert(self._codes, place, codes[order]), np.insert(self._slots, place, slots[order])
 
 
 class GlobalStore:
@@ -25,8 +46,8 @@ class GlobalStore:
         self._keys = np.zeros((0, 3), np.int32)  # of the next topology, where there is none
         self._rows = torch.zeros((VOXELS + 1, channels), device=device)
         self._count = torch.zeros(VOXELS, device=device)
-        self._known: dict[int, int] | None = None  # slots by code, on CUDA …
-        self._asked: tuple[Topology, Tensor] | None = None  # … and those of the blocks that were last asked for
+        self._known = _Slots()  # on CUDA …
+        self._asked: tuple[Topology, Tensor] | None = None  # … where these are those of the blocks that were last asked for
 
     @property
     def topology(self) -> Topology:
@@ -90,19 +111,20 @@ class GlobalStore:
         self._count[: self.topology.zero_row] = 0
         self._rows[: len(rows)], self._count[: len(count)] = rows, count
         self._topology = self.topology.alike(self.topology.keys[kept])
-        self._known = self._asked = None
+        self._asked = None
+        if gpu.fits(self._rows):
+            self._keys, self._known = self._topology.host, _Slots()
+            self._known.add(self._keys.astype(np.int64) @ CODE, np.arange(len(self._keys), dtype=np.int32))
 
     def _places(self, topology: Topology) -> Tensor:
         """(M,) int32 slots of blocks on CUDA, made where missing: the processor knows the keys, and does not ask the device."""
         if self._asked is None or self._asked[0] is not topology:
-            if self._known is None:
-                self._keys = self.topology.host
-                self._known = {code: slot for slot, code in enumerate((self._keys.astype(np.int64) @ CODE).tolist())}
-            known, codes = self._known, (topology.host.astype(np.int64) @ CODE).tolist()
-            before = len(known)
-            slots = np.array([known.setdefault(code, len(known)) for code in codes], np.int32)
-            if len(known) > before:
-                self._keys, self._topology = np.concatenate([self._keys, topology.host[slots >= before]]), None
+            codes = topology.host.astype(np.int64) @ CODE
+            slots, missing = self._known.find(codes)
+            if len(missing):
+                slots[missing] = self.blocks + np.arange(len(missing), dtype=np.int32)
+                self._known.add(codes[missing], slots[missing])
+                self._keys, self._topology = np.concatenate([self._keys, topology.host[missing]]), None
                 self._grow()
             self._asked = topology, sent(slots, self._rows.device)
         return self._asked[1]

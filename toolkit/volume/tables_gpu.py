@@ -34,21 +34,32 @@ def table(keys: Tensor, origin: tuple[int, int, int], size: tuple[int, int, int]
 
 
 @kernel("table", "cells", "out")
-def _around(table, cells, out, count, sx, sy, BLOCK: tl.constexpr):
+def _around(table, cells, chosen, slots, out, count, sx, sy, SOME: tl.constexpr, BLOCK: tl.constexpr):
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     some = n < count
     k = n % 27
     step = ((k // 9 - 1) * sy + (k // 3) % 3 - 1) * sx + k % 3 - 1
+    block = n // 27
+    if SOME:
+        block = tl.load(chosen + block, some, 0)
     # The margin keeps every step inside the table.
-    slot = tl.load(table + tl.load(cells + n // 27, some, 0) + step, some, -1)
+    slot = tl.load(table + tl.load(cells + block, some, 0) + step, some, -1)
+    if SOME:
+        slot = tl.load(slots + slot, slot >= 0, -1)
     tl.store(out + n, slot.to(tl.int64), some)
 
 
-def around(table: Tensor, cells: Tensor) -> Tensor:
-    """`Topology.around` from its table and the cells of its blocks."""
+def around(table: Tensor, cells: Tensor, chosen: Tensor | None = None, slots: Tensor | None = None) -> Tensor:
+    """`Topology.around` from its table and the cells of its blocks.
+
+    Args:
+        chosen, slots: of some of the blocks (M',) alone, each with its slot among them, (M,) int32, −1 where it is not one: then (M', 27) of
+            these, without a table of theirs.
+    """
     _, sy, sx = table.shape
-    count = 27 * cells.shape[0]
-    out = torch.empty((cells.shape[0], 27), dtype=torch.int64, device=cells.device)
-    if count:
-        _around[(pieces(count, BLOCK),)](table, cells, out, count, sx, sy, BLOCK=BLOCK)
+    blocks = cells.shape[0] if chosen is None else chosen.shape[0]
+    out = torch.empty((blocks, 27), dtype=torch.int64, device=cells.device)
+    if blocks:
+        given = table, cells, table if chosen is None else chosen, table if slots is None else slots
+        _around[(pieces(27 * blocks, BLOCK),)](*given, out, 27 * blocks, sx, sy, SOME=chosen is not None, BLOCK=BLOCK)
     return out

@@ -101,6 +101,7 @@ class Topology:
     def _believe(self, keys: Tensor, bounds: Bounds, max_table_cells: int) -> None:
         """The rest of the making of one whose keys are believed, on CUDA: the table is made when it is first asked for."""
         self.keys, self._max_table_cells, self._codes, self._dense = keys.to(torch.int32).contiguous(), max_table_cells, None, True
+        self._among: tuple[Topology, Tensor, Tensor] | None = None
         (ax, ay, az), (bx, by, bz) = bounds
         self.table_origin, self.table_size = (ax - 1, ay - 1, az - 1), (bx - ax + 3, by - ay + 3, bz - az + 3)
 
@@ -146,6 +147,18 @@ class Topology:
         """Other blocks of the same lattice, as much believed as these."""
         return Topology(keys, self._max_table_cells, self.bounds, host)
 
+    def some(self, keys: Tensor, host: NDArray[np.int32], chosen: Tensor, slots: Tensor) -> Topology:
+        """Some of these blocks, on CUDA, whose surroundings are found in the table of all.
+
+        Args:
+            keys, host: theirs, on either side.
+            chosen: (M',) int32 slots of them here.
+            slots: (M,) int32 of each block here among them, −1 where it is not one.
+        """
+        out = self.alike(keys, host)
+        out._among = self, chosen, slots
+        return out
+
     def to(self, device: torch.device | str) -> Topology:
         """The same blocks in the same order on another device (self when already there)."""
         keys = self.keys.to(device)
@@ -186,7 +199,10 @@ class Topology:
         if self.bounds is not None and gpu.there(self.keys):
             from toolkit.volume import tables_gpu
 
-            return tables_gpu.around(self.table, self.own_cells)
+            if self._among is not None:
+                whole, chosen, slots = self._among
+                return tables_gpu.around(*whole._placed, chosen, slots)
+            return tables_gpu.around(*self._placed)
         # The margin keeps every step inside the table.
         steps = constant(tuple((dz * sy + dy) * sx + dx for dx, dy, dz in shifts), self.device)
         return self.table.view(-1)[self.own_cells[:, None] + steps].to(torch.int64)

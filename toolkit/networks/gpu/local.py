@@ -48,10 +48,12 @@ def local_volume(
     keys = topology.host
     filled_keys, busy_keys = keys[filled], keys[busy]
     # All that the processor has to say goes there in one piece.
-    parts: list[Any] = [slots, filled_keys, busy_keys, slots[1, filled], slots[0, busy]]
+    parts: list[Any] = [slots, filled_keys, busy_keys, slots[1, filled], slots[0, busy], busy]
     whole = sent(np.concatenate([part.reshape(-1) for part in parts]), topology.device).split([part.size for part in parts])
     kept = topology.alike(whole[1].view(-1, 3), filled_keys)
-    few = topology.alike(whole[2].view(-1, 3), busy_keys)
+    # Beside which blocks they lie is read in a table that others need as well.
+    given = whole[2].view(-1, 3), busy_keys
+    few = kept.some(*given, whole[4], whole[3]) if wanted is None else topology.some(*given, whole[5], whole[0][topology.blocks :])
     sampled, variance, channels = sizes
     known = observer.observe(lattice, topology.keys, found, whole[0], local.project, sampled, variance, channels)
     learned = local.learned(known.latent, few, known.seen) if len(busy) else known.start
