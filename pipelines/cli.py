@@ -20,6 +20,7 @@ from pipelines import (
     bench,
     bench_effects,
     bench_engines,
+    bench_keyframes,
     compare,
     evaluate,
     export,
@@ -161,6 +162,7 @@ bench.app.command("effects-by-hand")(bench_effects.by_hand)
 bench.app.command("few-views")(few_views.few_views)
 bench.app.command("ablations")(few_views.ablations)
 bench.app.command("engines")(bench_engines.engines)
+bench.app.command("keyframes")(bench_keyframes.keyframes)
 app.add_typer(bench.app, name="bench")
 
 

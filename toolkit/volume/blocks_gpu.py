@@ -10,6 +10,7 @@ import triton.language as tl
 from torch import Tensor
 
 from toolkit.gpu import kernel, power_of_two
+from toolkit.volume.tables_gpu import row_of
 from toolkit.volume.topology import VOXELS, Topology
 
 TILE = 128  # voxels of a block at a time
@@ -60,12 +61,7 @@ def _resample(
     for k in range(8):
         x, y, z = lx + k % 2, ly + (k // 2) % 2, lz + k // 4
         weight = tl.where(k % 2 == 1, fx, 1 - fx) * tl.where((k // 2) % 2 == 1, fy, 1 - fy) * tl.where(k // 4 == 1, fz, 1 - fz)
-        # Far blocks are moved to the table's empty margin.
-        bx = tl.minimum(tl.maximum((x >> 3) - ox, 0), sx - 1)
-        by = tl.minimum(tl.maximum((y >> 3) - oy, 0), sy - 1)
-        bz = tl.minimum(tl.maximum((z >> 3) - oz, 0), sz - 1)
-        slot = tl.load(table + (bz * sy + by) * sx + bx).to(tl.int64)
-        row = slot * 512 + ((z & 7) * 8 + (y & 7)) * 8 + (x & 7)
+        slot, row = row_of(x, y, z, table, ox, oy, oz, sx, sy, sz)
         counts = tl.load(nodes + row, slot >= 0, 0) != 0
         weight = tl.where(counts, weight, 0.0)
         share += weight

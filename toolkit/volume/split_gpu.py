@@ -7,13 +7,13 @@ import math
 
 import numpy as np
 import torch
-import triton
 import triton.language as tl
 from numpy.typing import NDArray
 from torch import Tensor
 
 from toolkit.gpu import kernel, power_of_two, sent
 from toolkit.volume.blocks_gpu import pooled
+from toolkit.volume.tables_gpu import row_of
 from toolkit.volume.topology import VOXELS, Bounds, Topology
 
 FEW = 2**21  # block keys that there can be, up to which all are marked
@@ -40,16 +40,6 @@ def _reach(kept, out):
         o += 1
 
 
-@triton.jit
-def _row(x, y, z, table, ox, oy, oz, sx, sy, sz):
-    """Slot of the block that holds lattice corners, −1 where there is none, and their rows."""
-    bx = tl.minimum(tl.maximum((x >> 3) - ox, 0), sx - 1)  # far blocks are moved to the table's empty margin
-    by = tl.minimum(tl.maximum((y >> 3) - oy, 0), sy - 1)
-    bz = tl.minimum(tl.maximum((z >> 3) - oz, 0), sz - 1)
-    slot = tl.load(table + (bz * sy + by) * sx + bx).to(tl.int64)
-    return slot, slot * 512 + ((z & 7) * 8 + (y & 7)) * 8 + (x & 7)
-
-
 @kernel("rows", "table", "out")
 def _refine(
     rows, nodes, kept, table, keys, out, count, blocks, weight, ox, oy, oz, sx, sy, sz,
@@ -65,13 +55,13 @@ def _refine(
     c = tl.arange(0, WIDE)[None, :]
     used = tl.zeros((TILE,), tl.int32)
     for k in range(8):  # the cells about it
-        slot, row = _row((px - 1 + k % 2) >> 1, (py - 1 + (k // 2) % 2) >> 1, (pz - 1 + k // 4) >> 1, table, ox, oy, oz, sx, sy, sz)
+        slot, row = row_of((px - 1 + k % 2) >> 1, (py - 1 + (k // 2) % 2) >> 1, (pz - 1 + k // 4) >> 1, table, ox, oy, oz, sx, sy, sz)
         used = used | tl.load(kept + row, slot >= 0, 0).to(tl.int32)
     touched = used > 0
     fx, fy, fz = (px & 1).to(tl.float32) * 0.5, (py & 1).to(tl.float32) * 0.5, (pz & 1).to(tl.float32) * 0.5
     total, share = tl.zeros((TILE, WIDE), tl.float32), tl.zeros((TILE,), tl.float32)
     for k in range(8):
-        slot, row = _row((px >> 1) + k % 2, (py >> 1) + (k // 2) % 2, (pz >> 1) + k // 4, table, ox, oy, oz, sx, sy, sz)
+        slot, row = row_of((px >> 1) + k % 2, (py >> 1) + (k // 2) % 2, (pz >> 1) + k // 4, table, ox, oy, oz, sx, sy, sz)
         part = tl.where(k % 2 == 1, fx, 1 - fx) * tl.where((k // 2) % 2 == 1, fy, 1 - fy) * tl.where(k // 4 == 1, fz, 1 - fz)
         counts = touched & (part > 0) & (tl.load(nodes + row, slot >= 0, 0) != 0)
         part = tl.where(counts, part, 0.0)

@@ -4,12 +4,23 @@
 from __future__ import annotations
 
 import torch
+import triton
 import triton.language as tl
 from torch import Tensor
 
 from toolkit.gpu import kernel, pieces
 
 BLOCK = 256
+
+
+@triton.jit
+def row_of(x, y, z, table, ox, oy, oz, sx, sy, sz):
+    """Slots of the blocks that hold lattice corners, −1 where there is none, and the corners' rows."""
+    bx = tl.minimum(tl.maximum((x >> 3) - ox, 0), sx - 1)  # far blocks are moved to the table's empty margin
+    by = tl.minimum(tl.maximum((y >> 3) - oy, 0), sy - 1)
+    bz = tl.minimum(tl.maximum((z >> 3) - oz, 0), sz - 1)
+    slot = tl.load(table + (bz * sy + by) * sx + bx).to(tl.int64)
+    return slot, slot * 512 + ((z & 7) * 8 + (y & 7)) * 8 + (x & 7)
 
 
 @kernel("keys", "table")
@@ -53,8 +64,8 @@ def around(table: Tensor, cells: Tensor, chosen: Tensor | None = None, slots: Te
     """`Topology.around` from its table and the cells of its blocks.
 
     Args:
-        chosen, slots: of some of the blocks (M',) alone, each with its slot among them, (M,) int32, −1 where it is not one: then (M', 27) of
-            these, without a table of theirs.
+        chosen, slots: (M',) int32, some of the blocks, and (M,) int32 the slot of each block among these, −1 where it is not one: then
+            (M', 27) of these alone, without a table of theirs.
     """
     _, sy, sx = table.shape
     blocks = cells.shape[0] if chosen is None else chosen.shape[0]

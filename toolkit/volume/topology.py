@@ -65,6 +65,7 @@ class Topology:
         if bounds is not None and math.prod(high - low + 3 for low, high in zip(*bounds, strict=True)) > max_table_cells:
             bounds = None
         self.bounds, self._host = bounds, host
+        self._among: tuple[Topology, Tensor, Tensor] | None = None  # where `around` is found, see `some`
         if bounds is not None and gpu.there(keys):
             self._believe(keys, bounds, max_table_cells)
             return
@@ -101,7 +102,6 @@ class Topology:
     def _believe(self, keys: Tensor, bounds: Bounds, max_table_cells: int) -> None:
         """The rest of the making of one whose keys are believed, on CUDA: the table is made when it is first asked for."""
         self.keys, self._max_table_cells, self._codes, self._dense = keys.to(torch.int32).contiguous(), max_table_cells, None, True
-        self._among: tuple[Topology, Tensor, Tensor] | None = None
         (ax, ay, az), (bx, by, bz) = bounds
         self.table_origin, self.table_size = (ax - 1, ay - 1, az - 1), (bx - ax + 3, by - ay + 3, bz - az + 3)
 

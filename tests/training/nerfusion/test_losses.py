@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from toolkit.training.nerfusion.health import feature_deviation, opacity_histogram, relative_depth_error, saturation
-from toolkit.training.nerfusion.losses import FLOOR, WIDTH, Traced, annealed, depth_likelihood, psnr, rendering_loss
+from toolkit.training.nerfusion.losses import FLOOR, WIDTH, Traced, annealed, depth_likelihood, mean_likelihood, psnr, rendering_loss
 from toolkit.training.nerfusion.rays import TargetRays, picture_rays, random_rays
 from toolkit.training.nerfusion.samples import Pictures
+from toolkit.training.nerfusion.step import Outcome
 
 
 def traced(seed: int, rays: int = 7, samples: int = 9) -> Traced:
@@ -89,6 +90,19 @@ def test_rendering_loss_is_its_three_terms() -> None:
     assert float(without.total) == pytest.approx(float(error)) and float(without.depth) == 0 and float(without.opacity) == 0
 
 
+def test_means_are_over_what_is_known() -> None:
+    seen, truth = traced(5), torch.linspace(0.6, 3, 7).double()
+    truth[::2] = 0
+    assert float(mean_likelihood(seen, truth, 0.1)) == pytest.approx(float(depth_likelihood(seen, truth, 0.1)[0].mean()))
+    assert mean_likelihood(seen, torch.zeros_like(truth)).isnan()
+    outcome = Outcome()
+    assert outcome.means() == {}
+    outcome.note({"some": torch.tensor(1.0), "none": torch.tensor(torch.nan)})
+    outcome.note({"some": torch.tensor(torch.nan)})
+    outcome.note({"some": torch.tensor(4.0, dtype=torch.float64)})
+    assert outcome.means() == {"some": 2.5}
+
+
 def test_the_depth_weight_falls_to_exactly_zero() -> None:
     values = [annealed(0.2, step, 100) for step in range(120)]
     assert values[0] == 0.2 and all(a >= b for a, b in pairwise(values))
@@ -103,13 +117,13 @@ def test_psnr() -> None:
 
 def test_health_numbers() -> None:
     flat, lively = torch.full((2, 4, 8, 8), 3.0), torch.randn(2, 4, 8, 8, generator=torch.Generator().manual_seed(0))
-    assert feature_deviation(flat) == 0.0
-    assert feature_deviation(lively) == pytest.approx(1.0, abs=0.1)
+    assert float(feature_deviation(flat)) == 0.0
+    assert float(feature_deviation(lively)) == pytest.approx(1.0, abs=0.1)
     assert saturation(torch.tensor([0.001, 0.5, 0.995, 0.5])) == 0.5 and saturation(torch.zeros(0)) == 0.0
-    shares = opacity_histogram(torch.tensor([0.1, 0.2, 0.5, 0.9]))
+    shares = {name: float(share) for name, share in opacity_histogram(torch.tensor([0.1, 0.2, 0.5, 0.9])).items()}
     assert shares == pytest.approx({"opacity_low": 0.5, "opacity_middle": 0.25, "opacity_high": 0.25})
-    assert relative_depth_error(torch.tensor([1.1, 0.0, 4.0]), torch.tensor([1.0, 2.0, 0.0])) == pytest.approx(0.1)
-    assert relative_depth_error(torch.zeros(2), torch.ones(2)) is None
+    assert relative_depth_error(torch.tensor([1.1, 0.0, 4.0]), torch.tensor([1.0, 2.0, 0.0])).item() == pytest.approx(0.1)
+    assert relative_depth_error(torch.zeros(2), torch.ones(2)).isnan()
 
 
 def test_rays_go_through_their_pixels() -> None:

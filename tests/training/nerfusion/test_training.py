@@ -277,6 +277,21 @@ def test_averaging_alone_changes_nothing_and_a_crew_of_one_needs_no_group() -> N
         assert parameter.grad.tolist() == [1.0, 2.0, 3.0] and crew.any(True) and crew.mean({"a": 2.0}) == {"a": 2.0}
 
 
+@pytest.mark.parametrize(("processes", "backend"), [(8, "gloo"), (2, "nccl")])
+def test_processes_that_share_a_device_meet_on_the_processor(processes: int, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[str] = []
+    for name, value in (("is_available", lambda: True), ("device_count", lambda: 2), ("set_device", lambda _device: None)):
+        monkeypatch.setattr(torch.cuda, name, value)
+    monkeypatch.setattr(torch.distributed, "init_process_group", begun.append)
+    monkeypatch.setattr(torch.distributed, "get_backend", lambda: begun[-1])
+    monkeypatch.setattr(torch.distributed, "destroy_process_group", lambda: None)
+    for name, number in (("WORLD_SIZE", processes), ("LOCAL_WORLD_SIZE", processes), ("RANK", 1), ("LOCAL_RANK", 1)):
+        monkeypatch.setenv(name, str(number))
+    with join_crew("cuda") as crew:
+        assert begun == [backend] and crew.device == torch.device("cuda", 1)
+        assert crew.meeting == (torch.device("cpu") if backend == "gloo" else crew.device)
+
+
 @pytest.mark.parametrize("device", ["tpu", "cuda"])
 def test_a_device_that_is_not_there_is_refused(device: str) -> None:
     if device == "cuda" and torch.cuda.is_available():

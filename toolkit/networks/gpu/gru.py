@@ -4,20 +4,15 @@
 from __future__ import annotations
 
 import torch
-import triton
 import triton.language as tl
 from torch import Tensor
 
 from toolkit.gpu import kernel, pieces, power_of_two
+from toolkit.networks.gpu.volumes import tanh
 from toolkit.networks.lattice import LatentVolume, LocalVolume
 from toolkit.volume.topology import VOXELS
 
 BLOCK = 64  # rows at a time
-
-
-@triton.jit
-def _tanh(x):
-    return 2 / (1 + tl.exp(-2 * tl.minimum(tl.maximum(x, -15.0), 15.0))) - 1
 
 
 @kernel("state", "local", "out")
@@ -80,8 +75,8 @@ def _step(
     at, of = row[:, None] * CHANNELS + c, n[:, None] * CHANNELS + c
     here = looks[:, None] & (c < CHANNELS)
     learned = tl.load(candidate + of, here, 0.0).to(tl.float32)
-    learned = tl.where(c == held, change * _tanh(learned / change), learned)
-    after = _tanh(tl.load(raw + at, here, 0.0) + learned)
+    learned = tl.where(c == held, change * tanh(learned / change), learned)
+    after = tanh(tl.load(raw + at, here, 0.0) + learned)
     s = 1 / (1 + tl.exp(-tl.load(gates + n[:, None] * (2 * CHANNELS) + c, here, 0.0).to(tl.float32)))
     known = tl.minimum(known, most)[:, None]
     z = tl.where(known > 0, s * w[:, None] / (s * w[:, None] + (1 - s) * known), 1.0)  # σ(u + log(w / n))

@@ -18,7 +18,7 @@ BLOCK = 64  # rows at a time
 
 
 @triton.jit
-def _tanh(x):
+def tanh(x):
     return 2 / (1 + tl.exp(-2 * tl.minimum(tl.maximum(x, -15.0), 15.0))) - 1
 
 
@@ -33,10 +33,10 @@ def _settle(
     at = n[:, None] * CHANNELS + c
     of = (slot.to(tl.int64) * 512 + n % 512)[:, None] * CHANNELS + c
     added = tl.load(learned + of, mask & (slot >= 0)[:, None], 0.0).to(tl.float32)
-    added = tl.where(c == held, change * _tanh(added / change), added)
+    added = tl.where(c == held, change * tanh(added / change), added)
     value = tl.where((n < rows)[:, None], tl.load(start + at, mask, 0.0) + added, 0.0)
     tl.store(raw + at, value, mask)
-    tl.store(out + at, _tanh(value), mask)
+    tl.store(out + at, tanh(value), mask)
 
 
 def settle(start: Tensor, learned: Tensor, busy: Tensor) -> tuple[Tensor, Tensor]:
@@ -93,7 +93,7 @@ def _solid(
     layer = tl.load(weight + h[None, :] * CHANNELS + c[:, None], (h < HIDDEN)[None, :] & (c < CHANNELS)[:, None], 0.0)
     hidden = tl.dot(values, layer, input_precision="tf32x3") + tl.load(bias + h, h < HIDDEN, 0.0)[None, :]
     learned = tl.sum(tl.maximum(hidden, 0.0) * tl.load(density + h, h < HIDDEN, 0.0)[None, :], 1) + tl.load(added)
-    learned = change * _tanh(learned / change)
+    learned = change * tanh(learned / change)
     signed = tl.sum(tl.where((c == inside)[None, :], values, 0.0), 1)
     thickness = start + scale * (learned + tl.load(steep) * signed)
     known = tl.load(count + n, some, 0.0) > 0

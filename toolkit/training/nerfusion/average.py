@@ -34,9 +34,9 @@ class Average:
     def update(self, model: nn.Module, step: int) -> None:
         """Take in the weights after step number `step`, counted from 0."""
         decay = min(self.decay, (1 + step) / (10 + step))
-        for name, value in model.named_parameters():
-            if name in self.values:
-                self.values[name].lerp_(value, 1 - decay)
+        now = [(self.values[name], value) for name, value in model.named_parameters() if name in self.values]
+        if now:
+            torch._foreach_lerp_([mine for mine, _ in now], [value for _, value in now], 1 - decay)
 
     def load(self, values: Mapping[str, Tensor]) -> None:
         """Go on from a checkpoint's averages; without any, from the weights as they are.

@@ -26,14 +26,20 @@ class Crew:
         """Whether this process writes files."""
         return self.rank == 0
 
+    @property
+    def meeting(self) -> torch.device:
+        """Where numbers lie that the processes exchange: nccl takes those of a device, gloo the processor's."""
+        return self.device if dist.get_backend() == "nccl" else torch.device("cpu")
+
     def average_gradients(self, parameters: Iterable[torch.nn.Parameter]) -> None:
         """Mean over the processes, as one flat message. A parameter without a gradient counts as zero; all processes must call this."""
         if self.size == 1:
             return
         parameters = [p for p in parameters if p.requires_grad]
         flat = torch.cat([(p.grad if p.grad is not None else torch.zeros_like(p)).reshape(-1).float() for p in parameters])
-        dist.all_reduce(flat)
-        flat /= self.size
+        shared = flat.to(self.meeting)
+        dist.all_reduce(shared)
+        flat = shared.to(flat.device).div_(self.size)
         for p, part in zip(parameters, flat.split([p.numel() for p in parameters]), strict=True):
             p.grad = part.view_as(p).to(p.dtype)
 
@@ -41,7 +47,7 @@ class Crew:
         """Whether the flag is set in any process."""
         if self.size == 1:
             return flag
-        value = torch.tensor([float(flag)], device=self.device)
+        value = torch.tensor([float(flag)], device=self.meeting)
         dist.all_reduce(value, dist.ReduceOp.MAX)
         return bool(value.item())
 
@@ -68,7 +74,7 @@ class Crew:
 def join_crew(device: str = "auto") -> Iterator[Crew]:
     """The crew that `torchrun` started (its environment variables tell), or a crew of one.
 
-    nccl between CUDA devices, gloo between CPUs.
+    nccl between CUDA devices; gloo between CPUs, and where a machine's processes share its devices, which nccl refuses.
 
     Raises:
         InputError: a device that is not there, or a device that is not known.
@@ -86,7 +92,8 @@ def join_crew(device: str = "auto") -> Iterator[Crew]:
     if size == 1:
         yield Crew(0, 1, place)
         return
-    dist.init_process_group("nccl" if cuda else "gloo")
+    shared = int(os.environ.get("LOCAL_WORLD_SIZE", size)) > torch.cuda.device_count()
+    dist.init_process_group("nccl" if cuda and not shared else "gloo")
     try:
         yield Crew(rank, size, place)
     finally:

@@ -65,12 +65,24 @@ def depth_likelihood(traced: Traced, distance: Tensor, voxel_size: float = 0.0) 
         (R',) natural logarithm of Σ_i w_i exp(−½ ((t_i − t*) / s)²) with s = max(`WIDTH` · t*, voxel_size / 2), not below log `FLOOR`,
         for the rays with a known distance; and (R,) bool, which those are.
     """
+    likelihood, known = _likelihood(traced, distance, voxel_size)
+    return likelihood[known], known
+
+
+def mean_likelihood(traced: Traced, distance: Tensor, voxel_size: float = 0.0) -> Tensor:
+    """Mean of `depth_likelihood` without asking a device how many distances are known: not a number where none is."""
+    likelihood, known = _likelihood(traced, distance, voxel_size)
+    return torch.where(known, likelihood, 0.0).sum() / known.sum()
+
+
+def _likelihood(traced: Traced, distance: Tensor, voxel_size: float) -> tuple[Tensor, Tensor]:
+    """(R,) of all rays, and which have a known distance."""
     known = distance > 0
     safe = torch.where(known, distance, torch.ones_like(distance))
     true = safe[traced.ray]
     window = torch.exp(-0.5 * ((traced.distance - true) / (WIDTH * true).clamp_min(0.5 * voxel_size)).square())
     mass = ray_sum(traced.weight * window, traced.ray, len(distance))
-    return torch.log(mass[known].clamp(0, 1) + FLOOR), known
+    return torch.log(mass.clamp(0, 1) + FLOOR), known
 
 
 @dataclass(frozen=True)
@@ -91,11 +103,12 @@ def rendering_loss(traced: Traced, rays: TargetRays, opacity_weight: float, dept
     colour = (traced.colour - rays.colour).square().mean()
     zero = colour.new_zeros(())
     solid = rays.solid
-    opacity = (1 - traced.opacity[solid]).square().mean() if bool(solid.any()) else zero
+    # Sums of what counts, by how many there are: nobody waits for the answer to how many.
+    opacity = torch.where(solid, (1 - traced.opacity).square(), 0.0).sum() / solid.sum().clamp_min(1)
     depth = zero
     if depth_weight > 0:
-        likelihood, _ = depth_likelihood(traced, rays.distance, voxel_size)
-        depth = -likelihood.mean() if len(likelihood) else zero
+        likelihood, known = _likelihood(traced, rays.distance, voxel_size)
+        depth = -torch.where(known, likelihood, 0.0).sum() / known.sum().clamp_min(1)
     return LossParts(colour + opacity_weight * opacity + depth_weight * depth, colour, opacity, depth)
 
 
@@ -108,4 +121,9 @@ def annealed(start: float, step: int, steps: int) -> float:
 
 def psnr(error: Tensor | float) -> float:
     """Mean squared error → decibels."""
-    return float(-10 * torch.log10(torch.as_tensor(error, dtype=torch.float64).clamp_min(1e-10)))
+    return float(decibels(torch.as_tensor(error, dtype=torch.float64)))
+
+
+def decibels(error: Tensor) -> Tensor:
+    """`psnr`, left on the device."""
+    return -10 * torch.log10(error.double().clamp_min(1e-10))

@@ -24,6 +24,7 @@ SHAPES = (4 / 3, 4 / 3, 3 / 4, 16 / 9, 9 / 16, 1.0)  # width by height
 BANKS = 8  # sets of textures that scenes choose from
 TEXELS = 256  # a side of a texture: training pictures are small
 TRIES = 6
+AT_ONCE = 2**21  # rays on a device: 0.3 kB each
 
 
 @lru_cache(maxsize=2 * BANKS)
@@ -97,7 +98,9 @@ class ProceduralScene:
         if self._device.type == "cpu":
             taken = [take(self._scene, self._eye, self._poses[index][None]) for index in new]
         else:
-            taken = take_all(self._scene, self._eye, self._poses[new])
+            few = max(1, AT_ONCE // (self._camera.width * self._camera.height))
+            parts = [new[first : first + few] for first in range(0, len(new), few)]
+            taken = [one for part in parts for one in take_all(self._scene, self._eye, self._poses[part])]
         for index, seen in zip(new, taken, strict=True):
             picture = transfer.encode(seen.linear).permute(2, 0, 1) * self._gain[:, None, None]
             if self._noise > 0:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
+from toolkit.gpu import sent
 from toolkit.training.nerfusion.samples import Pictures
 
 Tensor = torch.Tensor
@@ -57,8 +58,7 @@ def random_rays(pictures: Pictures, targets: Tensor, count: int, generator: torc
     flat = targets.reshape(-1).cpu()
     view = flat[torch.arange(count) % len(flat)]
     pixel = torch.randint(height * width, (count,), generator=generator)
-    device = pictures.images.device
-    return rays_through(pictures, view.to(device), (pixel // width).to(device), (pixel % width).to(device))
+    return rays_through(pictures, *sent(torch.stack([view, pixel // width, pixel % width]).numpy(), pictures.images.device).unbind())
 
 
 def in_sight(rays: TargetRays, pictures: Pictures, references: Tensor) -> Tensor:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
 
+from toolkit.gpu import sent
 from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume
 from toolkit.networks.matching import SIDE
 from toolkit.networks.model import NerfusionModel
@@ -28,16 +31,24 @@ class Outcome:
     """What a step measured; gradients are in the parameters."""
 
     loss: float = 0.0
-    depth_loss: float = 0.0
-    numbers: dict[str, list[float]] = field(default_factory=dict)
+    numbers: dict[str, list[Tensor]] = field(default_factory=dict)
 
-    def note(self, values: dict[str, float]) -> None:
+    def note(self, values: Mapping[str, Tensor]) -> None:
         for name, value in values.items():
             self.numbers.setdefault(name, []).append(value)
 
     def means(self) -> dict[str, float]:
-        """Each number's mean over the step."""
-        return {name: sum(values) / len(values) for name, values in self.numbers.items()}
+        """Each number's mean over where it is one, asked of the device all at once."""
+        noted = [value.detach().double() for values in self.numbers.values() for value in values]
+        if not noted:
+            return {}
+        answers = iter(torch.stack(noted).tolist())
+        out = {}
+        for name, values in self.numbers.items():
+            known = [answer for answer in (next(answers) for _ in values) if not math.isnan(answer)]
+            if known:
+                out[name] = sum(known) / len(known)
+        return out
 
 
 def background_of(pictures: Pictures, count: int, generator: torch.Generator | None) -> Tensor:
@@ -50,7 +61,7 @@ def background_of(pictures: Pictures, count: int, generator: torch.Generator | N
         return torch.tensor(pictures.background, device=device)
     if generator is None:
         return torch.full((3,), 0.5, device=device)
-    return torch.rand(count, 3, generator=generator).to(device)
+    return sent(torch.rand(count, 3, generator=generator).numpy(), device)
 
 
 def local_of(model: NerfusionModel, sample: Sample, frame: int, log: Outcome | None = None) -> LocalVolume:
@@ -64,7 +75,7 @@ def local_of(model: NerfusionModel, sample: Sample, frame: int, log: Outcome | N
 
 
 @torch.no_grad()
-def encoder_deviation(model: NerfusionModel, images: Tensor) -> float:
+def encoder_deviation(model: NerfusionModel, images: Tensor) -> Tensor:
     """Spatial deviation of the encoder's features on these pictures."""
     return feature_deviation(model.encoder(images))
 
@@ -123,8 +134,7 @@ class Stepper:
         parts = rendering_loss(traced, rays, self.settings.loss.opacity, self.depth_weight(step), volume.lattice.voxel_size)
         health = rendering_health(traced, rays)
         log.note({f"psnr_{which}": health.pop("psnr")})
-        log.note(health)
-        log.depth_loss += float(parts.depth.detach())
+        log.note(health | {"loss_depth": parts.depth.detach()})
         return parts.total
 
     def stage_one(self, sample: Sample, step: int, generator: torch.Generator) -> Outcome:
@@ -143,6 +153,7 @@ class Stepper:
         rays = max(1, weights.rays // ((1 + stage.levels) * frames))
         state = begin(model, sample, stage.levels, stage.gamma, stage.most_split)
         sweeps = sweeps_of(sample) if stage.witnesses else None
+        targets = sample.targets.cpu()  # where pixels are drawn
         pending: list[Tensor] = []
         for frame in range(frames):
             indices = sample.references[frame]
@@ -151,11 +162,9 @@ class Stepper:
             if self.watched and frame == 0:
                 log.note({"feature_deviation": encoder_deviation(model, sample.pictures.images[indices[:1]])})
             state, local = state.add(model, views, cameras, None if sweeps is None else sweeps[frame])
-            pending.append(
-                weights.local / frames * self._loss(local, sample, sample.targets[frame], indices, rays, LOCAL, step, generator, log)
-            )
+            pending.append(weights.local / frames * self._loss(local, sample, targets[frame], indices, rays, LOCAL, step, generator, log))
             # The global volumes answer for every place they have seen, not only for the newest.
-            seen = sample.targets[: frame + 1]
+            seen = targets[: frame + 1]
             for level, volume in enumerate(state.volumes):
                 name = FUSED if level == 0 else f"{FUSED}_{level}"
                 allowed = state.allowed(model, level)
@@ -166,7 +175,6 @@ class Stepper:
                 total.backward()
                 log.loss += float(total.detach())
                 pending, state = [], state.detached()
-        log.depth_loss /= (1 + stage.levels) * frames
         return log
 
 

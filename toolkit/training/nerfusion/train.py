@@ -159,7 +159,7 @@ class Trainer:
             self.caution.well()
         else:
             self._skip(outcome.loss)
-        row = {"loss": outcome.loss, "loss_depth": outcome.depth_loss, "gradient_norm": norm, "rate": rate, "skipped": float(not good)}
+        row = {"loss": outcome.loss, "gradient_norm": norm, "rate": rate, "skipped": float(not good)}
         row |= outcome.means() | self.gates.shares()
         row |= {"seconds_data": drawn - start, "seconds": time.monotonic() - start, "voxels": float(sample.resolution)}
         return row

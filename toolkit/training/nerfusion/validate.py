@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -65,8 +66,8 @@ def predict(model: NerfusionModel, case: Case, device: torch.device, prune: bool
         allowed = state.allowed(model, level) if name != "local" else None
         colour, distance, likelihood = _render(model, volume, rays, behind, 0.5 * sample.near, prune and name != "local", allowed)
         numbers[f"psnr_{name}"] = psnr((colour.clamp(0, 1).view(height, width, 3) - truth).square().mean())
-        error = relative_depth_error(distance, rays.distance)
-        if error is not None:  # of the last one, the finest
+        error = float(relative_depth_error(distance, rays.distance))
+        if math.isfinite(error):  # of the last one, the finest
             numbers["depth_error"], numbers["depth_likelihood"] = error, likelihood
     depth = (distance * rays.cosine).view(height, width)
     return Predicted(case, colour.clamp(0, 1).view(height, width, 3).cpu(), depth.cpu(), numbers)

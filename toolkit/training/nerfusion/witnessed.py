@@ -30,8 +30,8 @@ def sweeps_of(sample: Sample, side: int = SIDE) -> list[Sweep]:
     """
     described = describe(sample.pictures.images, side)
     compared = [
-        compare([described[index] for index in indices], cameras_of(sample.pictures, indices), sample.near, sample.far)
-        for indices in sample.references
+        compare([described[index] for index in numbers], cameras_of(sample.pictures, indices), sample.near, sample.far)
+        for indices, numbers in zip(sample.references, sample.references.tolist(), strict=True)
     ]
     alone = [decide(one) for one in compared]
     if len(alone) == 1:
