@@ -90,7 +90,7 @@ def resample(topology: Topology, nodes: Tensor, rows: Sequence[Tensor], new_keys
 
 @kernel("rows", "below", "out")
 def _take(
-    rows, count, slots, below, below_count, table, cells, out, out_count, blocks,
+    rows, count, slots, below, below_count, table, keys, out, out_count, blocks, ox, oy, oz, sx, sy,
     INHERITS: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, TILE: tl.constexpr,
 ):  # fmt: skip
     """Rows and counts of one block, zero where there is none; corners of which nothing is known are as below."""
@@ -103,7 +103,8 @@ def _take(
     known = tl.load(count + slot * 512 + voxel, here, 0.0)
     value = tl.load(rows + (slot * 512 + voxel)[:, None] * CHANNELS + c, here[:, None] & (c < CHANNELS), 0.0)
     if INHERITS:
-        slot = tl.load(table + tl.load(cells + block)).to(tl.int64)
+        x, y, z = tl.load(keys + 3 * block) - ox, tl.load(keys + 3 * block + 1) - oy, tl.load(keys + 3 * block + 2) - oz
+        slot = tl.load(table + (z.to(tl.int64) * sy + y) * sx + x).to(tl.int64)
         new = (voxel < 512) & (slot >= 0) & (known == 0)
         inherited = tl.load(below_count + slot * 512 + voxel, new, 0.0)
         new = new & (inherited > 0)
@@ -134,11 +135,11 @@ def take(
     out, out_count = rows.new_empty((blocks * VOXELS + 1, channels)), rows.new_empty(blocks * VOXELS)
     other, other_count, place = below or (rows, count, topology)
     table = slots if below is None else place.table
-    cells = slots if below is None else topology.own_cells
     sizes = {"CHANNELS": channels, "WIDE": power_of_two(channels), "TILE": TILE}
     _take[(blocks * (VOXELS // TILE),)](
-        rows, count, slots, other, other_count, table, cells, out, out_count, blocks, INHERITS=below is not None, **sizes
-    )
+        rows, count, slots, other, other_count, table, topology.keys, out, out_count, blocks, *place.table_origin, *place.table_size[:2],
+        INHERITS=below is not None, **sizes,
+    )  # fmt: skip
     return out, out_count
 
 

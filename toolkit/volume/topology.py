@@ -191,18 +191,18 @@ class Topology:
     @cached_property
     def around(self) -> Tensor:
         """(M, 27) int64 slots of the 3×3×3 blocks around each, −1 absent; column (dz+1)·9 + (dy+1)·3 + (dx+1), itself in column 13."""
+        if self.bounds is not None and gpu.there(self.keys):
+            from toolkit.volume import tables_gpu
+
+            if self._among is None:
+                return tables_gpu.around(*self._placed)
+            whole, chosen, slots = self._among
+            return tables_gpu.around(*whole._placed, chosen, slots)
         line = range(-1, 2)
         shifts = [(dx, dy, dz) for dz in line for dy in line for dx in line]
         if self.table is None:
             return self.find(self.keys.to(torch.int64)[:, None] + torch.tensor(shifts, device=self.device))
         sx, sy, _ = self.table_size
-        if self.bounds is not None and gpu.there(self.keys):
-            from toolkit.volume import tables_gpu
-
-            if self._among is not None:
-                whole, chosen, slots = self._among
-                return tables_gpu.around(*whole._placed, chosen, slots)
-            return tables_gpu.around(*self._placed)
         # The margin keeps every step inside the table.
         steps = constant(tuple((dz * sy + dy) * sx + dx for dx, dy, dz in shifts), self.device)
         return self.table.view(-1)[self.own_cells[:, None] + steps].to(torch.int64)
