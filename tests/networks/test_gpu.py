@@ -333,8 +333,7 @@ def test_a_step_of_the_gru(busy: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("toolkit.networks.model.fits", lambda *_: False)
     with torch.no_grad():
         expected = made.fuse_part(part, local)
-        monkeypatch.setattr(gpu, "fits", lambda *values: True)
-        monkeypatch.setattr("toolkit.networks.gru.on_cpu", lambda device: False)
+        on_device(monkeypatch)
         found = made.fuse_part(part, local)
     torch.testing.assert_close(found.rows, expected.rows, atol=3e-5, rtol=0)
     torch.testing.assert_close(found.count, expected.count)

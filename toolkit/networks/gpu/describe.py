@@ -9,8 +9,8 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel
-from toolkit.networks.gpu.matching import CHANNELS, COLOURS, corners, lens, parts
+from toolkit.gpu import kernel, pieces
+from toolkit.networks.gpu.matching import CHANNELS, COLOURS, corners, lens
 
 BLOCK = 32  # pixels whose neighbours or channels are looked at together
 GROUPS = (CHANNELS - COLOURS) // 9  # of 3×3 neighbours, the n-th of them n pixels apart
@@ -48,7 +48,7 @@ def describe(images: Tensor, grey: tuple[float, float, float], contrast: float) 
     """(V, 3, H, W), in any order in memory → (V, 21, H, W) of `matching.describe` at this size."""
     views, _, height, width = images.shape
     out = torch.empty((views, CHANNELS, height, width), dtype=images.dtype, device=images.device)
-    _describe[(parts(height * width, BLOCK), views)](
+    _describe[(pieces(height * width, BLOCK), views)](
         images, out, height, width, *images.stride(), *grey, contrast, BLOCK=BLOCK, COLOURS=COLOURS, GROUPS=GROUPS
     )
     return out
@@ -94,7 +94,7 @@ def pixels(described: Tensor, camera: Any, shape: tuple[int, int], planes: int, 
     """
     described, count = described.contiguous(), shape[0] * shape[1]
     rays, own, inverses = (described.new_empty(size) for size in ((count, 3), (count, CHANNELS), (planes,)))
-    _grid[(parts(max(count, planes), BLOCK),)](
+    _grid[(pieces(max(count, planes), BLOCK),)](
         described, *lens(camera), rays, own, inverses, *described.shape[1:], *shape, planes,
         first, last, (last - first) / (planes - 1), BLOCK=BLOCK, CHANNELS=CHANNELS,
     )  # fmt: skip

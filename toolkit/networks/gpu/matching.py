@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel
+from toolkit.gpu import kernel, pieces, power_of_two, sent
 
 CHANNELS = 21  # of a descriptor, colours first
 COLOURS = 3
@@ -106,7 +107,7 @@ def _cost(
 def noted(pictures: Sequence[Tensor]) -> Tensor:
     """(K, 3) int64 on the device of (C, h, w) pictures, contiguous: where each lies, its height and its width."""
     rows = [(picture.data_ptr(), *picture.shape[1:]) for picture in pictures]
-    return torch.tensor(rows, dtype=torch.int64).to(pictures[0].device, non_blocking=True)
+    return sent(np.array(rows, np.int64), pictures[0].device)
 
 
 def costs(described: Sequence[Tensor], cameras: Any, inverses: Tensor, rays: Tensor, own: Tensor, gain: float, unknown: float) -> Tensor:
@@ -120,7 +121,7 @@ def costs(described: Sequence[Tensor], cameras: Any, inverses: Tensor, rays: Ten
     described = [picture.contiguous() for picture in described]
     out = rays.new_empty((pixels, planes))
     if pixels:
-        grid = (parts(pixels, TILE[0]), parts(planes, TILE[1]))
+        grid = (pieces(pixels, TILE[0]), pieces(planes, TILE[1]))
         _cost[grid](
             own, rays, inverses, noted(described), *lens(cameras), len(described), out, pixels, planes, gain, unknown,
             CHANNELS=CHANNELS, COLOURS=COLOURS, BP=TILE[0], BD=TILE[1],
@@ -207,12 +208,7 @@ def _likely(paths, out, pixels, planes, scale, BP: tl.constexpr, BD: tl.constexp
 
 def wide(planes: int) -> int:
     """A power of two that holds the planes, the same for nearly all."""
-    return max(PLANES, 1 << (planes - 1).bit_length())
-
-
-def parts(count: int, at_once: int) -> int:
-    """How many launches' tiles hold all; Triton's own takes longer to ask."""
-    return -(-count // at_once)
+    return max(PLANES, power_of_two(planes))
 
 
 def _paths(volume: Tensor, small: float, large: float, said: Tensor | None = None) -> Tensor:
@@ -247,7 +243,7 @@ def distribution(cost: Tensor, small: float, large: float, temperature: float) -
     volume = rows(cost)
     height, width, planes = volume.shape
     paths, out = _paths(volume, small, large), torch.empty_like(volume)
-    grid = (parts(height * width, PIXELS),)
+    grid = (pieces(height * width, PIXELS),)
     _likely[grid](paths, out, height * width, planes, -1 / temperature, BP=PIXELS, BD=wide(planes))
     return out.permute(2, 0, 1)
 
@@ -291,7 +287,7 @@ def table(likely: Tensor, step: float, peak: int) -> Tensor:
     volume = rows(likely)
     height, width, planes = volume.shape
     out = volume.new_empty((height, width, planes, 3))
-    grid = (parts(height * width, PIXELS),)
+    grid = (pieces(height * width, PIXELS),)
     _tabled[grid](volume, out, height * width, planes, step, window=window_of(peak, planes), BP=PIXELS, BD=wide(planes))
     return out.permute(3, 2, 0, 1)
 
@@ -302,7 +298,7 @@ def decided(cost: Tensor, said: Tensor | None, small: float, large: float, tempe
     height, width, planes = volume.shape
     paths = _paths(volume, small, large, None if said is None else rows(said))
     out = volume.new_empty((height, width, planes, 3))
-    grid = (parts(height * width, PIXELS),)
+    grid = (pieces(height * width, PIXELS),)
     _decided[grid](paths, out, height * width, planes, -1 / temperature, step, window=window_of(peak, planes), BP=PIXELS, BD=wide(planes))
     return out.permute(3, 2, 0, 1)
 
@@ -356,7 +352,7 @@ def alone(
     height, width, planes = volume.shape
     paths = _paths(volume, *smoothing[:2])
     says, places, row = torch.empty_like(volume), rays.new_empty((height * width, 3)), rays.new_empty(23)
-    _alone[(parts(height * width, PIXELS),)](
+    _alone[(pieces(height * width, PIXELS),)](
         paths, rays.contiguous(), inverses, *lens(camera), says, places, row, height, width, planes, -1 / smoothing[2], lowest, step,
         *weights[:2], least, window=window_of(peak, planes), ABOUT=weights[2], BP=PIXELS, BD=wide(planes),
     )  # fmt: skip

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel
+from toolkit.gpu import kernel, pieces
 from toolkit.networks.gpu import matching
 from toolkit.networks.gpu.matching import corners, table_of
 
@@ -59,7 +59,7 @@ def measured(
     height, width = shape
     out = volume.new_empty((height, width, planes, 3))
     (upper, down), (left, across) = spans
-    _measured[(matching.parts(height * width, matching.PIXELS),)](
+    _measured[(pieces(height * width, matching.PIXELS),)](
         volume, inverses, depth, out, tall, wide, height, width, planes, *depth.shape, float(upper), float(left), down / height,
         across / width, step, noise, trust, window=matching.window_of(peak, planes), BP=matching.PIXELS, BD=matching.wide(planes),
     )  # fmt: skip

@@ -6,12 +6,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel
+from toolkit.gpu import kernel, pieces, sent
 from toolkit.networks.gpu import matching
 
 BLOCK = 128
@@ -103,7 +104,7 @@ def look(points: Tensor, truncation: Tensor, table: Tensor, camera: Any, lowest:
         points, truncation, pose, lens, size = (
             values.contiguous() for values in (points, truncation, camera.world_from_camera, camera.intrinsics, camera.size)
         )
-        _look[(matching.parts(count, BLOCK),)](
+        _look[(pieces(count, BLOCK),)](
             points, truncation, rows, pose, lens, size, out, count, height, width, planes, lowest, step, BLOCK=BLOCK
         )
     return out
@@ -201,7 +202,7 @@ def _mean(
 
 def numbers(camera: Any, says: Tensor, lowest: float, step: float) -> Tensor:
     """(23,) that a witness is asked by: its pose (12), lens (4) and size (2), its planes' lowest and step, and h, w and D."""
-    rest = torch.tensor([lowest, step, says.shape[1], says.shape[2], says.shape[0]]).to(says.device, non_blocking=True)
+    rest = sent(np.array([lowest, step, says.shape[1], says.shape[2], says.shape[0]], np.float32), says.device)
     return torch.cat([camera.world_from_camera[0, :3].reshape(12), camera.intrinsics[0], camera.size[0], rest])
 
 
@@ -216,12 +217,12 @@ class Asked:
         self.count = len(witnesses)
         # Kept until kernels that go to their addresses are on their way.
         self._kept = [(matching.rows(one.says), one.numbers()) for one in witnesses]
-        places = torch.tensor([(says.data_ptr(), row.data_ptr()) for says, row in self._kept], dtype=torch.int64)
-        self._addresses = places.to(self._kept[0][0].device, non_blocking=True)
+        places = np.array([(says.data_ptr(), row.data_ptr()) for says, row in self._kept], np.int64)
+        self._addresses = sent(places, self._kept[0][0].device)
 
     def confirmed(self, points: Tensor) -> Tensor:
         """(W, B, 2): for each witness the sum of what it says of places (N, 3), and how many of them it sees, in B parts."""
-        blocks = max(1, matching.parts(len(points), BLOCK))
+        blocks = max(1, pieces(len(points), BLOCK))
         out = points.new_empty((self.count, blocks, 2))
         _confirmed[(blocks, self.count)](points.contiguous(), self._addresses, out, len(points), blocks, BLOCK=BLOCK)
         return out
@@ -245,7 +246,7 @@ class Asked:
         """
         out = rays.new_empty((*coarse, len(inverses)))
         blocks = 0 if sums is None else sums.shape[1]
-        tiles = (matching.parts(coarse[0] * coarse[1], TILE[0]), matching.parts(len(inverses), TILE[1]))
+        tiles = (pieces(coarse[0] * coarse[1], TILE[0]), pieces(len(inverses), TILE[1]))
         _mean[tiles](
             rays.contiguous(), inverses, matching.lens(camera)[0], self._addresses, out if sums is None else sums, out, self.count, blocks,
             *grid, *coarse, len(inverses), believed, share, BP=TILE[0], BD=TILE[1], PARTS=PARTS,
@@ -269,7 +270,7 @@ def says(table: Tensor, gain: float, against: float, about: int) -> Tensor:
     rows = table.permute(2, 3, 1, 0).contiguous()
     height, width, planes = rows.shape[:3]
     out = rows.new_empty((height, width, planes))
-    grid = (matching.parts(height * width, matching.PIXELS),)
+    grid = (pieces(height * width, matching.PIXELS),)
     sizes = {"ABOUT": about, "BP": matching.PIXELS, "BD": matching.wide(planes)}
     _witness[grid](rows, out, height * width, planes, gain, against, **sizes)
     return out.permute(2, 0, 1)
@@ -297,5 +298,5 @@ def surest(table: Tensor, rays: Tensor, inverses: Tensor, origin: Tensor, least:
     planes = rows.shape[2]
     out = torch.empty_like(rays)
     sizes = {"BP": matching.PIXELS, "BD": matching.wide(planes)}
-    _surest[(matching.parts(len(rays), matching.PIXELS),)](rows, rays, inverses, origin, out, len(rays), planes, least, **sizes)
+    _surest[(pieces(len(rays), matching.PIXELS),)](rows, rays, inverses, origin, out, len(rays), planes, least, **sizes)
     return out
