@@ -198,3 +198,30 @@ import toolkit.fusion, toolkit.networks.model, toolkit.networks.weights, toolkit
     root = Path(__file__).resolve().parents[1]
     done = subprocess.run([sys.executable, "-c", code], check=False, cwd=root, capture_output=True, text=True, timeout=170)
     assert done.returncode == 0, done.stderr
+
+
+def test_where_a_device_works_behind_the_processor_pictures_are_encoded_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of some key frames at once, before they are asked for, each once, and with the same result."""
+    model, (views, keys), lattice = opinionated(), captured(11), fusion_lattice(SPACE, 0.2, 1)
+    encode, together = model.encode, list[int]()
+
+    def counted(images: torch.Tensor, *rest: object) -> object:
+        together.append(len(images))
+        return encode(images, *rest)
+
+    def fused() -> tuple[list[int], torch.Tensor]:
+        together.clear()
+        known = list[int]()
+        for step in fuse_views(model, views, keys, lattice, FusionOptions(1, 0.1, FAR)):
+            known.append(sum(together))
+            volume = step.volume
+        return known, volume.rows.clone()
+
+    monkeypatch.setattr(model, "encode", counted)
+    one_by_one, expected = fused()
+    assert set(together) == {1} and one_by_one == [2, *range(3, 12), 11]
+    monkeypatch.setattr("toolkit.fusion.asks_freely", lambda device: False)
+    ahead, found = fused()
+    # Four key frames and their neighbours; the next ones come when the fourth is fused.
+    assert together == [5, 4, 2] and ahead == [5, 5, 5, 9, 9, 9, 9, 11, 11, 11, 11]
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)

@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -129,12 +129,20 @@ class Fusion:
         self._balls = block_balls(self.stores[0].lattice, self._keys)
 
     @torch.no_grad()
-    def add(self, views: Sequence[EncodedView], cameras: Cameras, depth: Tensor | None = None, swept: Sweep | None = None) -> None:
+    def add(
+        self,
+        views: Sequence[EncodedView],
+        cameras: Cameras,
+        depth: Tensor | None = None,
+        swept: Sweep | None = None,
+        meanwhile: Callable[[], None] | None = None,
+    ) -> None:
         """Fuse one key frame (first) and its neighbours.
 
         Args:
             depth: (H, W) of the key frame where a sensor measured it, working units.
             swept: of the key frame, where it was made already (`KeySweeps`), depth and all; None: made here.
+            meanwhile: called once a device of its own has been asked the last question, so that what it does delays no answer.
         """
         options = self.options
         topology, finer = self._visible(cameras), None
@@ -144,6 +152,8 @@ class Fusion:
         for level, store in enumerate(self.stores):
             wanted = None if finer is None else finer.known
             local = self.model.local_volume(views, cameras, store.lattice, topology, wanted, options.near, options.far, swept)
+            if meanwhile is not None and level + 1 == options.levels:
+                meanwhile()
             before, seen = store.part(local.topology, finer), local.known
             after = self.model.fuse_part(before, local)
             store.write(after, seen)
@@ -195,17 +205,22 @@ class _Pictures:
 
     def __call__(self, groups: Sequence[Sequence[int]]) -> list[tuple[EncodedView, Cameras]]:
         """The pictures of the first of `groups`; where one of them is new, those of `ahead` groups that are new are encoded together."""
+        self.prepare(groups)
+        return [self._kept.get(index, self._one) for index in groups[0]]
+
+    def prepare(self, groups: Sequence[Sequence[int]]) -> None:
+        """On a device of its own: begin with what a call with `groups` will ask for, if there are any, while there is other work to do."""
+        if self.ahead == 1 or not groups or all(index in self._kept for index in groups[0]):
+            return
         group = groups[0]
-        if self.ahead > 1 and any(index not in self._kept for index in group):
-            for index in group:  # they stay when others come
-                if index in self._kept:
-                    self._kept.get(index, self._one)
-            some = dict.fromkeys(index for one in groups[: self.ahead] for index in one if index not in self._kept)
-            shape = self.views.images[group[0]].shape
-            new = [index for index in some if self.views.images[index].shape == shape][: KEPT_ON_DEVICE - len(group)]
-            for index, made in zip(new, self._encode(new), strict=True) if new else ():
-                self._kept.put(index, made)
-        return [self._kept.get(index, self._one) for index in group]
+        for index in group:  # they stay when others come
+            if index in self._kept:
+                self._kept.get(index, self._one)
+        some = dict.fromkeys(index for one in groups[: self.ahead] for index in one if index not in self._kept)
+        shape = self.views.images[group[0]].shape
+        new = [index for index in some if self.views.images[index].shape == shape][: KEPT_ON_DEVICE - len(group)]
+        for index, made in zip(new, self._encode(new), strict=True) if new else ():
+            self._kept.put(index, made)
 
     def _one(self, index: int) -> tuple[EncodedView, Cameras]:
         return self._encode([index])[0]
@@ -262,7 +277,8 @@ def fuse_views(
         depth = sensed(views, int(key), model.device) if measured else None
         swept = None if sweeps is None else sweeps(done)
         with computing(fusion.options.precision, model.device):
-            fusion.add([view for view, _ in group], Cameras.together([camera for _, camera in group]), depth, swept)
+            cameras, coming = Cameras.together([camera for _, camera in group]), partial(encoded.prepare, groups[done + 1 :])
+            fusion.add([view for view, _ in group], cameras, depth, swept, coming)
         if (done + 1) % fusion.options.prune_every == 0:
             fusion.prune()
         seconds = time.perf_counter() - begin
