@@ -32,7 +32,7 @@ from toolkit.networks.gpu import convolution, lookup, matching, observe, reading
 from toolkit.networks.gpu import describe as describing
 from toolkit.networks.gpu import gru as compiled_rows
 from toolkit.networks.gpu import volumes as volumes_gpu
-from toolkit.networks.lattice import LatentVolume, cells, rows_of
+from toolkit.networks.lattice import LatentVolume, Lattice, cells, rows_of
 from toolkit.networks.matching import describe, distribution, semi_global
 from toolkit.networks.sweep import _table, compare, decide
 from toolkit.networks.unproject import look_up, project
@@ -302,7 +302,7 @@ def test_a_local_volume(shell: float, variance: bool, count: int, monkeypatch: p
 def test_key_frames_are_fused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two of them on two lattices, and what is left of them when blocks are forgotten."""
     model = small_model(config=replace(SIZES, hidden=16))
-    seen_by, space = cameras(4), lattice(16, 0.0)
+    seen_by, space = cameras(4), Lattice(Space((0.0, 0.0, 0.0), 0.8, 0.0, (0.7, 0.7, 1.0)), 16)  # two coarse blocks
     with torch.no_grad():
         for parameter in (*model.local.parameters(), *model.fusion.parameters()):
             parameter.add_(0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(parameter.numel())))
