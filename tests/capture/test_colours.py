@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -17,11 +19,13 @@ from toolkit.camera import Array
 from toolkit.capture.colours import MOST_BYTES, SAME, to_srgb
 from toolkit.capture.convert import write_picture
 from toolkit.capture.images import load_image, load_mask
+from toolkit.capture.primaries import png_colours, profile_of
 from toolkit.capture.types import Frame
 
 # Chromaticities of red, green and blue (SMPTE EG 432-1; Adobe RGB (1998); ITU-R BT.709), all under the white D65.
 P3 = ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060))
 ADOBE = ((0.64, 0.33), (0.21, 0.71), (0.15, 0.06))
+BT2020 = ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046))
 SRGB = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))
 D65, D50 = (0.3127, 0.3290), (0.3457, 0.3585)
 BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
@@ -158,6 +162,59 @@ def test_a_heif_photo_is_read_and_converted_as_srgb(tmp_path: Path) -> None:
         assert jpeg.info.get("icc_profile") is None
     for got in (load_image(Frame("a", path)), load_image(Frame("a", written))):
         assert np.abs(got - wanted)[inner].mean() < 2 < np.abs(got.astype(int) - picture)[inner].mean()
+
+
+def with_colours_by_number(png: bytes, *numbers: int) -> bytes:
+    """A PNG with a chunk cICP behind its first one."""
+    chunk = b"cICP" + bytes(numbers)
+    return png[:33] + struct.pack(">I", len(numbers)) + chunk + struct.pack(">I", zlib.crc32(chunk)) + png[33:]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "primaries"), [((12, 13, 0, 1), P3), ((9, 1, 0, 1), BT2020), ((1, 13, 0, 1), SRGB), ((9, 16, 0, 1), SRGB)]
+)
+@pytest.mark.parametrize("profiled", [False, True])
+def test_a_png_that_says_its_colours_by_number(
+    tmp_path: Path, numbers: tuple[int, ...], primaries: tuple[tuple[float, float], ...], profiled: bool
+) -> None:
+    """They go before a profile, where they are known and of ordinary range."""
+    picture, path = colours(), tmp_path / "a.png"
+    told = io.BytesIO()
+    Image.fromarray(picture).save(told, format="PNG", icc_profile=profile(ADOBE, 2.19921875) if profiled else None)
+    path.write_bytes(with_colours_by_number(told.getvalue(), *numbers))
+    wanted = expected(picture, primaries) if primaries is not SRGB or not profiled else expected(picture, ADOBE, 2.19921875)
+    assert np.abs(load_image(Frame("a", path)) - wanted).max() <= 2
+
+
+@given(st.binary(max_size=60), st.integers(0, 60))
+def test_chunks_that_lie_about_their_length_stop_nothing(noise: bytes, at: int) -> None:
+    whole = io.BytesIO()
+    Image.fromarray(colours(2, 3)).save(whole, format="PNG")
+    data = with_colours_by_number(whole.getvalue(), 12, 13, 0, 1)
+    found = png_colours(data[:at] + noise + data[at + len(noise) :])
+    assert found is None or found in (profile_of(9, 13), profile_of(12, 13))
+
+
+@pytest.mark.parametrize(("number", "icc"), [(12, False), (1, False), (12, True)])
+def test_a_heif_photo_that_says_its_colours_by_number(tmp_path: Path, number: int, icc: bool) -> None:
+    """As phones write it without a profile; a profile goes before it."""
+    pillow_heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not installed; make test brings it")
+    pillow_heif.register_heif_opener()
+    picture, path = np.full((64, 64, 3), (200, 60, 40), np.uint8), tmp_path / "a.heic"
+    codes = {"color_primaries": number, "transfer_characteristics": 13, "matrix_coefficients": 6, "full_range_flag": 1}
+    more = {"icc_profile": profile(SRGB)} if icc else {}
+    Image.fromarray(picture).save(path, format="HEIF", quality=95, **codes, **more)
+    wanted = expected(picture, P3 if number == 12 and not icc else SRGB)
+    assert np.abs(load_image(Frame("a", path)) - wanted).mean() < 2
+
+
+def test_profiles_by_number_are_those_of_their_primaries() -> None:
+    picture = colours()
+    for number, primaries in ((9, BT2020), (12, P3)):
+        told = profile_of(number, 13)
+        assert told is not None and np.abs(to_srgb(picture, told) - expected(picture, primaries)).max() <= 2
+        assert np.abs(to_srgb(picture, told).astype(int) - to_srgb(picture, profile(primaries))).max() <= SAME
+    assert profile_of(1, 13) is None and profile_of(12, 18) is None and profile_of(2, 2) is None
 
 
 def test_grey_photos_with_a_profile_and_masks_stay_as_they_are(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from PIL import Image, UnidentifiedImageError
 
 from toolkit.capture import heif
+from toolkit.capture.primaries import heif_colours, png_colours
 from toolkit.errors import InputError
 
 MAX_PIXELS = 200_000_000
@@ -21,7 +22,7 @@ _pillow_limit = threading.Lock()
 @dataclass(frozen=True)
 class Header:
     """Stored size (before any EXIF turn; of HEIF as it is seen), file format in Pillow's name for it, EXIF orientation (1: as stored), and
-    the ICC profile of its colours, if it has one."""
+    the ICC profile of its colours, if it says what they are."""
 
     width: int
     height: int
@@ -65,7 +66,7 @@ def read_header(data: bytes, path: Path) -> Header:
                     width, height = picture.size
                     kind = picture.format or ""
                     orientation = _orientation(picture)
-                    profile = picture.info.get("icc_profile")
+                    profile = _profile(picture, data)
             finally:
                 Image.MAX_IMAGE_PIXELS = limit
     except UnidentifiedImageError as error:
@@ -80,11 +81,20 @@ def read_header(data: bytes, path: Path) -> Header:
         raise InputError(f"the picture {path} has no pixels ({width}×{height}); remove it")
     if not _complete(data, kind):
         raise _cut_short(path)
-    return Header(width, height, kind, orientation, profile if isinstance(profile, bytes) and profile else None)
+    return Header(width, height, kind, orientation, profile)
 
 
 def _cut_short(path: Path) -> InputError:
     return InputError(f"the picture {path} is cut short (the file ends before the picture does); copy it again or remove it")
+
+
+def _profile(picture: Image.Image, data: bytes) -> bytes | None:
+    """Of its colours: in an ICC profile, or by number, which PNG's chunk says before the profile and HEIF's box after it."""
+    icc = picture.info.get("icc_profile")
+    icc = icc if isinstance(icc, bytes) and icc else None
+    if picture.format == "PNG":
+        return png_colours(data) or icc
+    return icc or heif_colours(picture.info.get("nclx_profile"))
 
 
 def _orientation(picture: Image.Image) -> int:
