@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from toolkit.errors import LONGEST, FieldfuseError, InputError, PoseError, first_line
+from toolkit.errors import LONGEST, FieldfuseError, InputError, PoseError, all_lines, first_line
 
 ANYTHING = st.text(st.characters(exclude_categories=()))
 
@@ -40,6 +40,13 @@ def test_a_name_that_no_terminal_can_show(tmp_path, name):
 def test_what_another_library_says_is_short(text):
     said = first_line(ValueError(text * 200))
     assert 0 < len(said) <= LONGEST + 2 and len(said.splitlines()) == 1
+
+
+@given(ANYTHING)
+def test_all_lines_of_what_it_says_are_one_and_short(text):
+    said = all_lines(ValueError(text * 200))
+    assert 0 < len(said) <= LONGEST + 2 and len(said.splitlines()) == 1
+    assert all_lines(ValueError("sizes:\n  16 of 8 ")) == "sizes: 16 of 8" and all_lines(ValueError()) == "ValueError"
 
 
 def test_what_the_system_says_is_without_its_number():

@@ -21,6 +21,11 @@ def first_line(error: BaseException) -> str:
     return brief(next((line.strip() for line in said.splitlines() if line.strip()), type(error).__name__))
 
 
+def all_lines(error: BaseException) -> str:
+    """The same of all lines in one, for libraries whose first line says nothing (torch's of weights that do not fit)."""
+    return brief(" ".join(str(error).split()) or type(error).__name__)
+
+
 def brief(text: str) -> str:
     """What a foreign file says, to be quoted: its first `LONGEST` characters."""
     return text if len(text) <= LONGEST else f"{text[:LONGEST]} …"

@@ -16,7 +16,6 @@ from toolkit.errors import OutputError
 from toolkit.evaluate import words
 from toolkit.evaluate.pictures import DEPTH_COLOURS, ERROR_COLOURS, ERROR_TOP, Pictures, colour_bar
 from toolkit.evaluate.plots import psnr_over_time, stage_bars
-from toolkit.evaluate.report import SCORE
 from toolkit.evaluate.templates import template
 
 TEMPLATE = "report.html.j2"
@@ -43,7 +42,7 @@ def data_uri(picture: Array, lossless: bool = False) -> str:
 
 def scores_by_name(score: dict[str, Any] | None) -> dict[str, dict[str, Any]]:
     """Name of the view → its scores."""
-    return {str(view.get("name")): {**dict.fromkeys(SCORE), **view} for view in (score or {}).get("per_view") or []}
+    return {str(view.get("name")): {**dict.fromkeys(words.SCORE), **view} for view in (score or {}).get("per_view") or []}
 
 
 def view_rows(data: dict[str, Any], pictures: Pictures) -> list[dict[str, Any]]:

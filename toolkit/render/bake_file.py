@@ -17,7 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from toolkit.camera import Similarity
-from toolkit.errors import InputError, OutputError, first_line
+from toolkit.errors import InputError, OutputError, all_lines, first_line
 from toolkit.files import atomic_path
 from toolkit.networks.encoding import DIRECTION
 from toolkit.render import kernels as K
@@ -98,8 +98,7 @@ def read_baked(path: Path | str) -> BakedField:
         arrays = {name: tensor.numpy() if name in MAPPED else tensor.clone().numpy() for name, tensor in tensors.items()}
         return _checked(arrays, json.loads(text))
     except (_Unusable, SafetensorError, OSError, ValueError, TypeError, KeyError, RuntimeError, OverflowError, RecursionError) as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise InputError(f"{path} cannot be used, because {reason}; bake the run again") from error
+        raise InputError(f"{path} cannot be used, because {all_lines(error)}; bake the run again") from error
 
 
 class _Unusable(Exception):

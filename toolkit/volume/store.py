@@ -21,7 +21,7 @@ from torch import Tensor
 
 from toolkit import memory
 from toolkit.camera import Similarity
-from toolkit.errors import FieldfuseError, InputError, OutputError, first_line
+from toolkit.errors import FieldfuseError, InputError, OutputError, all_lines, first_line
 from toolkit.files import atomic_path
 from toolkit.volume.rows import zero_rows
 from toolkit.volume.topology import MAX_TABLE_CELLS, VOXELS
@@ -153,8 +153,8 @@ def read_field(path: Path | str) -> FieldFile:
     except FieldfuseError:
         raise
     except (_Unusable, SafetensorError, OSError, ValueError, TypeError, KeyError, RuntimeError, OverflowError, MemoryError) as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise InputError(f"{path} cannot be used, because {reason}; fit the field again or take another copy of the file") from error
+        why = all_lines(error)
+        raise InputError(f"{path} cannot be used, because {why}; fit the field again or take another copy of the file") from error
 
 
 class _Unusable(Exception):
