@@ -63,6 +63,20 @@ def test_a_launch_of_a_known_kind_goes_straight_to_what_was_compiled(version: st
     assert len(jitted.slow) == 7 and len(jitted.quick) == 2
 
 
+def test_a_triton_that_wants_other_arguments_is_launched_its_own_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch._C, "_cuda_getCurrentRawStream", lambda device: 7, raising=False)
+
+    def refuse(*_: Any) -> None:
+        raise TypeError("function takes exactly 12 arguments (15 given)")
+
+    monkeypatch.setattr(gpu, "_launcher", lambda compiled: refuse)
+    jitted = Jitted()
+    kernel = gpu.Kernel(jitted, ("rows", "SIZE"), (1,), ())
+    for _ in range(3):
+        kernel[(1,)](torch.zeros(4), SIZE=8)
+    assert len(jitted.slow) == 3 and not jitted.quick
+
+
 def test_what_is_sent_arrives_whatever_was_sent_before() -> None:
     class Small(gpu._Outbox):
         HALF = 1024

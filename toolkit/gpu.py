@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 OLDEST = 7  # compute capability
+OTHERS_GO_ON = "thread_local"  # while a graph is recorded, other threads (a viewer's) may use the device
 
 
 @cache
@@ -122,7 +123,7 @@ class Kernel:
 
     Triton looks at every number and tensor of a launch to know which variant is meant, and asks its hooks: most of what a small launch
     costs. Here a short key finds what the first launch of its kind had compiled, which is then launched directly. Whole numbers are of
-    32 bits: a kernel that is given a longer one is compiled for it if it comes first, else refuses it.
+    32 bits: a kernel that is given a longer one is compiled for it if it comes first, else refuses it (OverflowError).
 
     Args:
         jitted: the kernel as Triton made it.
@@ -137,6 +138,7 @@ class Kernel:
         self._aligned = tuple(self.names.index(name) for name in aligned)
         self._tensors: tuple[int, ...] = ()
         self._compiled: dict[Any, Any] = {}
+        self._quick = True
 
     def __getitem__(self, grid: tuple[int, ...]) -> Callable[..., None]:
         return partial(self._launch, grid)
@@ -151,15 +153,18 @@ class Kernel:
         count = len(given)
         constants = [given[place] for place in self._constants if place < count]
         key = (device, *kinds, *ends, *constants, *map(type, given), *named.values())
-        launch = self._compiled.get(key)
-        if launch is None:
-            compiled = self.jitted[grid](*given, **named)
-            if hasattr(compiled, "function"):  # neither the interpreter nor what stands in for it in tests
-                self._compiled[key] = _launcher(compiled)
-            return
-        first, second, third = (*grid, 1, 1)[:3]
-        stream = torch._C._cuda_getCurrentRawStream(device)
-        launch(first, second, third, stream, *given, *[named[name] for name in self.names[count:]])
+        launch = self._compiled.get(key) if self._quick else None
+        if launch is not None:
+            first, second, third = (*grid, 1, 1)[:3]
+            stream = torch._C._cuda_getCurrentRawStream(device)
+            try:
+                launch(first, second, third, stream, *given, *[named[name] for name in self.names[count:]])
+                return
+            except TypeError:  # a Triton that wants other arguments here, before 3.3 say: nothing was launched
+                self._quick = False
+        compiled = self.jitted[grid](*given, **named)
+        if hasattr(compiled, "function"):  # neither the interpreter nor what stands in for it in tests
+            self._compiled[key] = _launcher(compiled)
 
 
 def _launcher(compiled: Any) -> Callable[..., None]:

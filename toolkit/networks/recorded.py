@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from toolkit.gpu import OTHERS_GO_ON
+
 MOST = 4  # recordings that are kept
 Work = Callable[..., tuple[Tensor, ...]]
 Recording = tuple[torch.cuda.CUDAGraph, list[Tensor], tuple[Tensor, ...]]  # with where it reads and what it writes
@@ -66,6 +68,6 @@ class Recorded:
             self._pool = torch.cuda.graph_pool_handle()  # one after the other they can share memory
         inputs = [value.clone() for value in given]
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, pool=self._pool):
+        with torch.cuda.graph(graph, pool=self._pool, capture_error_mode=OTHERS_GO_ON):
             results = work(*inputs)
         return graph, inputs, results

@@ -12,6 +12,7 @@ import math
 import torch
 import triton
 
+from toolkit.gpu import OTHERS_GO_ON
 from toolkit.networks.decoder import Deferred
 from toolkit.networks.encoding import DIRECTION, spherical_harmonics
 from toolkit.render.field import Field
@@ -178,7 +179,7 @@ class TritonOptimiser:
         """Record a step, and take it."""
         graph = torch.cuda.CUDAGraph()
         torch.cuda.synchronize()
-        with torch.cuda.graph(graph):
+        with torch.cuda.graph(graph, capture_error_mode=OTHERS_GO_ON):
             self._draw(rays)
             self._learn(rays, remember=True)
         self._graph = graph
