@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from toolkit.config import load_settings
 from toolkit.errors import LONGEST, FieldfuseError, InputError, PoseError, all_lines, first_line
 
 ANYTHING = st.text(st.characters(exclude_categories=()))
@@ -52,3 +53,12 @@ def test_all_lines_of_what_it_says_are_one_and_short(text):
 def test_what_the_system_says_is_without_its_number():
     assert first_line(OSError(28, "No space left on device", "somewhere")) == "No space left on device"
     assert first_line(OSError("of its own")) == "of its own" and first_line(KeyError()) == "KeyError"
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("fit.slow_within", 10**400), ("network.recolour", "a" * 5000), ("a" * 5000, 1), ("engine", "b" * 5000)]
+)
+def test_settings_that_are_too_long_are_quoted_in_part(key, value):
+    with pytest.raises(InputError) as said:
+        load_settings(stored={key: value})
+    assert len(str(said.value)) < 800

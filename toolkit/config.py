@@ -16,7 +16,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from toolkit.errors import InputError, first_line
+from toolkit.errors import InputError, brief, first_line
 
 MAX_YAML = 2**18  # characters
 MAX_NESTING = 16
@@ -197,13 +197,13 @@ def _set(config: DictConfig, known: list[str], key: str, value: Any, where: str)
     if full not in known:
         near = difflib.get_close_matches(key, known + list(SHORT_NAMES), n=1, cutoff=0.3)
         hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise InputError(f"{where}: there is no setting {key!r}{hint}")
+        raise InputError(f"{where}: there is no setting {brief(repr(key))}{hint}")
     if isinstance(value, bool) and "off" in CHOICES.get(full, ()):
         value = "on" if value else "off"  # YAML reads a bare on and off as true and false
     try:
         OmegaConf.update(config, full, value)
-    except (OmegaConfBaseException, ValueError) as error:
-        raise InputError(f"{where}: {value!r} does not fit the setting {key!r} ({first_line(error)})") from error
+    except (OmegaConfBaseException, ValueError, OverflowError) as error:
+        raise InputError(f"{where}: {brief(repr(value))} does not fit the setting {key!r} ({first_line(error)})") from error
 
 
 def _flatten(data: Any, where: str, prefix: str = "") -> list[tuple[str, Any]]:
@@ -292,7 +292,7 @@ def load_settings(
         if value not in choices:
             near = difflib.get_close_matches(str(value), choices, n=1)
             raise InputError(
-                f"{key} is {value!r}; it must be one of {', '.join(choices)}" + (f" (did you mean {near[0]!r}?)" if near else "")
+                f"{key} is {brief(repr(value))}; it must be one of {', '.join(choices)}" + (f" (did you mean {near[0]!r}?)" if near else "")
             )
     settings = OmegaConf.to_object(config)
     assert isinstance(settings, Settings)

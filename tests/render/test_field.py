@@ -37,7 +37,14 @@ def test_settling_changes_nothing_that_is_seen() -> None:
     )
 
 
-@pytest.mark.parametrize("change", [{"resolution": -1}, {"decoder": "evil"}, {"space": {}}, {"hidden": 10**9}, {"background": ["a"]}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"resolution": -1}, {"decoder": "evil"}, {"space": {}}, {"hidden": 10**9}, {"background": ["a"]}, {"background": [0.2, 0.5, "nan"]},
+        {"background": [0, 0, 1e30]}, {"near": "nan"},
+        {"space": {"centre": [0, "nan", 0], "half": 1, "shell": 0, "box": [1, 1, 1]}},
+    ],
+)  # fmt: skip
 def test_a_field_with_a_spoiled_configuration_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
     from toolkit.volume.store import read_field, write_field
 

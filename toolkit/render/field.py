@@ -21,6 +21,7 @@ from toolkit.volume.store import FieldFile, compact, expand, read_field, write_f
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
 
 Tensor = torch.Tensor
+BRIGHTEST = 1e3  # of a background that is read; colours are 0 to 1
 
 
 def density(raw: Tensor) -> Tensor:
@@ -165,7 +166,8 @@ class Field:
             kind, hidden, fine, near = str(config["decoder"]), int(config["hidden"]), int(config["fine"]), float(config["near"])
             background, sky = torch.tensor([float(v) for v in config["background"]]), checked_sky(config.get("sky"))
             sane = kind in ("deferred", "per_sample") and 8 <= resolution <= 8192 and 1 <= hidden <= 4096 and 1 <= fine <= 64 and near >= 0
-            if not sane or len(background) != 3 or not space.half > 0 or not 0 <= space.shell <= 16:
+            sane = sane and len(background) == 3 and bool((background.abs() <= BRIGHTEST).all())  # not of what is not a number
+            if not sane or not space.half > 0 or not 0 <= space.shell <= 16:
                 raise ValueError("a setting is out of range")
             if len(data.keys) and (int(data.keys.min()) < 0 or int(data.keys.max()) > resolution // BLOCK):
                 raise ValueError("a block lies outside the lattice")

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 Tensor = torch.Tensor
+LIMIT = 1e30  # of the numbers that are read: float32 holds them
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,14 @@ class Space:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Space:
+        """The way back of `to_dict`.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is none.
+        """
         x, y, z = (float(v) for v in data["centre"])
         bx, by, bz = (float(v) for v in data["box"])
-        return cls((x, y, z), float(data["half"]), float(data["shell"]), (bx, by, bz))
+        half, shell = float(data["half"]), float(data["shell"])
+        if not all(abs(value) < LIMIT for value in (x, y, z, bx, by, bz, half, shell)):
+            raise ValueError("a number of the space is out of range")
+        return cls((x, y, z), half, shell, (bx, by, bz))
