@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pipelines.console import ConsoleProgress
 from pipelines.folder import RunFolder, is_run_folder
 from pipelines.stages import Stages
+from toolkit import memory
 from toolkit.config import Settings, load_settings
 from toolkit.errors import InputError
 
@@ -115,7 +116,8 @@ def read_settings(options: dict[str, Any], stored: dict[str, Any] | None = None)
 
 
 def bound_threads(options: dict[str, Any]) -> None:
-    """Tell numeric libraries the thread count that the command line gives; they read it once, when they are loaded."""
+    """Tell numeric libraries the thread count that the command line gives, which they read once, when they are loaded; and that all threads
+    allocate from one heap."""
     # Threads that spin while they wait take the cores from whatever else runs: on a busy machine with two cores a fit made 83 steps
     # in 15 s with spinning threads and 306 with sleeping ones. So they sleep, but not at once (GNU's library counts the turns): to wake
     # one for each of the networks' many short operations would cost a quarter of their time (docs/measured/performance.md).
@@ -125,6 +127,7 @@ def bound_threads(options: dict[str, Any]) -> None:
     wanted = options.get("flags", {}).get("threads") or next(iter(pairs), None)
     if wanted is not None and str(wanted).isdigit() and int(wanted) > 0:
         os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(wanted)))
+    memory.one_heap()
 
 
 def set_threads(threads: int | None) -> None:

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from pipelines.console import ConsoleProgress
 from pipelines.folder import STAGES, RunFolder
 from pipelines.memory import PeakMemory
-from toolkit import __version__
+from toolkit import __version__, libraries
 from toolkit.errors import FieldfuseError, InputError
 from toolkit.files import fingerprint, read_json, remove, write_json
 from toolkit.memory import give_back
@@ -147,6 +147,7 @@ class Stages:
             remove(self._path(name))
             paths = [Path(path) for path in save(value)]
         give_back()
+        libraries.let_go()
         for path in paths:
             path.chmod(0o666 & ~_umask())  # some writers make files that only their owner may read
         outputs = {path.relative_to(self.folder.path).as_posix(): path.stat().st_size for path in paths}

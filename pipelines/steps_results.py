@@ -143,8 +143,10 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     ]
     after = ["scene", "views", *known, *(["network"] if made is not None else [])]
     value = job.stages.run("field", make, save, load, uses=uses, after=after, keeps=True)
-    # The file holds less precision than memory: what is shown and scored is what everybody can load.
-    return value if job.stages.cached["field"] else load()
+    if job.stages.cached["field"]:
+        return value
+    del value  # the file holds less precision than memory: what is shown and scored is what everybody can load
+    return load()
 
 
 def fit_notes(job: Job) -> list[str]:

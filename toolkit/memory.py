@@ -1,12 +1,19 @@
-"""How much memory this process may still take, and the refusal, with numbers, of work that needs more. Only the standard library."""
+"""How much memory this process may still take, the refusal, with numbers, of work that needs more, and what is given back early."""
 
 from __future__ import annotations
 
 import ctypes
+import math
 import mmap
+import os
 import resource
+import sys
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from toolkit.errors import InputError
 
@@ -14,6 +21,7 @@ GIB = 2**30
 SPARE = 128 * 2**20  # left to everything else
 _MEMINFO, _STATUS = Path("/proc/meminfo"), Path("/proc/self/status")
 _CGROUP = Path("/sys/fs/cgroup")
+_ARENA_MAX = -8  # malloc.h's M_ARENA_MAX
 
 
 def available() -> int | None:
@@ -73,11 +81,64 @@ def pages(size: int) -> mmap.mmap | bytearray:
     return out
 
 
+def unwritten(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+    """An array of zeros, in pages of which those take no memory that nobody writes (`pages`): for what is sized for the worst case."""
+    return np.frombuffer(pages(math.prod(shape) * np.dtype(dtype).itemsize), dtype).reshape(shape)
+
+
 def give_back() -> None:
     """Give the system what this process has freed and its C library still holds (glibc keeps pieces of up to 32 MB); a few milliseconds.
     Called where much was just freed."""
     with suppress(OSError, TypeError, AttributeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def one_heap() -> None:
+    """Have all threads allocate from one heap: glibc gives each of them its own, and what is freed in one is of no use to the others. What
+    the environment says (MALLOC_ARENA_MAX) stays."""
+    if "MALLOC_ARENA_MAX" not in os.environ:
+        with suppress(OSError, TypeError, AttributeError):  # another C library
+            ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
+
+
+def keep_only(rows: NDArray[Any], used: NDArray[np.bool_]) -> int:
+    """Give the system the pages of `rows` in which no row is `used`; what is asked of them afterwards is zero, until it is written again.
+
+    Args:
+        rows: (N, …) contiguous, in memory of this process alone (no window into a file, nothing shared).
+        used: (N,) bool.
+
+    Returns:
+        bytes that were given back; 0 where the system knows no such call.
+    """
+    if len(rows) != len(used) or not rows.flags.c_contiguous:
+        raise ValueError("rows that are given back must be contiguous, and one mark belongs to each")
+    page, width, start = mmap.PAGESIZE, rows.nbytes // max(1, len(rows)), rows.ctypes.data
+    first = -start % page  # of the pages that lie wholly within
+    count = (rows.nbytes - width - first) // page  # the last row stays, so that no slice below ends beyond the marks
+    if madvise is None or width == 0 or count <= 0:
+        return 0
+    edges = first + np.arange(count, dtype=np.int64) * page
+    slices = np.stack([edges // width, -(-(edges + page) // width)], 1)  # rows of which a part lies in a page
+    free = ~np.logical_or.reduceat(used, slices.reshape(-1))[::2]
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], free, [False]]).astype(np.int8))).reshape(-1, 2)
+    for begin, end in (start + first + ends * page).tolist():
+        madvise(begin, end - begin, mmap.MADV_DONTNEED)
+    return int(free.sum()) * page
+
+
+def _system_call() -> Any:
+    """`madvise` of the C library, where pages that are not needed read as zero afterwards (Linux)."""
+    if not sys.platform.startswith("linux"):
+        return None
+    with suppress(OSError, AttributeError):
+        call = ctypes.CDLL(None).madvise
+        call.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
+        return call
+    return None
+
+
+madvise = _system_call()
 
 
 def _kilobytes(path: Path, name: str) -> int:

@@ -15,6 +15,7 @@ from dataclasses import field as default
 import numpy as np
 import torch
 
+from toolkit import libraries
 from toolkit.camera import Array
 from toolkit.capture.types import Views
 from toolkit.config import Settings
@@ -31,7 +32,7 @@ from toolkit.training.depth import FINE, ROUGH
 from toolkit.training.engine import Engine, chosen_engine, fit_device, make_engine, warm_up
 from toolkit.training.finite import NotFiniteError
 from toolkit.training.guard import Guard, refuse_broken
-from toolkit.training.levels import all_places, finer, first_field, looked_at, pruned, visible
+from toolkit.training.levels import all_places, finer, first_field, let_go, looked_at, pruned, visible
 from toolkit.training.rays import PixelPool
 from toolkit.training.schedule import RUNGS, WIDER, Schedule, most_rays
 from toolkit.training.start import NEAR, THIN, colour_behind, finest_resolution, levels, possible, space_of
@@ -109,7 +110,7 @@ def fit_field(
     settings: Settings,
     progress: Progress = SILENT,
     host: Host | None = None,
-    start: Field | None = None,
+    start: Field | Callable[[], Field] | None = None,
     coarse: bool = False,
     rungs: tuple[float, ...] = RUNGS,
     ticks: Callable[[], float] = time.perf_counter,
@@ -122,7 +123,7 @@ def fit_field(
         settings: `field`, `fit`, `seed`; `fit.budget` bounds the seconds.
         progress: `stopping()` ends the fit early and keeps what there is.
         host: where rows live while they change (`GridHost` puts them into Open3D's hash map).
-        start: a field to go on from, at its finest level.
+        start: a field to go on from, at its finest level, or what gives it; then nobody need hold it while its levels are climbed.
         coarse: `start` is a first guess and no fitted field: climb from its level to the finest, as from the classical start.
         rungs: share of the budget at which each level ends at the latest, from the first one on.
         ticks: the clock, in seconds, that the budget is counted on; a benchmark beside other work takes `time.process_time`.
@@ -135,6 +136,7 @@ def fit_field(
     if len(train) == 0:
         raise InputError("no training view is left; lower --holdout or give more pictures")
     host = host or TorchHost(device)
+    start = start() if callable(start) else start
     generator = torch.Generator().manual_seed(settings.seed)
     torch.manual_seed(settings.seed)
     held_out = _Sample(views, np.flatnonzero(views.test), TIMELINE_PIXELS, device)
@@ -148,6 +150,7 @@ def fit_field(
         raise InputError("every pixel of the training pictures is masked away; look at the capture's masks (black is left out)")
     budget = settings.fit.budget or DEFAULT_BUDGET
     warm_up(settings, progress)
+    libraries.let_go()  # what was read to load kernels
     clock = Clock(ticks)
     if start is None:
         current, ladder = _first(views, train, scene, settings, device, host, generator)
@@ -157,6 +160,7 @@ def fit_field(
         current, ladder = finer(start, keep, start.resolution, host), [start.resolution]
         if coarse:
             ladder += [resolution for resolution in _ladder(views, train, scene, settings)[1] if resolution > start.resolution]
+    start = None  # its rows are the host's now
     engine = make_engine(settings, current, pool)
     limit_rays = most_rays(len(pool), bool(aside.any()), settings.fit.passes)
     slow_within = settings.fit.slow_within * scene.median_depth
@@ -185,6 +189,8 @@ def fit_field(
                 engine.renew_rows(current)
         elif plan.wants_pruning(done):
             current = pruned(current, visible(current, engine.seen, engine.visits, settings.fit.prune_weight))
+            let_go(current)
+            give_back()
             engine.go_on_with(current)
         if plan.decided(done):
             pool.limit = len(pool)
@@ -214,8 +220,10 @@ def fit_field(
     _measure(result, held_out, engine, result.seconds)
     current = engine.sync()
     engine.let_go()
+    del engine, pool
+    give_back()
     packed = current.packed()
-    del engine, current  # their rows are the host's
+    del current  # its rows are the host's
     host.close()
     give_back()
     result.field = replace(packed(), sky=sky_behind(views))

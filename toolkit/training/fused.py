@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from toolkit import memory
 from toolkit.networks.decoder import Deferred
 from toolkit.networks.encoding import DIRECTION
 from toolkit.render import kernels as K
@@ -30,6 +31,11 @@ from toolkit.training.view import blind
 Array = np.ndarray[Any, Any]
 BETAS, EPSILON = (0.9, 0.99), 1e-10  # of the decoder; rows have no first moment
 _CONSTANTS = (np.float32(BETAS[0]), np.float32(BETAS[1]), np.float32(EPSILON))
+
+
+def _parts(count: int, size: int = 2**16) -> list[slice]:
+    """Slices of so many rows, in turn: what is computed of one at a time takes no memory to speak of."""
+    return [slice(begin, begin + size) for begin in range(0, count, size)]
 
 
 class FusedOptimiser:
@@ -63,8 +69,8 @@ class FusedOptimiser:
         # Sized for the worst case; the system gives memory only to the part that is written.
         self.records = K.aligned((rows * self.threads, moves.FEATURE + channels), np.uint16, zeroed=True)
         self.given, self.used = [0] * self.threads, [0] * self.threads
-        self.touched = np.empty((self.threads, rows), np.int32)
-        self.density_sums = np.empty((self.threads, rows), np.float32)
+        self.touched = memory.unwritten((self.threads, rows), np.int32)
+        self.density_sums = memory.unwritten((self.threads, rows), np.float32)
         self.feature_sums = K.aligned((self.threads, rows, channels), np.float32)
         self.marks = np.zeros((self.threads, len(field.occupied)), np.uint16)
         self.go_on_with(field)
@@ -87,12 +93,18 @@ class FusedOptimiser:
     @property
     def seen(self) -> torch.Tensor:
         """(M · 512,) largest weight that each voxel was seen with."""
-        return torch.from_numpy((self.marks.max(0) >> 4).astype(np.float32) / 4095)
+        out = np.empty(self.marks.shape[1], np.float32)
+        for part in _parts(len(out)):
+            np.divide(self.marks[:, part].max(0) >> 4, 4095, out=out[part])
+        return torch.from_numpy(out)
 
     @property
     def visits(self) -> torch.Tensor:
         """(M · 512,) how often samples fell into each voxel (saturating at 15 a thread)."""
-        return torch.from_numpy((self.marks & 15).sum(0, dtype=np.int32))
+        out = np.empty(self.marks.shape[1], np.int16)
+        for part in _parts(len(out)):
+            (self.marks[:, part] & 15).sum(0, dtype=np.int16, out=out[part])
+        return torch.from_numpy(out)
 
     @property
     def next_record(self) -> int:

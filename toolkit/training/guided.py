@@ -34,7 +34,7 @@ class Begin(TypedDict, total=False):
     """What a fit begins with besides its views; see `fit_field`."""
 
     host: Host | None
-    start: Field | None
+    start: Field | Callable[[], Field] | None
     coarse: bool
     rungs: tuple[float, ...]
 
@@ -110,8 +110,9 @@ def fit_guided(
     shown = known if left_out is None else left_out.without(known)
     if begin.get("start") is None and depth_start.starts_by_depth(shown, settings):
         first = depth_start.depth_start(shown, scene, settings, fit_device(settings))
-        begin["start"], begin["coarse"] = first, True
         begin["rungs"] = RUNGS if first.resolution == depth_start.RESOLUTION_KNOWN else PARTLY
+        begin["start"], begin["coarse"] = [first].pop, True  # once it is taken nobody here holds it
+        del first
     give_back()  # what pictures, costs and votes took
     spent = clock.seconds()
     rest = replace(settings, fit=replace(settings.fit, budget=max(budget - spent, 0.5 * budget)))

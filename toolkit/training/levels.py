@@ -92,9 +92,12 @@ def visible(field: Field, seen: Tensor, visits: Tensor, threshold: float) -> Ten
         visits: (M · 512,) samples since then.
     """
     strong = seen > threshold
+    del seen  # at the finest level each of these is a number a corner
     if not bool(strong.any()):
         return field.occupied
-    return (beside(field.topology, strong) | (visits < ENOUGH_VISITS)) & field.occupied
+    stays = visits < ENOUGH_VISITS
+    del visits
+    return stays.logical_or_(beside(field.topology, strong)).logical_and_(field.occupied)
 
 
 def looked_at(field: Field, seen: Tensor, visits: Tensor, threshold: float) -> Tensor:
@@ -115,6 +118,15 @@ def beside(topology: Topology, strong: Tensor) -> Tensor:
 def pruned(field: Field, keep: Tensor) -> Field:
     """The field with only the voxels `keep` (M · 512,) occupied; rows stay where they are, so optimiser state stays good."""
     return replace(field, occupied=field.occupied & keep)
+
+
+def let_go(field: Field) -> None:
+    """On the CPU, give back the memory of rows that no voxel uses any more after pruning. They read as zero, so what the field was before
+    is void; its rows must be in memory of this process alone."""
+    if field.device.type == "cpu":
+        from toolkit.volume import compiled
+
+        compiled.let_go(compiled.corner_nodes(field.topology, field.occupied), field.density_rows, field.feature_rows)
 
 
 def finer(field: Field, keep: Tensor, resolution: int, host: Host) -> Field:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numba import njit
 
+from toolkit.memory import keep_only
 from toolkit.volume.host import Host, Hosted
 from toolkit.volume.topology import Topology
 
@@ -117,13 +118,14 @@ def _resample(
     ox: Any,
     oy: Any,
     oz: Any,
-    known: Any,
+    place: Any,
     density: Any,
     feature: Any,
     out_density: Any,
     out_feature: Any,
 ) -> None:
-    """Values at the corners `nodes` of the finer lattice from the known corners of the coarser, weights scaled to sum to 1."""
+    """Values at the corners `nodes` of the finer lattice from the known corners of the coarser, weights scaled to sum to 1. Row r of the
+    coarser has the value `place[r]`, or none (−1)."""
     channels = feature.shape[1]
     for row in range(len(nodes)):
         if not nodes[row]:
@@ -148,8 +150,8 @@ def _resample(
             block = table[bz, by, bx]
             if block < 0:
                 continue
-            source = block * 512 + ((w & 7) * 8 + (v & 7)) * 8 + (u & 7)
-            if not known[source]:
+            source = place[block * 512 + ((w & 7) * 8 + (v & 7)) * 8 + (u & 7)]
+            if source < 0:
                 continue
             total += weight
             value += weight * density[source]
@@ -172,7 +174,8 @@ def refined(
     """The same field on a lattice that is finer by `ratio`, in rows of the host.
 
     A finer voxel is occupied when its centre lies in an occupied one. Corners of occupied voxels get the trilinear values of the
-    coarser lattice's known corners; all others stay zero.
+    coarser lattice's known corners; all others stay zero, and take no memory where a page of rows has none but such. `density` and
+    `feature` may be the host's: they are looked at before it is asked for rows, which voids what it gave before.
 
     Args:
         density: (M · 512 + 1,), feature: (M · 512 + 1, C): value arrays with the zero row.
@@ -189,13 +192,29 @@ def refined(
     _mark_blocks(keys, occupied.numpy(), ratio, low, place)
     z, y, x = np.nonzero(place)
     new_keys = torch.from_numpy(np.stack([x, y, z], 1) + low)
+    known = corner_nodes(topology, occupied)
+    source = known.nonzero().squeeze(1)
+    index = torch.full((len(known),), -1, dtype=torch.int32)
+    index[source] = torch.arange(len(source), dtype=torch.int32)
+    values = (index.numpy(), density.detach()[source].numpy(), feature.detach()[source].numpy())
+    del source
     hosted = host.allocate(new_keys.int(), feature.shape[1], voxel_size)
     new = hosted.topology
     assert new.table is not None and topology.table is not None
     out = torch.zeros(new.zero_row, dtype=torch.bool)
     _mark_children(keys, occupied.numpy(), ratio, new.table.numpy(), *new.table_origin, out.numpy())
-    known = corner_nodes(topology, occupied)
     nodes = corner_nodes(new, out)
-    values = (known.numpy(), density.numpy(), feature.numpy(), hosted.density.numpy(), hosted.feature.numpy())
-    _resample(new.keys.numpy().astype(np.int64), nodes.numpy(), 1 / ratio, topology.table.numpy(), *topology.table_origin, *values)
+    into = (hosted.density.numpy(), hosted.feature.numpy())
+    let_go(nodes, hosted.density, hosted.feature)
+    _resample(new.keys.numpy().astype(np.int64), nodes.numpy(), 1 / ratio, topology.table.numpy(), *topology.table_origin, *values, *into)
     return hosted, out
+
+
+def let_go(nodes: Tensor, density: Tensor, feature: Tensor) -> None:
+    """Give back the memory of rows that no voxel uses, page by page: of the corners of a block along a surface that is a third and more.
+
+    Args:
+        nodes: (M · 512,) bool, corners that are used. density: (M · 512 + 1,), feature: (M · 512 + 1, C): in memory of this process alone.
+    """
+    for rows in (density, feature):
+        keep_only(rows.detach().numpy()[: len(nodes)], nodes.numpy())

@@ -21,6 +21,7 @@ from toolkit.errors import InputError
 from toolkit.volume.topology import BLOCK, VOXELS, Topology
 
 DEFAULT_ATTRIBUTES = {"feature": 16, "density": 1, "occupied": 1}
+LOOKED_AT = 64  # blocks at once, when memory is asked whether it is clean: each value is a byte for a moment
 GROWTH = 1.5  # a table that must grow gets at least this much more room
 
 
@@ -141,7 +142,7 @@ class BlockGrid:
             rows = self.rows(name).detach().view(-1, VOXELS * channels)
             dirty = fresh
             if 2 * len(fresh) > self.capacity:  # memory that is new is zero, and takes nothing as long as it is only looked at
-                dirty = fresh[rows.any(1)[fresh]]
+                dirty = fresh[torch.cat([part.any(1) for part in rows.split(LOOKED_AT)])[fresh]]
             rows.index_fill_(0, dirty, 0.0)
         return self.find(keys)
 

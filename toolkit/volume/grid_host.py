@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import open3d as o3d
 import torch
 
+from toolkit.memory import keep_only
 from toolkit.volume.grid import BlockGrid
 from toolkit.volume.host import Host, Hosted, TorchHost
 from toolkit.volume.rows import zero_rows
@@ -28,12 +30,11 @@ class GridHost:
         self.grid: BlockGrid | None = None
 
     def allocate(self, keys: Tensor, channels: int, voxel_size: float) -> Hosted:
-        previous, blocks = self.grid, len(keys)
+        blocks = len(keys)
+        self.close()
         # One spare block holds the zero row, so the table never grows and the views stay good. It gives `_aligned` room, too.
         self.grid = BlockGrid(voxel_size, {"feature": channels, "density": 1}, capacity=blocks + 1, device=self.device)
         slots = self.grid.activate(keys)
-        if previous is not None:
-            previous.close()
         if int(slots.max()) != blocks - 1:  # a fresh table hands out its first slots; otherwise its order is not ours to use
             topology = self.grid.topology()
             size = topology.zero_row + 1
@@ -44,9 +45,13 @@ class GridHost:
         return Hosted(Topology(ordered), density[:, 0], feature)
 
     def close(self) -> None:
-        if self.grid is not None:
-            self.grid.close()
-            self.grid = None
+        if self.grid is None:
+            return
+        for name in self.grid.attributes if self.device.type == "cpu" else ():
+            rows = self.grid.rows(name).numpy()
+            keep_only(rows, np.zeros(len(rows), np.bool_))  # at once, though somebody may still hold the void rows: they read as zero
+        self.grid.close()
+        self.grid = None
 
 
 def _aligned(buffer: Tensor, rows: int) -> Tensor:

@@ -31,6 +31,7 @@ METADATA_KEY = "fieldfuse.field"
 MAX_METADATA_BYTES = 16 * 2**20
 MAX_CHANNELS = 1024
 KEY_LIMIT = 2**20  # block keys lie in [−KEY_LIMIT, KEY_LIMIT)
+AT_ONCE = 2**16  # values that are looked at, or brought into their rows, at a time: so copies stay small
 _BITS = VOXELS // 8
 _DTYPES = {
     "keys": (torch.int32,),
@@ -49,7 +50,7 @@ class FieldFile:
         keys: (M, 3) int32 block keys, none twice.
         occupied: (M, 512) bool, voxels that are sampled, z-major inside the block.
         node_index: (R,) int32 ascending rows (slot · 512 + local) of the stored lattice corners.
-        features: (R, C) float32.
+        features: (R, C) float32, or float16 as a file may hold them.
         density: (R,) float32 raw density.
         decoder: name → float32 tensor.
         config: how the field is to be read (plain JSON).
@@ -74,15 +75,30 @@ class FieldFile:
     version: int = VERSION
 
 
-def compact(rows: Tensor, node_index: Tensor) -> Tensor:
-    """(M · 512 [+ 1], …) block rows → (R, …) values of the stored corners."""
-    return rows.index_select(0, node_index)
+def compact(rows: Tensor, node_index: Tensor, precision: torch.dtype = torch.float32) -> Tensor:
+    """(M · 512 [+ 1], …) float32 block rows → (R, …) values of the stored corners, in `precision` where all of them fit into it."""
+    if precision == torch.float32:
+        return rows.detach().index_select(0, node_index)
+    out = torch.empty((len(node_index), *rows.shape[1:]), dtype=precision, device=rows.device)
+    for part, index in zip(out.split(AT_ONCE), node_index.split(AT_ONCE), strict=True):
+        values = rows.detach().index_select(0, index)
+        if largest(values) > torch.finfo(precision).max:  # they would become infinite
+            return compact(rows, node_index)
+        part.copy_(values)
+    return out
+
+
+def largest(values: Tensor) -> float:
+    """Largest magnitude, without a copy of the values; 0 of none."""
+    return max(map(abs, map(float, torch.aminmax(values.detach())))) if values.numel() else 0.0
 
 
 def expand(values: Tensor, node_index: Tensor, blocks: int) -> Tensor:
-    """(R, …) stored values → (blocks · 512 + 1, …) block rows; what is not stored, and the zero row at the end, is zero."""
-    rows = zero_rows((blocks * VOXELS + 1, *values.shape[1:]), values.device, values.dtype)
-    return rows.index_copy_(0, node_index.long(), values)
+    """(R, …) stored values → (blocks · 512 + 1, …) float32 block rows; what is not stored, and the zero row at the end, is zero."""
+    rows = zero_rows((blocks * VOXELS + 1, *values.shape[1:]), values.device)
+    for part, index in zip(values.split(AT_ONCE), node_index.split(AT_ONCE), strict=True):
+        rows.index_copy_(0, index.long(), part.float())
+    return rows
 
 
 def write_field(path: Path | str, data: FieldFile, precision: str = "float32") -> None:
@@ -95,7 +111,7 @@ def write_field(path: Path | str, data: FieldFile, precision: str = "float32") -
         raise ValueError(f"features are stored as float16 or float32, not {precision!r}")
     path = Path(path)
     kind = getattr(torch, precision)
-    if data.features.numel() and float(data.features.detach().abs().max()) > torch.finfo(kind).max:
+    if largest(data.features) > torch.finfo(kind).max:
         kind = torch.float32  # beyond float16's range they would become infinite, and a finished fit could not be kept
     features = data.features.detach().to("cpu", kind).contiguous()
     tensors = {name: getattr(data, name).detach().cpu().contiguous() for name in ("keys", "node_index", "density")}
@@ -192,9 +208,9 @@ def _checked(tensors: dict[str, Tensor], text: str) -> FieldFile:
     for name, tensor in {"features": features, "density": density, **decoder}.items():
         if name in decoder and tensor.dtype != torch.float32:
             raise _Unusable(f"its decoder tensor {name[:40]!r} has the type {tensor.dtype}")
-        if not bool(torch.isfinite(tensor).all()):
+        if not all(bool(torch.isfinite(part).all()) for part in tensor.reshape(-1).split(AT_ONCE)):
             raise _Unusable(f"its tensor {name[:40]!r} holds values that are not finite")
-    return FieldFile(keys, unpack_bits(packed), nodes, features.float(), density, decoder, **information)
+    return FieldFile(keys, unpack_bits(packed), nodes, features, density, decoder, **information)
 
 
 def _check_keys(keys: Tensor) -> None:
