@@ -7,7 +7,6 @@ numba and Open3D they are 0.15 GB of what counts as this process's memory, and 0
 from __future__ import annotations
 
 import mmap
-import os
 import struct
 import sys
 from contextlib import suppress
@@ -61,7 +60,7 @@ def _loaded() -> dict[Path, list[tuple[int, int]]]:
                 found[path].append((low, high))
             elif int(offset, 16) == 0:
                 with suppress(OSError):
-                    if os.stat(path).st_ino == int(node):
+                    if path.stat().st_ino == int(node):
                         found[path] = [(low, high)]
     return found
 

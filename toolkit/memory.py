@@ -21,6 +21,11 @@ GIB = 2**30
 SPARE = 128 * 2**20  # left to everything else
 _MEMINFO, _STATUS = Path("/proc/meminfo"), Path("/proc/self/status")
 _CGROUP = Path("/sys/fs/cgroup")
+# Of control groups, second and first version: what is allowed, what is in use, and which part of it are files nobody looked at lately.
+_GROUPS = (
+    ("memory.max", "memory.current", "inactive_file"),
+    ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "total_inactive_file"),
+)
 _ARENA_MAX = -8  # malloc.h's M_ARENA_MAX
 
 
@@ -29,8 +34,9 @@ def available() -> int | None:
     limits = []
     with suppress(OSError, KeyError, ValueError):
         limits.append(_kilobytes(_MEMINFO, "MemAvailable"))
-    with suppress(OSError, ValueError):  # "max" where there is no limit
-        limits.append(int((_CGROUP / "memory.max").read_text()) - int((_CGROUP / "memory.current").read_text()))
+    for allowed, used, idle in _GROUPS:
+        with suppress(OSError, ValueError):  # "max" where there is no limit
+            limits.append(int((_CGROUP / allowed).read_text()) - int((_CGROUP / used).read_text()) + _idle_files(_CGROUP / used, idle))
     with suppress(OSError, KeyError, ValueError):
         most = resource.getrlimit(resource.RLIMIT_AS)[0]
         if most != resource.RLIM_INFINITY:
@@ -139,6 +145,14 @@ def _system_call() -> Any:
 
 
 madvise = _system_call()
+
+
+def _idle_files(used: Path, name: str) -> int:
+    """Bytes of files that a control group holds and the system takes back when memory is asked for; 0 where it does not say."""
+    with suppress(OSError, ValueError):
+        entries = dict(line.split(" ", 1) for line in (used.parent / "memory.stat").read_text(encoding="ascii").splitlines())
+        return int(entries.get(name, 0))
+    return 0
 
 
 def _kilobytes(path: Path, name: str) -> int:

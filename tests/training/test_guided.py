@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
@@ -197,6 +198,24 @@ def test_a_fit_begins_with_what_is_known_of_depth_within_its_budget(monkeypatch:
     fit_guided(measured, SCENE, wanted("budget=1", "fit.depth=0"), ticks=now)
     fit_guided(views(), SCENE, wanted("budget=1"), ticks=now)  # six pictures were matched: too few
     assert len(begun) == 1
+
+
+def test_nobody_holds_the_guess_while_its_levels_are_climbed(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, guesses, alive = depth_start.depth_start, [], []
+
+    def watched(*given: object, **options: object) -> Field:
+        guess = whole(*given, **options)  # type: ignore[arg-type]
+        guesses.append(weakref.ref(guess.feature_rows))
+        return guess
+
+    class Looking(Progress):
+        def update(self, done: float, total: float, note: str = "") -> None:
+            if "³" in note:
+                alive.append(guesses[0]() is not None)
+
+    monkeypatch.setattr(depth_start, "depth_start", watched)
+    fit_guided(replace(views(), depths=corner()[1]), SCENE, wanted("budget=1", "fit.moving=off"), Looking(), ticks=steady())
+    assert alive and not any(alive)
 
 
 def test_a_guess_leaves_the_coarsest_lattice_sooner() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import textwrap
+from mmap import PAGESIZE
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from toolkit.errors import InputError
+from toolkit.memory import madvise
+from toolkit.volume.compiled import corner_nodes, let_go, refined
 from toolkit.volume.grid import BlockGrid
 from toolkit.volume.grid_host import GridHost, host_for
 from toolkit.volume.host import TorchHost
@@ -300,6 +303,50 @@ def test_a_fits_rows_are_open3ds_memory_from_a_cache_line_on(channels: int) -> N
             buffer = host.grid.rows(name)
             assert int((buffer == value).sum()) == (len(keys) * 512 + 1) * buffer.shape[1]
     host.close()
+
+
+@pytest.mark.skipif(madvise is None, reason="this system takes no pages back early")
+def test_a_coarser_levels_rows_take_no_memory_while_the_finer_ones_are_made() -> None:
+    keys = torch.cartesian_prod(*[torch.arange(8)] * 3).int()
+    host = GridHost()
+    hosted = host.allocate(keys, 16, 0.1)
+    hosted.feature[:] = 1
+    assert in_memory(hosted.feature.numpy()) > 0.99
+    host.allocate(keys[:4], 16, 0.05)
+    assert in_memory(hosted.feature.numpy()) < 0.01, "though somebody still holds them"
+    assert not hosted.feature[512:-512].any()  # void, and nothing that was freed
+    host.close()
+
+
+@pytest.mark.skipif(madvise is None, reason="this system takes no pages back early")
+def test_rows_beside_no_voxel_take_no_memory() -> None:
+    """A wall through a cube of blocks, made twice as fine: of each block that it crosses a few layers of corners are used."""
+    keys = torch.cartesian_prod(*[torch.arange(8)] * 3).int()
+    occupied = torch.zeros(len(keys), 8, 8, 8, dtype=torch.bool)
+    occupied[(keys < 7).all(1), 3] = True  # z, y, x; blocks beyond hold corners
+    start = Topology(keys)
+    density, feature = torch.ones(start.zero_row + 1), torch.ones(start.zero_row + 1, 16)
+    host = GridHost()
+    hosted, finer = refined(start, occupied.view(-1), density, feature, 2.0, host, 0.05)
+    nodes = corner_nodes(hosted.topology, finer)
+    assert int(nodes.sum()) < 0.5 * len(nodes)
+    assert in_memory(hosted.feature.numpy()) == pytest.approx(float(nodes.float().mean()), abs=0.05)
+    assert (hosted.feature[:-1][nodes] == 1).all()
+    finer[: len(finer) // 2] = False
+    let_go(corner_nodes(hosted.topology, finer), hosted.density, hosted.feature)
+    nodes = corner_nodes(hosted.topology, finer)
+    assert in_memory(hosted.feature.numpy()) == pytest.approx(float(nodes.float().mean()), abs=0.05)
+    assert (hosted.feature[:-1][nodes] == 1).all() and not hosted.feature[:-1][~nodes].any()
+    host.close()
+
+
+def in_memory(rows: np.ndarray) -> float:
+    """Share of the pages of `rows` that the system has in memory; to read what was never written counts as well."""
+    first, last = rows.ctypes.data // PAGESIZE, -(-(rows.ctypes.data + rows.nbytes) // PAGESIZE)
+    with Path("/proc/self/pagemap").open("rb", buffering=0) as file:
+        file.seek(8 * first)
+        entries = np.frombuffer(file.read(8 * (last - first)), np.uint64)
+    return float((entries >> np.uint64(63)).mean())
 
 
 def test_rows_live_where_open3d_can_have_them() -> None:

@@ -80,7 +80,9 @@ def test_half_precision_is_half_the_size_and_rounds_only_features(tmp_path: Path
     write_field(tmp_path / "full", data)
     write_field(tmp_path / "half", data, precision="float16")
     back = read_field(tmp_path / "half")
-    assert torch.equal(back.features, data.features.half().float()) and back.features.dtype == torch.float32
+    assert torch.equal(back.features, data.features.half()) and back.features.dtype == torch.float16
+    rows = expand(back.features, back.node_index, len(back.keys))
+    assert torch.equal(compact(rows, back.node_index), data.features.half().float()) and rows.dtype == torch.float32
     assert_same(replace(back, features=data.features), data)
     saved = (tmp_path / "full").stat().st_size - (tmp_path / "half").stat().st_size
     assert saved == pytest.approx(data.features.numel() * 2, abs=64)
@@ -96,6 +98,20 @@ def test_compact_and_expand_are_inverse_on_stored_corners() -> None:
     unstored[data.node_index.long()] = False
     assert bool(unstored[-1]) and float(rows[unstored].abs().sum()) == 0
     assert expand(data.density, data.node_index, blocks).shape == (blocks * VOXELS + 1,)
+    half = compact(rows, data.node_index, torch.float16)
+    assert half.dtype == torch.float16 and torch.equal(half, data.features.half())
+    rows[data.node_index[-1].long(), 0] = -1e5  # does not fit
+    assert torch.equal(compact(rows, data.node_index, torch.float16), rows[data.node_index.long()])
+
+
+def test_many_values_go_to_and_fro_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "AT_ONCE", 7)
+    data = make_field(6)
+    rows = expand(data.features.half(), data.node_index, len(data.keys))
+    assert torch.equal(compact(rows, data.node_index, torch.float16), data.features.half())
+    data.features[-1, 0] = torch.nan
+    with pytest.raises(OutputError, match="not finite"):
+        write_field(Path("never"), data)
 
 
 # ------------------------------------------------------------------------------------------------ tampering
