@@ -321,6 +321,10 @@ def test_a_coarser_levels_rows_take_no_memory_while_the_finer_ones_are_made() ->
 @pytest.mark.skipif(madvise is None, reason="this system takes no pages back early")
 def test_rows_beside_no_voxel_take_no_memory() -> None:
     """A wall through a cube of blocks, made twice as fine: of each block that it crosses a few layers of corners are used."""
+
+    def used(nodes: torch.Tensor) -> float:
+        return float(nodes.float().mean())
+
     keys = torch.cartesian_prod(*[torch.arange(8)] * 3).int()
     occupied = torch.zeros(len(keys), 8, 8, 8, dtype=torch.bool)
     occupied[(keys < 7).all(1), 3] = True  # z, y, x; blocks beyond hold corners
@@ -330,12 +334,12 @@ def test_rows_beside_no_voxel_take_no_memory() -> None:
     hosted, finer = refined(start, occupied.view(-1), density, feature, 2.0, host, 0.05)
     nodes = corner_nodes(hosted.topology, finer)
     assert int(nodes.sum()) < 0.5 * len(nodes)
-    assert in_memory(hosted.feature.numpy()) == pytest.approx(float(nodes.float().mean()), abs=0.05)
+    assert used(nodes) <= in_memory(hosted.feature.numpy()) < 1.6 * used(nodes)  # a layer of a block may lie in two pages
     assert (hosted.feature[:-1][nodes] == 1).all()
     finer[: len(finer) // 2] = False
     let_go(corner_nodes(hosted.topology, finer), hosted.density, hosted.feature)
     nodes = corner_nodes(hosted.topology, finer)
-    assert in_memory(hosted.feature.numpy()) == pytest.approx(float(nodes.float().mean()), abs=0.05)
+    assert used(nodes) <= in_memory(hosted.feature.numpy()) < 1.6 * used(nodes)  # a layer of a block may lie in two pages
     assert (hosted.feature[:-1][nodes] == 1).all() and not hosted.feature[:-1][~nodes].any()
     host.close()
 
