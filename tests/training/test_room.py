@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from tests.pages import in_memory
 from tests.training.test_fit import scene, sphere_views, ticking, wanted
 from toolkit import memory
 from toolkit.errors import InputError
@@ -15,6 +16,8 @@ from toolkit.training.levels import finer
 from toolkit.training.rays import PixelPool
 from toolkit.training.schedule import Schedule
 from toolkit.training.step import Rates
+from toolkit.volume.compiled import finer_blocks
+from toolkit.volume.grid_host import GridHost
 from toolkit.volume.host import TorchHost
 
 
@@ -32,19 +35,51 @@ def test_rows_of_a_finer_level_are_about_what_is_foreseen(ratio: float, monkeypa
         assert 0.6 < room.level_rows(keep, ratio) / made < 2.5, share
 
 
-@pytest.mark.parametrize("decoder", ["deferred", "per_sample"])
-def test_bytes_of_a_row_are_those_of_the_compiled_engine(decoder: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_of_a_finer_level_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     ticking(monkeypatch, 0.2)
-    settings = wanted(f"decoder={decoder}", "engine=numba", "budget=2", "field.resolution=32", "threads=1")
+    field = fit_field(sphere_views(), scene(), wanted("engine=numba", "budget=2", "field.resolution=32")).field
+    for ratio in (1.0, 1.5, 2.0, 3.75):
+        keep = field.occupied & (torch.rand(len(field.occupied), generator=torch.Generator().manual_seed(1)) < 0.3)
+        assert len(finer_blocks(field.topology, keep, ratio)) == finer(field, keep, int(ratio * field.resolution), TorchHost()).blocks
+
+
+@pytest.mark.skipif(memory.madvise is None, reason="this system takes no pages back early")
+@pytest.mark.parametrize("decoder", ["deferred", "per_sample"])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_what_the_compiled_engine_needs_is_what_it_takes(decoder: str, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the rows' arrays, as the system holds them page by page after some steps on the finer lattice."""
+    ticking(monkeypatch, 0.05)
+    settings = wanted(f"decoder={decoder}", "engine=numba", "budget=3", "field.resolution=64", f"threads={threads}")
     field = fit_field(sphere_views(), scene(), settings).field
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    engine = make_engine(settings, field, PixelPool(sphere_views()))
+    torch.set_num_threads(threads)
+    host = GridHost()
+    grown = finer(field, torch.ones_like(field.occupied), 128, host)
+    engine = make_engine(settings, grown, PixelPool(sphere_views()))
+    for _ in range(40):
+        engine.step(512, Rates(0.1, 0.1, 1e-3, 0.01))
     torch.set_num_threads(before)
-    engine.step(64, Rates(0.1, 0.1, 1e-3, 0.01))
-    names = ("index", "records", "touched", "density_sums", "feature_sums", "marks")
-    held = sum(getattr(engine, name).nbytes for name in names) + field.density_rows.nbytes + field.feature_rows.nbytes
-    assert room.row_bytes(settings, field.device) == pytest.approx(held / len(field.density_rows), rel=0.05)
+    arrays = [getattr(engine, name) for name in ("index", "records", "touched", "density_sums", "feature_sums", "marks")]
+    arrays += [grown.density_rows.numpy(), grown.feature_rows.numpy()]
+    held = sum(in_memory(rows) * rows.nbytes for rows in arrays)
+    foreseen = room.compiled_bytes(field, torch.ones_like(field.occupied), 128, settings, replaced=False)
+    assert 0.8 * held < foreseen < 2 * held + threads * room.SUMS  # this ball has more of its rows touched than captures have
+    assert room.compiled_bytes(field, torch.ones_like(field.occupied), 128, settings) < foreseen
+    host.close()
+
+
+def test_a_fit_climbs_where_there_is_little_memory_but_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is sized for the worst case and never written is not asked for."""
+    settings = wanted("engine=numba", "budget=3", "field.resolution=64", "threads=1")
+    monkeypatch.setattr(Schedule, "worth", lambda self, voxels, rays_left: True)
+    reached = []
+    for free in (2**21, 2**26):
+        ticking(monkeypatch, 0.02)
+        allow(monkeypatch, memory.SPARE + free)
+        result = fit_field(sphere_views(), scene(), settings, host=GridHost())
+        reached.append(result.field.resolution)
+        assert len(result.notes) == (result.field.resolution < 64)
+    assert reached == [32, 64]
 
 
 def test_a_level_that_does_not_fit_is_not_made_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,5 +105,7 @@ def test_what_cannot_begin_is_refused_with_numbers(monkeypatch: pytest.MonkeyPat
     allow(monkeypatch, memory.SPARE + 2**20)
     with pytest.raises(InputError, match=r"going on from a field of [\d,]+ blocks needs about .* is free; fit it anew"):
         fit_field(sphere_views(), scene(), settings, start=field)
+    with pytest.raises(InputError, match=r"going on from a field of [\d,]+ blocks needs about"):
+        fit_field(sphere_views(), scene(), wanted("engine=numba", "budget=2", "field.resolution=32"), start=field)
     allow(monkeypatch, None)
     assert not fit_field(sphere_views(), scene(), settings, start=field).notes

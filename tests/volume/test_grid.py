@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import textwrap
-from mmap import PAGESIZE
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.pages import in_memory
 from toolkit.errors import InputError
 from toolkit.memory import madvise
 from toolkit.volume.compiled import corner_nodes, let_go, refined
@@ -342,15 +342,6 @@ def test_rows_beside_no_voxel_take_no_memory() -> None:
     assert used(nodes) <= in_memory(hosted.feature.numpy()) < 1.6 * used(nodes)  # a layer of a block may lie in two pages
     assert (hosted.feature[:-1][nodes] == 1).all() and not hosted.feature[:-1][~nodes].any()
     host.close()
-
-
-def in_memory(rows: np.ndarray) -> float:
-    """Share of the pages of `rows` that the system has in memory; to read what was never written counts as well."""
-    first, last = rows.ctypes.data // PAGESIZE, -(-(rows.ctypes.data + rows.nbytes) // PAGESIZE)
-    with Path("/proc/self/pagemap").open("rb", buffering=0) as file:
-        file.seek(8 * first)
-        entries = np.frombuffer(file.read(8 * (last - first)), np.uint64)
-    return float((entries >> np.uint64(63)).mean())
 
 
 def test_rows_live_where_open3d_can_have_them() -> None:

@@ -15,19 +15,18 @@ from toolkit.volume.topology import BLOCK, VOXELS
 
 POOL_BYTES = 15  # a pixel: colour, distance, and where some are left out its place, that twice while they are put together
 HALF = BLOCK // 2
+WRITTEN, TOUCHED = 0.85, 0.5  # shares of a level's rows: that lie in pages with corners of voxels, that a gradient comes to
+SUMS = 2**23  # bytes a thread, for the gradients of a batch
 BESIDE = 1.5  # blocks at a finer level, by those that hold voxels: some hold nothing but corners of their neighbours' voxels
 
 
 def row_bytes(settings: Settings, device: torch.device) -> int:
-    """Memory of one lattice corner at its most: its values, the optimiser's state, and what threads gather for it."""
-    channels, threads = settings.field.channels, settings.threads or torch.get_num_threads()
+    """Memory of one lattice corner at its most, with engines that hold all of it: its values, gradients and the optimiser's state."""
+    channels = settings.field.channels
     values = 4 * (1 + channels)
-    chosen = chosen_engine(settings, device)
-    if chosen == "torch":
+    if chosen_engine(settings, device) == "torch":
         return values + 4 * (channels + 3) + 8
-    if chosen == "triton":
-        return 3 * values + 4 + 1  # gradients and moments; steps and a mark
-    return values + 4 + threads * (4 + 10 + 4 * channels + 2 * (2 + channels))  # moments have two bytes
+    return 3 * values + 4 + 1  # gradients and moments; steps and a mark
 
 
 def require_start(views: Views, start: Field | None, settings: Settings, device: torch.device) -> None:
@@ -39,12 +38,31 @@ def require_start(views: Views, start: Field | None, settings: Settings, device:
     pixels = sum(image.shape[0] * image.shape[1] for image in views.images)
     memory.require(POOL_BYTES * pixels, f"a fit to {pixels / 1e6:.0f} million pixels", "lower --image-size, or give fewer pictures")
     if start is not None:
-        needed = 2 * len(start.density_rows) * row_bytes(settings, device)
+        if chosen_engine(settings, device) == "numba":
+            needed = compiled_bytes(start, torch.ones_like(start.occupied), start.resolution, settings, replaced=False)
+        else:
+            needed = 2 * len(start.density_rows) * row_bytes(settings, device)
         where = f"going on from a field of {start.blocks:,} blocks"
         there = _there(device)
         if there is not None and needed > there:
             sizes = f"about {needed / memory.GIB:.1f} GB of memory and {there / memory.GIB:.1f} GB is free"
             raise InputError(f"{where} needs {sizes}; fit it anew")
+
+
+def compiled_bytes(field: Field, keep: torch.Tensor, finer: int, settings: Settings, replaced: bool = True) -> int:
+    """Memory that the compiled engine takes beyond what there is when the voxels `keep` (M · 512,) go on in a lattice of `finer` voxels a
+    side: while rows are made, or while they are fitted, whichever is more, less the memory of the field's rows if they are `replaced`.
+    Blocks are counted; what of a level's rows is written to and touched is what it was on captures."""
+    from toolkit.volume.compiled import corner_nodes, finer_blocks
+
+    channels, threads = settings.field.channels, settings.threads or torch.get_num_threads()
+    values, kept = 4 * (1 + channels), field.occupied & keep
+    rows = VOXELS * len(finer_blocks(field.topology, kept, finer / field.resolution))
+    packed = int(corner_nodes(field.topology, kept).sum()) * values
+    layers = corner_nodes(field.topology, field.occupied).view(-1, BLOCK * BLOCK).any(1)  # a layer of a block is a page
+    freed = int(layers.sum()) * BLOCK * BLOCK * values if replaced else 0
+    fitted = rows * (WRITTEN * values + 4 + threads * (4 + 2) + TOUCHED * 2 * (2 + channels)) + threads * SUMS
+    return max(0, max(rows * (values + 3) + packed, int(fitted)) - freed)
 
 
 def level_rows(keep: torch.Tensor, ratio: float) -> int:
@@ -56,7 +74,10 @@ def level_rows(keep: torch.Tensor, ratio: float) -> int:
 def fits(field: Field, keep: torch.Tensor, plan: Schedule, settings: Settings, notes: list[str]) -> bool:
     """Whether there is room for the next level; when not, the level at hand is the last, and `notes` says so with the numbers."""
     finer = plan.ladder[plan.level + 1]
-    needed = level_rows(keep, finer / field.resolution) * row_bytes(settings, field.device)
+    if chosen_engine(settings, field.device) == "numba":
+        needed = compiled_bytes(field, keep, finer, settings)
+    else:
+        needed = level_rows(keep, finer / field.resolution) * row_bytes(settings, field.device)
     there = _there(field.device)
     if there is None or needed <= there:
         return True

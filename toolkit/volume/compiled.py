@@ -168,6 +168,18 @@ def _resample(
                 out_feature[row, c] = 0
 
 
+def finer_blocks(topology: Topology, occupied: Tensor, ratio: float) -> Tensor:
+    """(N, 3) int32 keys of the blocks that a lattice finer by `ratio` needs: they hold children of occupied voxels, or corners of them."""
+    keys = topology.keys.numpy().astype(np.int64)
+    low = np.floor(keys.min(0) * ratio).astype(np.int64) - 1 if len(keys) else np.zeros(3, np.int64)
+    high = np.ceil((keys.max(0) + 1) * ratio).astype(np.int64) + 1 if len(keys) else np.zeros(3, np.int64)
+    size = high - low + 1
+    place = np.zeros((size[2], size[1], size[0]), np.bool_)
+    _mark_blocks(keys, occupied.numpy(), ratio, low, place)
+    z, y, x = np.nonzero(place)
+    return torch.from_numpy(np.stack([x, y, z], 1) + low).int()
+
+
 def refined(
     topology: Topology, occupied: Tensor, density: Tensor, feature: Tensor, ratio: float, host: Host, voxel_size: float
 ) -> tuple[Hosted, Tensor]:
@@ -185,20 +197,14 @@ def refined(
         the new rows, and (M' · 512,) bool.
     """
     keys = topology.keys.numpy().astype(np.int64)
-    low = np.floor(keys.min(0) * ratio).astype(np.int64) - 1 if len(keys) else np.zeros(3, np.int64)
-    high = np.ceil((keys.max(0) + 1) * ratio).astype(np.int64) + 1 if len(keys) else np.zeros(3, np.int64)
-    size = high - low + 1
-    place = np.zeros((size[2], size[1], size[0]), np.bool_)
-    _mark_blocks(keys, occupied.numpy(), ratio, low, place)
-    z, y, x = np.nonzero(place)
-    new_keys = torch.from_numpy(np.stack([x, y, z], 1) + low)
+    new_keys = finer_blocks(topology, occupied, ratio)
     known = corner_nodes(topology, occupied)
     source = known.nonzero().squeeze(1)
     index = torch.full((len(known),), -1, dtype=torch.int32)
     index[source] = torch.arange(len(source), dtype=torch.int32)
     values = (index.numpy(), density.detach()[source].numpy(), feature.detach()[source].numpy())
     del source
-    hosted = host.allocate(new_keys.int(), feature.shape[1], voxel_size)
+    hosted = host.allocate(new_keys, feature.shape[1], voxel_size)
     new = hosted.topology
     assert new.table is not None and topology.table is not None
     out = torch.zeros(new.zero_row, dtype=torch.bool)
