@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from types import TracebackType
+from typing import Any
 
 import psutil
 
@@ -12,13 +13,14 @@ CHILDREN_EVERY = 3  # samples between two looks at the children, which cost far 
 
 
 class PeakMemory:
-    """Context manager; afterwards `megabytes` is the largest resident memory seen, children included.
+    """Context manager; afterwards `megabytes` is the largest resident memory seen, children included, and `own` the largest without the
+    pages of files, those of libraries first of all.
 
-    Memory that is shared between parent and children counts once for each of them.
+    Memory that is shared between parent and children counts once for each of them in `megabytes`.
     """
 
     def __init__(self) -> None:
-        self.megabytes = 0.0
+        self.megabytes = self.own = 0.0
         self._stop = threading.Event()
         self._process = psutil.Process()
         self._thread = threading.Thread(target=self._watch, name="peak-memory", daemon=True)
@@ -40,10 +42,16 @@ class PeakMemory:
             self._sample(count % CHILDREN_EVERY == 0)
 
     def _sample(self, children: bool = True) -> None:
-        resident = self._process.memory_info().rss
+        seen = [self._process.memory_info()]
         for child in self._process.children(recursive=True) if children else ():
             try:
-                resident += child.memory_info().rss
+                seen.append(child.memory_info())
             except psutil.Error:  # it ended in between
                 continue
-        self.megabytes = max(self.megabytes, resident / 2**20)
+        self.megabytes = max(self.megabytes, sum(one.rss for one in seen) / 2**20)
+        self.own = max(self.own, sum(own_bytes(one) for one in seen) / 2**20)
+
+
+def own_bytes(found: Any) -> int:
+    """Resident bytes of a process, by psutil, that are pages of no file (and of nothing shared), where the system tells them apart."""
+    return int(found.rss - getattr(found, "shared", 0))

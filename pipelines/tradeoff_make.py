@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import psutil
 
-from pipelines.memory import PeakMemory
+from pipelines.memory import PeakMemory, own_bytes
 from pipelines.rendered import Picture, to_picture
 from toolkit.camera import Array, Intrinsics
 from toolkit.config import Settings, TsdfSettings
@@ -35,7 +35,7 @@ class Ground:
 
     Attributes:
         views: all views. chosen: those that this point may use, test views among them.
-        used: indices of its training views. resident: bytes of the process before the views were loaded.
+        used: indices of its training views. resident: bytes of the process, but for pages of files, before the views were loaded.
         test_depths: exact depth of the test views, where the capture brings it.
     """
 
@@ -65,7 +65,7 @@ def open_ground(folder: Path, settings: Settings, share: float) -> Ground:
     from toolkit.training.engine import warm_up
 
     warm_up(settings, SILENT)
-    resident = psutil.Process().memory_info().rss
+    resident = own_bytes(psutil.Process().memory_info())
     chosen_frames = folder / "frames" / "capture.json"
     capture = capture_from_dict(read_json(chosen_frames if chosen_frames.is_file() else folder / "capture.json"))
     poses = PoseResult.from_dict(read_json(folder / "poses.json"))
@@ -105,9 +105,8 @@ class Cost:
         self.stages[name], self._since = self.stages.get(name, 0.0) + now - self._since, now
 
     def facts(self) -> dict[str, Any]:
-        peak = self._memory.megabytes
-        own = max(0.0, peak - self.ground.resident / 2**20)
-        return {"stages": self.stages, "peak_memory_mb": round(peak, 1), "memory_mb": round(own, 1)}
+        own = max(0.0, self._memory.own - self.ground.resident / 2**20)
+        return {"stages": self.stages, "peak_memory_mb": round(self._memory.megabytes, 1), "memory_mb": round(own, 1)}
 
 
 def make_field(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dict[str, Any]]:
