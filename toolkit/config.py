@@ -100,6 +100,9 @@ class FitSettings:
     moving: str = "auto"
     patience: bool = False  # end before the budget when the validation views stop improving
     passes: float | None = 50.0  # over the pixels, where there are too few views to keep some aside for validation; None: the whole budget
+    # On coarse lattices colours of training pictures are means over a Gaussian of so many times a voxel of theirs (in pixels, where a voxel
+    # of the finest lattice is one): what voxels cannot show is not asked of them. With few views, and 0: colours as they are
+    soften: float = 0.25
     prune_weight: float = 0.05  # voxels whose largest seen weight stays below are removed
 
 

@@ -144,7 +144,8 @@ def fit_field(
     validation = _Sample(train, np.flatnonzero(aside), VALIDATION_PIXELS, device)
     room.require_start(train, start, settings, device)
     # Views that are kept aside come last, so that joining them is a matter of a limit.
-    pool = PixelPool(train.subset(np.argsort(aside, kind="stable")), device, depth=settings.fit.depth > 0)
+    ordered = train.subset(np.argsort(aside, kind="stable"))
+    pool = PixelPool(ordered, device, depth=settings.fit.depth > 0)
     pool.limit = int(pool.starts[np.count_nonzero(~aside)])
     if pool.limit == 0:
         raise InputError("every pixel of the training pictures is masked away; look at the capture's masks (black is left out)")
@@ -168,6 +169,7 @@ def fit_field(
     wider = WIDER if chosen_engine(settings, device) == "triton" else 1
     opaque, patient = views.background is None, settings.fit.patience
     plan = Schedule(ladder, budget, settings.fit, opaque, patient, limit_rays, slow_within, trust, rungs, wider)
+    softens, radius = len(train) >= LEAST_VIEWS, 0.0
     guard = Guard()
     result = FitResult(current, notes=guard.notes)
     marks = [budget * 0.02 * 50 ** (i / (TIMELINE_POINTS - 1)) for i in range(TIMELINE_POINTS - 1)]
@@ -192,6 +194,9 @@ def fit_field(
             let_go(current)
             give_back()
             engine.go_on_with(current)
+        if softens and plan.radius(done) != radius:
+            radius = plan.radius(done)
+            pool.soften(ordered, radius)
         if plan.decided(done):
             pool.limit = len(pool)
         elif plan.wants_look(done) and (psnr := validation.psnr(engine)) is not None:

@@ -6,6 +6,7 @@ import zlib
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
@@ -58,6 +59,16 @@ class PixelPool:
         self.limit = len(self.colour)  # batches are drawn from the pixels before this one
         self.pose = torch.from_numpy(views.world_from_camera.astype(np.float32)).to(device)
 
+    def soften(self, views: Views, radius: float) -> None:
+        """Set the colours to those of the `views` that the pool was made of, as means over a Gaussian of a deviation of `radius` pixels (0:
+        as they are). Pixels that do not take part go into no mean. The array stays the same: whoever holds it sees the new colours."""
+        for index, image in enumerate(views.images):
+            begin, end = int(self.starts[index]), int(self.starts[index + 1])
+            valid = views.valid[index] if views.valid else None
+            colour = softened(image, valid, radius).reshape(-1, 3)
+            places = self.places[begin:end].cpu().numpy() if len(self.places) else slice(None)
+            self.colour[begin:end] = torch.from_numpy(np.ascontiguousarray(colour[places])).to(self.colour.device)
+
     @staticmethod
     def _kept(views: Views, index: int) -> np.ndarray[Any, Any] | None:
         """(P,) int32 places of a view's pixels that take part, ascending; None: all."""
@@ -89,3 +100,15 @@ class PixelPool:
         directions = torch.nn.functional.normalize((pose[:, :3, :3] @ camera[:, :, None]).squeeze(2), dim=1)
         distance = self.distance[pick] if len(self.distance) else None
         return Batch(pose[:, :3, 3], directions, self.colour[pick].float() / 255, view, distance)
+
+
+def softened(image: np.ndarray[Any, Any], valid: np.ndarray[Any, Any] | None, radius: float) -> np.ndarray[Any, Any]:
+    """(H, W, 3) uint8 → the same, each pixel the mean over a Gaussian with a deviation of `radius` pixels; of `valid` (H, W) ones alone."""
+    if radius <= 0:
+        return image
+    if valid is None or valid.all():
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), radius))
+    known = valid.astype(np.float32)
+    weight = np.maximum(cv2.GaussianBlur(known, (0, 0), radius), 1e-6)
+    whole = cv2.GaussianBlur(image * known[:, :, None], (0, 0), radius) / weight[:, :, None]
+    return np.where(valid[:, :, None], np.clip(np.rint(whole), 0, 255), image).astype(np.uint8)

@@ -21,6 +21,8 @@ GUESSED = (0.01, 0.06, 0.25, 0.55, 0.9)  # … of one that begins with a guess, 
 LEVEL_STEPS = 100  # a level is not left, nor pruned, before so many: what has not had time to grow is not empty
 PRUNE_EVERY = 150  # steps
 LAST_PRUNE = 0.8  # of the budget; from here on the field is only polished, on all views
+LAST_SOFT = 0.6  # of the budget; from here on colours are as they are, whatever the level
+MOST_SOFT = 8.0  # pixels
 SLOWING = 1e7  # rays after which step sizes begin to fall
 LAST_RATE = 0.08  # of the step sizes, at the very end
 FIRST_BATCH = 256  # rays a step at the coarsest lattice, and as many times more as one is finer: early on the number of steps counts
@@ -86,6 +88,11 @@ class Schedule:
     @property
     def next_is_finest(self) -> bool:
         return self.level == len(self.ladder) - 2
+
+    def radius(self, done: float) -> float:
+        """Deviation in pixels of the means that colours are at this level: 0 at the finest, and late in a fit that does not reach it."""
+        sharp = self.finest or done > LAST_SOFT
+        return 0.0 if sharp else min(MOST_SOFT, self.settings.soften * self.ladder[-1] / self.resolution)
 
     @property
     def rays(self) -> int:
