@@ -23,6 +23,7 @@ from toolkit.errors import FieldfuseError, InputError
 from toolkit.files import fingerprint, read_json, remove, write_json
 from toolkit.memory import give_back
 
+LONG = 0.5  # seconds of a stage after which pages of libraries are given back; shorter ones load little
 T = TypeVar("T")
 
 
@@ -147,7 +148,8 @@ class Stages:
             remove(self._path(name))
             paths = [Path(path) for path in save(value)]
         give_back()
-        libraries.let_go()
+        if time.monotonic() - start > LONG:
+            libraries.let_go()
         for path in paths:
             path.chmod(0o666 & ~_umask())  # some writers make files that only their owner may read
         outputs = {path.relative_to(self.folder.path).as_posix(): path.stat().st_size for path in paths}

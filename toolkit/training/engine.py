@@ -11,6 +11,7 @@ from typing import Protocol
 
 import torch
 
+from toolkit import libraries
 from toolkit.config import Settings
 from toolkit.gpu import runs_kernels
 from toolkit.networks.decoder import Deferred
@@ -140,3 +141,4 @@ def warm_up(settings: Settings, progress: Progress) -> None:
     if not warm.ready(*kind):
         progress.update(0, 1, "compiling the fast engine, once on this machine, about half a minute")
         warm.run(*kind)
+        libraries.let_go()  # what was read to load kernels

@@ -15,7 +15,6 @@ from dataclasses import field as default
 import numpy as np
 import torch
 
-from toolkit import libraries
 from toolkit.camera import Array
 from toolkit.capture.types import Views
 from toolkit.config import Settings
@@ -46,6 +45,7 @@ TIMELINE_PIXELS = 8192
 VALIDATION_PIXELS = 2048
 VALIDATION_SHARE = 20  # every so manieth training view steers the schedule …
 LEAST_VIEWS = 24  # … when there are enough: with few views each of them is worth more than what it would decide
+MANY_ROWS = 2**19
 MANY_VOXELS = 2_000_000  # beyond this a finer level is made only where rays came
 
 
@@ -151,7 +151,6 @@ def fit_field(
         raise InputError("every pixel of the training pictures is masked away; look at the capture's masks (black is left out)")
     budget = settings.fit.budget or DEFAULT_BUDGET
     warm_up(settings, progress)
-    libraries.let_go()  # what was read to load kernels
     clock = Clock(ticks)
     if start is None:
         current, ladder = _first(views, train, scene, settings, device, host, generator)
@@ -191,8 +190,9 @@ def fit_field(
                 engine.renew_rows(current)
         elif plan.wants_pruning(done):
             current = pruned(current, visible(current, engine.seen, engine.visits, settings.fit.prune_weight))
-            let_go(current)
-            give_back()
+            if len(current.occupied) >= MANY_ROWS:  # where it takes longer than it is worth nothing is given back
+                let_go(current)
+                give_back()
             engine.go_on_with(current)
         if softens and plan.radius(done) != radius:
             radius = plan.radius(done)
