@@ -45,7 +45,7 @@ TIMELINE_PIXELS = 8192
 VALIDATION_PIXELS = 2048
 VALIDATION_SHARE = 20  # every so manieth training view steers the schedule …
 LEAST_VIEWS = 24  # … when there are enough: with few views each of them is worth more than what it would decide
-MANY_ROWS = 2**19
+MANY_ROWS = 2**19  # from here on memory of rows that pruning left unused is given back
 MANY_VOXELS = 2_000_000  # beyond this a finer level is made only where rays came
 
 
@@ -190,7 +190,7 @@ def fit_field(
                 engine.renew_rows(current)
         elif plan.wants_pruning(done):
             current = pruned(current, visible(current, engine.seen, engine.visits, settings.fit.prune_weight))
-            if len(current.occupied) >= MANY_ROWS:  # where it takes longer than it is worth nothing is given back
+            if len(current.occupied) >= MANY_ROWS:
                 let_go(current)
                 give_back()
             engine.go_on_with(current)
