@@ -74,6 +74,20 @@ def test_the_schedule_believes_depth_as_far_as_it_is_told(trust: Trust) -> None:
     assert first.depth == pytest.approx(0.06 * trust.weight) and last.depth == pytest.approx(first.depth * trust.last)
 
 
+@pytest.mark.parametrize("trust", [FINE, ROUGH])
+def test_depth_is_believed_no_longer_in_a_longer_fit(trust: Trust) -> None:
+    def believed(budget: float, seconds: float) -> float:
+        plan = Schedule([32], budget, FitSettings(depth=0.06), True, trust=trust)
+        return plan.rates(plan.position(seconds), round(seconds * trust.rays / 50)).depth
+
+    fits = [[believed(budget, seconds) for seconds in np.linspace(0, budget, 9)] for budget in (20, 60, 300)]
+    assert all(np.diff(fit).max() <= 0 for fit in fits)
+    assert {fit[0] for fit in fits} == {0.06 * trust.weight}
+    assert [fit[-1] for fit in fits] == pytest.approx([0.06 * trust.weight * trust.last] * 3)
+    assert [believed(budget, 25) for budget in (60, 300)] == pytest.approx([0.06 * trust.weight * trust.last**0.5] * 2)
+    assert believed(300, 50) == believed(300, 200) == pytest.approx(fits[2][-1])
+
+
 @pytest.mark.parametrize("rough", [True, False])
 def test_a_fit_knows_where_depth_comes_from(rough: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[float] = []

@@ -28,11 +28,17 @@ class Trust:
 
     noise: float  # e: share of the distance by which it may be off: noise, and pictures that are not quite registered
     weight: float  # of the term at the beginning of a fit, in units of `fit.depth` …
-    last: float  # … and the share of it at the end: depth decides early where surfaces are, colours how they look
+    last: float  # … and the share of it at the end: depth decides early where surfaces are, colours how they look …
+    rays: float = 1e7  # … which it comes to after so many rays, when the fit has more
+
+    def share(self, done: float, rays: float) -> float:
+        """Share of the weight at `done` (0 … 1) of a fit, after so many rays. It goes by what was fitted, not by how long the fit is meant
+        to be: a long one would hold surfaces where rough depth has them, long after colours know better."""
+        return float(self.last ** min(1.0, max(done, rays / self.rays)))
 
 
-FINE = Trust(noise=0.004, weight=1.0, last=0.1)  # by a sensor, or by matching pictures in full
-ROUGH = Trust(noise=0.01, weight=2.0, last=0.05)  # by matching small ones
+FINE = Trust(noise=0.004, weight=1.0, last=0.05)  # by a sensor, or by matching pictures in full
+ROUGH = Trust(noise=0.01, weight=2.0, last=0.0025)  # by matching small ones
 
 
 def ray_distances(depth: Array, camera: Intrinsics) -> Array:

@@ -167,6 +167,6 @@ class Schedule:
         fall = (1 + rays / SLOWING) ** -0.85 * self.slower * LAST_RATE ** max(0.0, (done - LAST_PRUNE) / (1 - LAST_PRUNE))
         fit = self.settings
         opacity = fit.opacity if self.opaque else 0.0
-        depth = fit.depth * self.trust.weight * self.trust.last**done
+        depth = fit.depth * self.trust.weight * self.trust.share(done, rays)
         steps = (fit.rate_density * fall, fit.rate_feature * fall, fit.rate_decoder * fall)
         return Rates(*steps, fit.distortion, opacity, depth=depth, depth_noise=self.trust.noise, slow_within=self.slow_within)
