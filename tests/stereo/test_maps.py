@@ -12,10 +12,10 @@ from toolkit.stereo.match import StereoDepth
 WIDTH, HEIGHT, STEP = 24, 16, 11
 
 
-def found(depth: Array, confidence: float = 0.75) -> StereoDepth:
+def found(depth: Array, confidence: float = 0.75, noise: float = 0.0) -> StereoDepth:
     height, width = depth.shape
     camera = Intrinsics(width, height, float(width), float(width), width / 2, height / 2)
-    return StereoDepth(depth.astype(np.float32), np.where(depth > 0, confidence, 0).astype(np.float32), camera)
+    return StereoDepth(depth.astype(np.float32), np.where(depth > 0, confidence, 0).astype(np.float32), camera, noise)
 
 
 def two_surfaces() -> Array:
@@ -52,6 +52,17 @@ def test_on_more_pixels_nothing_lies_between_two_surfaces() -> None:
     got = depth_at(found(two_surfaces()), 3 * WIDTH, 3 * HEIGHT)
     assert set(np.unique(got)) <= {np.float32(0), np.float32(1), np.float32(3)}
     assert 0.7 < (got > 0).mean() < 1
+
+
+def test_noise_of_what_is_far_is_no_edge() -> None:
+    depth = two_surfaces()
+    rough = np.where(np.indices(depth.shape).sum(axis=0) % 2 == 0, 10.0, 12.0)  # inverse depths that differ by 0.017
+    depth[:, STEP:] = rough[:, STEP:]
+    beyond, before = np.s_[:, 2 * (STEP + 1) :], np.s_[:, : 2 * (STEP - 1)]
+    assert not depth_at(found(depth), 2 * WIDTH, HEIGHT)[beyond].any()
+    got = depth_at(found(depth, noise=0.02), 2 * WIDTH, HEIGHT)
+    assert ((got[beyond] >= 10) & (got[beyond] <= 12)).all() and (got[before] == 1).all()
+    assert not got[:, 2 * (STEP - 1) : 2 * (STEP + 1)].any()  # the edge between the surfaces stays one
 
 
 def test_what_is_not_confident_is_unknown() -> None:

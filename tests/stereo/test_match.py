@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ from toolkit.capture.types import Views
 from toolkit.errors import InputError, Interrupted
 from toolkit.poses.overlap import parallax, spread_parallax
 from toolkit.progress import Progress
+from toolkit.stereo import match
 from toolkit.stereo.cost import NOISE, UNKNOWN, GreyView, Matcher, best_half, between, grey_view, plane_homography, sweep
 from toolkit.stereo.match import LENIENT, MANY, STRICT, StereoDepth, demands, inverse_depths, stereo_depths, usable_neighbours
 from toolkit.stereo.polish import Polisher
@@ -351,3 +353,38 @@ def test_two_pictures_confirm_each_other_and_more_find_no_less() -> None:
             found = one.depth > 0
             assert found.mean() > 0.3
             assert np.mean(np.abs(one.depth[found] / true[found] - 1) < 0.02) > 0.9
+
+
+def near_and_far(noise: float = 12.0) -> tuple[Views, list[Array]]:
+    """Seven cameras side by side before a textured wall at a depth of 12 whose left half is hidden by one at 1.5; and exact depth."""
+    rng = np.random.default_rng(0)
+    textures = [cv2.GaussianBlur(rng.uniform(0, 255, (400, 600, 3)).astype(np.float32), (0, 0), 1.2) * 2 - 128 for _ in range(2)]
+    poses = np.tile(np.eye(4), (7, 1, 1))
+    poses[:, 0, 3] = 0.06 * np.arange(7)
+    grid = pixel_grid(CAMERA.width, CAMERA.height).reshape(CAMERA.height, CAMERA.width, 2)
+    pictures, depths = [], []
+    for pose in poses:
+        layers = []
+        for texture, depth in zip(textures, (1.5, 12.0), strict=True):
+            place = grid + np.array([pose[0, 3] / depth * CAMERA.fx + 200, 100])  # pixels of the wall, as the first camera sees it
+            layers.append(cv2.remap(texture, *np.moveaxis(place.astype(np.float32), -1, 0), interpolation=cv2.INTER_LINEAR))
+        hidden = grid[..., 0] + pose[0, 3] / 1.5 * CAMERA.fx < 90
+        seen = np.where(hidden[..., None], *layers) + noise * rng.standard_normal((*hidden.shape, 3))
+        pictures.append(np.clip(seen, 0, 255).astype(np.uint8))
+        depths.append(np.where(hidden, 1.5, 12.0))
+    return views_of(poses, pictures), depths
+
+
+def test_what_stands_far_behind_is_found_though_its_depth_is_rough(monkeypatch: pytest.MonkeyPatch) -> None:
+    views, truth = near_and_far()
+    depths = stereo_depths(views, 1.0, 20.0, 1.5)
+    behind = np.array(truth) > 2
+    far = np.array([one.depth for one in depths])[behind]
+    off = np.abs(far[far > 0] / 12 - 1)
+    assert (far > 0).mean() > 0.8 and np.median(off) < 0.1 and np.quantile(off, 0.95) < 0.3
+    assert all(0 < one.noise < 0.05 for one in depths)
+    errors, coverage = relative_errors(depths, [np.where(true < 2, true, 0) for true in truth])
+    assert coverage > 0.7 and np.median(errors) < 0.01
+    monkeypatch.setattr(match, "NOISE", 0.0)
+    strict = np.array([one.depth for one in stereo_depths(views, 1.0, 20.0, 1.5)])[behind]
+    assert (strict > 0).mean() < 0.6 * (far > 0).mean()

@@ -79,7 +79,7 @@ def continued(
     def compared(index: int) -> tuple[Array, StereoDepth]:
         progress.check()
         one, plan = found[index], proposed[index]
-        said = agreement(index, others[index], depths, cameras, poses, pictures=soft)
+        said = agreement(index, others[index], depths, cameras, poses, noise=one.noise, pictures=soft)
         sure = plan.new & (said.agree >= min(CONFIRMED, len(others[index]))) & (said.agree > said.through)
         confidence = np.where(sure, said.agree / (said.agree + said.through + 1), one.confidence).astype(np.float32)
         return _middle(said.colours), replace(one, depth=np.where(sure, plan.depth, one.depth), confidence=confidence)

@@ -35,6 +35,7 @@ def _compare(
     other_camera: Array,
     there: Array,
     tolerance: float,
+    noise: float,
     picture: Array,
     other_picture: Array,
     agree: Array,
@@ -73,7 +74,7 @@ def _compare(
                 colours[y, x] = difference / 3
             if seen <= 0:
                 continue
-            if abs(seen - qz) <= tolerance * qz:
+            if abs(seen - qz) <= max(tolerance, noise * seen) * qz:
                 # The other's point, brought back: rotation transposed.
                 rx = (column + 0.5 - ox) / gx * seen - there[0, 3]
                 ry = (row + 0.5 - oy) / gy * seen - there[1, 3]
@@ -94,21 +95,24 @@ def confirmed(
     world_from_camera: Array,
     needed: int = 2,
     tolerance: float = TOLERANCE,
+    noise: float = 0.0,
 ) -> tuple[Array, Array]:
     """The depth map `index` checked against the maps `others`.
 
-    A depth is kept when at least `needed` others have the same point (within `tolerance`), and more of them than see through it; it becomes
-    the mean, over inverse depths, of its own value and theirs. Small patches are dropped.
+    A depth is kept when at least `needed` others have the same point, and more of them than see through it; it becomes the mean, over
+    inverse depths, of its own value and theirs. Small patches are dropped.
 
     Args:
         depths: (H, W) along z, 0 = missing.
         world_from_camera: (N, 4, 4).
+        tolerance: share of depth by which two views may differ …
+        noise: … or inverse depth, whichever is more: what is far moves by fewer pixels, so it cannot be told as well (`StereoDepth.noise`).
 
     Returns:
         (H, W) float32 depth, 0 where it is not kept, and (H, W) float32 confidence in [0, 1): a / (a + t + 1) for a others that agree and t
         that see through the point.
     """
-    depth, found = depths[index], agreement(index, others, depths, cameras, world_from_camera, tolerance)
+    depth, found = depths[index], agreement(index, others, depths, cameras, world_from_camera, tolerance, noise)
     agree, through, total = found.agree, found.through, found.total
     kept = (depth > 0) & (agree >= needed) & (agree > through)
     mean = np.where(kept, (agree + 1) / np.maximum(total, 1e-12), 0)
@@ -124,12 +128,13 @@ def agreement(
     cameras: Sequence[Intrinsics],
     world_from_camera: Array,
     tolerance: float = TOLERANCE,
+    noise: float = 0.0,
     pictures: Sequence[Array] | None = None,
 ) -> Agreement:
     """What the views `others` say of each pixel of the depth map `index`.
 
     Args:
-        depths, world_from_camera, tolerance: as in `confirmed`.
+        depths, world_from_camera, tolerance, noise: as in `confirmed`.
         pictures: (H, W, 3) uint8 of all views, of the size of their depth maps; None: colours are not compared.
     """
     depth = np.ascontiguousarray(depths[index], dtype=np.float32)
@@ -144,7 +149,7 @@ def agreement(
             shown, out = (NO_PICTURE, NO_PICTURE), NO_COLOURS
         else:
             shown, out = (pictures[index], pictures[other]), colours[number]
-        _compare(*here, *away, there, tolerance, *shown, agree, through, total, out)
+        _compare(*here, *away, there, tolerance, noise, *shown, agree, through, total, out)
     return Agreement(agree, through, total, colours)
 
 

@@ -17,7 +17,7 @@ from toolkit.files import atomic_path
 from toolkit.stereo.match import StereoDepth
 
 LEAST_CONFIDENCE = 0.5  # two other views confirm a depth for each one that sees through it
-SMOOTH = 0.05  # share by which depths side by side may differ, to be interpolated
+SMOOTH = 0.05  # share by which depths side by side may differ, to be interpolated, besides their noise
 
 
 def depth_at(found: StereoDepth, width: int, height: int, least_confidence: float = LEAST_CONFIDENCE) -> Array:
@@ -26,7 +26,7 @@ def depth_at(found: StereoDepth, width: int, height: int, least_confidence: floa
     depth = np.where(found.confidence >= least_confidence, found.depth, np.float32(0))
     if depth.shape == (height, width):
         return np.ascontiguousarray(depth, dtype=np.float32)
-    return _interpolated(depth, width, height)
+    return _interpolated(depth, width, height, found.noise)
 
 
 def enlarged(depth: Array, width: int, height: int) -> Array:
@@ -36,12 +36,13 @@ def enlarged(depth: Array, width: int, height: int) -> Array:
     return np.where(between > 0, between, cv2.resize(known, (width, height), interpolation=cv2.INTER_NEAREST))
 
 
-def _interpolated(depth: Array, width: int, height: int) -> Array:
-    """(height, width) float32, linear in inverse depth, 0 beside what is unknown and beside edges."""
+def _interpolated(depth: Array, width: int, height: int, noise: float = 0.0) -> Array:
+    """(height, width) float32, linear in inverse depth, 0 beside what is unknown and beside edges; inverse depths that differ by no more
+    than `noise` make none."""
     inverse: Array = np.where(depth > 0, 1 / np.maximum(depth, np.float32(1e-12)), 0).astype(np.float32)
     window = np.ones((3, 3), np.uint8)
     nearest, farthest = cv2.dilate(inverse, window), cv2.erode(inverse, window)
-    smooth: Array = ((farthest > 0) & (nearest <= (1 + SMOOTH) * farthest)).astype(np.uint8)
+    smooth: Array = ((farthest > 0) & (nearest - farthest <= np.maximum(SMOOTH * farthest, np.float32(noise)))).astype(np.uint8)
     inverse = cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
     smooth = cv2.resize(smooth, (width, height), interpolation=cv2.INTER_NEAREST)
     return np.where(smooth > 0, 1 / np.maximum(inverse, np.float32(1e-12)), np.float32(0)).astype(np.float32)
@@ -58,6 +59,7 @@ def save_stereo(path: Path | str, names: Sequence[str], depths: Sequence[StereoD
         tensors[f"depth.{index}"] = np.ascontiguousarray(found.depth, dtype=np.float32)
         tensors[f"confidence.{index}"] = np.round(found.confidence * 255).astype(np.uint8)
     about = {"names": list(names), "cameras": [found.intrinsics.to_dict() for found in depths]}
+    about["noise"] = [found.noise for found in depths]
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, metadata={"stereo": json.dumps(about)})
 
@@ -72,13 +74,16 @@ def load_stereo(path: Path | str) -> tuple[list[str], list[StereoDepth]]:
         with safe_open(str(path), framework="numpy") as file:
             about = json.loads(file.metadata()["stereo"])
             names, cameras = [str(name) for name in about["names"]], [Intrinsics.from_dict(camera) for camera in about["cameras"]]
+            noises = [float(noise) for noise in about.get("noise", [0.0] * len(cameras))]  # older files have none
+            if len(noises) != len(cameras) or not all(0 <= noise < np.inf for noise in noises):
+                raise ValueError("the noise of the depth maps cannot be")
             out = []
-            for index, camera in enumerate(cameras):
+            for index, (camera, noise) in enumerate(zip(cameras, noises, strict=True)):
                 depth, confidence = file.get_tensor(f"depth.{index}"), file.get_tensor(f"confidence.{index}")
                 shape = (camera.height, camera.width)
                 if depth.shape != shape or confidence.shape != shape or depth.dtype != np.float32 or not np.isfinite(depth).all():
                     raise ValueError(f"the depth map {index} does not fit its camera")
-                out.append(StereoDepth(depth, confidence.astype(np.float32) / 255, camera))
+                out.append(StereoDepth(depth, confidence.astype(np.float32) / 255, camera, noise))
             if len(names) != len(out):
                 raise ValueError("there are not as many names as depth maps")
             return names, out

@@ -29,13 +29,14 @@ from toolkit.stereo.smooth import smoothed_planes
 LONG_SIDE = 400  # pixels; cost grows with the third power of it
 MATCHED = 4  # neighbours that a picture is matched with
 CHECKED = 8  # neighbours that its depth is checked against
-SWEET = 8.0  # degrees of parallax that are looked for
+SWEET = 5.0  # degrees of parallax that are looked for: what is seen from farther apart looks less alike (docs/measured/fitting.md)
 MANY = 24  # pictures; fewer have no choice of neighbours (`LENIENT`)
 MOST_COST = 0.4  # matching cost beyond which nothing was recognised: bare walls have 0.5 everywhere
 STEP = (
     1.5  # pixels that the picture of the neighbour that moves most moves by from one plane to the next; refinement finds what lies between
 )
 PLANES = (32, 128)  # fewest and most planes
+NOISE = 0.4  # of their distance: how well depths of two pictures agree at best, about 0.6 pixels of the neighbour that moves most
 MOST_WORKERS = 8
 COSTS_HELD = 3  # volumes of costs that a worker has room for: those of the sweep, those that are smoothed, and pictures
 
@@ -70,6 +71,7 @@ class StereoDepth:
     depth: Array  # (H, W) float32 along z, working units, 0 = unknown
     confidence: Array  # (H, W) float32 in [0, 1), 0 where depth is unknown; see `check.confirmed`
     intrinsics: Intrinsics  # pinhole, of the depth map's size
+    noise: float = 0.0  # inverse depth by which it may be off, wherever that is more than a share of the depth
 
 
 @dataclass(frozen=True)
@@ -117,24 +119,27 @@ def stereo_depths(
             "no two pictures see the same things from places far enough apart to match them for depth; the camera has to move sideways"
         )
 
-    def raw(index: int) -> Array:
+    def raw(index: int) -> tuple[Array, float]:
         progress.check()
         return _matched(ready, index, neighbours[index][:matched], near, far)
 
     def checked(index: int) -> StereoDepth:
         progress.check()
         known = [other for other in neighbours[index] if neighbours[other]]
-        depth, confidence = confirmed(index, known, maps, cameras, poses, needed=min(asked.confirm, max(1, len(known))))
-        return StereoDepth(depth, confidence, cameras[index])
+        needed = min(asked.confirm, max(1, len(known)))
+        depth, confidence = confirmed(index, known, maps, cameras, poses, needed=needed, noise=noises[index])
+        return StereoDepth(depth, confidence, cameras[index], noises[index])
 
     each = COSTS_HELD * PLANES[1] * 4 * max(camera.width * camera.height for camera in cameras)
     what = f"matching pictures of {long_side} pixels for depth"
     workers = memory.workers(max(1, min(MOST_WORKERS, cv2.getNumThreads())), each, what, "close other programs")
     maps: list[Array] = []
+    noises: list[float] = []
     with ThreadPoolExecutor(workers) as pool:
         try:
-            for depth in pool.map(raw, range(len(ready))):
+            for depth, noise in pool.map(raw, range(len(ready))):
                 maps.append(depth)
+                noises.append(noise)
                 progress.update(len(maps), 1.1 * len(ready), "pictures matched")
             out = list(pool.map(checked, range(len(ready))))
         finally:
@@ -206,11 +211,12 @@ def usable_pixels(views: Views, index: int, camera: Intrinsics) -> Array | None:
     return np.asarray(cv2.resize(usable.astype(np.uint8), (camera.width, camera.height), interpolation=cv2.INTER_NEAREST) > 0)
 
 
-def _matched(ready: Sequence[_View], index: int, neighbours: Sequence[int], near: float, far: float) -> Array:
-    """(H, W) float32 depth of one view from matching alone; 0 where its mask excludes it, and everywhere without neighbours."""
+def _matched(ready: Sequence[_View], index: int, neighbours: Sequence[int], near: float, far: float) -> tuple[Array, float]:
+    """(H, W) float32 depth of one view from matching alone, 0 where its mask excludes it, and everywhere without neighbours; and its noise,
+    an inverse depth."""
     view = ready[index].grey
     if not neighbours:
-        return np.zeros(view.grey.shape, np.float32)
+        return np.zeros(view.grey.shape, np.float32), 0.0
     others = [ready[other].grey for other in neighbours]
     planes = inverse_depths(view, others, near, far)
     step = float(planes[1] - planes[0])
@@ -218,4 +224,4 @@ def _matched(ready: Sequence[_View], index: int, neighbours: Sequence[int], near
     inverse, cost = refined(view, others, planes[0] + plane * step, step)
     depth = np.where(cost <= MOST_COST, 1 / np.clip(inverse, 1 / far, 1 / near), 0)
     usable = ready[index].usable
-    return np.asarray(depth if usable is None else np.where(usable, depth, 0), dtype=np.float32)
+    return np.asarray(depth if usable is None else np.where(usable, depth, 0), dtype=np.float32), NOISE * step
