@@ -89,9 +89,7 @@ def _carry(depth: Array, picture: Array, camera: Array, target: Array, there: Ar
 
 
 @numba.njit(cache=True, nogil=True)
-def _agree(
-    depths: Array, colours: Array, least: int, same: float, count: Array, depth: Array, colour: Array, scatter: Array
-) -> None:
+def _agree(depths: Array, colours: Array, least: int, same: float, count: Array, depth: Array, colour: Array, scatter: Array) -> None:
     """The nearest surface that at least `least` of the maps agree on, pixel by pixel."""
     number, height, width = depths.shape
     order = np.empty(max(number, 1), np.int64)
