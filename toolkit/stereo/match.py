@@ -36,7 +36,7 @@ STEP = (
     1.5  # pixels that the picture of the neighbour that moves most moves by from one plane to the next; refinement finds what lies between
 )
 PLANES = (32, 128)  # fewest and most planes
-NOISE = 0.4  # of the step from plane to plane: how well depths of two pictures agree at best, about 0.6 pixels of the neighbour that moves most
+NOISE = 0.4  # of the step from plane to plane, mostly 0.6 pixels of the neighbour that moves most: how well two depths agree
 MOST_WORKERS = 8
 COSTS_HELD = 3  # volumes of costs that a worker has room for: those of the sweep, those that are smoothed, and pictures
 
