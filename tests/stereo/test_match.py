@@ -15,7 +15,7 @@ from toolkit.errors import InputError, Interrupted
 from toolkit.poses.overlap import parallax, spread_parallax
 from toolkit.progress import Progress
 from toolkit.stereo import match
-from toolkit.stereo.cost import NOISE, UNKNOWN, GreyView, Matcher, best_half, between, grey_view, plane_homography, sweep
+from toolkit.stereo.cost import NOISE, UNKNOWN, GreyView, Matcher, best_half, grey_view, plane_homography, sweep
 from toolkit.stereo.match import LENIENT, MANY, STRICT, StereoDepth, demands, inverse_depths, stereo_depths, usable_neighbours
 from toolkit.stereo.polish import Polisher
 from toolkit.stereo.smooth import PATHS, SOFT_EDGE, smoothed_planes
@@ -156,7 +156,7 @@ def test_a_plane_maps_pixels_as_projection_does() -> None:
 
 
 def slow_cost(view: GreyView, other: GreyView, inverse_depth: Array, half: int = 3) -> Array:
-    """`Matcher.cost` by its definition: points of the depth map are projected, and windows compared one by one."""
+    """`Matcher.costs` by its definition: points of the depth map are projected, and windows compared one by one."""
     height, width = view.grey.shape
     points = unproject(view.camera, view.world_from_camera, pixel_grid(width, height), 1 / inverse_depth.reshape(-1))
     place, depth = project(other.camera, other.world_from_camera, points)
@@ -183,14 +183,36 @@ def test_cost_is_what_its_definition_says() -> None:
     first, second = (grey_view(views.images[i], CAMERA, views.world_from_camera[i]) for i in (0, 2))
     small = grey_view(views.images[2], CAMERA.scaled(80, 60), views.world_from_camera[2])
     for other, inverse_depth in ((second, 1 / truth[0]), (second, np.full((120, 160), 0.3)), (small, 1 / truth[0])):
-        cost = Matcher(first).cost(other, between(first, other), inverse_depth.astype(np.float32))
+        cost = Matcher(first, [other]).costs(inverse_depth)[0]
         expected = slow_cost(first, other, inverse_depth)
         alike = (cost < 0) == (expected < 0)
         assert alike.mean() > 0.995 and (cost >= 0).mean() > 0.4  # a point on the very border may round either way
         assert np.abs(cost - expected)[alike].max() < 2e-3
     volume = sweep(first, [second], np.array([0.1, 0.3]))
-    cost = Matcher(first).cost(second, between(first, second), np.full((120, 160), 0.3, np.float32))
+    cost = Matcher(first, [second]).costs(np.full((120, 160), 0.3))[0]
     assert np.array_equal(volume[:, :, 1], np.where(cost < 0, np.float32(UNKNOWN), cost))
+
+
+@pytest.mark.parametrize("width", [2, 9, 10, 11, 26, 27, 41])
+def test_pictures_of_any_width(width: int) -> None:
+    rng = np.random.default_rng(width)
+    camera = Intrinsics(width, 11, 20.0, 20.0, width / 2, 5.5)
+    pose = np.eye(4)
+    pose[:3, 3] = 0.03, 0.01, 0
+    pictures = rng.integers(0, 256, (2, 11, width)).astype(np.uint8)
+    first, second = GreyView(pictures[0], camera, np.eye(4)), GreyView(pictures[1], camera, pose)
+    inverse_depth = rng.uniform(0.4, 1.6, (11, width))
+    cost = Matcher(first, [second]).costs(inverse_depth)[0]
+    expected = slow_cost(first, second, inverse_depth)
+    assert np.array_equal(cost < 0, expected < 0) and (cost >= 0).any()
+    assert np.abs(cost - expected).max() < 2e-3
+    for count in (3, 16, 21):  # planes, of which `GROUP` come at once
+        planes = np.linspace(0.4, 1.6, count)
+        volume = sweep(first, [second, first], planes)
+        matcher = Matcher(first, [second, first])
+        for d, plane in enumerate(planes):
+            assert np.array_equal(volume[..., d], matcher.cost(np.full((11, width), plane)))
+    assert (Matcher(first, []).cost(inverse_depth) == UNKNOWN).all()
 
 
 def test_cost_is_correlation() -> None:
@@ -198,11 +220,9 @@ def test_cost_is_correlation() -> None:
     camera = Intrinsics(40, 30, 30.0, 30.0, 20.0, 15.0)
     grey = rng.integers(0, 256, (30, 40)).astype(np.uint8)
     here, plane = GreyView(grey, camera, np.eye(4)), np.ones((30, 40), np.float32)
-    matcher = Matcher(here)
 
     def cost_of(other: Array, pose: Array) -> Array:
-        view = GreyView(other, camera, pose)
-        return matcher.cost(view, between(here, view), plane)
+        return Matcher(here, [GreyView(other, camera, pose)]).costs(plane)[0]
 
     inner = slice(4, -4), slice(4, -4)
     assert cost_of(grey // 2 + 20, np.eye(4))[inner].max() < 0.01  # brightness and contrast do not matter
@@ -226,10 +246,10 @@ def test_cameras_out_of_this_world_are_not_read_at(far: float) -> None:
         other = grey_view(views.images[1], CAMERA, pose)
         for inverse_depth in (1e-30, 0.3, 1e30):
             with np.errstate(all="ignore"):
-                cost = Matcher(first).cost(other, between(first, other), np.full((120, 160), inverse_depth, np.float32))
+                cost = Matcher(first, [other]).costs(np.full((120, 160), inverse_depth))[0]
             assert np.all((cost == -1) | ((cost >= -1e-3) & (cost <= 1.001)))
     thin = grey_view(views.images[1][:1], CAMERA.scaled(160, 1), views.world_from_camera[1])
-    assert (Matcher(first).cost(thin, between(first, thin), np.full((120, 160), 0.3, np.float32)) == -1).all()
+    assert (Matcher(first, [thin]).costs(np.full((120, 160), 0.3))[0] == -1).all()
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6, 8])

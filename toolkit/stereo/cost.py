@@ -19,6 +19,7 @@ RING = 8  # rows that are kept, a power of two: those of a window and the one th
 NOISE = 4.0  # variance (grey levels²) below which a window holds nothing to compare: correlation is drawn to 0 there
 UNKNOWN = 0.5  # cost where no neighbour shows anything, which is that of no correlation
 GROUP = 16  # planes that are put into the volume at once: as many costs as a cache line holds
+LANES = 16  # float32 that a processor takes at once: rows are as many times that long, so that their loops leave no rest to be taken singly
 MIDDLE = 128  # is taken from grey levels so that their squares keep their digits
 # What is looked up is rounded to quarters of a grey level (adding this leaves no finer digits). Sums of such values, of their squares and
 # of their products with whole ones, over a window, are exact in float32, so a window may move on by adding what comes and taking what
@@ -72,27 +73,29 @@ def between(view: GreyView, other: GreyView) -> tuple[Array, Array]:
 
 
 @numba.njit(**OPTIONS)
-def _places(height: int, width: int, far: Array, move: Array, inverse: Array, v: int, place: Array, share: Array, inside: Array) -> None:
-    """Where a picture of this size shows the points of row `v` with the inverse depths inverse[v]: upper left pixel, shares of its right
-    and lower neighbours, and 1 where it is in the picture, 0 elsewhere. A loop of its own, because it becomes vectors, and what is read
-    by it not."""
+def _places(
+    height: int, width: int, far: Array, move: Array, inverse: Array, columns: Array, v: int, place: Array, share: Array, inside: Array
+) -> None:
+    """Where a picture of this size shows the points of row `v` at `columns` with the inverse depths `inverse`: upper left pixel, shares of
+    its right and lower neighbours, and 1 where it is in the picture, 0 elsewhere. A loop of its own, because it becomes vectors, and what
+    is read by it not."""
     zero, one, least = F(0), F(1), F(1e-6)
     bottom, right = F(height - 1), F(width - 1)
     bx, by, bz = far[0, 1] * F(v) + far[0, 2], far[1, 1] * F(v) + far[1, 2], far[2, 1] * F(v) + far[2, 2]
     ax, ay, az, mx, my, mz = far[0, 0], far[1, 0], far[2, 0], move[0], move[1], move[2]
     last, below, across = np.int32(width - 2), np.int32(height - 2), np.int32(width)
-    for u in range(len(place)):
-        depth = inverse[v, u]
-        z = az * F(u) + bz + depth * mz
+    for i in range(len(columns)):
+        depth, u = inverse[i], columns[i]
+        z = az * u + bz + depth * mz
         scale = one / max(z, least)
-        x, y = (ax * F(u) + bx + depth * mx) * scale, (ay * F(u) + by + depth * my) * scale
+        x, y = (ax * u + bx + depth * mx) * scale, (ay * u + by + depth * my) * scale
         x_in, y_in = min(max(x, zero), right), min(max(y, zero), bottom)
-        inside[u] = one if (z > least) & (x == x_in) & (y == y_in) else zero
+        inside[i] = one if (z > least) & (x == x_in) & (y == y_in) else zero
         # Whole numbers are bounded once more: what is no number (a camera out of this world) must not be read at.
         column = min(max(np.int32(min(x_in, right - one)), np.int32(0)), last)
         row = min(max(np.int32(min(y_in, bottom - one)), np.int32(0)), below)
-        share[0, u], share[1, u] = x_in - F(column), y_in - F(row)
-        place[u] = row * across + column
+        share[0, i], share[1, i] = x_in - F(column), y_in - F(row)
+        place[i] = row * across + column
 
 
 @numba.njit(**OPTIONS)
@@ -114,24 +117,19 @@ def _take(quads: Array, place: Array, share: Array, inside: Array, found: Array,
 
 @numba.njit(**OPTIONS)
 def _move_on(new: Array, new_own: Array, old: Array, old_own: Array, sums: Array) -> None:
-    """Sums over the rows of a window, (3, W + 2 HALF) of values, squares and products: one row more and one less. Loops apart, because
-    each becomes vectors."""
-    first, second, third = sums[0, HALF:], sums[1, HALF:], sums[2, HALF:]
+    """Sums over the rows of a window, (3, wide) of values, squares and products: one row more and one less."""
+    values, squares, products = sums[0], sums[1], sums[2]
     for x in range(len(new)):
-        first[x] += new[x] - old[x]
-    for x in range(len(new)):
-        second[x] += new[x] * new[x] - old[x] * old[x]
-    for x in range(len(new)):
-        third[x] += new[x] * new_own[x] - old[x] * old_own[x]
-    for part in range(3):
-        for x in range(HALF):  # the ends are repeated
-            sums[part, x], sums[part, HALF + len(new) + x] = sums[part, HALF], sums[part, HALF + len(new) - 1]
+        come, gone = new[x], old[x]
+        values[x] += come - gone
+        squares[x] += come * come - gone * gone
+        products[x] += come * new_own[x] - gone * old_own[x]
 
 
 @numba.njit(**OPTIONS)
 def _correlated(sums: Array, mean: Array, steep: Array, seen: Array, out: Array) -> None:
-    """Costs of a row from the sums over the rows of its windows; `mean` and `steep` (1 / deviation) are those of the windows that they are
-    compared with."""
+    """Costs of a row from the sums over the rows of its windows, which begin `HALF` before their middles, as does what is `seen`; `mean`
+    and `steep` (1 / deviation) are those of the windows that they are compared with."""
     zero, half, part_of = F(0), F(0.5), F(1 / (WINDOW * WINDOW))
     values, squares, products = sums[0], sums[1], sums[2]
     for x in range(len(out)):
@@ -143,28 +141,38 @@ def _correlated(sums: Array, mean: Array, steep: Array, seen: Array, out: Array)
         their = value * part_of
         spread = max(square * part_of - their * their, zero) + F(NOISE)
         cost = half - half * (product * part_of - mean[x] * their) * steep[x] / np.sqrt(spread)
-        out[x] = cost if seen[x] > zero else F(-1)
+        out[x] = cost if seen[x + HALF] > zero else F(-1)
 
 
 @numba.njit(**OPTIONS)
-def _compare(own: Array, mean: Array, steep: Array, quads: Array, far: Array, move: Array, inverse: Array, out: Array) -> None:
-    """`Matcher.cost`, a row at a time: what was warped stays in the cache until all windows that hold it are done."""
-    height, width = own.shape
+def _compare(
+    own: Array, mean: Array, steep: Array, columns: Array, quads: Array, far: Array, move: Array, inverse: Array, out: Array
+) -> None:
+    """Costs of one other picture, a row at a time: what was warped stays in the cache until all windows that hold it are done.
+
+    Args:
+        own, mean, steep: (H, wide) grey levels less `MIDDLE`; mean and 1 / deviation of windows, which begin `HALF` before their middles.
+        columns: (wide,) of the picture, as numbers with fractions.
+        inverse: (H, wide) inverse depths, whose first `HALF` stand before the first column.
+        out: (H, wide), −1 where the other picture does not show a point; nothing of meaning beyond the picture's width.
+    """
+    height, wide = own.shape
     pixels = quads.reshape(-1)
-    place, found, share = np.empty(width, np.int32), np.empty(width, np.uint32), np.empty((2, width), np.float32)
-    warped, inside = np.empty((RING, width), np.float32), np.empty((RING, width), np.float32)
-    sums, nothing = np.zeros((3, width + 2 * HALF), np.float32), np.zeros(width, np.float32)
+    place, found, share = np.empty(wide, np.int32), np.empty(wide, np.uint32), np.empty((2, wide), np.float32)
+    warped, inside = np.empty((RING, wide), np.float32), np.zeros((RING, wide + LANES), np.float32)
+    sums, nothing = np.zeros((3, wide + LANES), np.float32), np.zeros(wide, np.float32)
     bottom = height - 1
     for ahead in range(-HALF, height + HALF):
         new, old = min(max(ahead, 0), bottom), ahead - WINDOW  # rows at the ends are repeated
+        come = new % RING
         if ahead == -HALF or 0 < ahead < height:
-            _places(quads.shape[0], quads.shape[1], far, move, inverse, new, place, share, inside[new % RING])
-            _take(pixels, place, share, inside[new % RING], found, warped[new % RING])
+            _places(quads.shape[0], quads.shape[1], far, move, inverse[new], columns, new, place, share, inside[come])
+            _take(pixels, place, share, inside[come], found, warped[come])
         if old < -HALF:
-            _move_on(warped[new % RING], own[new], nothing, nothing, sums)
+            _move_on(warped[come], own[new], nothing, nothing, sums)
         else:
             old = max(old, 0)
-            _move_on(warped[new % RING], own[new], warped[old % RING], own[old], sums)
+            _move_on(warped[come], own[new], warped[old % RING], own[old], sums)
         y = ahead - HALF
         if y >= 0:
             _correlated(sums, mean[y], steep[y], inside[y % RING], out[y])
@@ -173,31 +181,60 @@ def _compare(own: Array, mean: Array, steep: Array, quads: Array, far: Array, mo
 class Matcher:
     """Compares other pictures with one, window by window.
 
-    The cost is (1 − zero-mean normalised cross-correlation) / 2: 0 alike, ½ unrelated, 1 inverted; brightness and contrast do not matter.
+    The cost of one is (1 − zero-mean normalised cross-correlation) / 2: 0 alike, ½ unrelated, 1 inverted; brightness and contrast do not
+    matter.
+
+    Rows are kept `wide`: with `HALF` columns more before them and at least as many behind, where the ends are repeated, which makes them a
+    multiple of `LANES` long.
+
+    Args:
+        others: K ≥ 0.
     """
 
-    def __init__(self, view: GreyView) -> None:
-        self.own = view.grey.astype(np.float32) - MIDDLE
-        self.mean = self._mean(self.own)
-        self.steep = 1 / np.sqrt(np.maximum(self._mean(self.own * self.own) - self.mean**2, 0) + np.float32(NOISE))
+    def __init__(self, view: GreyView, others: Sequence[GreyView]) -> None:
+        self._others = [(other.quads, *between(view, other)) for other in others]
+        height, self._width = view.grey.shape
+        wide = -(-(self._width + 2 * HALF) // LANES) * LANES
+        own = view.grey.astype(np.float32) - MIDDLE
+        mean = self._mean(own)
+        steep = 1 / np.sqrt(np.maximum(self._mean(own * own) - mean**2, 0) + np.float32(NOISE))
+        self._columns = np.clip(np.arange(-HALF, wide - HALF), 0, self._width - 1)
+        windows = (np.pad(of, ((0, 0), (0, wide - self._width))) for of in (mean, steep))
+        self._own = (np.take(own, self._columns, axis=1), *windows, self._columns.astype(np.float32))
+        self._each = np.empty((len(others), height, wide), np.float32)
 
     @staticmethod
     def _mean(values: Array) -> Array:
         return np.asarray(cv2.boxFilter(values, cv2.CV_32F, (WINDOW, WINDOW), borderType=cv2.BORDER_REPLICATE))
 
-    def cost(self, other: GreyView, way: tuple[Array, Array], inverse_depth: Array, out: Array | None = None) -> Array:
-        """(H, W) float32 costs of the picture of `other` where it shows the points at `inverse_depth` (H, W); −1 where it does not.
+    def _compared(self, inverse_depth: Array) -> Array:
+        """(K, H, wide) costs at inverse depths (H, wide)."""
+        for (quads, far, move), out in zip(self._others, self._each, strict=True):
+            if min(quads.shape) < 2:  # nothing lies between its pixels
+                out[:] = -1
+            else:
+                _compare(*self._own, quads, far, move, inverse_depth, out)
+        return self._each
 
-        Args:
-            way: `between` the matcher's view and the other one.
-            out: (H, W) float32 to be filled.
-        """
-        out = np.empty(self.own.shape, np.float32) if out is None else out
-        if min(other.grey.shape) < 2:  # nothing lies between its pixels
-            out[:] = -1
-            return out
-        _compare(self.own, self.mean, self.steep, other.quads, *way, inverse_depth, out)
-        return out
+    def costs(self, inverse_depth: Array) -> Array:
+        """(K, H, W) float32 costs of the others where they show the points at `inverse_depth` (H, W); −1 where they do not. Valid until the
+        next call."""
+        return self._compared(np.take(np.asarray(inverse_depth, np.float32), self._columns, axis=1))[:, :, : self._width]
+
+    def cost(self, inverse_depth: Array) -> Array:
+        """(H, W) float32 `best_half` of `costs`."""
+        out = self.room()
+        self.costs(inverse_depth)
+        best_half(self._each, out)
+        return out[:, : self._width]
+
+    def plane_cost(self, inverse_depth: float, out: Array) -> None:
+        """`cost` of a plane, into the first columns of `out` (H, wide)."""
+        best_half(self._compared(np.full(out.shape, inverse_depth, np.float32)), out)
+
+    def room(self, *planes: int) -> Array:
+        """(…, H, wide) float32."""
+        return np.empty((*planes, *self._each.shape[1:]), np.float32)
 
 
 @numba.njit(**OPTIONS)
@@ -226,7 +263,7 @@ def _into_order(low: Array, high: Array) -> None:
 
 @numba.njit(**OPTIONS)
 def best_half(costs: Array, out: Array) -> None:
-    """(K, H, W) costs, −1 unknown → the mean of the better half of the known ones: the worse half may be hidden behind something.
+    """(K, H, W) costs, −1 unknown → (H, W) the mean of the better half of the known ones: the worse half may be hidden behind something.
 
     Rows are sorted against each other, all their pixels at once: sorting pixel by pixel takes ten times as long.
     """
@@ -258,27 +295,29 @@ def best_half(costs: Array, out: Array) -> None:
 
 @numba.njit(**OPTIONS)
 def _put(costs: Array, first: int, volume: Array) -> None:
-    """Costs of some planes (G, H, W) into volume[:, :, first …], pixel by pixel: plane by plane each cost would go to a line of its own."""
-    for y in range(costs.shape[1]):
-        for x in range(costs.shape[2]):
-            for d in range(costs.shape[0]):
-                volume[y, x, first + d] = costs[d, y, x]
+    """Costs of some planes (G, H, wide) into volume[:, :, first …], pixel by pixel: plane by plane each would go to a line of its own."""
+    planes, height, width = costs.shape[0], volume.shape[0], volume.shape[1]
+    for y in range(height):
+        for start in range(0, width, LANES):
+            count = min(LANES, width - start)
+            if planes == GROUP and count == LANES:  # of known length, so it becomes loads and stores without loops
+                for x in range(LANES):
+                    for d in range(GROUP):
+                        volume[y, start + x, first + d] = costs[d, y, start + x]
+            else:
+                for x in range(count):
+                    for d in range(planes):
+                        volume[y, start + x, first + d] = costs[d, y, start + x]
 
 
 def sweep(view: GreyView, others: Sequence[GreyView], inverse_depths: Array) -> Array:
     """(H, W, D) float32 costs of the planes at `inverse_depths` (D,)."""
-    height, width = view.grey.shape
-    matcher = Matcher(view)
-    ways = [between(view, other) for other in others]
-    volume = np.empty((height, width, len(inverse_depths)), np.float32)
-    costs, group = np.empty((len(others), height, width), np.float32), np.empty((GROUP, height, width), np.float32)
-    plane = np.empty((height, width), np.float32)
+    matcher = Matcher(view, others)
+    volume = np.empty((*view.grey.shape, len(inverse_depths)), np.float32)
+    group = matcher.room(GROUP)
     for first in range(0, len(inverse_depths), GROUP):
         some = inverse_depths[first : first + GROUP]
-        for d, inverse_depth in enumerate(some):
-            plane[:] = inverse_depth
-            for k, other in enumerate(others):
-                matcher.cost(other, ways[k], plane, costs[k])
-            best_half(costs, group[d])
+        for inverse_depth, out in zip(some, group, strict=False):
+            matcher.plane_cost(float(inverse_depth), out)
         _put(group[: len(some)], first, volume)
     return volume

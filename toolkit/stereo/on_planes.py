@@ -17,7 +17,7 @@ import numpy as np
 from toolkit.camera import Array, Intrinsics
 from toolkit.stereo.bare import BLUR, spread_along
 from toolkit.stereo.check import agreement
-from toolkit.stereo.cost import UNKNOWN, GreyView, Matcher, best_half, between
+from toolkit.stereo.cost import GreyView, Matcher
 from toolkit.stereo.plane_maps import depth_of, in_camera, numbers_of
 
 ON = 0.03  # share of its depth by which a sure pixel may miss the plane that it speaks for
@@ -86,19 +86,14 @@ def shown_planes(index: int, views: Sequence[Unsure], planes: Array, rather: Arr
 
 def matching_costs(view: GreyView, others: Sequence[GreyView], depths: Sequence[Array]) -> Array:
     """(H, W, N) float32 costs of N depth maps, 0 to 1: how unlike the others' pictures are there; 1 where a map has no depth."""
-    matcher, ways = Matcher(view), [between(view, other) for other in others]
+    matcher = Matcher(view, others)
     out = np.ones((*view.grey.shape, len(depths)), np.float32)
-    each, cost = np.empty((len(others), *view.grey.shape), np.float32), np.full(view.grey.shape, UNKNOWN, np.float32)
     for number, depth in enumerate(depths):
         known = depth > 0
         if not known.any():
             continue
         inverse = np.where(known, 1 / np.where(known, depth, 1), 1 / np.median(depth[known])).astype(np.float32)
-        for k, other in enumerate(others):
-            matcher.cost(other, ways[k], inverse, each[k])
-        if others:
-            best_half(each, cost)
-        out[..., number] = np.where(known, cost, 1)
+        out[..., number] = np.where(known, matcher.cost(inverse), 1)
     return out
 
 

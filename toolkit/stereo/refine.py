@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from toolkit.camera import Array
-from toolkit.stereo.cost import GreyView, Matcher, best_half, between
+from toolkit.stereo.cost import GreyView, Matcher
 
 EVEN = 5  # pixels a side of the median that the depth map is evened out with before pictures are warped by it
 LEAST_BEND = 1e-4  # of the costs' parabola; flatter ones have no lowest point worth moving to
@@ -21,18 +21,14 @@ def refined(view: GreyView, others: Sequence[GreyView], inverse_depth: Array, st
     Returns:
         (H, W) float32 inverse depth, and (H, W) float32 the lowest of the last round's costs.
     """
-    matcher = Matcher(view)
-    ways = [between(view, other) for other in others]
+    matcher = Matcher(view, others)
     now = inverse_depth.astype(np.float32)
-    costs = np.empty((len(others), *now.shape), np.float32)
     three = np.empty((3, *now.shape), np.float32)
     for number in range(rounds):
         reach = np.float32(0.5 * step / 2**number)
         even = cv2.medianBlur(now, EVEN)
         for place, side in enumerate((-1, 0, 1)):
-            for k, other in enumerate(others):
-                matcher.cost(other, ways[k], even + side * reach, costs[k])
-            best_half(costs, three[place])
+            three[place] = matcher.cost(even + side * reach)
         low, mid, high = three
         bend = low - 2 * mid + high
         shift = np.clip(0.5 * (low - high) / np.maximum(bend, LEAST_BEND), -1, 1)
