@@ -13,6 +13,12 @@ if not torch.cuda.is_available():
 torch.set_num_threads(1)  # the tensors are small, and two threads that share one core wait for each other
 
 
+@pytest.fixture(autouse=True)
+def _numbers_of_its_own() -> None:
+    """Each test draws the same tensors whichever ran before it: one that held for most of them failed once in 27 runs."""
+    torch.manual_seed(0)
+
+
 def shared_data(name: str) -> Path:
     """The folder (or file) of a real capture, or skip the test with the reason.
 
