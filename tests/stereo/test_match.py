@@ -15,7 +15,8 @@ from toolkit.errors import InputError, Interrupted
 from toolkit.poses.overlap import parallax, spread_parallax
 from toolkit.progress import Progress
 from toolkit.stereo import match
-from toolkit.stereo.cost import NOISE, UNKNOWN, GreyView, Matcher, best_half, grey_view, plane_homography, sweep
+from toolkit.stereo.correlate import NOISE
+from toolkit.stereo.cost import UNKNOWN, GreyView, Matcher, best_half, grey_view, plane_homography, sweep
 from toolkit.stereo.match import LENIENT, MANY, STRICT, StereoDepth, demands, inverse_depths, stereo_depths, usable_neighbours
 from toolkit.stereo.polish import Polisher
 from toolkit.stereo.smooth import PATHS, SOFT_EDGE, smoothed_planes
