@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.poses.textured import PLANES, arc, render, texture
-from tests.stereo.test_match import CAMERA, FAR, MEDIAN, NEAR, relative_errors, views_of
+from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, relative_errors, views_of
 from toolkit.camera import Array, Intrinsics, pixel_grid, unproject
 from toolkit.capture.types import Views
 from toolkit.stereo import bare

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.stereo.test_match import CAMERA, FAR, MEDIAN, NEAR, corner
+from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, corner
 from toolkit.camera import Array, Intrinsics, project, unproject
 from toolkit.capture.types import Views
 from toolkit.errors import InputError, Interrupted

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.poses.textured import look_at
+from tests.stereo.made import CAMERA
 from tests.stereo.test_bare import filmed
-from tests.stereo.test_match import CAMERA
 from toolkit.camera import Array
 from toolkit.stereo.bare import points_of
 from toolkit.stereo.cost import UNKNOWN, grey_view

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.stereo.test_match import FAR, MEDIAN, NEAR, corner
+from tests.stereo.made import FAR, MEDIAN, NEAR, corner
 from toolkit.capture.types import Views
 from toolkit.stereo import quick
 from toolkit.stereo.match import LONG_SIDE

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from tests.stereo.made import CAMERA, MEDIAN
 from tests.stereo.test_bare import filmed
-from tests.stereo.test_match import CAMERA, MEDIAN
 from toolkit.camera import Array
 from toolkit.capture.types import Views
 from toolkit.errors import Interrupted

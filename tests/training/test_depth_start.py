@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.stereo.test_match import FAR, MEDIAN, NEAR, corner
+from tests.stereo.made import FAR, MEDIAN, NEAR, corner
 from toolkit.camera import Array, Similarity, invert, unproject
 from toolkit.capture.types import Views
 from toolkit.config import Settings, load_settings

@@ -10,7 +10,7 @@ from itertools import count
 import numpy as np
 import pytest
 
-from tests.stereo.test_match import FAR, MEDIAN, NEAR, corner
+from tests.stereo.made import FAR, MEDIAN, NEAR, corner
 from tests.stereo.test_moving import PASSED, with_passer
 from toolkit.camera import Similarity
 from toolkit.capture.types import Views

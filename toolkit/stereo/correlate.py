@@ -103,7 +103,9 @@ def correlate(
 
     Args:
         own, mean, steep: (H, wide) grey levels less `MIDDLE`; mean and 1 / deviation of windows, which begin `HALF` before their middles.
-        columns: (wide,) of the picture, as numbers with fractions.
+        columns: (wide,) float32 of the picture.
+        quads: (h, w) of the other picture, both at least 2 (`cost.GreyView.quads`).
+        far, move: (3, 3) and (3,) of `cost.between`.
         inverse: (H, wide) inverse depths, whose first `HALF` stand before the first column.
         out: (H, wide), −1 where the other picture does not show a point; nothing of meaning beyond the picture's width.
     """
