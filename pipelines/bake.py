@@ -77,10 +77,10 @@ def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: floa
         for index in np.flatnonzero(views.test):
             job.progress.check()
             lens, pose = views.intrinsics[index], views.world_from_camera[index]
-            truth = views.images[index].astype(np.float32) / 255
+            truth = views.photo(int(index)).astype(np.float32) / 255
             valid = views.valid[index] if views.valid else None
             pictures = render_view(field, lens, pose, view).rgb, renderer.render(lens, pose).rgb
-            pair = [psnr(picture, truth, valid) for picture in pictures]
+            pair = [psnr(views.as_taken(int(index), picture), truth, valid) for picture in pictures]
             if None not in pair:
                 scores.append(pair)
         job.progress.finish("bake", time.monotonic() - start, False)

@@ -54,6 +54,7 @@ def find_effects(job: Job, posed: Capture) -> Corrections:
         load=lambda: read_kept(path, EFFECTS),
         uses=[asdict(settings), holdout, [frame.name for frame in posed.frames], pixel_state(posed)],
         after=["poses"],
+        version=2,
     )
     corrections = Corrections.from_dict(data.get("corrections", {}) if isinstance(data, dict) else {})
     choose_field(field, data["effects"], settings.off)

@@ -16,8 +16,6 @@ def as_taken(job: Job, posed: Capture, indices: Array, shown: Views, side: int) 
     """Cameras and pictures of the frames `indices`, which are the views `shown`: as large as they were taken, up to `side` pixels along
     the long side, corrected as those of the fit, and read one at a time; those of the fit where the originals are no larger."""
     from toolkit.capture.prepare import pictures_at, target_size
-    from toolkit.effects.correct import canonical
-
     found = job.corrections
     lenses = []
     for index, small in zip(indices, shown.intrinsics, strict=True):
@@ -33,6 +31,7 @@ def as_taken(job: Job, posed: Capture, indices: Array, shown: Views, side: int) 
         for lens, name, (_, picture) in zip(lenses, shown.names, pictures_at(posed, indices, side), strict=True):
             if picture.shape[:2] != (lens.height, lens.width):
                 picture = cv2.resize(picture, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-            yield picture if found is None else canonical(picture, lens, found.gain.get(name), found.corner)[0]
+            tone = None if found is None else found.tone(name)
+            yield picture if tone is None else tone.undone(picture, lens)[0]
 
     return lenses, read()

@@ -17,6 +17,7 @@ from toolkit.capture.types import Views
 from toolkit.capture.views_file import load_views, save_views
 from toolkit.config import CaptureSettings
 from toolkit.errors import InputError, OutputError
+from toolkit.tone import Tone
 
 PLAIN = Intrinsics(480, 360, 400.0, 396.0, 236.5, 183.25)
 BARREL = Intrinsics(480, 360, 400.0, 396.0, 236.5, 183.25, OPENCV, (-0.18, 0.04, 0.002, -0.0015))
@@ -52,6 +53,21 @@ def test_views_survive_the_file(tmp_path: Path) -> None:
         assert same(getattr(back, name), getattr(views, name)), name
     assert [value is None for value in back.alpha] == [False, True, True]
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["views.safetensors"]
+
+
+def test_photos_and_what_was_taken_out_of_them_survive(tmp_path: Path) -> None:
+    plain = some_views(tmp_path)
+    tones = [Tone((1.5, 1.25, 1.0), 0.6), None, Tone((0.5, 0.5, 0.5))]
+    views = replace(plain, photos=[plain.images[0], None, None], tones=tones)
+    save_views(tmp_path / "v.safetensors", views)
+    back = load_views(tmp_path / "v.safetensors")
+    assert back.tones == tones and same(back.photos, views.photos) and np.array_equal(back.photo(0), plain.images[0])
+    data = (tmp_path / "v.safetensors").read_bytes()
+    for bad in (data.replace(b"[1.5, 1.25, 1.0]", b"[1.5, 1.25, -1.]"), data.replace(b"[1.5, 1.25, 1.0]", b"[1.5, 1.25     ]")):
+        assert bad != data
+        (tmp_path / "v.safetensors").write_bytes(bad)
+        with pytest.raises(InputError, match="damaged"):
+            load_views(tmp_path / "v.safetensors")
 
 
 def test_views_without_optional_lists_survive(tmp_path: Path) -> None:

@@ -11,8 +11,11 @@ import torch
 from toolkit.camera import FISHEYE, OPENCV, Intrinsics, distort
 from toolkit.capture.types import Capture, Frame, Views
 from toolkit.effects import transfer, vignetting
-from toolkit.effects.correct import Corrections, bent, canonical, correctable
+from toolkit.effects.correct import Corrections, bent, correctable
 from toolkit.errors import InputError
+from toolkit.evaluate.score import score_views
+from toolkit.render.image import Rendered
+from toolkit.tone import Tone
 from toolkit.training.rays import PixelPool
 
 CAMERA = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -32,8 +35,7 @@ def test_nothing_to_correct_gives_the_very_same_objects() -> None:
     capture = Capture("transforms", root=Path(), frames=())
     assert Corrections().on_views(before) is before
     assert Corrections().on_capture(capture) is capture
-    image, lost = canonical(before.images[0], CAMERA, None, None)
-    assert image is before.images[0] and lost is None
+    assert Corrections().tone("a") is None
 
 
 def test_gain_and_vignetting_are_undone() -> None:
@@ -41,9 +43,10 @@ def test_gain_and_vignetting_are_undone() -> None:
     gain = (1.3, 1.1, 0.8)
     dimmed = vignetting.forward(vignetting.Vignetting(0.5), linear, vignetting.radii(CAMERA)) * torch.tensor(gain)
     stored = transfer.to_bytes(transfer.encode(dimmed)).numpy()
-    back, lost = canonical(stored, CAMERA, gain, 0.5)
+    back, lost = Tone(gain, 0.5).undone(stored, CAMERA)
+    assert lost is not None
     assert np.abs(back.astype(int) - picture())[~lost].max() <= 3  # 8 bits twice, brightened by 2 in the corner
-    even, _ = canonical(transfer.to_bytes(transfer.encode(linear * torch.tensor(gain))).numpy(), CAMERA, gain, None)
+    even, _ = Tone(gain).undone(transfer.to_bytes(transfer.encode(linear * torch.tensor(gain))).numpy(), CAMERA)
     assert np.abs(even.astype(int) - picture()).max() <= 2
 
 
@@ -54,6 +57,33 @@ def test_clipped_pixels_that_become_darker_are_not_valid() -> None:
     assert after.valid[1] is not None and not after.valid[1].any()
     assert after.valid[0] is None and after.valid[2] is None
     assert after.images[0] is before.images[0]
+
+
+def test_held_out_views_keep_their_photo_and_all_of_its_pixels() -> None:
+    before = views()
+    before.images[0][:10] = 255
+    after = Corrections(gain={"a": (2.0, 2.0, 2.0), "c": (0.5, 0.5, 0.5)}).on_views(before)
+    assert after.photo(0) is before.images[0] and after.valid[0] is None
+    assert after.images[0] is not before.images[0] and after.photos[1] is None and after.photos[2] is None
+    shown = after.as_taken(0, after.images[0] / 255)
+    assert np.abs(shown * 255 - before.images[0]).max() < 3
+    assert after.photo(2) is after.images[2] and after.as_taken(2, shown) is shown  # a training view is what is fitted
+    part = after.subset([2, 0])
+    assert part.photo(1) is before.images[0] and np.array_equal(part.as_taken(1, after.images[0] / 255), shown)
+
+
+def test_a_perfect_field_is_scored_as_perfect_whatever_was_corrected() -> None:
+    """A picture exposed and darkened more than others is told from its canonical colours as they were taken, not brightened ones."""
+    scene, gain = picture(5), (0.5, 0.45, 0.55)
+    linear = transfer.decode(torch.from_numpy(scene.astype(np.float32) / 255))
+    dimmed = vignetting.forward(vignetting.Vignetting(0.4), linear, vignetting.radii(CAMERA)) * torch.tensor(gain)
+    before = views()
+    before.images[0] = transfer.to_bytes(transfer.encode(dimmed)).numpy()
+    after = Corrections(gain={"a": gain}, corner=0.4, dimmed=1.3).on_views(before)
+    field = transfer.encode(linear / 1.3).numpy()  # what a fit to such pictures would show
+    shown = Rendered(field, np.zeros((48, 64), np.float32), np.ones((48, 64), np.float32))
+    assert score_views([shown], after, [0])["psnr"] > 55
+    assert score_views([shown], before, [0])["psnr"] < 25
 
 
 def test_weights_are_of_training_views_and_change_no_pixel() -> None:
@@ -101,13 +131,16 @@ def test_poses_and_lens_go_into_the_capture() -> None:
 
 
 def test_corrections_survive_their_file_and_damaged_ones_are_refused() -> None:
-    whole = Corrections({"a": (1.0, 1.1, 0.9)}, 0.6, (-0.1, 0.02), {"a": np.eye(4)}, {"b": 0.25})
+    whole = Corrections({"a": (1.0, 1.1, 0.9)}, 0.6, 1.25, (-0.1, 0.02), {"a": np.eye(4)}, {"b": 0.25})
     again = Corrections.from_dict(whole.to_dict())
     assert again.to_dict() == whole.to_dict() and again.gain == whole.gain
     for damage in (
         {"gain": {"a": [0.0, 1, 1]}},
         {"gain": {"a": [1, 1]}},
         {"corner": "x"},
+        {"corner": -1},
+        {"dimmed": 0},
+        {"dimmed": float("nan")},
         {"poses": {"a": [1]}},
         {"lens": [1]},
         {"weight": 3},
@@ -116,7 +149,8 @@ def test_corrections_survive_their_file_and_damaged_ones_are_refused() -> None:
     ):
         with pytest.raises(InputError, match=r"effects\.json"):
             Corrections.from_dict({**whole.to_dict(), **damage})
-    older = {key: value for key, value in whole.to_dict().items() if key != "weight"}
+    older = {key: value for key, value in whole.to_dict().items() if key not in ("weight", "dimmed")}
+    assert Corrections.from_dict({**older, "weight": {}}).dimmed == 1
     assert Corrections.from_dict({**older, "left_out": ["b"]}).weight == {"b": 0.0}
     for damage in ({}, {"left_out": 3}):
         with pytest.raises(InputError, match=r"effects\.json"):

@@ -11,12 +11,12 @@ import pytest
 from pipelines.bench_effects import switched_table
 from toolkit.capture import open_capture
 from toolkit.capture.prepare import held_out
-from toolkit.effects.correct import canonical
 from toolkit.errors import InputError, Interrupted
 from toolkit.evaluate import effects_fits, effects_plan, effects_switch
 from toolkit.evaluate.effects_plan import Planned, drifting, film
 from toolkit.evaluate.effects_truth import canonical_capture, known_light
 from toolkit.progress import Progress
+from toolkit.tone import Tone
 
 DRIFT = (("exposure", "medium"), ("vignetting", "medium"))
 
@@ -55,7 +55,7 @@ def test_exact_corrections_bring_the_pictures_to_the_canonical_ones(tmp_path: Pa
             continue
         camera = before.intrinsics
         assert camera is not None
-        corrected, lost = canonical(picture(before.image), camera, known.gain[before.name], known.corner)
+        corrected, lost = Tone(known.gain[before.name], known.corner).undone(picture(before.image), camera)
         dark = ~lost if lost is not None else np.ones(corrected.shape[:2], dtype=bool)
         off = np.abs(corrected.astype(int) - picture(after.image))[dark]
         assert np.percentile(off, 95) <= 3 and np.abs(picture(before.image).astype(int) - picture(after.image)).mean() > 5

@@ -17,9 +17,10 @@ from pipelines.surface import finer_views
 from pipelines.taken import as_taken
 from tests.pipelines.made import CAMERA, call, make_room
 from tests.pipelines.short import ALONE
-from toolkit.effects.correct import Corrections, canonical
+from toolkit.effects.correct import Corrections
 from toolkit.errors import InputError
 from toolkit.files import read_json
+from toolkit.tone import Tone
 
 Capsys = pytest.CaptureFixture[str]
 FEW = ["--image-size", "48", "--budget", "2", *ALONE, "--set", "field.resolution=32", "--set", "export.mesh_views=6", "--quiet"]
@@ -73,7 +74,7 @@ def test_large_pictures_are_corrected_as_those_of_the_fit(run: Path) -> None:
         plain = next(iter(as_taken(job, posed, np.array([1]), shown, 1280)[1]))
         job.corrections = Corrections({views.names[1]: (1.5, 1.0, 0.8)})
         corrected = next(iter(as_taken(job, posed, np.array([1]), shown, 1280)[1]))
-    assert np.array_equal(corrected, canonical(plain, TAKEN, (1.5, 1.0, 0.8), None)[0])
+    assert np.array_equal(corrected, Tone((1.5, 1.0, 0.8)).undone(plain, TAKEN)[0])
     assert (corrected[..., 0] < plain[..., 0]).mean() > 0.9 and np.array_equal(corrected[..., 1], plain[..., 1])
 
 

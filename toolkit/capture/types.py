@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from toolkit.camera import Array, Intrinsics
+from toolkit.tone import Tone
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,8 @@ class Views:
     matched: bool = False  # `depths` were found by matching pictures, not measured
     rough: bool = False  # `depths` were found by matching small pictures: less exact than a sensor's, or than those of matching in full
     weight: list[float] = field(default_factory=list)  # share of a view's pixels that a fit draws rays from; empty: all of all views
+    photos: list[Array | None] = field(default_factory=list)  # held-out pictures as they were before colours were corrected, uint8
+    tones: list[Tone | None] = field(default_factory=list)  # what was taken out of each picture's colours; None, empty: nothing
 
     def __len__(self) -> int:
         return len(self.names)
@@ -101,4 +104,16 @@ class Views:
             matched=self.matched,
             rough=self.rough,
             weight=[self.weight[i] for i in keep] if self.weight else [],
+            photos=[self.photos[i] for i in keep] if self.photos else [],
+            tones=[self.tones[i] for i in keep] if self.tones else [],
         )
+
+    def photo(self, index: int) -> Array:
+        """(H, W, 3) uint8: what a rendering of view `index` is held against, the picture in the colours in which it was taken."""
+        photo = self.photos[index] if self.photos else None
+        return self.images[index] if photo is None else photo
+
+    def as_taken(self, index: int, shown: Array) -> Array:
+        """A rendering (H, W, 3) in [0, 1] of view `index` with what was taken out of the picture's colours put back."""
+        tone = self.tones[index] if self.photos and self.photos[index] is not None else None
+        return shown if tone is None else tone.applied(shown, self.intrinsics[index])

@@ -15,9 +15,10 @@ from toolkit.camera import PINHOLE, Array, Intrinsics
 from toolkit.capture.types import Views
 from toolkit.errors import InputError, OutputError, first_line
 from toolkit.files import atomic_path
+from toolkit.tone import Tone
 
 VERSION = 1
-_OPTIONAL: dict[str, type] = {"valid": np.bool_, "alpha": np.uint8, "depth": np.float32}
+_OPTIONAL: dict[str, type] = {"valid": np.bool_, "alpha": np.uint8, "depth": np.float32, "photo": np.uint8}
 
 
 def save_views(path: Path, views: Views) -> None:
@@ -32,7 +33,7 @@ def save_views(path: Path, views: Views) -> None:
     }
     for index in range(len(views)):
         tensors[f"image.{index}"] = np.ascontiguousarray(views.images[index], dtype=np.uint8)
-        for name, values in (("valid", views.valid), ("alpha", views.alpha), ("depth", views.depths)):
+        for name, values in (("valid", views.valid), ("alpha", views.alpha), ("depth", views.depths), ("photo", views.photos)):
             value = values[index] if values else None
             if value is not None:
                 tensors[f"{name}.{index}"] = np.ascontiguousarray(value, dtype=_OPTIONAL[name])
@@ -41,6 +42,7 @@ def save_views(path: Path, views: Views) -> None:
         "intrinsics": [intrinsics.to_dict() for intrinsics in views.intrinsics],
         "background": views.background,
         "weight": views.weight,
+        "tones": [None if tone is None else tone.to_dict() for tone in views.tones],
     }
     with atomic_path(path) as temporary:
         try:
@@ -85,14 +87,19 @@ def _assemble(facts: dict[str, Any], keys: set[str], file: Any) -> Views:
     for index, camera in enumerate(cameras):
         _require(camera.lens == PINHOLE and not camera.distorted, f"camera {index} has a lens")
         views.images.append(_tensor(file, f"image.{index}", np.uint8, (camera.height, camera.width, 3)))
-        for name, values in (("valid", views.valid), ("alpha", views.alpha), ("depth", views.depths)):
-            key = f"{name}.{index}"
-            values.append(_tensor(file, key, _OPTIONAL[name], (camera.height, camera.width)) if key in keys else None)
+        for name, values in (("valid", views.valid), ("alpha", views.alpha), ("depth", views.depths), ("photo", views.photos)):
+            key, shape = f"{name}.{index}", (camera.height, camera.width, *((3,) if name == "photo" else ()))
+            values.append(_tensor(file, key, _OPTIONAL[name], shape) if key in keys else None)
     if facts["background"] is not None:
         red, green, blue = (float(value) for value in facts["background"])
         _require(all(math.isfinite(value) and 0 <= value <= 1 for value in (red, green, blue)), "the background is no colour")
         views.background = (red, green, blue)
     views.weight = [float(value) for value in facts.get("weight", [])]
+    views.tones = [None if entry is None else Tone.from_dict(entry) for entry in facts.get("tones", [])]
+    _require(len(views.tones) in (0, count), "a picture's tone is missing")
+    if all(photo is None for photo in views.photos):
+        views.photos = []
+    _require(bool(views.tones) or not views.photos, "there are photos in other colours, and nothing tells in which")
     _require(len(views.weight) in (0, count) and all(0 <= value <= 1 for value in views.weight), "a weight is no share, or one is missing")
     return views
 

@@ -21,8 +21,9 @@ import numpy as np
 from toolkit.camera import Array, distort
 from toolkit.effects.adjust import Problem
 from toolkit.effects.evidence import Evidence, HeldOut
-from toolkit.effects.sightings import LINEAR, Sightings
+from toolkit.effects.sightings import Sightings
 from toolkit.poses.points import undistorted
+from toolkit.tone import LINEAR
 
 THRESHOLD = 0.002  # share of the patches that tell
 LEAST = 5  # far ones: fewer may be chance

@@ -1,7 +1,8 @@
 """What is taken out of a capture before anything is fitted to it, as plain data: colours, the lens, errors of poses, weights.
 
 Gains have geometric mean 1 over the training pictures, the vignetting is 1 in the middle, refined poses are held to the given ones
-(`refine.believed`): every freedom that pictures cannot tell is fixed. Where nothing is to be corrected, the very same objects come back.
+(`refine.believed`): every freedom that pictures cannot tell is fixed. What would then be too bright for a picture is made room for
+(`dimmed`). Where nothing is to be corrected, the very same objects come back.
 """
 
 from __future__ import annotations
@@ -13,13 +14,8 @@ import numpy as np
 
 from toolkit.camera import OPENCV, PINHOLE, Array, Intrinsics, distort
 from toolkit.capture.types import Capture, Views
-from toolkit.effects.sightings import LINEAR
 from toolkit.errors import InputError, first_line
-
-Gain = tuple[float, float, float]  # of red, green and blue
-
-CLIPPED = 254  # of 255: such a pixel may have been brighter
-DARKER = 1.02  # a clipped pixel that is divided by more than this has no known colour
+from toolkit.tone import Gain, Tone, positive
 
 
 @dataclass(frozen=True)
@@ -28,6 +24,7 @@ class Corrections:
 
     gain: dict[str, Gain] = field(default_factory=dict)
     corner: float | None = None  # light left at half a diagonal
+    dimmed: float = 1.0  # canonical light is divided by this besides, so that little of it is clipped
     lens: tuple[float, float] | None = None  # k1, k2 beyond the given lens
     poses: dict[str, Array] = field(default_factory=dict)  # (4, 4) world_from_camera
     weight: dict[str, float] = field(default_factory=dict)  # of frames that count for less in the fit: share of their pixels, 0 to 1
@@ -37,8 +34,20 @@ class Corrections:
         return self.lens is not None or bool(self.poses)
 
     @property
+    def coloured(self) -> bool:
+        """Whether colours are corrected."""
+        return self.corner is not None or bool(self.gain)
+
+    def tone(self, name: str) -> Tone | None:
+        """What is taken out of the colours of a frame; None: nothing."""
+        if self.corner is None and name not in self.gain and self.dimmed == 1:
+            return None
+        red, green, blue = (value * self.dimmed for value in self.gain.get(name, (1.0, 1.0, 1.0)))
+        return Tone((red, green, blue), self.corner)
+
+    @property
     def photometric(self) -> bool:
-        return self.corner is not None or bool(self.gain) or bool(self.weight)
+        return self.coloured or bool(self.weight)
 
     def on_capture(self, capture: Capture) -> Capture:
         """The capture with the refined lens and poses."""
@@ -51,27 +60,34 @@ class Corrections:
         return capture.with_frames(frames)
 
     def on_views(self, views: Views) -> Views:
-        """The views in canonical colour, training views with their weights.
+        """The views in canonical colour, training views with their weights, held-out ones with their photos.
 
-        Not valid any more are clipped pixels that become darker: their colour is not known.
+        Not valid any more are clipped pixels of training views that become darker: their colour is not known.
         """
         if not self.photometric:
             return views
-        images: list[Array] = []
+        tones = [self.tone(name) for name in views.names]
+        images = list(views.images)
         valid: list[Array | None] = list(views.valid) if views.valid else [None] * len(views)
-        for index, name in enumerate(views.names):
-            image, lost = canonical(views.images[index], views.intrinsics[index], self.gain.get(name), self.corner)
-            images.append(image)
-            if lost is not None and lost.any():
+        photos: list[Array | None] = [None] * len(views)
+        for index, tone in enumerate(tones):
+            if tone is None:
+                continue
+            images[index], lost = tone.undone(views.images[index], views.intrinsics[index])
+            if views.test[index]:  # scored against the photo, which is known everywhere
+                photos[index] = views.images[index]
+            elif lost is not None and lost.any():
                 before = valid[index]
                 valid[index] = ~lost if before is None else before & ~lost
         weight = [1.0 if test else self.weight.get(name, 1.0) for name, test in zip(views.names, views.test, strict=True)]
-        return replace(views, images=images, valid=valid, weight=weight if self.weight else [])
+        changed = replace(views, images=images, valid=valid, weight=weight if self.weight else [])
+        return replace(changed, photos=photos, tones=tones) if self.coloured else changed
 
     def to_dict(self) -> dict[str, Any]:
         return {
             "gain": {name: [round(value, 6) for value in gain] for name, gain in self.gain.items()},
             "corner": self.corner,
+            "dimmed": self.dimmed,
             "lens": None if self.lens is None else list(self.lens),
             "poses": {name: pose.tolist() for name, pose in self.poses.items()},
             "weight": dict(self.weight),
@@ -85,64 +101,24 @@ class Corrections:
             InputError: the data does not hold what `to_dict` writes.
         """
         try:
-            gain = {str(name): tuple(float(value) for value in values) for name, values in data["gain"].items()}
+            gain = {str(name): tuple(positive(value) for value in values) for name, values in data["gain"].items()}
             poses = {str(name): np.array(pose, dtype=np.float64).reshape(4, 4) for name, pose in data["poses"].items()}
-            corner = None if data["corner"] is None else float(data["corner"])
+            corner = None if data["corner"] is None else positive(data["corner"])
+            dimmed = positive(data.get("dimmed", 1.0))
             lens = None if data["lens"] is None else (float(data["lens"][0]), float(data["lens"][1]))
-            numbers = [*(value for values in gain.values() for value in values), *([] if corner is None else [corner])]
             # Before there were weights, the most blurred frames were left out.
             weights = data["weight"] if "weight" in data else dict.fromkeys(data["left_out"], 0)
             weight = {str(name): float(value) for name, value in weights.items()}
             if any(not 0 <= value <= 1 for value in weight.values()):
                 raise ValueError("a weight is not a share")
-            if any(len(values) != 3 for values in gain.values()) or any(not 0 < value < 1e6 for value in numbers):
-                raise ValueError("a gain is not a positive number for each channel")
+            if any(len(values) != 3 for values in gain.values()):
+                raise ValueError("a gain is not a number for each channel")
             if any(not np.isfinite(pose).all() for pose in poses.values()) or (lens is not None and not np.isfinite(lens).all()):
                 raise ValueError("a pose or the lens is not finite")
             exact = {name: (values[0], values[1], values[2]) for name, values in gain.items()}
-            return cls(exact, corner, lens, poses, weight)
+            return cls(exact, corner, dimmed, lens, poses, weight)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
             raise InputError(f"effects.json is not what the effects stage writes ({first_line(error)}); remove it and run again") from error
-
-
-def canonical(image: Array, camera: Intrinsics, gain: Gain | None, corner: float | None) -> tuple[Array, Array | None]:
-    """(H, W, 3) uint8 sRGB with gains and vignetting divided out in linear light, and (H, W) bool where the result is not known."""
-    if gain is None and corner is None:
-        return image, None
-    factor = np.array(gain or (1.0, 1.0, 1.0), dtype=np.float32)
-    clipped: Array = np.asarray((image >= CLIPPED).any(2))
-    if corner is None:
-        table = np.stack([_stored(LINEAR / factor[channel]) for channel in range(3)], axis=1)  # (256, 3)
-        out = np.stack([table[image[..., channel], channel] for channel in range(3)], axis=2)
-        return out, clipped if factor.max() > DARKER else None
-    share = (1 + (corner**-0.5 - 1) * _square_radius(camera)) ** -2
-    divisor = share[..., None] * factor
-    return _stored(LINEAR[image] / divisor), clipped & (divisor.max(2) > DARKER)
-
-
-def _square_radius(camera: Intrinsics) -> Array:
-    """(H, W) squared distance from the principal point in half diagonals, as in `vignetting.radii`."""
-    x = np.arange(camera.width, dtype=np.float32) + 0.5 - camera.cx
-    y = np.arange(camera.height, dtype=np.float32) + 0.5 - camera.cy
-    return np.asarray((x[None] ** 2 + y[:, None] ** 2) / (0.25 * (camera.width**2 + camera.height**2)), dtype=np.float32)
-
-
-STEPS = 4096
-
-
-def _stored(linear: Array) -> Array:
-    """Linear light → uint8 sRGB, through a table that is fine enough for 8 bits: steps of the square root, which is nearly even in sRGB."""
-    root = np.sqrt(np.clip(linear, 0, 1))
-    return ENCODED[(root * (STEPS - 1) + 0.5).astype(np.int32)]
-
-
-def _encoded() -> Array:
-    light = (np.arange(STEPS) / (STEPS - 1)) ** 2
-    stored = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return np.round(255 * stored).astype(np.uint8)
-
-
-ENCODED = _encoded()  # (STEPS,)
 
 
 def correctable(camera: Intrinsics) -> bool:

@@ -19,12 +19,16 @@ from toolkit.effects.light import EXPOSURE, VIGNETTING
 from toolkit.effects.motion_blur import POWER
 from toolkit.effects.paid import POINTS, Paid
 from toolkit.effects.refine import refined_poses
-from toolkit.effects.sightings import Look, gather
+from toolkit.effects.sightings import Look, Sightings, gather
 from toolkit.effects.survey import BLUR, FAR, VIEWS, Finding, Survey, survey
 from toolkit.progress import SILENT, Progress
+from toolkit.tone import LINEAR, Gain, share
 
 SHARP = 0.75  # quantile of the sharpness from which on a frame counts in full
 LEAST_WEIGHT = 0.1
+CLIPS = 0.01  # share of the pixels that corrections may make too bright for a picture …
+DIMMEST = 2.0  # … unless all would have to become darker than by this
+STRIDE = 4  # working pixels between those that tell
 TOLD_ONLY = {
     ROWS: "only told, not corrected",
 }
@@ -144,8 +148,8 @@ def _corrections(
         with found.paid.by(LENS):
             lens = (explained.problem if LENS in explained.kept else adjust(explained.problem, explained.kept | {LENS}).problem).lens
     if seen is None or not on & {EXPOSURE, POSES, BLUR}:
-        return Corrections(corner=corner, lens=lens)
-    gain: dict[str, tuple[float, float, float]] = {}
+        return Corrections(corner=corner, dimmed=_dimmed(seen, corner, {}), lens=lens)
+    gain: dict[str, Gain] = {}
     poses: dict[str, Array] = {}
     weight: dict[str, float] = {}
     if BLUR in on:
@@ -165,7 +169,21 @@ def _corrections(
                 moved, beyond = refined_poses(every, ~test, kept | on)
             poses = dict(zip(every.names, moved, strict=True))
             lens = beyond if LENS in on else None
-    return Corrections(gain, corner, lens, poses, weight)
+    return Corrections(gain, corner, _dimmed(seen, corner, gain), lens, poses, weight)
+
+
+def _dimmed(seen: Sightings | None, corner: float | None, gain: dict[str, Gain]) -> float:
+    """What canonical light is divided by so that hardly any of it is too bright for a picture, `DIMMEST` at most: what is clipped there
+    is lost, and agrees with no photo that shows it because it was exposed less."""
+    if seen is None or not (gain or corner is not None):
+        return 1.0
+    brightness = []
+    for name, grey, camera, scale in zip(seen.names, seen.pictures, seen.cameras, seen.scale, strict=True):
+        y, x = (np.arange(0, side, STRIDE) + 0.5 for side in grey.shape)
+        square = (x[None] / scale - camera.cx) ** 2 + (y[:, None] / scale - camera.cy) ** 2
+        left = 1.0 if corner is None else share(corner, square / (0.25 * (camera.width**2 + camera.height**2)))
+        brightness.append((LINEAR[grey[::STRIDE, ::STRIDE]] / (left * min(gain.get(name, (1.0,))))).ravel())
+    return round(float(np.clip(np.quantile(np.concatenate(brightness), 1 - CLIPS), 1.0, DIMMEST)), 4)
 
 
 def _weights(train: Sequence[str], names: Sequence[str], sharpness: Array) -> dict[str, float]:

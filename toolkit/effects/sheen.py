@@ -16,15 +16,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
 
 from toolkit.camera import Array
 from toolkit.effects.adjust import Problem
 from toolkit.effects.beyond import carried, rays_of
 from toolkit.effects.evidence import Evidence, HeldOut
 from toolkit.effects.light import EXPOSURE, VIGNETTING, Light
-from toolkit.effects.sightings import LINEAR, Sightings
-from toolkit.effects.vignetting import Vignetting, falloff
+from toolkit.effects.sightings import Sightings
+from toolkit.tone import LINEAR, share
 
 THRESHOLD = 0.0014  # share of the patches
 LEAST = 3  # shiny ones
@@ -87,8 +86,8 @@ def _picture(seen: Sightings, index: int, found: Light) -> _Picture:
     if VIGNETTING in found.kept:
         x = (np.arange(grey.shape[1]) + 0.5) / seen.scale[index] - camera.cx
         y = (np.arange(grey.shape[0]) + 0.5) / seen.scale[index] - camera.cy
-        radius = np.hypot(x[None], y[:, None]) / (0.5 * np.hypot(camera.width, camera.height))
-        light = light / falloff(Vignetting(found.corner), torch.from_numpy(radius)).numpy()
+        square = (x[None] ** 2 + y[:, None] ** 2) / (0.25 * (camera.width**2 + camera.height**2))
+        light = light / share(found.corner, square)
     log = np.log2(cv2.GaussianBlur(light, (0, 0), BLUR))
     square = np.ones((2 * HALF + 1, 2 * HALF + 1), np.uint8)
     return _Picture(log.astype(np.float32), cv2.erode(grey, square), cv2.dilate(grey, square))

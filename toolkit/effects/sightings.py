@@ -20,6 +20,7 @@ from toolkit.effects.evidence import Tracks
 from toolkit.poses.overlap import best_neighbours, guessed_depth, overlap, parallax
 from toolkit.poses.points import epipolar_distance, mutual_matches, tracks, undistorted
 from toolkit.progress import SILENT, Progress
+from toolkit.tone import LINEAR
 
 LONG_SIDE = 480  # pixels that features are looked for on
 FEATURES = 700  # a picture
@@ -250,11 +251,3 @@ def _around(light: Array, at: Array, size: Array) -> Array:
             values = cv2.remap(blurred, at[None, mine, 0], at[None, mine, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             out[mine] += share[mine, None] * values.reshape(-1, 3)
     return out
-
-
-def _decoded() -> Array:
-    stored = np.arange(256) / 255.0
-    return np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-LINEAR = _decoded()  # (256,) linear light of the stored values

@@ -11,6 +11,7 @@ import numpy as np
 from toolkit.camera import Array
 from toolkit.capture.types import Views
 from toolkit.evaluate.images import psnr
+from toolkit.evaluate.pixels import as_float
 from toolkit.evaluate.score import entry, mean
 
 
@@ -43,10 +44,10 @@ def nearest_image_scores(views: Views, indices: Sequence[int] | Array) -> dict[s
         nearest = nearest_training(views, index)
         value = None
         if nearest is not None:
-            truth, picture = views.images[index], views.images[nearest]
+            truth, picture = views.photo(index), views.images[nearest]
             if picture.shape != truth.shape:
                 picture = cv2.resize(picture, (truth.shape[1], truth.shape[0]), interpolation=cv2.INTER_AREA)
-            value = psnr(picture, truth, entry(views.valid, index))
+            value = psnr(views.as_taken(index, as_float(picture)), truth, entry(views.valid, index))
         shown = None if nearest is None else views.names[nearest]
         per_view.append({"index": index, "name": views.names[index], "nearest": shown, "psnr": value})
     return {"views": len(per_view), "psnr": mean(view["psnr"] for view in per_view), "per_view": per_view}

@@ -12,7 +12,7 @@ from toolkit.camera import Array
 from toolkit.capture.types import Views
 from toolkit.evaluate.depth import has_depth
 from toolkit.evaluate.images import lpips, psnr, ssim
-from toolkit.evaluate.score import RenderedView, entry, mean, on_background, score_views
+from toolkit.evaluate.score import RenderedView, as_photo, entry, mean, score_views
 
 WITHIN = (0.01, 0.05)  # thresholds of the depth's accuracy, in shares of the scale
 
@@ -83,7 +83,7 @@ def _on(shown: Sequence[RenderedView], surface: Sequence[RenderedView], views: V
         valid = entry(views.valid, index)
         mask = np.asarray(getattr(other, "mask", None)).astype(bool)
         mask = mask if valid is None else mask & np.asarray(valid).astype(bool)
-        rgb, truth = on_background(picture, views), views.images[index]
+        rgb, truth = as_photo(picture, views, index), views.photo(index)
         for key, measure in (("psnr", psnr), ("ssim", ssim), ("lpips", lpips)):
             found[key].append(measure(rgb, truth, mask))
     return {key: mean(values) for key, values in found.items()}

@@ -25,11 +25,12 @@ from toolkit.evaluate.affine import right_half_psnr
 from toolkit.evaluate.effects_plan import Planned, film
 from toolkit.evaluate.effects_truth import canonical_capture, known_light
 from toolkit.evaluate.images import psnr
-from toolkit.evaluate.score import RenderedView, entry, mean
+from toolkit.evaluate.score import RenderedView, as_photo, entry, mean
 from toolkit.files import read_json, write_json
 from toolkit.poses.scene import describe_scene
 from toolkit.progress import SILENT, Progress
 from toolkit.render.image import make_renderer, render_view
+from toolkit.tone import Tone
 from toolkit.training.engine import warm_up
 
 FITS = "fits"
@@ -83,6 +84,8 @@ def fit_with(
     out = {"on": on, **_scores(shown, views, indices, ("psnr", "psnr_corrected"))}
     if truth is not None:
         right = prepare_views(corrections.on_capture(truth), scene.working_from_input, settings.capture, progress)
+        brighter = Tone((corrections.dimmed,) * 3)  # as bright as these are
+        shown = [replace(one, rgb=brighter.applied(one.rgb, views.intrinsics[i])) for one, i in zip(shown, indices, strict=True)]
         out |= _scores(shown, right, indices, ("canonical", "canonical_corrected"))
     return {**out, "effects_seconds": round(looked, 3), "seconds": round(whole, 3), "steps": result.steps}
 
@@ -92,8 +95,9 @@ def _scores(shown: Sequence[RenderedView], views: Views, indices: Array, names: 
     plain, corrected = [], []
     for picture, index in zip(shown, indices, strict=True):
         valid = entry(views.valid, int(index))
-        plain.append(psnr(picture.rgb, views.images[index], valid))
-        corrected.append(right_half_psnr(picture.rgb, views.images[index], valid))
+        rgb, truth = as_photo(picture, views, int(index)), views.photo(int(index))
+        plain.append(psnr(rgb, truth, valid))
+        corrected.append(right_half_psnr(rgb, truth, valid))
     return {names[0]: mean(plain), names[1]: mean(corrected)}
 
 

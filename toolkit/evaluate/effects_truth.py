@@ -15,12 +15,13 @@ import numpy as np
 
 from toolkit.camera import Array
 from toolkit.capture.types import Capture
-from toolkit.effects.correct import Corrections, canonical
+from toolkit.effects.correct import Corrections
 from toolkit.effects.listed import parse
 from toolkit.files import atomic_path, read_json
 from toolkit.simulate.capture_files import TRUTH
 from toolkit.simulate.settings import scene_file
 from toolkit.simulate.simulate import prepare
+from toolkit.tone import Tone
 
 LIGHT = ("motion_blur", "vignetting", "exposure", "sensor_noise", "compression")  # what a canonical picture is free of
 CANONICAL = f"{TRUTH}/canonical"
@@ -71,7 +72,7 @@ def canonical_capture(place: Path, capture: Capture, test: Array) -> Capture:
         path = place / CANONICAL / f"{index:06d}.png"
         if not path.is_file():
             film = film or prepare(settings, place, parse(kept, str(place)))
-            picture, _ = canonical(film.shot(int(index)).rgb, film.intrinsics, (red, green, blue), None)
+            picture, _ = Tone((red, green, blue)).undone(film.shot(int(index)).rgb, film.intrinsics)
             with atomic_path(path) as temporary:
                 temporary.write_bytes(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
         frames[index] = replace(frames[index], image=path)

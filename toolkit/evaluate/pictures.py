@@ -18,7 +18,7 @@ from toolkit.capture.types import Views
 from toolkit.errors import OutputError
 from toolkit.evaluate.depth import has_depth
 from toolkit.evaluate.pixels import as_float
-from toolkit.evaluate.score import RenderedView, entry, on_background
+from toolkit.evaluate.score import RenderedView, as_photo, entry
 from toolkit.files import atomic_path
 from toolkit.stereo.left_out import LeftOut
 
@@ -165,10 +165,10 @@ def method_pictures(
     )
     out = []
     for place, index in enumerate(shown):
-        truth, valid, sensor = views.images[index], entry(views.valid, index), measured[place]
+        truth, valid, sensor = views.photo(index), entry(views.valid, index), measured[place]
         tiles = {}
         for name, of in rendered.items():
-            rgb, depth = on_background(of[place], views), of[place].depth
+            rgb, depth = as_photo(of[place], views, index), of[place].depth
             off = None if sensor is None or depth_error_top is None else depth_error_picture(depth, sensor, depth_error_top)
             render = np.round(rgb * 255).astype(np.uint8)
             tiles[name] = Tiles(render, error_picture(rgb, truth, valid), depth_picture(depth, limits), off)

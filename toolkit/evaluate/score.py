@@ -41,13 +41,14 @@ def mean(values: Iterable[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def on_background(rendered: RenderedView, views: Views) -> Array:
-    """The rendered picture (H, W, 3) float64; where a surface has nothing, the capture's known background colour is filled in."""
+def as_photo(rendered: RenderedView, views: Views, index: int) -> Array:
+    """The rendered picture (H, W, 3) float64 in the colours in which the photo of view `index` was taken; where a surface has nothing,
+    the capture's known background colour is filled in."""
     rgb = as_float(rendered.rgb)
     mask = getattr(rendered, "mask", None)
     if mask is not None and views.background is not None:
         rgb = np.where(np.asarray(mask).astype(bool)[..., None], rgb, np.asarray(views.background, dtype=np.float64))
-    return rgb
+    return views.as_taken(index, rgb)
 
 
 def score_view(rendered: RenderedView, views: Views, index: int) -> dict[str, Any]:
@@ -59,9 +60,9 @@ def score_view(rendered: RenderedView, views: Views, index: int) -> dict[str, An
     Raises:
         InputError: the rendering has another size than the view.
     """
-    truth = views.images[index]
+    truth = views.photo(index)
     valid = entry(views.valid, index)
-    rgb = on_background(rendered, views)
+    rgb = as_photo(rendered, views, index)
     out: dict[str, Any] = {
         "name": views.names[index],
         "psnr": psnr(rgb, truth, valid),

@@ -15,7 +15,6 @@ from dataclasses import field as default
 import numpy as np
 import torch
 
-from toolkit.camera import Array
 from toolkit.capture.types import Views
 from toolkit.config import Settings
 from toolkit.errors import InputError
@@ -33,6 +32,7 @@ from toolkit.training.finite import NotFiniteError
 from toolkit.training.guard import Guard, refuse_broken
 from toolkit.training.levels import all_places, finer, first_field, let_go, looked_at, pruned, visible
 from toolkit.training.rays import PixelPool
+from toolkit.training.sample import Sample
 from toolkit.training.schedule import RUNGS, WIDER, Schedule, most_rays
 from toolkit.training.start import NEAR, THIN, colour_behind, finest_resolution, levels, possible, space_of
 from toolkit.training.view import limit
@@ -85,25 +85,6 @@ class Clock:
         self._since = self.ticks()
 
 
-class _Sample:
-    """PSNR over a fixed random sample of some views' pixels: the mean over views, as the report's table counts it."""
-
-    def __init__(self, views: Views, indices: Array, pixels: int, device: torch.device) -> None:
-        self.batch = None
-        if len(indices):
-            pool = PixelPool(views.subset(indices), device)
-            pick = torch.randperm(len(pool), generator=torch.Generator().manual_seed(0))[:pixels]
-            self.batch = pool.take(pick.to(device))
-
-    def psnr(self, engine: Engine) -> float | None:
-        if self.batch is None:
-            return None
-        error = (engine.colours(self.batch.origins, self.batch.directions) - self.batch.colour).square().mean(-1)
-        views, pixels = self.batch.view.unique(return_inverse=True, return_counts=True)[1:]
-        of_views = torch.zeros(len(pixels), device=error.device).index_add(0, views, error) / pixels
-        return float(-10 * of_views.clamp_min(1e-10).log10().mean())
-
-
 def fit_field(
     views: Views,
     scene: Scene,
@@ -139,9 +120,9 @@ def fit_field(
     start = start() if callable(start) else start
     generator = torch.Generator().manual_seed(settings.seed)
     torch.manual_seed(settings.seed)
-    held_out = _Sample(views, np.flatnonzero(views.test), TIMELINE_PIXELS, device)
+    held_out = Sample(views, np.flatnonzero(views.test), TIMELINE_PIXELS, device)
     aside = np.arange(len(train)) % VALIDATION_SHARE == VALIDATION_SHARE // 2 if len(train) >= LEAST_VIEWS else np.zeros(len(train), bool)
-    validation = _Sample(train, np.flatnonzero(aside), VALIDATION_PIXELS, device)
+    validation = Sample(train, np.flatnonzero(aside), VALIDATION_PIXELS, device)
     room.require_start(train, start, settings, device)
     # Views that are kept aside come last, so that joining them is a matter of a limit.
     ordered = train.subset(np.argsort(aside, kind="stable"))
@@ -255,7 +236,7 @@ def _ladder(views: Views, train: Views, scene: Scene, settings: Settings) -> tup
     return space, levels(settings.field.resolution or finest_resolution(space, train, scene))
 
 
-def _measure(result: FitResult, held_out: _Sample, engine: Engine, seconds: float) -> None:
+def _measure(result: FitResult, held_out: Sample, engine: Engine, seconds: float) -> None:
     value = held_out.psnr(engine)
     if value is not None and math.isfinite(value):
         result.timeline.append({"seconds": round(seconds, 3), "psnr": round(value, 4)})

@@ -1,0 +1,61 @@
+"""Light into a picture and back: each undoes the other, sRGB is sRGB, and what is too bright is said to be unknown."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from toolkit.camera import Intrinsics
+from toolkit.effects import transfer, vignetting
+from toolkit.tone import LINEAR, Tone, decode, encode, positive, share, square_radius
+
+CAMERA = Intrinsics(64, 48, 50.0, 50.0, 30.0, 25.0)
+
+
+def test_srgb_is_that_of_the_simulator() -> None:
+    shown = np.linspace(0, 1, 4001)
+    np.testing.assert_allclose(decode(shown), transfer.decode(torch.from_numpy(shown)).numpy(), atol=1e-12)
+    np.testing.assert_allclose(encode(shown), transfer.encode(torch.from_numpy(shown)).numpy(), atol=1e-12)
+    np.testing.assert_allclose(encode(decode(shown)), shown, atol=1e-7)
+    assert LINEAR[0] == 0 and LINEAR[255] == 1
+    np.testing.assert_allclose(encode(np.array([-1.0, 2.0])), [0, 1])
+
+
+def test_light_falls_off_as_the_simulator_has_it() -> None:
+    falloff = vignetting.falloff(vignetting.Vignetting(0.4), vignetting.radii(CAMERA)).numpy()
+    np.testing.assert_allclose(share(0.4, square_radius(CAMERA)), falloff, rtol=1e-5)
+    np.testing.assert_allclose(Tone((2.0, 1.0, 0.5), 0.4).factor(CAMERA), falloff[..., None] * np.array([2, 1, 0.5]), rtol=1e-5)
+    assert Tone((2.0, 1.0, 0.5)).factor(CAMERA).shape == (3,)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    gain=st.tuples(*[st.floats(0.4, 2.5)] * 3),
+    corner=st.one_of(st.none(), st.floats(0.25, 1.0)),
+    seed=st.integers(0, 1000),
+)
+def test_what_is_undone_and_put_back_is_the_photo(gain: tuple[float, float, float], corner: float | None, seed: int) -> None:
+    """Wherever neither clips: to half a step of what is stored in between, which a gain makes larger."""
+    tone, photo = Tone(gain, corner), np.random.default_rng(seed).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    scene, lost = tone.undone(photo, CAMERA)
+    back = tone.applied(scene / 255, CAMERA) * 255
+    free = (scene < 255) & (photo < 254)
+    assert np.abs(back - photo)[free].max() <= 1.0 + 0.75 * max(gain) ** (1 / 2.4)
+    if lost is not None:
+        assert not lost[(photo < 254).all(2)].any()
+        np.testing.assert_array_equal(lost[lost], (photo >= 254).any(2)[lost])
+
+
+def test_it_survives_json_and_damage_is_refused() -> None:
+    for tone in (Tone(), Tone((1.5, 1.0, 0.5)), Tone((1.0, 1.0, 1.0), 0.3)):
+        assert Tone.from_dict(tone.to_dict()) == tone
+    whole = Tone((1.5, 1.0, 0.5), 0.3).to_dict()
+    for damage in ({"gain": [1.0, 1.0]}, {"gain": [1.0, 1.0, 0.0]}, {"corner": -0.1}, {"corner": "x"}, {"gain": None}):
+        with pytest.raises((TypeError, ValueError)):
+            Tone.from_dict({**whole, **damage})
+    for value in (0, -1, float("inf"), float("nan"), "one"):
+        with pytest.raises(ValueError):
+            positive(value)
