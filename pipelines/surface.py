@@ -66,7 +66,7 @@ def fuse_training_frames(
     start = time.monotonic()
     if depths is None:
         train = [index for index, test in enumerate(views.test) if not test and posed.frames[index].depth is not None]
-        volume = fuse_capture(posed, scene.working_from_input, train, settings, job.progress)
+        volume = fuse_capture(posed, scene.working_from_input, train, settings, job.progress, views.toned())
     else:
         shown = views.subset(np.flatnonzero(~views.test))
         volume = fuse_stereo(shown, depths, settings.voxel_size, settings.depth_max, carve=not exact, progress=job.progress)

@@ -265,7 +265,7 @@ def fuse(ground: Ground, method: str, settings: TsdfSettings) -> TsdfVolume:
         from toolkit.tsdf.fuse import fuse_capture
 
         with_depth = [int(index) for index in ground.used if ground.posed.frames[int(index)].depth is not None]
-        return fuse_capture(ground.posed, ground.scene.working_from_input, with_depth, settings)
+        return fuse_capture(ground.posed, ground.scene.working_from_input, with_depth, settings, tones=ground.views.toned())
     from toolkit.stereo.maps import load_stereo
     from toolkit.tsdf.stereo_frames import fuse_stereo
 

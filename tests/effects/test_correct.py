@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,6 +13,8 @@ from toolkit.camera import FISHEYE, OPENCV, Intrinsics, distort
 from toolkit.capture.types import Capture, Frame, Views
 from toolkit.effects import transfer, vignetting
 from toolkit.effects.correct import Corrections, bent, correctable
+from toolkit.effects.decide import CLIPS, DIMMEST, room_for_light
+from toolkit.effects.sightings import Sightings
 from toolkit.errors import InputError
 from toolkit.evaluate.score import score_views
 from toolkit.render.image import Rendered
@@ -84,6 +87,40 @@ def test_a_perfect_field_is_scored_as_perfect_whatever_was_corrected() -> None:
     shown = Rendered(field, np.zeros((48, 64), np.float32), np.ones((48, 64), np.float32))
     assert score_views([shown], after, [0])["psnr"] > 55
     assert score_views([shown], before, [0])["psnr"] < 25
+
+
+def seen(images: list[np.ndarray]) -> Sightings:
+    nothing = np.zeros((0, 3))
+    greys = tuple(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images)
+    return Sightings(
+        names=list("abc"),
+        cameras=[CAMERA] * 3,
+        poses=np.tile(np.eye(4), (3, 1, 1)),
+        times=np.arange(3.0),
+        scale=np.ones(3),
+        frame=np.zeros(0, int),
+        point=np.zeros(0, int),
+        pixel=nothing[:, :2],
+        linear=nothing,
+        slope=nothing,
+        size=nothing[:, 0],
+        sharpness=np.ones(3),
+        pictures=greys,
+    )
+
+
+def test_there_is_room_for_what_becomes_brighter() -> None:
+    """Hardly a pixel is clipped that was not, no more is made dark than that takes, and nothing at all where nothing becomes too bright."""
+    grey = [np.repeat(np.random.default_rng(index).integers(20, 190, (48, 64, 1), dtype=np.uint8), 3, axis=2) for index in range(3)]
+    gain = {"a": (0.5, 0.5, 0.5), "b": (1.3, 1.3, 1.3), "c": (1.2, 1.2, 1.2)}
+    dimmed = room_for_light(seen(grey), 0.5, gain)
+    assert 1.2 < dimmed < DIMMEST
+    views = Views(list("abc"), grey, [CAMERA] * 3, np.tile(np.eye(4), (3, 1, 1)), np.zeros(3, bool))
+    crowded, roomy = (np.mean([image == 255 for image in Corrections(gain, 0.5, by).on_views(views).images]) for by in (1.0, dimmed))
+    assert roomy < 2 * CLIPS < 0.5 * crowded
+    assert room_for_light(seen(grey), 0.5, {"a": (0.2, 0.2, 0.2)}) == DIMMEST
+    dark = [image // 3 for image in grey]
+    assert room_for_light(seen(dark), 0.5, gain) == 1 == room_for_light(seen(grey), None, {}) == room_for_light(None, 0.5, gain)
 
 
 def test_weights_are_of_training_views_and_change_no_pixel() -> None:

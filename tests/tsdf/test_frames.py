@@ -16,6 +16,7 @@ from toolkit.capture import open_capture
 from toolkit.capture.types import Capture, Frame
 from toolkit.config import TsdfSettings
 from toolkit.errors import InputError
+from toolkit.tone import Tone
 from toolkit.tsdf.frames import automatic_depth_max, automatic_voxel_size, capture_depth_frames
 from toolkit.tsdf.fuse import fuse_capture
 
@@ -90,6 +91,22 @@ def test_fused_in_working_units_through_any_lens(tmp_path: Path, lens: str) -> N
     assert abs(np.median(np.linalg.norm(offset[seen], axis=1)) - RADIUS) < 0.3 * 0.02
     clear = seen & (np.abs(offset[:, 2]) > 0.02)
     assert ((mesh.colours[clear, 0] > mesh.colours[clear, 1]) == (offset[clear, 2] > 0)).mean() > 0.97
+
+
+def test_colours_are_those_of_the_scene_where_pictures_have_a_tone(tmp_path: Path) -> None:
+    """A picture that was exposed less, and darker towards its corners, gives the surface the colours that the others give it."""
+    capture = written(tmp_path, CAMERA, count=2)
+    plain, other = capture_depth_frames(capture, SIMILARITY)
+    tone = Tone((0.7, 0.8, 0.6), 0.5)
+    path = capture.frames[1].image
+    photo = tone.applied(other.colour / 255, CAMERA) * 255
+    cv2.imwrite(str(path), np.rint(photo)[..., ::-1].astype(np.uint8))
+    corrected = list(capture_depth_frames(capture, SIMILARITY, tones={capture.frames[1].name: tone}))
+    np.testing.assert_array_equal(corrected[0].colour, plain.colour)
+    bright = other.colour > 40
+    assert np.abs(corrected[1].colour.astype(int) - other.colour)[bright].max() <= 4
+    raw = next(capture_depth_frames(capture, SIMILARITY, [1]))
+    assert np.abs(raw.colour.astype(int) - other.colour)[bright].mean() > 15
 
 
 def test_frames_come_one_at_a_time(tmp_path: Path) -> None:

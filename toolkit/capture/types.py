@@ -108,6 +108,10 @@ class Views:
             tones=[self.tones[i] for i in keep] if self.tones else [],
         )
 
+    def toned(self) -> dict[str, Tone]:
+        """What was taken out of the pictures' colours, by their names; without those of which nothing was."""
+        return {name: tone for name, tone in zip(self.names, self.tones, strict=False) if tone is not None}
+
     def photo(self, index: int) -> Array:
         """(H, W, 3) uint8: what a rendering of view `index` is held against, the picture in the colours in which it was taken."""
         photo = self.photos[index] if self.photos else None

@@ -148,7 +148,7 @@ def _corrections(
         with found.paid.by(LENS):
             lens = (explained.problem if LENS in explained.kept else adjust(explained.problem, explained.kept | {LENS}).problem).lens
     if seen is None or not on & {EXPOSURE, POSES, BLUR}:
-        return Corrections(corner=corner, dimmed=_dimmed(seen, corner, {}), lens=lens)
+        return Corrections(corner=corner, dimmed=room_for_light(seen, corner, {}), lens=lens)
     gain: dict[str, Gain] = {}
     poses: dict[str, Array] = {}
     weight: dict[str, float] = {}
@@ -169,10 +169,10 @@ def _corrections(
                 moved, beyond = refined_poses(every, ~test, kept | on)
             poses = dict(zip(every.names, moved, strict=True))
             lens = beyond if LENS in on else None
-    return Corrections(gain, corner, _dimmed(seen, corner, gain), lens, poses, weight)
+    return Corrections(gain, corner, room_for_light(seen, corner, gain), lens, poses, weight)
 
 
-def _dimmed(seen: Sightings | None, corner: float | None, gain: dict[str, Gain]) -> float:
+def room_for_light(seen: Sightings | None, corner: float | None, gain: dict[str, Gain]) -> float:
     """What canonical light is divided by so that hardly any of it is too bright for a picture, `DIMMEST` at most: what is clipped there
     is lost, and agrees with no photo that shows it because it was exposed less."""
     if seen is None or not (gain or corner is not None):

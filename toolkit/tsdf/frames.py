@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -12,6 +12,7 @@ from toolkit.camera import Array, Intrinsics, Similarity, undistort_maps
 from toolkit.capture.images import load_depth, load_image, load_mask
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
+from toolkit.tone import Tone
 
 # A voxel this share of the median depth is 1 cm at 2 m (rooms) and 2.5 mm at half a metre (objects).
 VOXELS_PER_MEDIAN_DEPTH = 200.0
@@ -30,10 +31,13 @@ class DepthFrame:
     world_from_camera: Array  # (4, 4) float64
 
 
-def capture_depth_frames(capture: Capture, working_from_input: Similarity, indices: Iterable[int] | None = None) -> Iterator[DepthFrame]:
+def capture_depth_frames(
+    capture: Capture, working_from_input: Similarity, indices: Iterable[int] | None = None, tones: Mapping[str, Tone] | None = None
+) -> Iterator[DepthFrame]:
     """The frames `indices` of a capture (None: all) that have depth, one at a time, at their stored size, undistorted when a lens bends.
 
-    Depth is scaled to working units. Pixels under the frame's mask, or where alpha says that nothing is there, lose their depth.
+    Depth is scaled to working units. Pixels under the frame's mask, or where alpha says that nothing is there, lose their depth. What
+    `tones` has for a frame's name is taken out of its colours.
 
     Raises:
         InputError: a frame without pose or intrinsics, or a file that cannot be read.
@@ -41,10 +45,10 @@ def capture_depth_frames(capture: Capture, working_from_input: Similarity, indic
     for index in range(len(capture.frames)) if indices is None else indices:
         frame = capture.frames[int(index)]
         if frame.depth is not None:
-            yield load_depth_frame(frame, capture, working_from_input)
+            yield load_depth_frame(frame, capture, working_from_input, (tones or {}).get(frame.name))
 
 
-def load_depth_frame(frame: Frame, capture: Capture, working_from_input: Similarity) -> DepthFrame:
+def load_depth_frame(frame: Frame, capture: Capture, working_from_input: Similarity, tone: Tone | None = None) -> DepthFrame:
     """Decode one frame; see `capture_depth_frames`."""
     if frame.world_from_camera is None or frame.intrinsics is None:
         raise InputError(f"the frame {frame.name} has no pose or no intrinsics; find poses before fusing depth")
@@ -67,6 +71,8 @@ def load_depth_frame(frame: Frame, capture: Capture, working_from_input: Similar
         # Beyond the picture its edge is repeated: black there would bleed into the surface.
         colour_camera, map_x, map_y, _ = undistort_maps(colour_camera, colour_camera.width, colour_camera.height)
         colour = cv2.remap(colour, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    if tone is not None:
+        colour = tone.undone(colour, colour_camera)[0]
     depth = np.ascontiguousarray(depth, dtype=np.float32) * np.float32(working_from_input.scale)
     pose = working_from_input.poses(frame.world_from_camera)
     colour, colour_camera = cover(colour, colour_camera, depth_camera)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from toolkit.capture.types import Capture
 from toolkit.config import TsdfSettings
 from toolkit.errors import InputError
 from toolkit.progress import SILENT, Progress
+from toolkit.tone import Tone
 from toolkit.tsdf.frames import DepthFrame, automatic_depth_max, automatic_voxel_size, capture_depth_frames
 from toolkit.tsdf.view import MeshView
 from toolkit.tsdf.volume import Points, TsdfVolume, too_fine
@@ -108,8 +109,10 @@ def fuse_capture(
     indices: Iterable[int] | None = None,
     settings: TsdfSettings | None = None,
     progress: Progress = SILENT,
+    tones: Mapping[str, Tone] | None = None,
 ) -> TsdfVolume:
-    """Fuse the frames `indices` (None: all) of a capture; voxel size and range from its depth unless `settings` name them.
+    """Fuse the frames `indices` (None: all) of a capture; voxel size and range from its depth unless `settings` name them. What `tones`
+    has for a frame's name is taken out of its colours.
 
     Raises:
         InputError: no frame has depth, poses are missing, or the voxel size is too fine for the memory.
@@ -126,4 +129,5 @@ def fuse_capture(
     depth_max = settings.depth_max or automatic_depth_max(depths)
     voxel_size, expected = with_room(sample, settings.voxel_size, depth_max, len(wanted))
     del sample, depths
-    return fuse_frames(capture_depth_frames(capture, working_from_input, wanted), voxel_size, depth_max, len(wanted), expected, progress)
+    frames = capture_depth_frames(capture, working_from_input, wanted, tones)
+    return fuse_frames(frames, voxel_size, depth_max, len(wanted), expected, progress)
