@@ -87,7 +87,8 @@ def effects_part(job: Job, background: bool | None) -> dict[str, Any] | None:
         if entry["effect"] == "background" and background is not None:
             entry["on"] = background
             entry["note"] = "space beyond the region of interest is modelled" if background else "nothing beyond the region is modelled"
-    return {"effects": effects, "seconds": data["seconds"], "looked_at": data["looked_at"]}
+    dimmed = (data.get("corrections") or {}).get("dimmed", 1.0)
+    return {"effects": effects, "seconds": data["seconds"], "looked_at": data["looked_at"], "dimmed": dimmed}
 
 
 def effects_warnings(job: Job) -> list[str]:
