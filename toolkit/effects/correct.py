@@ -116,7 +116,7 @@ class Corrections:
             if any(not np.isfinite(pose).all() for pose in poses.values()) or (lens is not None and not np.isfinite(lens).all()):
                 raise ValueError("a pose or the lens is not finite")
             exact = {name: (values[0], values[1], values[2]) for name, values in gain.items()}
-            return cls(exact, corner, dimmed, lens, poses, weight)
+            return cls(exact, corner=corner, dimmed=dimmed, lens=lens, poses=poses, weight=weight)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
             raise InputError(f"effects.json is not what the effects stage writes ({first_line(error)}); remove it and run again") from error
 

@@ -169,7 +169,8 @@ def _corrections(
                 moved, beyond = refined_poses(every, ~test, kept | on)
             poses = dict(zip(every.names, moved, strict=True))
             lens = beyond if LENS in on else None
-    return Corrections(gain, corner, room_for_light(seen, corner, gain), lens, poses, weight)
+    dimmed = room_for_light(seen, corner, gain)
+    return Corrections(gain, corner=corner, dimmed=dimmed, lens=lens, poses=poses, weight=weight)
 
 
 def room_for_light(seen: Sightings | None, corner: float | None, gain: dict[str, Gain]) -> float:

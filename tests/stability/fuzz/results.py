@@ -80,7 +80,8 @@ def make_results(root: Path) -> None:
         for index, name in enumerate(names)
     ]  # fmt: skip
     pose = np.eye(4)
-    corrections = Corrections({"a": (1.1, 0.9, 1.0)}, 0.8, (0.01, -0.001), {"a": pose}, {"b": 0.5}).to_dict()
+    gain, weight = {"a": (1.1, 0.9, 1.0)}, {"b": 0.5}
+    corrections = Corrections(gain, corner=0.8, dimmed=1.2, lens=(0.01, -0.001), poses={"a": pose}, weight=weight).to_dict()
     about = {"frames": 8, "points": 300}
     write_json(root / "effects.json", {"effects": found, "seconds": 1.0, "looked_at": about, "corrections": corrections})
     write_json(root / "run.json", {})  # so that it counts as the folder of a run

@@ -44,6 +44,7 @@ from toolkit.files import read_json, write_json
 from toolkit.poses.given import given_poses
 from toolkit.render.field import Field
 from toolkit.render.rays import render_rays
+from toolkit.tone import Tone
 
 Act = Callable[[Path, int], object]
 
@@ -197,6 +198,7 @@ def make_runs(root: Path) -> None:
     pixels = np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8)
     depth = np.ones((12, 16), np.float32)
     views = Views(["a", "b"], [pixels] * 2, [camera] * 2, np.tile(np.eye(4), (2, 1, 1)), np.array([True, False]), depths=[depth, None])
+    views.photos, views.tones = [pixels, None], [Tone((1.2, 1.1, 0.9), 0.8), None]
     save_views(root / "views.safetensors", views)
     save_pictures(root / "field.pictures.safetensors", Pictures(["a"], [Picture(pixels, depth)], [0.1], {"x": 1}))
     small_field(1, 0.2).save(root / "field.safetensors")
