@@ -83,7 +83,7 @@ def table(data: dict[str, Any]) -> list[str]:
 def fits_table(data: dict[str, Any]) -> list[str]:
     """Each capture's scores in each mode as lines of Markdown, and their means."""
     modes = data["modes"]
-    told = (("canonical", "dB"), ("canonical_corrected", "dB, corrected"), ("psnr", "dB, own colours"), ("seconds", "s"))
+    told = (("canonical", "dB"), ("canonical_corrected", "dB, corrected"), ("psnr", "dB, photos' colours"), ("seconds", "s"))
     head = ["capture", "found", *(f"{mode.replace('_', ' ')}, {unit}" for _, unit in told for mode in modes)]
     out = [f"| {' | '.join(head)} |", "|" + " --- |" * len(head)]
     for one in [*data["each"], {"name": "mean", "found": [], **data["mean"]}]:
@@ -130,7 +130,7 @@ def by_hand(
 
 
 def switched_table(data: dict[str, Any]) -> list[str]:
-    """One row a switch, one column a capture: PSNR in canonical colour / with the left half's correction of colour."""
+    """One row a switch, one column a capture: PSNR in the photos' colours / with the left half's correction of colour."""
     names = list(data["mean"])
     out = [f"| switched | {' | '.join(names)} |", "|" + " --- |" * (1 + len(names))]
     for mode in next(iter(data["mean"].values()), {}):

@@ -22,7 +22,7 @@ from toolkit.effects.refine import refined_poses
 from toolkit.effects.sightings import Look, Sightings, gather
 from toolkit.effects.survey import BLUR, FAR, VIEWS, Finding, Survey, survey
 from toolkit.progress import SILENT, Progress
-from toolkit.tone import LINEAR, Gain, share
+from toolkit.tone import LINEAR, Gain, Tone
 
 SHARP = 0.75  # quantile of the sharpness from which on a frame counts in full
 LEAST_WEIGHT = 0.1
@@ -179,11 +179,9 @@ def room_for_light(seen: Sightings | None, corner: float | None, gain: dict[str,
     if seen is None or not (gain or corner is not None):
         return 1.0
     brightness = []
-    for name, grey, camera, scale in zip(seen.names, seen.pictures, seen.cameras, seen.scale, strict=True):
-        y, x = (np.arange(0, side, STRIDE) + 0.5 for side in grey.shape)
-        square = (x[None] / scale - camera.cx) ** 2 + (y[:, None] / scale - camera.cy) ** 2
-        left = 1.0 if corner is None else share(corner, square / (0.25 * (camera.width**2 + camera.height**2)))
-        brightness.append((LINEAR[grey[::STRIDE, ::STRIDE]] / (left * min(gain.get(name, (1.0,))))).ravel())
+    for name, grey, camera in zip(seen.names, seen.pictures, seen.cameras, strict=True):
+        factor = Tone(gain.get(name, (1.0, 1.0, 1.0)), corner).factor(camera.scaled(grey.shape[1], grey.shape[0]))
+        brightness.append((LINEAR[grey] / factor.min(-1))[::STRIDE, ::STRIDE].ravel())
     return round(float(np.clip(np.quantile(np.concatenate(brightness), 1 - CLIPS), 1.0, DIMMEST)), 4)
 
 

@@ -23,7 +23,7 @@ from toolkit.effects.beyond import carried, rays_of
 from toolkit.effects.evidence import Evidence, HeldOut
 from toolkit.effects.light import EXPOSURE, VIGNETTING, Light
 from toolkit.effects.sightings import Sightings
-from toolkit.tone import LINEAR, share
+from toolkit.tone import LINEAR, share, square_radius
 
 THRESHOLD = 0.0014  # share of the patches
 LEAST = 3  # shiny ones
@@ -84,10 +84,7 @@ def _picture(seen: Sightings, index: int, found: Light) -> _Picture:
     grey, camera = seen.pictures[index], seen.cameras[index]
     light = np.maximum(LINEAR[grey], LINEAR[8])
     if VIGNETTING in found.kept:
-        x = (np.arange(grey.shape[1]) + 0.5) / seen.scale[index] - camera.cx
-        y = (np.arange(grey.shape[0]) + 0.5) / seen.scale[index] - camera.cy
-        square = (x[None] ** 2 + y[:, None] ** 2) / (0.25 * (camera.width**2 + camera.height**2))
-        light = light / share(found.corner, square)
+        light = light / share(found.corner, square_radius(camera.scaled(grey.shape[1], grey.shape[0])))
     log = np.log2(cv2.GaussianBlur(light, (0, 0), BLUR))
     square = np.ones((2 * HALF + 1, 2 * HALF + 1), np.uint8)
     return _Picture(log.astype(np.float32), cv2.erode(grey, square), cv2.dilate(grey, square))

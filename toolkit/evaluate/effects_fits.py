@@ -52,7 +52,7 @@ def fit_with(
         found: what a survey of the training frames found before.
 
     Returns:
-        `on` (what is corrected), `psnr` (in the colours that the fit was given), `psnr_corrected` (each test picture's colours fitted on
+        `on` (what is corrected), `psnr` (in the colours of the photos), `psnr_corrected` (each test picture's colours fitted on
         its left half, scored on its right), with `truth` the same two against its pictures, `canonical` and `canonical_corrected`,
         `effects_seconds`, `seconds` (the whole, without warming up), `steps`.
 
