@@ -12,6 +12,7 @@ from toolkit.camera import Intrinsics, Similarity, pixel_grid, rays
 from toolkit.capture.types import Views
 from toolkit.config import Settings, load_settings
 from toolkit.poses.scene import Scene
+from toolkit.progress import Progress
 from toolkit.render.image import render_view
 from toolkit.training.fit import fit_field
 from toolkit.training.levels import all_places, finer, looked_at, visible
@@ -177,3 +178,18 @@ def test_when_memory_is_short_surfaces_keep_the_neighbours_that_no_ray_came_to()
     kept = looked_at(field, seen, visits, 0.05)
     assert bool(kept[surface]) and bool(kept[passed])
     assert 8 <= int(kept.sum()) <= 28  # the surface with up to 26 neighbours, and what light only passed, which has none
+
+
+def test_coarse_levels_end_soon_where_no_validation_views_tell_that_they_gain_nothing_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    ticking(monkeypatch, 0.01)
+    climbed: list[int] = []
+
+    def note(done: float, total: float, text: str = "") -> None:
+        if text.startswith("64³") and not climbed:
+            climbed.append(round(done))
+
+    progress = Progress()
+    monkeypatch.setattr(progress, "update", note)
+    late = (0.7, 0.8, 0.9)
+    result = fit_field(sphere_views(), scene(), wanted("budget=10"), progress, rungs=late)
+    assert result.field.resolution == 64 and climbed[0] <= 2  # by `UNTOLD`, or as soon as a level has had time to grow, not by `late`

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from toolkit.config import FitSettings
-from toolkit.training.schedule import COARSE_GAIN, LEAST_RAYS, LEVEL_STEPS, RUNGS, WINDOW, Schedule, most_rays
+from toolkit.training.schedule import COARSE_GAIN, FINE_MOST, FINE_WORTH, GUESSED, LEAST_RAYS, LEVEL_STEPS, PARTLY, RUNGS, WINDOW, Schedule, most_rays
 
 
 def plan() -> Schedule:
@@ -39,6 +39,36 @@ def test_a_level_that_would_see_too_few_rays_is_not_entered() -> None:
     schedule = plan()
     assert schedule.worth(1000, 1000) and schedule.ladder == [32, 64, 128]
     assert not schedule.worth(1000, 100) and schedule.ladder == [32] and schedule.finest
+
+
+def test_a_lattice_finer_than_usual_wants_more_rays_a_voxel_and_is_not_made_too_large() -> None:
+    def asked(voxels: float, rays_left: float) -> tuple[bool, list[int]]:
+        schedule = Schedule([512, 1024], 10.0, FitSettings(), True)
+        return schedule.worth(voxels, rays_left), schedule.ladder
+
+    assert Schedule([256, 512], 10.0, FitSettings(), True).worth(1e6, 0.5e6)
+    surface = 0.5e6  # of a million voxels when it is twice as fine
+    assert asked(1e6, FINE_WORTH * surface) == (True, [512, 1024])
+    assert asked(1e6, 0.9 * FINE_WORTH * surface) == (False, [512])
+    assert asked(2 * FINE_MOST, 1e9)[0] and not asked(2.1 * FINE_MOST, 1e9)[0]
+
+
+@pytest.mark.parametrize("rungs", [RUNGS, PARTLY, GUESSED])
+@pytest.mark.parametrize("ladder", [[32, 64, 128, 256, 512], [64, 128, 256, 512], [32, 64, 128, 256], [64, 512], [512]])
+@pytest.mark.parametrize("more", [[1024], [672], [704, 1024]])
+def test_a_finer_ladder_has_more_steps_in_the_same_share_of_the_budget(rungs: tuple[float, ...], ladder: list[int], more: list[int]) -> None:
+    def deadlines(resolutions: list[int]) -> list[float]:
+        schedule = Schedule(resolutions, 10.0, FitSettings(), True, rungs=rungs)
+        out = []
+        for _ in resolutions[1:]:
+            out.append(schedule.deadline())
+            schedule.climb()
+        return out
+
+    usual, finer = deadlines(ladder), deadlines(ladder + more)
+    assert usual == list(rungs[: len(usual)])
+    assert finer == sorted(finer) and finer[0] == rungs[0]
+    assert finer[-1] == pytest.approx(usual[-1] if len(ladder) > 2 else finer[0])
 
 
 def test_few_views_bound_the_rays_and_many_do_not() -> None:

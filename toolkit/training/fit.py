@@ -33,7 +33,7 @@ from toolkit.training.guard import Guard, refuse_broken
 from toolkit.training.levels import all_places, finer, first_field, let_go, looked_at, pruned, visible
 from toolkit.training.rays import PixelPool
 from toolkit.training.sample import Sample
-from toolkit.training.schedule import RUNGS, WIDER, Schedule, most_rays
+from toolkit.training.schedule import RUNGS, UNTOLD, WIDER, Schedule, most_rays
 from toolkit.training.start import NEAR, THIN, colour_behind, finest_resolution, levels, possible, space_of
 from toolkit.training.view import limit
 from toolkit.volume.host import Host, TorchHost
@@ -106,7 +106,8 @@ def fit_field(
         host: where rows live while they change (`GridHost` puts them into Open3D's hash map).
         start: a field to go on from, at its finest level, or what gives it; then nobody need hold it while its levels are climbed.
         coarse: `start` is a first guess and no fitted field: climb from its level to the finest, as from the classical start.
-        rungs: share of the budget at which each level ends at the latest, from the first one on.
+        rungs: share of the budget at which each level ends at the latest, from the first one on; with too few views to keep some aside for
+            validation it ends by `UNTOLD`, if that is sooner.
         ticks: the clock, in seconds, that the budget is counted on; a benchmark beside other work takes `time.process_time`.
 
     Raises:
@@ -148,6 +149,7 @@ def fit_field(
     trust = ROUGH if views.rough else FINE
     wider = WIDER if chosen_engine(settings, device) == "triton" else 1
     opaque, patient = views.background is None, settings.fit.patience
+    rungs = rungs if aside.any() else tuple(map(min, rungs, UNTOLD))
     plan = Schedule(ladder, budget, settings.fit, opaque, patient, limit_rays, slow_within, trust, rungs, wider)
     softens, radius = len(train) >= LEAST_VIEWS, 0.0
     guard = Guard()

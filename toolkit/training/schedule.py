@@ -10,14 +10,18 @@ import math
 from dataclasses import dataclass
 from dataclasses import field as default
 
+import numpy as np
+
 from toolkit.config import FitSettings
 from toolkit.training.depth import FINE, Trust
-from toolkit.training.start import COARSEST
+from toolkit.training.start import COARSEST, USUAL
 from toolkit.training.step import Rates
 
 RUNGS = (0.1, 0.3, 0.6, 0.8, 0.9)  # share of the budget at which each level ends at the latest, from the first one on …
 PARTLY = (0.2, 0.45, 0.7, 0.85, 0.9)  # … of a fit that begins with what is known of depth, and knows a part: what is not takes longer
 GUESSED = (0.01, 0.06, 0.25, 0.55, 0.9)  # … of one that begins with a guess, on the coarsest lattice: a hundred steps there make it smooth
+# … of one that no validation views steer, at the latest: nobody tells there when a coarse level gains nothing more.
+UNTOLD = (0.03, 0.12, 0.3, 0.55, 0.9)
 LEVEL_STEPS = 100  # a level is not left, nor pruned, before so many: what has not had time to grow is not empty
 PRUNE_EVERY = 150  # steps
 LAST_PRUNE = 0.8  # of the budget; from here on the field is only polished, on all views
@@ -28,6 +32,8 @@ LAST_RATE = 0.08  # of the step sizes, at the very end
 FIRST_BATCH = 256  # rays a step at the coarsest lattice, and as many times more as one is finer: early on the number of steps counts
 WIDER = 4  # times as many of them on CUDA, where a step of few takes as long; with sixteen times as many fits are worse
 WORTH = 0.5  # rays that must be left for every voxel of a finer level: with fewer it ends blurred, and worse than the coarser one
+FINE_WORTH = 3.0  # as `WORTH`, of a level finer than `USUAL`, which also …
+FINE_MOST = 6_000_000  # … has no more voxels: memory, files and exports grow with them, and what is seen hardly does
 LOOK_STEPS = 60  # from one look at the validation views to the next …
 FINEST_LOOK_STEPS = 250  # … and at the finest level
 WINDOW = 4  # looks that a plateau is judged by
@@ -144,11 +150,23 @@ class Schedule:
         """Time for the next level: its share is spent, or the validation views gain nothing more here."""
         if self.finest or self.steps_here < LEVEL_STEPS or done >= self.rungs[-1]:
             return False
-        return done > self.rungs[min(self.level, len(self.rungs) - 1)] or self.plateau()
+        return done > self.deadline() or self.plateau()
+
+    def deadline(self) -> float:
+        """Share of the budget at which this level ends at the latest. The finest begins when the one of `USUAL` voxels a side would."""
+        climbs, usual = len(self.ladder) - 1, sum(resolution <= USUAL for resolution in self.ladder[1:])
+        place = self.level * max(usual - 1, 0) / (climbs - 1) if climbs > max(usual, 1) else self.level
+        return float(np.interp(place, range(len(self.rungs)), self.rungs))
 
     def worth(self, voxels: float, rays_left: float) -> bool:
-        """Whether a finer level of so many voxels would see enough rays; if not, this level is the last."""
-        if rays_left >= WORTH * voxels:
+        """Whether a finer level would see enough rays, and have few enough voxels; if not, this level is the last.
+
+        Args:
+            voxels: that it would have at most, were all of the voxels that stay split.
+        """
+        finer = self.ladder[self.level + 1]
+        surface = voxels * self.resolution / finer  # a finer surface is thinner, too
+        if rays_left >= WORTH * voxels if finer <= USUAL else surface <= min(FINE_MOST, rays_left / FINE_WORTH):
             return True
         del self.ladder[self.level + 1 :]
         return False

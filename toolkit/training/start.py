@@ -25,7 +25,9 @@ LEAST_REACH = 0.9
 NEAR = 0.8  # of the scene's nearest depth: where a fit's rays begin
 COARSEST = 32
 THIN = -4.5  # raw density of what nobody knows: thin enough that every voxel along a ray is tried, thick enough that none is ignored
-FINEST = 512
+FINEST = 1024
+USUAL = 512  # what a schedule's shares of the budget are meant for; finer ladders have the same shares, with more steps between
+FINER = 1.5  # times as fine as usual at least, where it is finer: less is not worth a level of its own
 PIXELS = 2.0  # of the training views, a voxel in the middle of the scene
 OBJECT_PIXELS = 1.3  # the same where alpha cuts the object out: fewer voxels are in play, so they may be finer
 SEEN_BY = 3  # training views that must see a voxel: fewer cannot tell its depth …
@@ -64,12 +66,14 @@ def colour_behind(views: Views) -> Tensor:
 def finest_resolution(space: Space, views: Views, scene: Scene) -> int:
     """Voxels a side so that one voxel in the middle of the scene spans `PIXELS` pixels of the training views.
 
-    Finer lattices fitted worse at equal seconds (more unknowns than the pixels can tell apart).
+    Finer lattices fitted worse at equal seconds (more unknowns than the pixels can tell apart). Beyond `USUAL` voxels a side the schedule
+    decides whether there are rays enough for them (`Schedule.worth`).
     """
     focal = float(np.median([camera.fx for camera in views.intrinsics]))
     pixels = PIXELS if views.background is None else OBJECT_PIXELS
     wanted = 2 * space.extent * space.half / (pixels * scene.median_depth / focal)
-    return int(np.clip(round(wanted / 32) * 32, 64, FINEST))
+    most = FINEST if wanted >= FINER * USUAL else USUAL
+    return int(np.clip(round(wanted / 32) * 32, 64, most))
 
 
 def levels(finest: int) -> list[int]:
