@@ -19,7 +19,7 @@ from toolkit.training.step import Rates
 
 RUNGS = (0.1, 0.3, 0.6, 0.8, 0.9)  # share of the budget at which each level ends at the latest, from the first one on …
 PARTLY = (0.2, 0.45, 0.7, 0.85, 0.9)  # … of a fit that begins with what is known of depth, and knows a part: what is not takes longer
-GUESSED = (0.01, 0.06, 0.25, 0.55, 0.9)  # … of one that begins with a guess, on the coarsest lattice: a hundred steps there make it smooth
+GUESSED = (0.01, 0.04, 0.12, 0.35, 0.9)  # … of one that begins with a guess, on the coarsest lattice: a hundred steps there make it smooth
 # … of one that no validation views steer, at the latest: nobody tells there when a coarse level gains nothing more.
 UNTOLD = (0.03, 0.12, 0.3, 0.55, 0.9)
 LEVEL_STEPS = 100  # a level is not left, nor pruned, before so many: what has not had time to grow is not empty
