@@ -111,6 +111,8 @@ class TotalBudget:
 
     def choose_fit(self, job: Job, views: Views, scene: Scene) -> None:
         """Decide the fit's seconds and its finest lattice from what is left."""
+        from toolkit.training.start import worth_a_level
+
         assert self.speed is not None and self.work is not None and self.choice is not None
         if not self.again:
             pace = self._pace(job)
@@ -118,9 +120,8 @@ class TotalBudget:
             left = self.asked - self.elapsed() - after
             left -= self._for_exports(job, left) + self.speed.seconds("beside", 1.0)
             self.choice.fit_seconds = round(max(model.LEAST_FIT, left), 2)
-            self.choice.resolution = model.resolution_for(
-                self.choice.fit_seconds, self.speed.units["fit"] * pace, finest(job, views, scene)
-            )
+            possible = model.resolution_for(self.choice.fit_seconds, self.speed.units["fit"] * pace, finest(job, views, scene))
+            self.choice.resolution = worth_a_level(possible)
         job.settings.fit.budget = self.choice.fit_seconds
         job.settings.fit.passes = None  # so many seconds were asked for
         job.settings.field.resolution = self.choice.resolution

@@ -72,8 +72,12 @@ def finest_resolution(space: Space, views: Views, scene: Scene) -> int:
     focal = float(np.median([camera.fx for camera in views.intrinsics]))
     pixels = PIXELS if views.background is None else OBJECT_PIXELS
     wanted = 2 * space.extent * space.half / (pixels * scene.median_depth / focal)
-    most = FINEST if wanted >= FINER * USUAL else USUAL
-    return int(np.clip(round(wanted / 32) * 32, 64, most))
+    return worth_a_level(int(np.clip(round(wanted / 32) * 32, 64, FINEST)))
+
+
+def worth_a_level(resolution: int) -> int:
+    """As many voxels a side, or `USUAL` where these are little finer than that."""
+    return resolution if resolution >= FINER * USUAL else min(resolution, USUAL)
 
 
 def levels(finest: int) -> list[int]:
