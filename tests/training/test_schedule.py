@@ -7,7 +7,19 @@ import math
 import pytest
 
 from toolkit.config import FitSettings
-from toolkit.training.schedule import COARSE_GAIN, FINE_MOST, FINE_WORTH, GUESSED, LEAST_RAYS, LEVEL_STEPS, PARTLY, RUNGS, WINDOW, Schedule, most_rays
+from toolkit.training.schedule import (
+    COARSE_GAIN,
+    FINE_MOST,
+    FINE_WORTH,
+    GUESSED,
+    LEAST_RAYS,
+    LEVEL_STEPS,
+    PARTLY,
+    RUNGS,
+    WINDOW,
+    Schedule,
+    most_rays,
+)
 
 
 def plan() -> Schedule:
@@ -56,7 +68,7 @@ def test_a_lattice_finer_than_usual_wants_more_rays_a_voxel_and_is_not_made_too_
 @pytest.mark.parametrize("rungs", [RUNGS, PARTLY, GUESSED])
 @pytest.mark.parametrize("ladder", [[32, 64, 128, 256, 512], [64, 128, 256, 512], [32, 64, 128, 256], [64, 512], [512]])
 @pytest.mark.parametrize("more", [[1024], [672], [704, 1024]])
-def test_a_finer_ladder_has_more_steps_in_the_same_share_of_the_budget(rungs: tuple[float, ...], ladder: list[int], more: list[int]) -> None:
+def test_a_finer_ladder_has_more_steps_in_the_same_share(rungs: tuple[float, ...], ladder: list[int], more: list[int]) -> None:
     def deadlines(resolutions: list[int]) -> list[float]:
         schedule = Schedule(resolutions, 10.0, FitSettings(), True, rungs=rungs)
         out = []
