@@ -22,6 +22,7 @@ from toolkit.render.field import Field
 from toolkit.render.image import make_renderer, render_view
 from toolkit.stereo import moving, quick
 from toolkit.training import depth_start
+from toolkit.training.fit import LEAST_VIEWS
 from toolkit.training.guided import find_moving, fit_guided, looks_for_moving, wants_matching
 
 SCENE = Scene(Similarity.identity(), np.array([0.0, 0.0, 0.0]), np.full(3, 1.5), MEDIAN, NEAR, FAR, 0.0, True, False)
@@ -218,7 +219,7 @@ def test_nobody_holds_the_guess_while_its_levels_are_climbed(monkeypatch: pytest
     assert alive and not any(alive)
 
 
-def test_a_guess_leaves_the_coarsest_lattice_sooner() -> None:
+def test_a_guess_leaves_the_coarsest_lattice_sooner_where_validation_views_tell_when_to_and_as_soon_where_none_do() -> None:
     class Levels(Progress):
         def __init__(self) -> None:
             self.seen: list[str] = []
@@ -227,10 +228,14 @@ def test_a_guess_leaves_the_coarsest_lattice_sooner() -> None:
             self.seen += [note.split(",")[0]] if "³" in note else []
 
     rough = fit_guided(views(), SCENE, wanted("budget=1", "field.resolution=32"), ticks=steady()).field
-    shares = []
-    for begin in ({}, {"start": rough, "coarse": True}):
-        told = Levels()
-        fit_guided(views(), SCENE, wanted("fit.depth_from=sensor", "fit.moving=off"), told, ticks=steady(0.002), **begin)  # type: ignore[arg-type]
-        assert set(told.seen) == {"32³", "64³"}
-        shares.append(told.seen.count("32³") / len(told.seen))
-    assert shares[1] < 0.7 * shares[0]
+    few = views()
+    many = few.subset(np.tile(np.arange(len(few)), -(-LEAST_VIEWS // np.count_nonzero(~few.test))))
+    for shown, factor in ((many, 0.7), (few, 1.0)):
+        shares = []
+        for begin in ({}, {"start": rough, "coarse": True}):
+            told = Levels()
+            settings = wanted("fit.depth_from=sensor", "fit.moving=off")
+            fit_guided(shown, SCENE, settings, told, ticks=steady(0.002), **begin)  # type: ignore[arg-type]
+            assert set(told.seen) == {"32³", "64³"}
+            shares.append(told.seen.count("32³") / len(told.seen))
+        assert shares[1] <= factor * shares[0]
