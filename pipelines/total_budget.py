@@ -121,7 +121,7 @@ class TotalBudget:
             left -= self._for_exports(job, left) + self.speed.seconds("beside", 1.0)
             self.choice.fit_seconds = round(max(model.LEAST_FIT, left), 2)
             possible = model.resolution_for(self.choice.fit_seconds, self.speed.units["fit"] * pace, finest(job, views, scene))
-            self.choice.resolution = worth_a_level(possible)
+            self.choice.resolution = possible if job.settings.field.resolution is not None else worth_a_level(possible)
         job.settings.fit.budget = self.choice.fit_seconds
         job.settings.fit.passes = None  # so many seconds were asked for
         job.settings.field.resolution = self.choice.resolution

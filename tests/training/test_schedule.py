@@ -20,6 +20,7 @@ from toolkit.training.schedule import (
     Schedule,
     most_rays,
 )
+from toolkit.training.start import FINER
 
 
 def plan() -> Schedule:
@@ -58,7 +59,8 @@ def test_a_lattice_finer_than_usual_wants_more_rays_a_voxel_and_is_not_made_too_
         schedule = Schedule([512, 1024], 10.0, FitSettings(), True)
         return schedule.worth(voxels, rays_left), schedule.ladder
 
-    assert Schedule([256, 512], 10.0, FitSettings(), True).worth(1e6, 0.5e6)
+    for asked_for in (512, FINER - 32):  # what a user asks for is entered as ever
+        assert Schedule([256, asked_for], 10.0, FitSettings(), True).worth(1e6, 0.5e6)
     surface = 0.5e6  # of a million voxels when it is twice as fine
     assert asked(1e6, FINE_WORTH * surface) == (True, [512, 1024])
     assert asked(1e6, 0.9 * FINE_WORTH * surface) == (False, [512])
@@ -67,7 +69,7 @@ def test_a_lattice_finer_than_usual_wants_more_rays_a_voxel_and_is_not_made_too_
 
 @pytest.mark.parametrize("rungs", [RUNGS, PARTLY, GUESSED])
 @pytest.mark.parametrize("ladder", [[32, 64, 128, 256, 512], [64, 128, 256, 512], [32, 64, 128, 256], [64, 512], [512]])
-@pytest.mark.parametrize("more", [[1024], [672], [704, 1024]])
+@pytest.mark.parametrize("more", [[1024], [768], [800, 1024]])
 def test_a_finer_ladder_has_more_steps_in_the_same_share(rungs: tuple[float, ...], ladder: list[int], more: list[int]) -> None:
     def deadlines(resolutions: list[int]) -> list[float]:
         schedule = Schedule(resolutions, 10.0, FitSettings(), True, rungs=rungs)
@@ -78,6 +80,7 @@ def test_a_finer_ladder_has_more_steps_in_the_same_share(rungs: tuple[float, ...
         return out
 
     usual, finer = deadlines(ladder), deadlines(ladder + more)
+    assert deadlines([*ladder, FINER - 32]) == list(rungs[: len(ladder)])
     assert usual == list(rungs[: len(usual)])
     assert finer == sorted(finer) and finer[0] == rungs[0]
     assert finer[-1] == pytest.approx(usual[-1] if len(ladder) > 2 else finer[0])

@@ -23,6 +23,6 @@ def test_a_lattice_is_as_fine_as_the_pictures_ask_for_within_bounds(asked: float
 
 
 def test_what_is_little_finer_than_usual_is_no_level_of_its_own() -> None:
-    assert worth_a_level(USUAL) == worth_a_level(USUAL + 32) == worth_a_level(int(FINER * USUAL) - 1) == USUAL
-    assert worth_a_level(int(FINER * USUAL)) == FINER * USUAL and worth_a_level(64) == 64
+    assert worth_a_level(USUAL) == worth_a_level(USUAL + 32) == worth_a_level(FINER - 1) == USUAL
+    assert worth_a_level(FINER) == FINER and worth_a_level(64) == 64
     assert np.all(np.diff([worth_a_level(resolution) for resolution in range(64, 2 * FINEST, 32)]) >= 0)

@@ -14,7 +14,7 @@ import numpy as np
 
 from toolkit.config import FitSettings
 from toolkit.training.depth import FINE, Trust
-from toolkit.training.start import COARSEST, USUAL
+from toolkit.training.start import COARSEST, FINER
 from toolkit.training.step import Rates
 
 RUNGS = (0.1, 0.3, 0.6, 0.8, 0.9)  # share of the budget at which each level ends at the latest, from the first one on …
@@ -32,7 +32,7 @@ LAST_RATE = 0.08  # of the step sizes, at the very end
 FIRST_BATCH = 256  # rays a step at the coarsest lattice, and as many times more as one is finer: early on the number of steps counts
 WIDER = 4  # times as many of them on CUDA, where a step of few takes as long; with sixteen times as many fits are worse
 WORTH = 0.5  # rays that must be left for every voxel of a finer level: with fewer it ends blurred, and worse than the coarser one
-FINE_WORTH = 3.0  # as `WORTH`, of a level finer than `USUAL`, which also …
+FINE_WORTH = 3.0  # as `WORTH`, of a level of `FINER` voxels a side or more, which also …
 FINE_MOST = 6_000_000  # … has no more voxels: memory, files and exports grow with them, and what is seen hardly does
 LOOK_STEPS = 60  # from one look at the validation views to the next …
 FINEST_LOOK_STEPS = 250  # … and at the finest level
@@ -153,8 +153,9 @@ class Schedule:
         return done > self.deadline() or self.plateau()
 
     def deadline(self) -> float:
-        """Share of the budget at which this level ends at the latest. The finest begins when the one of `USUAL` voxels a side would."""
-        climbs, usual = len(self.ladder) - 1, sum(resolution <= USUAL for resolution in self.ladder[1:])
+        """Share of the budget at which this level ends at the latest. With a level of `FINER` voxels or more the finest begins when the last
+        one below that would."""
+        climbs, usual = len(self.ladder) - 1, sum(resolution < FINER for resolution in self.ladder[1:])
         place = self.level * max(usual - 1, 0) / (climbs - 1) if climbs > max(usual, 1) else self.level
         return float(np.interp(place, range(len(self.rungs)), self.rungs))
 
@@ -166,7 +167,7 @@ class Schedule:
         """
         finer = self.ladder[self.level + 1]
         surface = voxels * self.resolution / finer  # a finer surface is thinner, too
-        if rays_left >= WORTH * voxels if finer <= USUAL else surface <= min(FINE_MOST, rays_left / FINE_WORTH):
+        if rays_left >= WORTH * voxels if finer < FINER else surface <= min(FINE_MOST, rays_left / FINE_WORTH):
             return True
         del self.ladder[self.level + 1 :]
         return False

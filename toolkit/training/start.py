@@ -26,8 +26,7 @@ NEAR = 0.8  # of the scene's nearest depth: where a fit's rays begin
 COARSEST = 32
 THIN = -4.5  # raw density of what nobody knows: thin enough that every voxel along a ray is tried, thick enough that none is ignored
 FINEST = 1024
-USUAL = 512  # what a schedule's shares of the budget are meant for; finer ladders have the same shares, with more steps between
-FINER = 1.5  # times as fine as usual at least, where it is finer: less is not worth a level of its own
+USUAL, FINER = 512, 768  # finer than usual is worth a level of its own from `FINER` on; `schedule.py` decides whether it is made
 PIXELS = 2.0  # of the training views, a voxel in the middle of the scene
 OBJECT_PIXELS = 1.3  # the same where alpha cuts the object out: fewer voxels are in play, so they may be finer
 SEEN_BY = 3  # training views that must see a voxel: fewer cannot tell its depth …
@@ -66,8 +65,7 @@ def colour_behind(views: Views) -> Tensor:
 def finest_resolution(space: Space, views: Views, scene: Scene) -> int:
     """Voxels a side so that one voxel in the middle of the scene spans `PIXELS` pixels of the training views.
 
-    Finer lattices fitted worse at equal seconds (more unknowns than the pixels can tell apart). Beyond `USUAL` voxels a side the schedule
-    decides whether there are rays enough for them (`Schedule.worth`).
+    Finer lattices fitted worse at equal seconds (more unknowns than the pixels can tell apart).
     """
     focal = float(np.median([camera.fx for camera in views.intrinsics]))
     pixels = PIXELS if views.background is None else OBJECT_PIXELS
@@ -77,7 +75,7 @@ def finest_resolution(space: Space, views: Views, scene: Scene) -> int:
 
 def worth_a_level(resolution: int) -> int:
     """As many voxels a side, or `USUAL` where these are little finer than that."""
-    return resolution if resolution >= FINER * USUAL else min(resolution, USUAL)
+    return resolution if resolution >= FINER else min(resolution, USUAL)
 
 
 def levels(finest: int) -> list[int]:
