@@ -153,8 +153,8 @@ class Schedule:
         return done > self.deadline() or self.plateau()
 
     def deadline(self) -> float:
-        """Share of the budget at which this level ends at the latest. With a level of `FINER` voxels or more the finest begins when the last
-        one below that would."""
+        """Share of the budget at which this level ends at the latest. With a level of `FINER` voxels or more the finest begins when the
+        last one below that would."""
         climbs, usual = len(self.ladder) - 1, sum(resolution < FINER for resolution in self.ladder[1:])
         place = self.level * max(usual - 1, 0) / (climbs - 1) if climbs > max(usual, 1) else self.level
         return float(np.interp(place, range(len(self.rungs)), self.rungs))
