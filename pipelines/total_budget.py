@@ -1,7 +1,8 @@
 """`fieldfuse run --total-budget SECONDS`: settings chosen so that the whole run takes so long, and what was predicted beside what it took.
 
 Decided step by step, each time from what is known by then: pictures when the capture is known, the fit's seconds and its finest lattice
-when everything before it is done, the exports when the field can be rendered.
+when everything before it is done, the exports when the field can be rendered. What the machine's self-test takes, which is made once and
+has most of the compiling in it, comes on top: within the seconds asked for it would leave a first run next to none for its fit.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ FILE = "plan.json"
 LONGEST_START = 60.0  # seconds; a process that is older was not started for this command
 NOT_FITTED = ("capture", "frames", "poses", "effects", "scene", "views", "tsdf", TSDF_TEXTURE, "render", "export", "evaluate", "report")
 TOO_FEW = " The smallest choice needs about {:.0f} s on this machine as busy as it is; give more, or expect that."
+BESIDES = " Before that, this machine was measured, which is done once, and took {:.0f} s besides."
 WORTH_LEARNING = 0.3  # seconds; shorter stages say little
 
 
@@ -42,6 +44,7 @@ class TotalBudget:
         self.work: model.Work | None = None
         self.choice: model.Choice | None = None
         self.predicted: dict[str, float] = {}
+        self.self_test = 0.0  # seconds that the machine's self-test took, once, besides what was asked for: most of them are compiling
         self.export_planned = 0.0  # seconds, when it was decided how much is exported
         self.again = False  # an earlier run of the same plan has decided everything
         self.name = ""
@@ -61,7 +64,9 @@ class TotalBudget:
             job.progress.begin("self-test")
             start = time.monotonic()
             self.speed = self_test(settings)
-            job.progress.finish("self-test", time.monotonic() - start, False)
+            self.self_test = time.monotonic() - start
+            job.progress.finish("self-test", self.self_test, False)
+            self._began += self.self_test
             model.remember(self.name, self.speed)
         self.work = work_of(capture, settings)
         kept = self._kept(job)
@@ -168,6 +173,7 @@ class TotalBudget:
             "asked_seconds": self.asked,
             "predicted_seconds": _round(sum(self.predicted.values())),
             "real_seconds": _round(self.elapsed()),
+            "self_test_seconds": _round(self.self_test),
             "stages": shown,
             "choice": self.choice.to_dict(),
             "reused": any(job.stages.cached.values()),
@@ -188,6 +194,7 @@ class TotalBudget:
         return (
             f"Of the {told['asked_seconds']:g} s asked for, {told['predicted_seconds']:.0f} s were predicted and"
             f" {told['real_seconds']:.0f} s spent until this page was written; chosen: {', '.join(parts)}."
+            + (BESIDES.format(told["self_test_seconds"]) if told.get("self_test_seconds") else "")
             + (TOO_FEW.format(told["predicted_seconds"]) if told["predicted_seconds"] > (1 + model.AGREES) * self.asked else "")
         )
 

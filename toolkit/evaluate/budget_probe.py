@@ -23,10 +23,12 @@ def self_test(settings: Settings) -> Speed:
     megapixel scored."""
     from toolkit.progress import SILENT
     from toolkit.stereo import quick
+    from toolkit.training import depth_start
     from toolkit.training.engine import warm_up
 
     warm_up(settings, SILENT)
     quick.warm_up()
+    depth_start.warm_up()
     makers: dict[str, Callable[[], tuple[Callable[[], object], float]]] = {
         "decode": _decode,
         "features": _features,
