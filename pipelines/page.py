@@ -31,5 +31,5 @@ def put_page(job: Job, path: Path, field: Field, views: Views, scene: Scene) -> 
     require_page(field)
     _, _, around = orbit_cameras(views, scene, FLIGHT)
     cameras = (views.names, views.intrinsics, views.world_from_camera, views.test)
-    write_page(path, baked(job, field.to("cpu"), views), Tour(*cameras, around, scene.median_depth), job.source.name)
+    write_page(path, baked(job, field.to("cpu"), views), Tour(*cameras, around, scene.median_depth, views.exposure), job.source.name)
     return path

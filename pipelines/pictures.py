@@ -11,6 +11,7 @@ from pipelines.baking import baked_of
 from pipelines.rendered import to_picture
 from toolkit.camera import Array, Intrinsics
 from toolkit.progress import Progress
+from toolkit.tone import exposed
 
 if TYPE_CHECKING:
     from pipelines.job import Job
@@ -22,13 +23,21 @@ Camera = Callable[[Intrinsics, Array], Any]  # lens, pose → a `Rendered`
 
 
 def camera_of(job: Job, field: Field, views: Views, scene: Scene, baked: bool) -> Camera:
-    """What takes pictures of the field, or of its baked copy."""
+    """What takes pictures of the field, or of its baked copy, as bright as the training pictures are."""
     from toolkit.render.bake_image import BakedRenderer
     from toolkit.render.image import make_renderer, render_view
 
     if baked:
-        return BakedRenderer(baked_of(job, field, views, scene)).render
-    return partial(render_view, field, view=make_renderer(field))
+        camera: Camera = BakedRenderer(baked_of(job, field, views, scene)).render
+    else:
+        camera = partial(render_view, field, view=make_renderer(field))
+    exposure = views.exposure
+    return camera if exposure == 1 else lambda lens, pose: _exposed(camera(lens, pose), exposure)
+
+
+def _exposed(rendered: Any, exposure: float) -> Any:
+    """Colours become bytes by it."""
+    return replace(rendered, rgb=exposed(to_picture(rendered).rgb, exposure))
 
 
 def pictures(camera: Camera, lenses: list[Intrinsics], poses: Array, progress: Progress) -> Iterator[Array]:

@@ -16,6 +16,7 @@ from safetensors.numpy import save_file
 
 from toolkit.errors import InputError, OutputError, first_line
 from toolkit.files import atomic_path
+from toolkit.tone import exposed
 
 Array = NDArray[Any]
 
@@ -97,13 +98,13 @@ def file_name(name: str) -> str:
     return re.sub(r"[^\w.-]+", "_", name).strip("._") or "view"
 
 
-def write_pngs(folder: Path, prefix: str, pictures: Pictures) -> list[Path]:
-    """`<prefix>_<name>.png` and `<prefix>_<name>_depth.png` (16 bit, thousandths of a working unit) for every view."""
+def write_pngs(folder: Path, prefix: str, pictures: Pictures, exposure: float) -> list[Path]:
+    """`<prefix>_<name>.png`, brighter by `exposure`, and `<prefix>_<name>_depth.png` (16 bit, thousandths of a working unit)."""
     written: list[Path] = []
     for index, (name, picture) in enumerate(zip(pictures.names, pictures.pictures, strict=True)):
         stem = f"{prefix}_{index:03d}_{file_name(Path(name).stem)}"
         depth = np.clip(np.nan_to_num(picture.depth) * 1000, 0, 65535).astype(np.uint16)
-        written += [write_png(folder / f"{stem}.png", picture.rgb), write_png(folder / f"{stem}_depth.png", depth)]
+        written += [write_png(folder / f"{stem}.png", exposed(picture.rgb, exposure)), write_png(folder / f"{stem}_depth.png", depth)]
     return written
 
 

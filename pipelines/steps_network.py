@@ -16,6 +16,7 @@ from pipelines.room import require_pictures
 from pipelines.steps_capture import choose_keyframes
 from toolkit.errors import InputError
 from toolkit.files import fingerprint, write_json
+from toolkit.tone import exposed
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Views
@@ -141,7 +142,8 @@ def preview(inference: Inference, frame: int) -> Any:
     # The compiled renderer is faster, but the first picture must not wait for a compiler.
     shown = to_picture(render_view(field, camera, inference.train.world_from_camera[frame], make_renderer(field, "torch")))
     small = cv2.resize(photo, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    return np.concatenate([small, shown.rgb, depth_picture(shown.depth, depth_range([shown.depth]))], axis=1)
+    seen = exposed(np.concatenate([small, shown.rgb], axis=1), inference.train.exposure)
+    return np.concatenate([seen, depth_picture(shown.depth, depth_range([shown.depth]))], axis=1)
 
 
 def direct_result(job: Job, made: NetworkField, views: Views, scene: Scene) -> Field:
@@ -183,7 +185,7 @@ def render_network_views(job: Job, made: NetworkField, views: Views, scene: Scen
 
     def save(pictures: Pictures) -> list[Path]:
         save_pictures(kept, pictures)
-        return [kept, *([job.folder / DIRECT] if keep else []), *write_pngs(kept.parent, "network", pictures)]
+        return [kept, *([job.folder / DIRECT] if keep else []), *write_pngs(kept.parent, "network", pictures, views.exposure)]
 
     uses = [job.settings.engine, keep]
-    return job.stages.run("direct", make, save, load=lambda: load_pictures(kept), uses=uses, after=["network", "views", "scene"])
+    return job.stages.run("direct", make, save, load=lambda: load_pictures(kept), uses=uses, after=["network", "views", "scene"], version=2)

@@ -58,7 +58,7 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
 
     def save(pictures: Pictures) -> list[Path]:
         save_pictures(kept, pictures)
-        return [kept, *made, *write_pngs(kept.parent, name, pictures)]
+        return [kept, *made, *write_pngs(kept.parent, name, pictures, views.exposure)]
 
     return job.stages.run(
         name,
@@ -66,6 +66,7 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
         save=save,
         load=lambda: load_pictures(kept),
         uses=[asdict(job.settings.tsdf), pixel_state(posed), depth_from],
+        version=2,
         after=["scene", "views", *(["stereo"] if matched is not None else [])],
     )
 
@@ -190,9 +191,9 @@ def render_test_views(job: Job, field: Field, views: Views) -> Pictures:
 
     def save(pictures: Pictures) -> list[Path]:
         save_pictures(kept, pictures)
-        return [kept, *write_pngs(kept.parent, "field", pictures)]
+        return [kept, *write_pngs(kept.parent, "field", pictures, views.exposure)]
 
-    return job.stages.run("render", make=make, save=save, load=lambda: load_pictures(kept), after=["field", "views"])
+    return job.stages.run("render", make=make, save=save, load=lambda: load_pictures(kept), after=["field", "views"], version=2)
 
 
 def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, scene: Scene, views: Views) -> dict[str, Any]:
@@ -222,6 +223,7 @@ def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, sc
         load=lambda: read_kept(facts_path, EXPORT_FACTS),
         uses=asdict(job.settings.export),
         adds=True,
+        version=2,
         after=["field", "poses", "scene", "views"],
     )
 

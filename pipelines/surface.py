@@ -22,6 +22,7 @@ from pipelines.textured import TEXTURE, put_textured
 from toolkit import memory
 from toolkit.camera import Array, Intrinsics, Similarity
 from toolkit.errors import InputError
+from toolkit.tone import exposed
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Capture, Views
@@ -72,7 +73,7 @@ def fuse_training_frames(
         volume = fuse_stereo(shown, depths, settings.voxel_size, settings.depth_max, carve=not exact, progress=job.progress)
     fused = time.monotonic() - start
     mesh = volume.mesh().cleaned(min_area_share=SMALL_PART)
-    write_surface(folder, scene, mesh, volume.points())
+    write_surface(folder, scene, mesh, volume.points(), views.exposure)
     found = Pictures()
     lenses = [views.intrinsics[index] for index in np.flatnonzero(views.test)]
     require_pictures(lenses, kept=True, advice="run again with a lower --image-size")
@@ -94,20 +95,21 @@ def fuse_training_frames(
     return found, [folder / "mesh.ply", folder / "points.ply"]
 
 
-def write_surface(folder: Path, scene: Scene, mesh: Mesh, points: Points) -> None:
-    """Mesh and points of the working frame as files in the input's."""
+def write_surface(folder: Path, scene: Scene, mesh: Mesh, points: Points, exposure: float) -> None:
+    """Mesh and points of the working frame as files in the input's, brighter by `exposure`."""
     from toolkit.export.mesh import write_mesh
 
     input_from_working = scene.working_from_input.inverse()
-    write_mesh(folder / "mesh.ply", mesh.transformed(input_from_working))
-    put_points(folder / "points.ply", points, input_from_working)
+    write_mesh(folder / "mesh.ply", replace(mesh, colours=exposed(mesh.colours, exposure)).transformed(input_from_working))
+    put_points(folder / "points.ply", points, input_from_working, exposure)
 
 
-def put_points(path: Path, points: Points, input_from_working: Similarity) -> Path:
-    """Points of the working frame as a file in the input's."""
+def put_points(path: Path, points: Points, input_from_working: Similarity, exposure: float) -> Path:
+    """Points of the working frame as a file in the input's, brighter by `exposure`."""
     from toolkit.export.points import write_points
 
-    write_points(path, input_from_working.points(points.points), points.colours, input_from_working.directions(points.normals))
+    colours = exposed(points.colours, exposure)
+    write_points(path, input_from_working.points(points.points), colours, input_from_working.directions(points.normals))
     return path
 
 
@@ -165,10 +167,12 @@ def export_surface(
     volume = _volume_of(job, field, posed, scene, views)
     memory.give_back()  # what pictures and depth maps took
     input_from_working = scene.working_from_input.inverse()
-    written = [put_points(folder / "points.ply", volume.points(), input_from_working)] if "points" in formats else []
+    exposure = views.exposure
+    written = [put_points(folder / "points.ply", volume.points(), input_from_working, exposure)] if "points" in formats else []
     whole = volume.mesh().cleaned(min_area_share=SMALL_PART)
     del volume
     mesh = whole.decimated(MOST_TRIANGLES).transformed(input_from_working)
+    mesh = replace(mesh, colours=exposed(mesh.colours, exposure))
     facts = mesh_facts(mesh)
     for path in [job.folder / "mesh.ply", *(folder / f"mesh.{suffix}" for suffix in MESHES if suffix in formats)]:
         write_mesh(path, mesh)

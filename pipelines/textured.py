@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.taken import as_taken
+from toolkit.tone import exposed
 
 if TYPE_CHECKING:
     from pipelines.job import Job
@@ -32,7 +33,7 @@ def texture_tsdf(job: Job, posed: Capture, scene: Scene, views: Views) -> None:
         return put_textured(job, path, mesh.with_normals(), posed, scene, views)
 
     settings = [job.settings.export.texture_size, TRIANGLES]
-    job.stages.run(TSDF_TEXTURE, make=make, save=lambda made: [made], load=lambda: path, uses=settings, after=["tsdf", "views"])
+    job.stages.run(TSDF_TEXTURE, make=make, save=lambda made: [made], load=lambda: path, uses=settings, after=["tsdf", "views"], version=2)
 
 
 def put_textured(job: Job, path: Path, mesh: Mesh, posed: Capture, scene: Scene, views: Views) -> Path:
@@ -50,5 +51,5 @@ def put_textured(job: Job, path: Path, mesh: Mesh, posed: Capture, scene: Scene,
     lenses, images = as_taken(job, posed, train, shown, job.settings.export.texture_size)
     cameras = (lenses, shown.world_from_camera, shown.valid, shown.weight)
     atlas, texture = textured(thin, images, *cameras, largest=largest, progress=job.progress)
-    write_textured(path, thin, atlas, texture, scene.working_from_input)
+    write_textured(path, thin, atlas, exposed(texture, views.exposure), scene.working_from_input)
     return path

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from toolkit.camera import Intrinsics
 from toolkit.effects import transfer, vignetting
-from toolkit.tone import LINEAR, Tone, decode, encode, positive, share, square_radius
+from toolkit.tone import LINEAR, SHOULDER, Tone, brighter, decode, encode, exposed, positive, share, square_radius
 
 CAMERA = Intrinsics(64, 48, 50.0, 50.0, 30.0, 25.0)
 
@@ -59,3 +59,26 @@ def test_it_survives_json_and_damage_is_refused() -> None:
     for value in (0, -1, float("inf"), float("nan"), "one"):
         with pytest.raises(ValueError):
             positive(value)
+
+
+@settings(max_examples=60, deadline=None)
+@given(exposure=st.floats(0.3, 4.0))
+def test_what_is_brightened_keeps_its_order_and_nothing_becomes_white(exposure: float) -> None:
+    light = np.linspace(0, 1, 2001)
+    shown = brighter(light, exposure)
+    dark = light * exposure <= SHOULDER
+    np.testing.assert_allclose(shown[dark], exposure * light[dark])
+    assert (np.diff(shown) > 0).all() and shown[-1] == pytest.approx(min(exposure, 1.0))
+    assert (shown[:-1] < 1).all()
+    slopes = np.diff(shown) / np.diff(light)
+    assert slopes.max() <= exposure * (1 + 1e-6)  # no step where the shoulder begins, and contrast only becomes less
+    assert (np.diff(slopes) < 1e-6).all()
+
+
+def test_bytes_are_brightened_as_light_is() -> None:
+    colours = np.random.default_rng(0).integers(0, 256, (5, 4, 3), dtype=np.uint8)
+    assert exposed(colours, 1.0) is colours
+    bright = exposed(colours, 1.7)
+    assert bright.dtype == np.uint8 and bright.shape == colours.shape
+    np.testing.assert_allclose(bright, 255 * encode(brighter(decode(colours / 255), 1.7)), atol=0.51)
+    assert exposed(np.array([0, 255], np.uint8), 2.0).tolist() == [0, 255]

@@ -18,6 +18,7 @@ Gain = tuple[float, float, float]  # of red, green and blue
 CLIPPED = 254  # of 255: such a pixel may have been brighter
 DARKER = 1.02  # a clipped pixel that is divided by more than this has no known colour
 STEPS = 4096
+SHOULDER = 0.6  # linear light up to which `brighter` is exact
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,25 @@ def stored(linear: Array) -> Array:
     """Linear light → uint8 sRGB, through a table that is fine enough for 8 bits: steps of the square root, which is nearly even in sRGB."""
     root = np.sqrt(np.clip(linear, 0, 1))
     return ENCODED[(root * (STEPS - 1) + 0.5).astype(np.int32)]
+
+
+def brighter(linear: Array, exposure: float) -> Array:
+    """Linear light in [0, 1] times `exposure`, without anything becoming white that was not.
+
+    Up to `SHOULDER` it is exact; beyond, light is pressed together smoothly (s·u / (1 + (s − 1)·u), as steep as the rest where it begins),
+    and 1 stays 1. What becomes darker (`exposure` below 1) is exact throughout.
+    """
+    light = np.asarray(linear) * exposure
+    if exposure <= 1:
+        return light
+    steep = (exposure - SHOULDER) / (1 - SHOULDER)
+    over = np.clip((light - SHOULDER) / (exposure - SHOULDER), 0, 1)
+    return np.where(light <= SHOULDER, light, SHOULDER + (1 - SHOULDER) * steep * over / (1 + (steep - 1) * over))
+
+
+def exposed(colours: Array, exposure: float) -> Array:
+    """uint8 sRGB of any shape, `brighter`; the very same object for an `exposure` of 1."""
+    return colours if exposure == 1 else np.round(255 * encode(brighter(LINEAR, exposure))).astype(np.uint8)[colours]
 
 
 LINEAR = decode(np.arange(256) / 255.0).astype(np.float32)  # (256,) linear light of the stored values

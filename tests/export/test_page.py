@@ -23,6 +23,7 @@ from toolkit.export.page import Tour, corner_densities, decoder_blocks, page, re
 from toolkit.networks.decoder import Deferred, make_decoder
 from toolkit.render.bake import BakedField, bake
 from toolkit.render.bake_image import BakedRenderer
+from toolkit.tone import brighter, decode, encode
 
 WIDTH, HEIGHT = 48, 36
 CAMERA, POSES = lens(WIDTH, HEIGHT), around()
@@ -157,6 +158,20 @@ def test_a_browser_draws_what_the_baked_field_is(name: str, tmp_path: Path) -> N
             depth, opacity = expected.depth[HEIGHT // 2, WIDTH // 2], expected.opacity[HEIGHT // 2, WIDTH // 2]
             if opacity > 0.5:
                 assert told[:2] == pytest.approx([depth, opacity], abs=2e-3 * float(depth))
+        assert not browser.errors
+
+
+@pytest.mark.parametrize("exposure", [1.8, 0.7])
+def test_a_browser_draws_it_as_bright_as_the_pictures_were(exposure: float, tmp_path: Path) -> None:
+    baked = bake(coloured_field())
+    write_page(tmp_path / "field.html", baked, replace(tour(), exposure=exposure), "bright")
+    with driven((tmp_path / "field.html").as_uri(), tmp_path, (320, 240)) as browser:
+        loaded(browser)
+        plain = np.clip(BakedRenderer(baked, 1).render(CAMERA, POSES[1]).rgb, 0, 1)
+        expected = 255 * encode(brighter(decode(plain), exposure))
+        assert np.abs(expected - 255 * plain).mean() > 10
+        off = np.abs(seen(browser, POSES[1]) - expected)
+        assert np.median(off) < 0.8 and (off > 3).mean() < 0.01, off.max()
         assert not browser.errors
 
 

@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from typer.testing import CliRunner
 
 from pipelines.cli import app
-from pipelines.rendered import load_pictures
+from pipelines.pictures import camera_of
+from pipelines.rendered import Pictures, load_pictures, to_picture, write_pngs
+from pipelines.surface import write_surface
+from tests.render.made import coloured_field
+from toolkit.camera import Similarity
+from toolkit.capture.types import Views
 from toolkit.capture.views_file import load_views
 from toolkit.evaluate.baseline import nearest_image_scores
+from toolkit.evaluate.geometry import read_mesh
 from toolkit.evaluate.images import psnr
+from toolkit.evaluate.speed_state import around
+from toolkit.evaluate.speed_state import lens as around_lens
 from toolkit.files import read_json
+from toolkit.render.image import render_view
 from toolkit.simulate.settings import scene_file
 from toolkit.simulate.simulate import simulate
+from toolkit.tone import Tone, exposed
+from toolkit.tsdf.mesh import Mesh
+from toolkit.tsdf.volume import Points
 
 SCENE = {
     "scene": "room",
@@ -38,7 +53,7 @@ def test_field_surface_and_nearest_picture_are_scored_against_the_photos(tmp_pat
     assert told.exit_code == 0, told.output
     views, found, report = load_views(out / "views.safetensors"), read_json(out / "evaluation.json"), read_json(out / "report.json")
     assert {entry["effect"] for entry in report["effects"]["effects"] if entry["on"]} >= {"exposure", "vignetting"}
-    assert report["effects"]["dimmed"] >= 1
+    assert report["effects"]["dimmed"] >= 1 and views.exposure == pytest.approx(report["effects"]["dimmed"], rel=1e-3)
     indices = np.flatnonzero(views.test)
     plain = {path.stem: path for path in (place / "images").iterdir()}
     for index in indices:
@@ -52,3 +67,41 @@ def test_field_surface_and_nearest_picture_are_scored_against_the_photos(tmp_pat
         assert found[name]["psnr"] > np.mean(canonical) + 3  # type: ignore[arg-type]
     assert found["nearest_image"]["psnr"] == pytest.approx(nearest_image_scores(views, indices)["psnr"], abs=1e-6)
     assert "exports are in the corrected colours" in (out / "report.html").read_text() or report["effects"]["dimmed"] == 1
+
+
+def views_of(gains: list[float]) -> Views:
+    """Small pictures, of which so much was taken out; the last one is held out."""
+    count, lens = len(gains), around_lens(24, 18)
+    pictures = [np.full((18, 24, 3), 90, np.uint8)] * count
+    test = np.arange(count) == count - 1
+    tones = [Tone((gain,) * 3, 0.5) for gain in gains]
+    return Views([f"{i}" for i in range(count)], pictures, [lens] * count, np.array(around()[:count]), test, tones=tones)
+
+
+def test_exposure_is_what_was_taken_out_of_the_training_pictures() -> None:
+    assert views_of([1.0, 4.0, 9.0]).exposure == pytest.approx(2.0)
+    assert views_of([1.0, 4.0, 9.0]).subset([0]).exposure == 1 and views_of([0.5, 2.0, 9.0]).exposure == 1
+    assert views_of([1.0002, 1.0, 9.0]).exposure == 1  # rounded gains
+    assert replace(views_of([2.0, 2.0]), tones=[]).exposure == 1 and views_of([2.0]).exposure == 1  # nothing is fitted: nothing is known
+
+
+def test_cameras_points_and_meshes_show_it_as_bright_as_it_was_taken(tmp_path: Path) -> None:
+    field, views = coloured_field(), views_of([1.5, 1.5, 9.0])
+    lens, pose = views.intrinsics[0], views.world_from_camera[0]
+    plain = to_picture(render_view(field, lens, pose)).rgb
+    seen = camera_of(None, field, views, None, baked=False)(lens, pose)  # type: ignore[arg-type]
+    assert plain.std() > 5 and np.array_equal(to_picture(seen).rgb, exposed(plain, views.exposure))
+    same = camera_of(None, field, replace(views, tones=[]), None, baked=False)(lens, pose)  # type: ignore[arg-type]
+    assert same.rgb.dtype != np.uint8 and np.array_equal(to_picture(same).rgb, plain)
+
+    picture = to_picture(render_view(field, lens, pose))
+    png, _ = write_pngs(tmp_path, "field", Pictures(["a"], [picture], [0.0]), views.exposure)
+    assert np.array_equal(cv2.imread(str(png))[..., ::-1], exposed(plain, views.exposure))
+
+    colours = np.random.default_rng(0).integers(0, 256, (4, 3), dtype=np.uint8)
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    mesh = Mesh.create(corners, np.array([[0, 1, 2], [0, 3, 1]]), colours, np.tile([0.0, 0, 1], (4, 1)))
+    scene = SimpleNamespace(working_from_input=Similarity.identity())
+    write_surface(tmp_path, scene, mesh, Points(corners, colours, np.tile([0.0, 0, 1], (4, 1))), 1.5)  # type: ignore[arg-type]
+    assert np.array_equal(read_mesh(tmp_path / "mesh.ply").colours, exposed(colours, 1.5))
+    assert np.array_equal(trimesh.load(tmp_path / "points.ply").colors[:, :3], exposed(colours, 1.5))  # type: ignore[union-attr]

@@ -59,7 +59,7 @@ def writers() -> dict[str, Write]:
         "save_views": lambda folder: save_views(folder / "views.safetensors", views),
         "save_pictures": lambda folder: save_pictures(folder / "pictures.safetensors", pictures),
         "save_volume": lambda folder: save_volume(folder / "volume.safetensors", volume),
-        "write_pngs": lambda folder: write_pngs(folder, "a", pictures),
+        "write_pngs": lambda folder: write_pngs(folder, "a", pictures, 1.0),
         "write_png": lambda folder: write_png(folder / "a.png", pixels),
         "write_points": lambda folder: write_points(folder / "points.ply", mesh.vertices, mesh.colours),
         "write_cameras": lambda folder: write_cameras(

@@ -11,6 +11,8 @@ import numpy as np
 from toolkit.camera import Array, Intrinsics
 from toolkit.tone import Tone
 
+SAME_EXPOSURE = 1e-3  # gains are written with six digits, and their mean is 1 by no more
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -107,6 +109,14 @@ class Views:
             photos=[self.photos[i] for i in keep] if self.photos else [],
             tones=[self.tones[i] for i in keep] if self.tones else [],
         )
+
+    @property
+    def exposure(self) -> float:
+        """How much brighter the training pictures were taken than they are here, in the mean of logarithms and linear light. Exactly 1
+        where nothing was taken out of their colours."""
+        gains = [1.0 if tone is None else tone.gain for tone, test in zip(self.tones, self.test, strict=False) if not test]
+        exposure = float(np.exp(np.mean([np.mean(np.log(gain)) for gain in gains]))) if gains else 1.0
+        return 1.0 if abs(exposure - 1) < SAME_EXPOSURE else exposure
 
     def toned(self) -> dict[str, Tone]:
         """What was taken out of the pictures' colours, by their names; without those of which nothing was."""

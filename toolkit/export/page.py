@@ -30,6 +30,7 @@ from toolkit.render.bake import BakedField
 from toolkit.render.bake_kernels import CORNERS, FINER
 from toolkit.render.field import Field
 from toolkit.render.march import MAX_STRETCH
+from toolkit.tone import SHOULDER
 from toolkit.volume.topology import VOXELS
 
 CHANNELS, HIDDEN = 16, 96  # at most: what lies in one word of four, and, in thirds, in uniform blocks of 16 kB
@@ -49,6 +50,7 @@ class Tour:
         test: (N,) bool, held out.
         path: (F, 4, 4) closed.
         depth: median depth of the scene, working units: how far away what is looked at is taken to be.
+        exposure: colours are shown brighter by it (`toolkit.tone.brighter`).
     """
 
     names: Sequence[str]
@@ -57,6 +59,7 @@ class Tour:
     test: Array
     path: Array
     depth: float
+    exposure: float = 1.0
 
 
 def require_page(field: Field) -> None:
@@ -194,6 +197,7 @@ def _about(field: BakedField, tour: Tour) -> dict[str, Any]:
     }
     define: dict[str, Any] = {"FINE": field.fine, "FINER": FINER, "RESOLUTION": resolution, "HIDDEN": _width(field)}
     define |= {"MAX_STRETCH": f"{MAX_STRETCH:e}", "LONGEST": int(14 * space.extent / (4 * voxel)) + 32}
+    define["SHOULDER"] = repr(SHOULDER)
     define |= {f"C{number}": repr(value) for number, value in enumerate(SH)}
     return {
         "define": define,
@@ -202,6 +206,7 @@ def _about(field: BakedField, tour: Tour) -> dict[str, Any]:
         "table": list(field.arrays.table.shape[::-1]),
         "side": field.arrays.bricks.shape[0],
         "depth": tour.depth,
+        "exposure": tour.exposure,
         "range": [1 / (FARTHEST_DEPTH * tour.depth), 1 / (NEAREST_DEPTH * tour.depth)],
         "start": int(np.argmin(tour.test)),  # the first that the fit saw
         "photos": [

@@ -7,6 +7,7 @@ uniform mat3 turn;
 uniform vec2 size, range;  // of inverse depth, from far to near
 uniform vec3 sky[9];       // of one colour: the others are 0
 uniform int show;          // 0 colours, 1 depth, 2 opacity
+uniform float exposure;
 
 const int INPUTS = 8, WIDE = HIDDEN / 4, THIRD = WIDE / 3;
 layout(std140) uniform Small { mat4 w1[WIDE * INPUTS]; vec4 b1[WIDE], b2[WIDE], w3[3 * WIDE], b3; };
@@ -44,6 +45,18 @@ vec3 decoded(vec4 given[INPUTS]) {
   return 1.0 / (1.0 + exp(-clamp(out_, -80.0, 80.0)));
 }
 
+// `brighter` of `tone.py`, on sRGB.
+vec3 exposed(vec3 colour) {
+  if (exposure == 1.0) return colour;
+  vec3 light = exposure * mix(colour / 12.92, pow((colour + 0.055) / 1.055, vec3(2.4)), step(0.04045, colour));
+  if (exposure > 1.0) {
+    float steep = (exposure - SHOULDER) / (1.0 - SHOULDER);
+    vec3 over = clamp((light - SHOULDER) / (exposure - SHOULDER), 0.0, 1.0);
+    light = mix(light, SHOULDER + (1.0 - SHOULDER) * steep * over / (1.0 + (steep - 1.0) * over), step(SHOULDER, light));
+  }
+  return mix(12.92 * light, 1.055 * pow(max(light, 1e-9), vec3(1.0 / 2.4)) - 0.055, step(0.0031308, light));
+}
+
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy);
   uvec4 told = texelFetch(rest, at, 0);
@@ -65,7 +78,7 @@ void main() {
   for (int i = 0; i < 9; i++) behind += sky[i] * h[i];
   behind = clamp(behind, 0.0, 1.0);
   if (opacity == 0.0) {
-    shown = vec4(behind, 1);
+    shown = vec4(exposed(behind), 1);
     return;
   }
   uvec4 a = texelFetch(first, at, 0), b = texelFetch(second, at, 0);
@@ -73,5 +86,5 @@ void main() {
     vec4(unpackHalf2x16(a.x), unpackHalf2x16(a.y)), vec4(unpackHalf2x16(a.z), unpackHalf2x16(a.w)),
     vec4(unpackHalf2x16(b.x), unpackHalf2x16(b.y)), vec4(unpackHalf2x16(b.z), unpackHalf2x16(b.w)),
     vec4(h[0], h[1], h[2], h[3]), vec4(h[4], h[5], h[6], h[7]), vec4(h[8], h[9], h[10], h[11]), vec4(h[12], h[13], h[14], h[15]));
-  shown = vec4(mix(behind, decoded(given), opacity), 1);
+  shown = vec4(exposed(mix(behind, decoded(given), opacity)), 1);
 }

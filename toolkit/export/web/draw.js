@@ -36,6 +36,7 @@ class Field {
     for (const [name, value] of Object.entries(about.march)) this.set(this.march, name, value);
     gl.useProgram(this.decode.program);
     gl.uniform3fv(this.decode.at('sky'), about.sky);
+    gl.uniform1f(this.decode.at('exposure'), about.exposure);
     this.targets = new Map();
   }
 
