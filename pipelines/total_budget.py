@@ -46,6 +46,7 @@ class TotalBudget:
         self.predicted: dict[str, float] = {}
         self.self_test = 0.0  # seconds that the machine's self-test took, once, besides what was asked for: most of them are compiling
         self.export_planned = 0.0  # seconds, when it was decided how much is exported
+        self.all_wanted = False  # nobody said what is to be exported
         self.again = False  # an earlier run of the same plan has decided everything
         self.name = ""
 
@@ -69,14 +70,17 @@ class TotalBudget:
             self._began += self.self_test
             model.remember(self.name, self.speed)
         self.work = work_of(capture, settings)
+        self.all_wanted = list(settings.export.formats) == list(EXPORTS)
         kept = self._kept(job)
         self._decide_effects(settings, kept)
-        self._decide_extras(settings, kept)
+        for extra in (TEXTURE, PAGE) if self.all_wanted else ():
+            if self._left_out_early(extra, kept):
+                self._leave_out(settings, extra)
         if kept is not None:
             self.choice, self.again = kept, True
         else:
             self.choice = model.choose(self.speed, self.work, self.asked - self.elapsed(), settings.capture.max_frames)
-            self.choice.effects, self.choice.texture, self.choice.page = self.work.effects, self.work.texture, self.work.page
+            self.choice.effects = self.work.effects
         settings.capture.image_size = self.choice.image_size
         if self.choice.max_frames is not None:
             settings.capture.max_frames = self.choice.max_frames
@@ -98,34 +102,46 @@ class TotalBudget:
             settings.effects.mode = "off"
             self.work = replace(self.work, effects=False)
 
-    def _decide_extras(self, settings: Settings, kept: model.Choice | None) -> None:
-        """Textures, then the page to walk through, are left out of so short a run that they would take the fit's share; not where it was
-        said what is to be exported."""
+    @property
+    def _least_fit(self) -> float:
+        """Seconds that a fit should have: textures, then the page to walk through, are left out of a run in which they would take them."""
+        return model.FIT_SHARE * self.asked
+
+    def _left_out_early(self, extra: str, kept: model.Choice | None) -> bool:
+        """Whether it is already known now that this is left out: an earlier run decided so, or the TSDF, which is made before the field,
+        would take too long for its texture. Everything else is decided when the fit is."""
         assert self.speed is not None and self.work is not None
-        if list(settings.export.formats) != list(EXPORTS):
-            return
-        for extra in (TEXTURE, PAGE):
-            if kept is None:
-                seconds = self.asked - self.elapsed()
-                wanted = model.left_for_fit(self.speed, self.work, seconds) >= model.FIT_SHARE * self.asked
-            else:
-                wanted = getattr(kept, extra) is not False
-            if not wanted:
-                settings.export.formats = [name for name in settings.export.formats if name != extra]
-                self.work = replace(self.work, **{extra: False})
+        if kept is not None:
+            return getattr(kept, extra) is False
+        early = extra == TEXTURE and self.work.depth
+        return early and model.left_for_fit(self.speed, self.work, self.asked - self.elapsed()) < self._least_fit
+
+    def _leave_out(self, settings: Settings, extra: str) -> None:
+        """Exports are made without it."""
+        assert self.work is not None
+        settings.export.formats = [name for name in settings.export.formats if name != extra]
+        self.work = replace(self.work, **{extra: False})
+
+    def _left(self, job: Job) -> float:
+        """Seconds that are left for the fit, with all exports that are still wanted after it."""
+        assert self.speed is not None
+        after = sum(self.predicted.get(stage, 0.0) for stage in ("render", "evaluate", "report")) * self._pace(job)
+        left = self.asked - self.elapsed() - after
+        return left - self._for_exports(job, left) - self.speed.seconds("beside", 1.0)
 
     def choose_fit(self, job: Job, views: Views, scene: Scene) -> None:
-        """Decide the fit's seconds and its finest lattice from what is left."""
+        """Decide the fit's seconds and its finest lattice from what is left, and whether meshes get textures and the field its page."""
         from toolkit.training.start import worth_a_level
 
         assert self.speed is not None and self.work is not None and self.choice is not None
         if not self.again:
-            pace = self._pace(job)
-            after = sum(self.predicted.get(stage, 0.0) for stage in ("render", "evaluate", "report")) * pace
-            left = self.asked - self.elapsed() - after
-            left -= self._for_exports(job, left) + self.speed.seconds("beside", 1.0)
-            self.choice.fit_seconds = round(max(model.LEAST_FIT, left), 2)
-            possible = model.resolution_for(self.choice.fit_seconds, self.speed.units["fit"] * pace, finest(job, views, scene))
+            for extra in (TEXTURE, PAGE) if self.all_wanted else ():
+                if getattr(self.work, extra) and self._left(job) < self._least_fit:
+                    self._leave_out(job.settings, extra)
+            self.choice.texture, self.choice.page = self.work.texture, self.work.page
+            self.choice.fit_seconds = round(max(model.LEAST_FIT, self._left(job)), 2)
+            pace = self.speed.units["fit"] * self._pace(job)
+            possible = model.resolution_for(self.choice.fit_seconds, pace, finest(job, views, scene))
             self.choice.resolution = possible if job.settings.field.resolution is not None else worth_a_level(possible)
         job.settings.fit.budget = self.choice.fit_seconds
         job.settings.fit.passes = None  # so many seconds were asked for

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import psutil
 import pytest
@@ -49,28 +51,51 @@ def test_a_run_that_takes_what_was_asked_for(tmp_path: Path, capsys: Capsys, mon
     assert all(stage["cached"] for stage in again["stages"])
 
 
-def extras(seconds: float, formats: list[str], kept: model.Choice | None = None) -> tuple[list[str], model.Work]:
-    """What is left of `formats` for fox's photos on a machine that takes what one took, and the work then."""
-    units = {"decode": 0.0044, "features": 0.183, "ray": 1.5e-6, "fit": 3.9e-6, "score": 0.81}
+UNITS = {"decode": 0.0042, "features": 0.19, "ray": 1.3e-6, "fit": 3.9e-6, "score": 0.81}  # of a machine
+FOX = model.Work(50, 540, 960, 7, posed=True, depth=False, outlined=False, texture=True, page=True)
+
+
+def planned(seconds: float, work: model.Work = FOX) -> TotalBudget:
+    """A plan for photos like fox's on a machine that takes what one took, from now on."""
     plan = TotalBudget(seconds)
     plan._began = time.monotonic()
-    plan.speed = model.Speed(units)
-    plan.work = model.Work(50, 540, 960, 7, posed=True, depth=False, outlined=False, texture=True, page=True)
-    settings = load_settings("balanced")
-    settings.export.formats = formats
-    plan._decide_extras(settings, kept)
-    return settings.export.formats, plan.work
+    plan.speed, plan.work, plan.choice, plan.all_wanted = model.Speed(dict(UNITS)), work, model.Choice(320), True
+    return plan
+
+
+def fitted(seconds: float, formats: list[str] | None = None, spent: float = 10.0) -> Any:
+    """Settings and plan when the fit is decided, `spent` seconds after the start."""
+    plan, settings = planned(seconds), load_settings("balanced")
+    plan.all_wanted = formats is None
+    settings.export.formats = formats or list(EXPORTS)
+    plan._began -= spent
+    job = SimpleNamespace(settings=settings, stages=SimpleNamespace(cached={}, records={}))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipelines.total_budget.finest", lambda *_: 512)
+        plan.choose_fit(job, None, None)  # type: ignore[arg-type]
+    return settings, plan
 
 
 def test_textures_and_the_page_are_left_out_where_they_would_take_the_fits_share() -> None:
-    assert extras(300, list(EXPORTS))[0] == list(EXPORTS)
-    formats, work = extras(50, list(EXPORTS))
-    assert formats == [name for name in EXPORTS if name != "texture"] and work.page and not work.texture
-    formats, work = extras(20, list(EXPORTS))
-    assert formats == [name for name in EXPORTS if name not in ("texture", "page")] and not work.page and not work.texture
-    assert extras(20, ["texture", "glb"])[0] == ["texture", "glb"]  # what was asked for by name stays
-    assert extras(300, list(EXPORTS), model.Choice(160, texture=False))[0] == [name for name in EXPORTS if name != "texture"]
-    assert extras(20, list(EXPORTS), model.Choice(160))[0] == list(EXPORTS)  # an earlier plan, of before
+    settings, plan = fitted(300)
+    assert settings.export.formats == list(EXPORTS) and plan.choice.texture and plan.choice.page
+    assert plan.choice.fit_seconds > 0.35 * 300
+    settings, plan = fitted(50, spent=20)
+    assert settings.export.formats == [name for name in EXPORTS if name != "texture"]
+    assert plan.choice.texture is False and plan.choice.page and plan.choice.fit_seconds >= 0.35 * 50
+    settings, plan = fitted(50, spent=25)
+    assert settings.export.formats == [name for name in EXPORTS if name not in ("texture", "page")]
+    settings, plan = fitted(50, ["texture", "glb"], spent=25)
+    assert settings.export.formats == ["texture", "glb"]  # what was asked for by name stays
+
+
+def test_what_is_left_out_is_known_early_only_where_it_must_be() -> None:
+    """The TSDF's texture comes before the fit; of an earlier plan all is known."""
+    depth = replace(FOX, depth=True)
+    assert not planned(20)._left_out_early("texture", None) and not planned(20, depth)._left_out_early("page", None)
+    assert planned(20, depth)._left_out_early("texture", None) and not planned(400, depth)._left_out_early("texture", None)
+    kept = model.Choice(160, texture=False)
+    assert planned(300)._left_out_early("texture", kept) and not planned(20)._left_out_early("page", kept)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +104,8 @@ def test_textures_and_the_page_are_left_out_where_they_would_take_the_fits_share
 def test_what_looking_for_effects_teaches(tmp_path: Path, corrected: bool, real: float, factor: float) -> None:
     """One second is predicted for the first look, at ten pictures, and four for all looks."""
     plan = TotalBudget(60)
-    plan.speed = model.Speed({"decode": 1.0, "features": 0.1, "ray": 1.0, "fit": 1.0, "score": 1.0})
+    feature = 0.1 / model.COST["effects"][1]
+    plan.speed = model.Speed({"decode": 1.0, "features": feature, "ray": 1.0, "fit": 1.0, "score": 1.0})
     plan.work = model.Work(30, 640, 480, 20, posed=True, depth=False, outlined=True)
     (tmp_path / "effects.json").write_text(json.dumps({"corrections": {"poses": [1] if corrected else []}}))
     plan._learn_effects(SimpleNamespace(folder=tmp_path), real)  # type: ignore[arg-type]

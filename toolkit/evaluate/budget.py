@@ -27,9 +27,9 @@ STEADY = 5.0  # seconds of stages that count as predicted well when it is told h
 EXPORT_SHARE = 0.25  # of the seconds, at most, that are planned for exports
 # Pictures' worth of features that a mesh takes: whatever it is of; of a megapixel of one view, for its triangles, and of all views, to make
 # their depth agree, to polish, fuse and carve; each by the pixels that are rendered, and by those of the depth that is made of them.
-MESH_FIXED, MESH_TRIANGLES, MESH_DEPTH = 3.0, (180.0, 60.0), (28.0, 7.0)
+MESH_FIXED, MESH_TRIANGLES, MESH_DEPTH = 2.3, (145.0, 48.0), (23.0, 6.0)
 # For a texture besides: a coarser mesh, and of each training picture what it sees and its texels; for a page: what training rays see.
-TEXTURE_FIXED, TEXTURE_PICTURE, PAGE = 20.0, 0.3, 15.0
+TEXTURE_FIXED, TEXTURE_PICTURE, PAGE = 14.0, 0.2, 10.0
 OBJECT = 0.5  # of that where pictures have alpha: the object fills a part of them
 MESH_SIDE, VIDEO_SIDE = 400, 640  # long sides that are rendered at most
 EXPORT_RAY = 1.2  # of the time of a test view's ray: writing video frames comes on top
@@ -53,19 +53,19 @@ COST = {
     "capture": ("decode", 3.0),
     "frames": ("decode", 2.0),
     "poses": ("features", 1.0),
-    "effects": ("features", 1.0),
-    "scene": ("features", 1.0),
-    "views": ("decode", 7.0),
+    "effects": ("features", 0.9),
+    "scene": ("features", 0.6),
+    "views": ("decode", 11.0),
     "tsdf": ("decode", 80.0),
     "tsdf_texture": ("features", 1.0),
-    "beside": ("features", 8.0),  # what a fit takes beside its own seconds: reading, the timeline, writing
-    "render": ("ray", 1.5),
+    "beside": ("features", 4.5),  # what a fit takes beside its own seconds: reading, the timeline, writing
+    "render": ("ray", 1.2),
     "export": ("ray", 1.5),
     "evaluate": ("score", 1.0),
-    "report": ("decode", 40.0),
+    "report": ("decode", 75.0),
 }
 KINDS = ("decode", "features", "ray", "fit", "score")
-COUNTED = 3  # raised when a stage's work is counted in another way: what was learnt before says nothing then
+COUNTED = 4  # raised when a stage's work is counted in another way: what was learnt before says nothing then
 
 
 @dataclass(frozen=True)
