@@ -257,7 +257,7 @@ class TotalBudget:
         if not real or real < WORTH_LEARNING or not path.is_file():
             return
         made = read_json(path).get("corrections") or {}
-        some, all_of_them = (self.speed.seconds("effects", model.effects_work(self.work, self.choice, every)) for every in (False, True))
+        some, all_of_them = (self.speed.seconds("effects", model.effects_work(self.work, self.choice, every)) for every in (0.0, 1.0))
         corrected = bool(made.get("gain") or made.get("poses"))
         self.speed.learn("effects", all_of_them if corrected else min(max(real, some), all_of_them), real)
 

@@ -29,7 +29,7 @@ EXPORT_SHARE = 0.25  # of the seconds, at most, that are planned for exports
 # their depth agree, to polish, fuse and carve; each by the pixels that are rendered, and by those of the depth that is made of them.
 MESH_FIXED, MESH_TRIANGLES, MESH_DEPTH = 2.3, (145.0, 48.0), (23.0, 6.0)
 # For a texture besides: a coarser mesh, and of each training picture what it sees and its texels; for a page: what training rays see.
-TEXTURE_FIXED, TEXTURE_PICTURE, PAGE = 14.0, 0.2, 10.0
+TEXTURE_FIXED, TEXTURE_PICTURE, PAGE = 18.0, 0.2, 14.0
 OBJECT = 0.5  # of that where pictures have alpha: the object fills a part of them
 MESH_SIDE, VIDEO_SIDE = 400, 640  # long sides that are rendered at most
 EXPORT_RAY = 1.2  # of the time of a test view's ray: writing video frames comes on top
@@ -42,7 +42,8 @@ SIFT_FRAMES = 100
 SFM_PICTURE, SFM_FEATURES, SFM_PAIR, SFM_MAPPING = 0.5, 1.6, 0.7, 0.018
 HEIF = 4.0  # times as long as choosing a frame of a video takes: decoding a picture and writing it as JPEG, two threads
 NEIGHBOURS, ALIKE = 5, 12  # pairs for each frame of a video; for each of more photos than are matched with all others
-EFFECTS_LOOKED_AT = 40  # training pictures at most that are looked at for effects; all, when one is corrected picture by picture
+EFFECTS_LOOKED_AT = 40  # training pictures at most that are looked at for effects; all, when one is corrected picture by picture …
+CORRECTED = 0.4  # … which this share of captures asks for
 EFFECTS_SHARE = 0.5  # of the seconds, at most, that looking for effects may take
 AGREES = 0.15  # relative error of a prediction that is still good
 LEARNING = 0.7  # of what a run shows about a factor, the part that is believed
@@ -148,7 +149,7 @@ def amounts(work: Work, choice: Choice) -> dict[str, float]:
         "capture": (0.0 if work.video else frames * work.megapixels),
         "frames": (work.total if work.video else HEIF * work.converted) * work.megapixels,
         "poses": 0.0 if work.posed else sfm_work(work, frames),
-        "effects": effects_work(work, choice) if work.effects else 0.0,
+        "effects": effects_work(work, choice, CORRECTED) if work.effects else 0.0,
         "scene": 0.05 * frames * work.megapixels if work.outlined else float(min(frames, SIFT_FRAMES)),
         "views": frames * work.megapixels,
         "tsdf": (frames - test) * work.megapixels if work.depth else 0.0,
@@ -160,12 +161,12 @@ def amounts(work: Work, choice: Choice) -> dict[str, float]:
     }
 
 
-def effects_work(work: Work, choice: Choice | None = None, every: bool = True) -> float:
-    """Pictures whose features are found and matched; `every`: all of them a second time, as when one is corrected. Half where
-    structure from motion leaves points."""
+def effects_work(work: Work, choice: Choice | None = None, every: float = 1.0) -> float:
+    """Pictures whose features are found and matched; `every`: how likely all of them are looked at once more, since one is corrected. Half
+    where structure from motion leaves points."""
     frames = min(work.frames, (choice.max_frames if choice is not None else None) or work.frames)
     test = work.test * frames / max(work.frames, 1)
-    return (min(frames - test, EFFECTS_LOOKED_AT) + (frames if every else 0)) * (1.0 if work.posed else 0.5)
+    return (min(frames - test, EFFECTS_LOOKED_AT) + every * frames) * (1.0 if work.posed else 0.5)
 
 
 def sfm_work(work: Work, frames: int) -> float:
@@ -193,7 +194,7 @@ def mesh_work(work: Work, choice: Choice) -> tuple[float, float]:
     frames = min(work.frames, choice.max_frames or work.frames)
     extra = (texture_work(frames * (1 - work.test / max(work.frames, 1))) if work.texture else 0.0) + (PAGE if work.page else 0.0)
     triangles, depth = (sum(each * size for each, size in zip(of, sizes, strict=True)) for of in (MESH_TRIANGLES, MESH_DEPTH))
-    return MESH_FIXED + triangles + extra, depth
+    return MESH_FIXED + triangles + extra * (OBJECT if work.alpha else 1.0), depth
 
 
 def most_export_seconds(speed: Speed, work: Work, choice: Choice, mesh_views: int, video_frames: int) -> float:
