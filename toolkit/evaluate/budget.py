@@ -20,7 +20,8 @@ SIZES = (160, 240, 320, 400, 480, 640, 800, 960)  # long sides that pictures are
 RAYS_A_PIXEL = 0.6  # rays that a fit should have for each training pixel: with fewer, smaller pictures end better in the same time
 VOXELS_A_RAY = 2.0  # as the schedule: a finer level is worth its voxels only when so few rays are left for each
 SURFACE = 3.0  # occupied voxels of a lattice of n a side, in n²
-FIT_SHARE = 0.35  # of the seconds, at least, that the fit should have when pictures are chosen
+FIT_SHARE = 0.35  # of the seconds, at least, that the fit should have when pictures are chosen …
+FRAMES_SHARE = 0.25  # … and when a video's frames are: more of them are worth more than larger ones, or than more seconds of fitting
 NEARLY = 0.8  # of the seconds that the smallest pictures would leave, where they do not leave that share
 LEAST_FIT = 2.0  # seconds
 STEADY = 5.0  # seconds of stages that count as predicted well when it is told how busy the machine is: first imports are no sign of it
@@ -218,7 +219,7 @@ def choose(speed: Speed, work: Work, total: float, most_frames: int = 150) -> Ch
     """Picture size and, for a video, how many frames, for a run of `total` seconds.
 
     The largest pictures whose fit still gets `FIT_SHARE` of the seconds and enough rays for its training pixels; of a video the most
-    frames for which there is such a size. Where other things take so much that no size leaves that share, size has little to do with it:
+    frames that leave it `FRAMES_SHARE`. Where other things take so much that no size leaves that share, size has little to do with it:
     then the largest that leaves nearly as much as any. The smallest of everything when there are never rays enough.
     """
     counts: list[int | None] = [None]
@@ -226,10 +227,11 @@ def choose(speed: Speed, work: Work, total: float, most_frames: int = 150) -> Ch
         counts = [most_frames, *(count for count in FRAME_COUNTS if count < most_frames)]
     sizes = [size for size in SIZES if size == SIZES[0] or size <= 1.2 * max(work.width, work.height)]
     for count in counts:
-        left = {size: total * (1 - EXPORT_SHARE) - sum(predict(speed, work, Choice(size, count)).values()) for size in sizes}
-        most = max(left.values())
-        if most < FIT_SHARE * total and count != counts[-1]:
+        taken = {size: sum(predict(speed, work, Choice(size, count)).values()) for size in sizes}
+        if (total - min(taken.values())) * (1 - EXPORT_SHARE) < FRAMES_SHARE * total and count != counts[-1]:
             continue
+        left = {size: total * (1 - EXPORT_SHARE) - taken[size] for size in sizes}
+        most = max(left.values())
         least = min(FIT_SHARE * total, NEARLY * most)
         fitting = [size for size in sizes if left[size] >= least and _rays(speed, left[size]) >= _wanted_rays(work, Choice(size, count))]
         if fitting:

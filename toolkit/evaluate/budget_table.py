@@ -28,6 +28,7 @@ def budget_table(reports: Sequence[dict[str, Any]], commands: Sequence[str]) -> 
 def _cells(data: dict[str, Any], told: dict[str, Any], off: float) -> list[str]:
     choice, stages = told["choice"], told["stages"]
     video = f"{choice['video_frames']} video frames" if choice.get("video_frames") else "no video"
+    made = [video, *(f"no {extra}" for extra in ("texture", "page") if choice.get(extra) is False)]
     effects = stages.get("effects", {}).get("real")
     score = ((data.get("evaluation") or {}).get("field") or {}).get("psnr")
     return [
@@ -38,6 +39,6 @@ def _cells(data: dict[str, Any], told: dict[str, Any], off: float) -> list[str]:
         f"{100 * off:+.0f}%".replace("-", "−"),
         "not looked for" if choice.get("effects") is False else words.duration(effects),
         f"{choice['fit_seconds']:.1f} s",
-        f"{choice['image_size']} pixels, {choice['resolution']}³, {video}",
+        f"{choice['image_size']} pixels, {choice['resolution']}³, {', '.join(made)}",
         words.decimal(score, 1),
     ]
