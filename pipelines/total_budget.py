@@ -105,7 +105,7 @@ class TotalBudget:
     @property
     def _least_fit(self) -> float:
         """Seconds that a fit should have: textures, then the page to walk through, are left out of a run in which they would take them."""
-        return model.FIT_SHARE * self.asked
+        return min(model.FIT_SHARE * self.asked, model.ENOUGH)
 
     def _left_out_early(self, extra: str, kept: model.Choice | None) -> bool:
         """Whether it is already known now that this is left out: an earlier run decided so, or the TSDF, which is made before the field,

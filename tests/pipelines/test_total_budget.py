@@ -85,6 +85,8 @@ def test_textures_and_the_page_are_left_out_where_they_would_take_the_fits_share
     assert plan.choice.texture is False and plan.choice.page and plan.choice.fit_seconds >= 0.35 * 50
     settings, plan = fitted(50, spent=25)
     assert settings.export.formats == [name for name in EXPORTS if name not in ("texture", "page")]
+    settings, plan = fitted(200, spent=140)  # less than its share, and enough
+    assert settings.export.formats == list(EXPORTS) and 30 <= plan.choice.fit_seconds < 0.35 * 200
     settings, plan = fitted(50, ["texture", "glb"], spent=25)
     assert settings.export.formats == ["texture", "glb"]  # what was asked for by name stays
 

@@ -22,6 +22,7 @@ VOXELS_A_RAY = 2.0  # as the schedule: a finer level is worth its voxels only wh
 SURFACE = 3.0  # occupied voxels of a lattice of n a side, in n²
 FIT_SHARE = 0.35  # of the seconds, at least, that the fit should have when pictures are chosen …
 FRAMES_SHARE = 0.25  # … and when a video's frames are: more of them are worth more than larger ones, or than more seconds of fitting
+ENOUGH = 30.0  # seconds of fitting that textures and a page need not give way to, whatever share they are
 NEARLY = 0.8  # of the seconds that the smallest pictures would leave, where they do not leave that share
 LEAST_FIT = 2.0  # seconds
 STEADY = 5.0  # seconds of stages that count as predicted well when it is told how busy the machine is: first imports are no sign of it
