@@ -14,6 +14,7 @@ from toolkit.capture.types import Views
 from toolkit.training.depth import ray_distances
 
 Tensor = torch.Tensor
+REACH = 3.0  # deviations of a Gaussian beyond which nothing counts
 
 
 @dataclass(frozen=True)
@@ -103,12 +104,23 @@ class PixelPool:
 
 
 def softened(image: np.ndarray[Any, Any], valid: np.ndarray[Any, Any] | None, radius: float) -> np.ndarray[Any, Any]:
-    """(H, W, 3) uint8 → the same, each pixel the mean over a Gaussian with a deviation of `radius` pixels; of `valid` (H, W) ones alone."""
+    """(H, W, 3) uint8 → the same, each of the `valid` (H, W) pixels the mean over a Gaussian with a deviation of `radius` pixels; those
+    that are not valid go into no mean, and have no meaning afterwards. None: all are."""
     if radius <= 0:
         return image
     if valid is None or valid.all():
         return np.asarray(cv2.GaussianBlur(image, (0, 0), radius))
-    known = valid.astype(np.float32)
-    weight = np.maximum(cv2.GaussianBlur(known, (0, 0), radius), 1e-6)
-    whole = cv2.GaussianBlur(image * known[:, :, None], (0, 0), radius) / weight[:, :, None]
-    return np.where(valid[:, :, None], np.clip(np.rint(whole), 0, 255), image).astype(np.uint8)
+    return np.asarray(cv2.GaussianBlur(_filled(image, valid, int(np.ceil(REACH * radius))), (0, 0), radius))
+
+
+def _filled(image: np.ndarray[Any, Any], valid: np.ndarray[Any, Any], reach: int) -> np.ndarray[Any, Any]:
+    """A copy with the pixels that are not `valid` as the mean of those that are, over a square up to `reach` pixels to either side: a
+    Gaussian over it takes a quarter of the time of one over a picture with holes. As they were, where nothing valid is as near."""
+    side, holes = (2 * reach + 1, 2 * reach + 1), np.flatnonzero(~valid)
+    known = valid.view(np.uint8)
+    count = cv2.boxFilter(known, cv2.CV_32F, side, normalize=False, borderType=cv2.BORDER_CONSTANT).reshape(-1)[holes]
+    total = cv2.boxFilter(cv2.bitwise_and(image, image, mask=known), cv2.CV_32F, side, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    out = image.copy()
+    told = count > 0
+    out.reshape(-1, 3)[holes[told]] = np.rint(total.reshape(-1, 3)[holes[told]] / count[told, None])
+    return out
