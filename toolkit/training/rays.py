@@ -105,12 +105,13 @@ class PixelPool:
 
 def softened(image: np.ndarray[Any, Any], valid: np.ndarray[Any, Any] | None, radius: float) -> np.ndarray[Any, Any]:
     """(H, W, 3) uint8 → the same, each of the `valid` (H, W) pixels the mean over a Gaussian with a deviation of `radius` pixels; those
-    that are not valid go into no mean, and have no meaning afterwards. None: all are."""
+    that are not valid go into no mean, and stay as they are. None: all are valid."""
     if radius <= 0:
         return image
     if valid is None or valid.all():
         return np.asarray(cv2.GaussianBlur(image, (0, 0), radius))
-    return np.asarray(cv2.GaussianBlur(_filled(image, valid, int(np.ceil(REACH * radius))), (0, 0), radius))
+    soft = np.asarray(cv2.GaussianBlur(_filled(image, valid, int(np.ceil(REACH * radius))), (0, 0), radius))
+    return np.asarray(cv2.copyTo(image, (~valid).view(np.uint8), soft))
 
 
 def _filled(image: np.ndarray[Any, Any], valid: np.ndarray[Any, Any], reach: int) -> np.ndarray[Any, Any]:
