@@ -69,10 +69,10 @@ def spoiling(monkeypatch: pytest.MonkeyPatch, engine: str, value: float, when: I
         return
     compiled = FusedOptimiser._broken
 
-    def broken(self: FusedOptimiser, thread: int, error: float, weights: Any) -> str | None:
+    def broken(self: FusedOptimiser, thread: int, error: float) -> str | None:
         if thread == self.threads - 1 and next(when):
             (self.density_sums[thread] if what == "densities" else self.feature_sums[thread, 0])[5] = value
-        return compiled(self, thread, error, weights)
+        return compiled(self, thread, error)
 
     monkeypatch.setattr(FusedOptimiser, "_broken", broken)
 

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from toolkit.render.kernels import INLINE, LEAF, ONE, X, Y, Z
+from toolkit.render.kernels_row import mix
 
 X_ROW, Y_ROW, Z_ROW = np.uintp(1), np.uintp(8), np.uintp(64)  # rows from a corner of a block to the next one along each axis
 
@@ -106,8 +107,4 @@ def gather_row(width: Any, feature: Any, rows: Any, values: Any, weights: Any, o
     w4, w5, w6, w7 = a * b * z, x * b * z, a * y * z, x * y * z
     weights[index, 0], weights[index, 1], weights[index, 2], weights[index, 3] = w0, w1, w2, w3
     weights[index, 4], weights[index, 5], weights[index, 6], weights[index, 7] = w4, w5, w6, w7
-    r0, r1, r2, r3 = rows[index, 0], rows[index, 1], rows[index, 2], rows[index, 3]
-    r4, r5, r6, r7 = rows[index, 4], rows[index, 5], rows[index, 6], rows[index, 7]
-    for k in range(len(width)):
-        low = w0 * feature[r0, k] + w1 * feature[r1, k] + w2 * feature[r2, k] + w3 * feature[r3, k]
-        out[index, k] = low + w4 * feature[r4, k] + w5 * feature[r5, k] + w6 * feature[r6, k] + w7 * feature[r7, k]
+    mix(width, feature, rows, weights, index, out)

@@ -14,6 +14,7 @@ from toolkit.render import kernels as K
 from toolkit.render.kernels_decode import RAYS, Rays, decode, encode_direction
 from toolkit.render.kernels_lookup import gather_row
 from toolkit.render.kernels_march import march_ray
+from toolkit.render.kernels_row import add_row, add_to, product_with, put_row
 from toolkit.training.fused_decoder import Tape, decode_backward, forget_gradients
 from toolkit.training.fused_kernels import ask_for, depth_pull, pixel_ray, slow_near
 
@@ -145,8 +146,7 @@ def _composite(space: Any, volume: Any, index: Any, block: Any, tape: Any, count
                 K.prefetch(index, np.int64(rows[i, corner]))
             weight = values[i, K.WEIGHT]
             opacity += weight
-            for c in range(channels):
-                mean[c] += weight * features[i, c]
+            add_to(space.width, mean, features, i, weight)
         block.opacity[one] = opacity
         scale = ONE / max(opacity, F(1e-6))
         for c in range(channels):
@@ -234,8 +234,7 @@ def _to_lattice(
         before, before_place = ZERO, ZERO
         for i in range(first, last):
             g = constant + depth_loss * depth_pull(values[i, K.ALONG], distance, losses.depth_noise)
-            for c in range(channels):
-                g += features[i, c] * g_mean[c]
+            g += product_with(space.width, features, i, g_mean)
             weight, place = values[i, K.WEIGHT], values[i, K.PLACE]
             after, after_place = total - before - weight, total_place - before_place - weight * place
             pull = place * (before - after) - (before_place - after_place)
@@ -257,18 +256,15 @@ def _to_lattice(
                 row = rows[i, corner]
                 if row == zero_row:
                     continue
-                at = np.int64(index[row, column]) - base
-                if at < 0:
-                    at = used
-                    index[row, column] = base + at
-                    touched[at] = row
-                    density_sums[at] = ZERO
-                    for c in range(channels):
-                        feature_sums[at, c] = ZERO
-                    used += 1
                 part = weights[i, corner]
-                density_sums[at] += part * g_raw
-                part *= weight
-                for c in range(channels):
-                    feature_sums[at, c] += part * g_mean[c]
+                at = np.int64(index[row, column]) - base
+                if at >= 0:
+                    density_sums[at] += part * g_raw
+                    add_row(space.width, feature_sums, at, g_mean, part * weight)
+                    continue
+                index[row, column] = base + used
+                touched[used] = row
+                density_sums[used] = part * g_raw
+                put_row(space.width, feature_sums, used, g_mean, part * weight)
+                used += 1
     return used

@@ -99,13 +99,24 @@ def adam_pass(
 
 
 @njit(**K.OPTIONS)
-def adam_dense(values: Any, gradient: Any, first: Any, second: Any, rate: Any, b1: Any, b2: Any, epsilon: Any) -> None:
-    """Adam on all of `values`, (N,) like the others; the bias correction is part of `rate`."""
-    for i in range(len(values)):
-        g = gradient[i]
-        first[i] = b1 * first[i] + (ONE - b1) * g
-        second[i] = b2 * second[i] + (ONE - b2) * g * g
-        values[i] -= rate * first[i] / (np.sqrt(second[i]) + epsilon)
+def adam_dense(values: Any, gradients: Any, first: Any, second: Any, rate: Any, b1: Any, b2: Any, epsilon: Any) -> None:
+    """Adam on all of `values`, a tuple of (N,) arrays like the others; the bias correction is part of `rate`."""
+    for at in range(len(values)):
+        value, gradient, mean, square = values[at], gradients[at], first[at], second[at]
+        for i in range(len(value)):
+            g = gradient[i]
+            mean[i] = b1 * mean[i] + (ONE - b1) * g
+            square[i] = b2 * square[i] + (ONE - b2) * g * g
+            value[i] -= rate * mean[i] / (np.sqrt(square[i]) + epsilon)
+
+
+@njit(**K.OPTIONS)
+def add_dense(left: Any, right: Any, out: Any) -> None:
+    """out = left + right, tuples of (N,) arrays; `out` may be one of the others."""
+    for at in range(len(out)):
+        one, other, total = left[at], right[at], out[at]
+        for i in range(len(total)):
+            total[i] = one[i] + other[i]
 
 
 @njit(**K.OPTIONS)
@@ -119,8 +130,10 @@ def fade(marks: Any) -> None:
 
 @njit(**K.OPTIONS)
 def magnitude(values: Any) -> Any:
-    """Sum of the absolute values of (N,) float32: NaN or infinite where one of them is, or where they are huge."""
+    """Sum of the absolute values of a tuple of (N,) float32 arrays: NaN or infinite where one of them is, or where they are huge."""
     total = ZERO
     for at in range(len(values)):
-        total += abs(values[at])
+        value = values[at]
+        for i in range(len(value)):
+            total += abs(value[i])
     return total
