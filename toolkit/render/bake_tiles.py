@@ -11,6 +11,7 @@ from numba import njit
 from toolkit.render import kernels as K
 from toolkit.render.bake_kernels import VW, VX, VY, VZ, baked_march
 from toolkit.render.kernels_decode import RAYS, decode, encode_direction
+from toolkit.render.kernels_row import add_mixed_bytes
 
 F, ZERO, HALF, ONE = K.F, K.ZERO, K.HALF, K.ONE
 MOST_KEPT = 512  # samples of one ray that are coloured
@@ -21,16 +22,10 @@ TILE = 16  # pixels a side: rays of a tile share what they read while it is stil
 def add_feature(width: Any, feature: Any, starts: Any, kept_at: Any, i: Any, total: Any) -> None:
     """Add the trilinear feature of kept sample `i`, in steps and times its weight, to total[:C]."""
     x, y, z, weight = kept_at[i, VX], kept_at[i, VY], kept_at[i, VZ], kept_at[i, VW]
-    r0, r1 = starts[i, 0], starts[i, 1]
     a, b, c = ONE - x, ONE - y, (ONE - z) * weight
     z *= weight
-    w0, w1, w2, w3 = a * b * c, x * b * c, a * y * c, x * y * c
-    w4, w5, w6, w7 = a * b * z, x * b * z, a * y * z, x * y * z
-    r2, r3 = starts[i, 2], starts[i, 3]
-    for k in range(len(width)):
-        low = w0 * F(feature[r0, k]) + w1 * F(feature[r0 + 1, k]) + w2 * F(feature[r1, k]) + w3 * F(feature[r1 + 1, k])
-        high = w4 * F(feature[r2, k]) + w5 * F(feature[r2 + 1, k]) + w6 * F(feature[r3, k]) + w7 * F(feature[r3 + 1, k])
-        total[k] += low + high
+    weights = a * b * c, x * b * c, a * y * c, x * y * c, a * b * z, x * b * z, a * y * z, x * y * z
+    add_mixed_bytes(width, total, feature, starts, i, weights)
 
 
 @njit(**K.OPTIONS)

@@ -15,6 +15,7 @@ from toolkit.render.field import Field
 from toolkit.render.kernels_decode import RAYS, decode, encode_direction, layers_of, rays_of
 from toolkit.render.kernels_lookup import gather_row
 from toolkit.render.kernels_march import march_ray
+from toolkit.render.kernels_row import add_to
 from toolkit.threads import share
 from toolkit.volume.topology import VOXELS
 
@@ -127,8 +128,7 @@ def render_pass(
                 gather_row(space.width, feature, rows, values, weights, features, i)
                 weight = values[i, K.WEIGHT]
                 opacity += weight
-                for c in range(channels):
-                    mean[c] += weight * features[i, c]
+                add_to(space.width, mean, features, i, weight)
             share = K.ONE / max(opacity, K.F(1e-6))
             for c in range(channels):
                 given[one, c] = mean[c] * share

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from toolkit.render.kernels import INLINE, LEAF, ONE, X, Y, Z
+from toolkit.render.kernels import INLINE, LEAF, ONE, START, X, Y, Z
 from toolkit.render.kernels_row import mix
 
 X_ROW, Y_ROW, Z_ROW = np.uintp(1), np.uintp(8), np.uintp(64)  # rows from a corner of a block to the next one along each axis
@@ -87,12 +87,7 @@ def raw_density(density: Any, upper: Any, cell: Any, x: Any, y: Any, z: Any) -> 
 def gather_feature(width: Any, feature: Any, rows: Any, x: Any, y: Any, z: Any, weights: Any, out: Any) -> None:
     """Trilinear feature of the corners rows (8,) into out[:C]; weights (8,) are left for the caller."""
     corner_weights(x, y, z, weights)
-    r0, r1, r2, r3, r4, r5, r6, r7 = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], rows[7]
-    w0, w1, w2, w3 = weights[0], weights[1], weights[2], weights[3]
-    w4, w5, w6, w7 = weights[4], weights[5], weights[6], weights[7]
-    for c in range(len(width)):
-        low = w0 * feature[r0, c] + w1 * feature[r1, c] + w2 * feature[r2, c] + w3 * feature[r3, c]
-        out[c] = low + w4 * feature[r4, c] + w5 * feature[r5, c] + w6 * feature[r6, c] + w7 * feature[r7, c]
+    mix(width, feature, rows, weights, START, out)
 
 
 @njit(**LEAF)

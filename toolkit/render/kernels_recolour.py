@@ -12,6 +12,7 @@ from toolkit.render.compiled import MOST_KEPT
 from toolkit.render.kernels_decode import RAYS, decode, encode_direction
 from toolkit.render.kernels_lookup import gather_row
 from toolkit.render.kernels_march import march_ray
+from toolkit.render.kernels_row import add_to
 
 ROOM = 2 * MOST_KEPT  # samples of all rays that are decoded together
 
@@ -64,9 +65,7 @@ def project_back_pass(
                 mean[c] = K.ZERO
             for i in range(first, last):
                 gather_row(space.width, feature, rows, values, weights, features, i)
-                weight = values[i, K.WEIGHT]
-                for c in range(channels):
-                    mean[c] += weight * features[i, c]
+                add_to(space.width, mean, features, i, values[i, K.WEIGHT])
                 for corner in range(8):
                     K.prefetch(sums, np.int64(rows[i, corner]))
             for c in range(channels):

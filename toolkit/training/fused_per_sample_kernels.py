@@ -16,6 +16,7 @@ from toolkit.render import kernels as K
 from toolkit.render.kernels_matrix import add_outer, product
 from toolkit.render.kernels_net import BATCH, SAMPLES, Net, Tape, decode_colours, make_tape
 from toolkit.render.kernels_per_sample import march_ray
+from toolkit.render.kernels_row import add_row, put_row
 from toolkit.training.fused_kernels import depth_pull, pixel_ray, slow_near
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
@@ -191,19 +192,17 @@ def _scatter(
             row = tape.rows[i, corner]
             if row == zero_row:
                 continue
-            at = np.int64(index[row, column]) - base
-            if at < 0:
-                at = used
-                index[row, column] = base + at
-                touched[at] = row
-                density_sums[at] = ZERO
-                for c in range(len(channels)):
-                    feature_sums[at, c] = ZERO
-                used += 1
             share = tape.corners[i, corner]
-            density_sums[at] += share * g_raw
-            for c in range(len(channels)):
-                feature_sums[at, c] += share * g_given[c]
+            at = np.int64(index[row, column]) - base
+            if at >= 0:
+                density_sums[at] += share * g_raw
+                add_row(channels, feature_sums, at, g_given, share)
+                continue
+            index[row, column] = base + used
+            touched[used] = row
+            density_sums[used] = share * g_raw
+            put_row(channels, feature_sums, used, g_given, share)
+            used += 1
     return used
 
 
