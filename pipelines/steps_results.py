@@ -65,7 +65,7 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
         make=make,
         save=save,
         load=lambda: load_pictures(kept),
-        uses=[asdict(job.settings.tsdf), pixel_state(posed), depth_from],
+        uses=[asdict(job.settings.tsdf), pixel_state(posed), depth_from, job.settings.export.smooth],
         version=2,
         after=["scene", "views", *(["stereo"] if matched is not None else [])],
     )

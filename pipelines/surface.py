@@ -72,7 +72,7 @@ def fuse_training_frames(
         shown = views.subset(np.flatnonzero(~views.test))
         volume = fuse_stereo(shown, depths, settings.voxel_size, settings.depth_max, carve=not exact, progress=job.progress)
     fused = time.monotonic() - start
-    mesh = volume.mesh().cleaned(min_area_share=SMALL_PART)
+    mesh = volume.mesh().cleaned(min_area_share=SMALL_PART).smoothed(job.settings.export.smooth)
     write_surface(folder, scene, mesh, volume.points(), views.exposure)
     found = Pictures()
     lenses = [views.intrinsics[index] for index in np.flatnonzero(views.test)]
@@ -169,7 +169,7 @@ def export_surface(
     input_from_working = scene.working_from_input.inverse()
     exposure = views.exposure
     written = [put_points(folder / "points.ply", volume.points(), input_from_working, exposure)] if "points" in formats else []
-    whole = volume.mesh().cleaned(min_area_share=SMALL_PART)
+    whole = volume.mesh().cleaned(min_area_share=SMALL_PART).smoothed(job.settings.export.smooth)
     del volume
     mesh = whole.decimated(MOST_TRIANGLES).transformed(input_from_working)
     mesh = replace(mesh, colours=exposed(mesh.colours, exposure))

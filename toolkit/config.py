@@ -123,6 +123,7 @@ class ExportSettings:
     formats: list[str] = default(default_factory=lambda: list(EXPORTS))
     mesh_views: int = 60  # views whose rendered depth is fused into the mesh
     mesh_size: int = 640  # long side in pixels, at most, of that depth, and of the pictures, as they were taken, that it is polished by
+    smooth: int = 2  # rounds in which vertices of meshes, a TSDF's too, go to the mean of their neighbours; 0: never
     texture_size: int = 1280  # long side in pixels, at most, of the pictures that a texture is made of
     video_frames: int = 90
 
@@ -339,6 +340,8 @@ def _check_ranges(settings: Settings) -> None:
         raise InputError(f"effects.on and effects.off both name {both[0]!r}; it can be in one of them")
     if settings.capture.holdout < 0 or settings.capture.holdout == 1:
         raise InputError(f"holdout is {settings.capture.holdout}; it must be 0 (no test views) or at least 2")
+    if not 0 <= settings.export.smooth <= 100:
+        raise InputError(f"export.smooth is {settings.export.smooth}; it must lie between 0 and 100")
     if not 1 <= settings.network.levels <= 4:
         raise InputError(f"network.levels is {settings.network.levels}; it must lie between 1 and 4")
     if settings.capture.image_size is not None and settings.capture.image_size < 16:

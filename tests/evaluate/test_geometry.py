@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from toolkit.camera import Array, Intrinsics
+from toolkit.camera import Array, Intrinsics, Similarity
 from toolkit.errors import InputError
 from toolkit.evaluate.coverage import in_picture, seen_points
 from toolkit.evaluate.geometry import distances, geometry_metrics, inside, read_mesh, seen_surface, surface_points
@@ -78,9 +78,20 @@ def test_what_is_missing_costs_recall_and_what_is_too_much_costs_precision() -> 
     assert boxed["precision_1"] == 1
 
 
+def test_a_sheet_that_is_tilted_has_that_angle() -> None:
+    truth, wanted = sheet(), surface_points(sheet(), 20_000)
+    assert geometry_metrics(sheet(0.03), truth, wanted, 0.02, samples=5000)["normals"] == pytest.approx(0, abs=1e-5)
+    turn = trimesh.transformations.rotation_matrix(np.deg2rad(20), [1, 0, 0])[:3, :3]
+    tilted = sheet().transformed(Similarity(1.0, turn, np.zeros(3)))
+    upside_down = Mesh(tilted.vertices, tilted.triangles[:, ::-1], tilted.colours)
+    for mesh in (tilted, upside_down):
+        assert geometry_metrics(mesh, truth, wanted, 0.02, samples=5000)["normals"] == pytest.approx(20, abs=1e-4)
+    assert geometry_metrics(sheet(0.3), truth, wanted, 0.02, samples=5000)["normals"] is None  # nowhere near enough to tell
+
+
 def test_no_surface_scores_nothing() -> None:
     none = geometry_metrics(Mesh.empty(), ball(), surface_points(ball(), 1000), 0.02)
-    assert none["accuracy"] is None and none["completeness"] is None
+    assert none["accuracy"] is None and none["completeness"] is None and none["normals"] is None
     assert none["f_score_4"] == 0 and none["recall_4"] == 0
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import open3d as o3d
 import pytest
@@ -71,6 +73,50 @@ def test_colours_follow_their_vertices_through_cleaning() -> None:
     expected = ball(1.0)
     assert np.array_equal(cleaned.vertices, expected.vertices)
     assert np.array_equal(cleaned.colours, expected.colours)
+
+
+def test_smoothing_is_means_of_neighbours_and_borders_stay() -> None:
+    """Against a loop over neighbours; a closed surface, an open one, a vertex that nothing uses."""
+    rng = np.random.default_rng(0)
+    closed, half = ball(), ball()
+    half = Mesh(half.vertices, half.triangles[: len(half.triangles) // 2], half.colours)
+    for mesh in (closed, half):
+        mesh = replace(mesh, vertices=np.concatenate([mesh.vertices + rng.normal(0, 0.01, mesh.vertices.shape), np.full((1, 3), 9.0)]))
+        mesh = replace(mesh, colours=rng.integers(0, 255, mesh.vertices.shape, dtype=np.uint8), normals=None)
+        sides: dict[tuple[int, int], int] = {}
+        for triangle in mesh.triangles.tolist():
+            for a, b in zip(triangle, triangle[1:] + triangle[:1], strict=True):
+                sides[min(a, b), max(a, b)] = sides.get((min(a, b), max(a, b)), 0) + 1
+        beside: dict[int, set[int]] = {number: set() for number in range(len(mesh.vertices))}
+        for a, b in sides:
+            beside[a].add(b)
+            beside[b].add(a)
+        border = {vertex for side, count in sides.items() if count == 1 for vertex in side}
+        assert bool(border) == (len(mesh.triangles) < len(closed.triangles))
+        border |= {vertex for vertex, others in beside.items() if not others}
+        expected = mesh.vertices
+        for rounds in (1, 2):
+            old = expected
+            means = {vertex: np.mean([old[n] for n in others], axis=0) for vertex, others in beside.items() if others}
+            expected = np.array([old[vertex] if vertex in border else means[vertex] for vertex in range(len(old))])
+            got = mesh.smoothed(rounds)
+            np.testing.assert_allclose(got.vertices, expected, atol=1e-12)
+            assert got.colours is mesh.colours and got.triangles is mesh.triangles
+        assert mesh.smoothed(0) is mesh
+
+
+def test_smoothing_takes_ripples_and_leaves_the_shape() -> None:
+    """A ball with a ripple on each vertex: nearer to the ball, and normals nearer to its own; far from the origin likewise."""
+    plain = ball(subdivisions=5)
+    noise = np.random.default_rng(1).normal(0, 0.01, plain.vertices.shape)
+    for shift in (0.0, 6e6):
+        rough = replace(plain, vertices=plain.vertices + noise + shift, normals=None).with_normals()
+        smooth = rough.smoothed(2)
+        assert smooth.normals is not None and rough.normals is not None
+        apart = [np.abs(np.linalg.norm(mesh.vertices - shift, axis=1) - 1).mean() for mesh in (rough, smooth)]
+        assert apart[1] < 0.5 * apart[0]
+        off = [1 - (mesh.normals * plain.vertices).sum(axis=1).mean() for mesh in (rough, smooth)]
+        assert off[1] < 0.2 * off[0]
 
 
 def test_thinning_keeps_shape_and_colour() -> None:

@@ -121,6 +121,10 @@ def _percent(value: float | None) -> str:
     return words.NONE if value is None else f"{100 * value:.2f}%"
 
 
+def _degrees(value: float | None) -> str:
+    return words.NONE if value is None else f"{value:.1f}°"
+
+
 def _cost(methods: Sequence[dict[str, Any]]) -> list[Row]:
     return [
         *_row("Time to make it", methods, ("seconds",), words.duration, min, "with its test views, after the shared stages"),
@@ -183,6 +187,7 @@ def _geometry(methods: Sequence[dict[str, Any]], unit: str) -> list[Row]:
             f"Completeness ({unit}) ↓", methods, ("geometry", "completeness"), words.significant, min, "mean distance from truth to mesh"
         ),
         *scores,
+        *_row("Normals off by ↓", methods, ("geometry", "normals"), _degrees, min, "in the mean, within 4 voxels of the truth"),
     ]
 
 

@@ -51,10 +51,15 @@ def read_mesh(path: Path | str) -> Mesh:
 
 def surface_points(mesh: Mesh, count: int, seed: int = 0) -> Array:
     """(count, 3) points spread evenly by area over a mesh, always the same ones for a seed; none for a mesh without area."""
+    return _spread(mesh, count, seed)[0]
+
+
+def _spread(mesh: Mesh, count: int, seed: int) -> tuple[Array, Array]:
+    """`surface_points`, and the triangle (count,) that each of them lies in."""
     areas = mesh.areas()
     total = float(areas.sum())
     if not total > 0:
-        return np.zeros((0, 3))
+        return np.zeros((0, 3)), np.zeros(0, np.int64)
     rng = np.random.default_rng(seed)
     # One sample in each of `count` equal shares of the area: less uneven than independent draws.
     at = (np.arange(count) + rng.random(count)) / count * total
@@ -62,17 +67,24 @@ def surface_points(mesh: Mesh, count: int, seed: int = 0) -> Array:
     first, second = rng.random((2, count, 1))
     root = np.sqrt(first)
     a, b, c = (mesh.vertices[mesh.triangles[triangle, corner]] for corner in range(3))
-    return np.asarray((1 - root) * a + root * (1 - second) * b + root * second * c)
+    return np.asarray((1 - root) * a + root * (1 - second) * b + root * second * c), triangle
 
 
 def distances(points: Array, mesh: Mesh) -> Array:
     """(N,) distance of (N, 3) points to the nearest point of a mesh's surface, infinite when it has none."""
+    return _nearest(points, mesh)[0]
+
+
+def _nearest(points: Array, mesh: Mesh) -> tuple[Array, Array]:
+    """`distances`, and the triangle (N,) int64 that the nearest point lies in (0 when there is none)."""
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     if len(mesh.triangles) == 0:
-        return np.full(len(points), np.inf)
+        return np.full(len(points), np.inf), np.zeros(len(points), np.int64)
     origin = mesh.bounds().mean(axis=0)
-    found = ray_scene(mesh, origin).compute_distance(o3c.Tensor.from_numpy((points - origin).astype(np.float32)))
-    return np.asarray(found.numpy(), dtype=np.float64)
+    query = (points - origin).astype(np.float32)
+    found = ray_scene(mesh, origin).compute_closest_points(o3c.Tensor.from_numpy(query))
+    gaps = np.linalg.norm(found["points"].numpy().astype(np.float64) - query, axis=1)
+    return gaps, found["primitive_ids"].numpy().astype(np.int64)
 
 
 def inside(points: Array, region: Region | None) -> Array:
@@ -125,17 +137,24 @@ def geometry_metrics(
 
     Returns:
         plain data: `accuracy` and `accuracy_median`, distance of the mesh's points from the true surface; `completeness` and
-        `completeness_median`, distance of the wanted points from the mesh; for 1, 2 and 4 voxels `precision_n` and `recall_n`, the shares
-        of both within that distance, and `f_score_n`, their harmonic mean; `voxel_size`. Without a surface: accuracy None, scores 0.
+        `completeness_median`, distance of the wanted points from the mesh; `normals`, degrees between the mesh's triangles and the
+        nearest true ones in the mean, where they are at most four voxels apart, whichever side is out; for 1, 2 and 4 voxels
+        `precision_n` and `recall_n`, the shares of both within that distance, and `f_score_n`, their harmonic mean; `voxel_size`.
+        Without a surface: accuracy None, scores 0.
     """
-    own = surface_points(mesh, samples, seed + 1)
-    own = own[inside(own, region)]
-    to_truth, to_mesh = distances(own, truth), distances(wanted, mesh)
+    own, triangle = _spread(mesh, samples, seed + 1)
+    kept = inside(own, region)
+    own, triangle = own[kept], triangle[kept]
+    to_truth, nearest = _nearest(own, truth)
+    to_mesh = distances(wanted, mesh)
+    close = to_truth <= VOXELS[-1] * voxel_size
+    alike = np.abs((mesh.facing(triangle[close]) * truth.facing(nearest[close])).sum(axis=1))
     out: dict[str, Any] = {
         "accuracy": _number(to_truth, np.mean),
         "accuracy_median": _number(to_truth, np.median),
         "completeness": _number(to_mesh, np.mean),
         "completeness_median": _number(to_mesh, np.median),
+        "normals": _number(np.degrees(np.arccos(np.minimum(alike, 1))), np.mean),
         "voxel_size": float(voxel_size),
     }
     for n in VOXELS:

@@ -8,6 +8,7 @@ import fast_simplification
 import numpy as np
 import open3d as o3d
 import open3d.core as o3c
+from scipy import sparse
 
 from toolkit.camera import Array, Similarity
 from toolkit.errors import InputError
@@ -65,6 +66,12 @@ class Mesh:
         a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
         return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
+    def facing(self, triangles: Array) -> Array:
+        """(N, 3) unit normals of the triangles (N,); zero where one has no area."""
+        a, b, c = (self.vertices[self.triangles[triangles, corner]] for corner in range(3))
+        across = np.cross(b - a, c - a)
+        return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), np.finfo(np.float64).tiny))
+
     def components(self) -> Array:
         """(T,) int32: the connected component of each triangle (triangles that share an edge are connected), largest number unknown."""
         if len(self.triangles) == 0:
@@ -109,6 +116,28 @@ class Mesh:
         triangles = triangles[np.lexsort(triangles.T[::-1])]
         normals = None if self.normals is None else self.normals[order]
         return Mesh(self.vertices[order], triangles, self.colours[order], normals)
+
+    def smoothed(self, rounds: int) -> Mesh:
+        """Without the ripples that a lattice and noise leave: each vertex goes to the mean of its neighbours, `rounds` times.
+
+        Vertices of open borders stay where they are, so that what was seen in part does not shrink. Colours stay with their vertices.
+        """
+        count = len(self.vertices)
+        if rounds == 0 or count == 0:
+            return self
+        from_, to = self.triangles.reshape(-1), np.roll(self.triangles, -1, axis=1).reshape(-1)
+        directed = sparse.csr_matrix((np.ones(len(from_), np.float32), (from_, to)), shape=(count, count))
+        edges = directed + directed.T  # 2 between two triangles, 1 at a border
+        of_vertex = np.repeat(np.arange(count), np.diff(edges.indptr))
+        fixed = np.ones(count, bool)  # and what no triangle uses
+        fixed[of_vertex] = False
+        fixed[of_vertex[edges.data < 2]] = True
+        share = np.asarray(edges.sum(axis=1)).reshape(-1, 1)
+        vertices = self.vertices
+        for _ in range(rounds):
+            vertices = np.where(fixed[:, None], self.vertices, edges @ vertices / np.maximum(share, 1))
+        normals = None if self.normals is None else replace(self, vertices=vertices, normals=None).with_normals().normals
+        return replace(self, vertices=vertices, normals=normals)
 
     def compacted(self) -> Mesh:
         """Without vertices that no triangle uses; the order of the others is kept."""
