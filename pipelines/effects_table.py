@@ -28,7 +28,7 @@ def effects_facts(target: Path, quiet: bool) -> dict[str, Any]:
     if len(posed) < 3:
         raise InputError(
             f"{target} comes without camera poses, which the evidence needs; find them first: fieldfuse poses {target} --out DIR, "
-            "then fieldfuse info DIR/exports/cameras/transforms.json --effects"
+            "copy DIR/exports/cameras/transforms.json into the capture's folder, then fieldfuse info THERE/transforms.json --effects"
         )
     progress = make_progress(quiet)
     with progress.listening():

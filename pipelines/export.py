@@ -7,6 +7,8 @@ from typing import Annotated
 import typer
 
 from pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
+from toolkit.config import EXPORTS
+from toolkit.errors import InputError
 
 
 def export(
@@ -26,5 +28,7 @@ def export(
     from pipelines.work import work
 
     wanted = None if formats is None else [name.strip() for name in formats.split(",") if name.strip()]
+    if wanted == []:
+        raise InputError(f"--formats names none; give some of {', '.join(EXPORTS)}, separated by commas")
     options = gather(None, config, pairs, threads=threads, **{"export.formats": wanted})
     work(target, out, options, ("export",), quiet=quiet, as_json=json, trusted=(*BEFORE, "field"))

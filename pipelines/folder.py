@@ -27,6 +27,7 @@ FILES = (
     "capture.json",
     "plan.json",
     "poses.json",
+    "effects.json",
     "scene.json",
     "keyframes.json",
     "views.safetensors",

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from toolkit.keyframes import KeyFrames
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+MOST_A_CORE, LEAST_MOST_THREADS = 4, 64  # threads that may be asked for: more of them only wait for each other
 SHORT_SPIN = "1000"  # turns, microseconds
 
 
@@ -84,8 +85,26 @@ def open_job(
             before = read_settings({}, about["settings"])
             other = settings.field != before.field or settings.fit.finetune != before.fit.finetune
             other_network = settings.network != before.network or settings.field.background != before.field.background
+        else:
+            _check_same_source(folder, source)
         folder.start(source, settings)
         yield Job(folder, source, settings, progress, Stages(folder, progress, trusted if again else ()), again, other, other_network)
+
+
+def _check_same_source(folder: RunFolder, source: Path) -> None:
+    """What another capture's run took long to make is not replaced because of a folder's name.
+
+    Raises:
+        InputError: the folder holds a run of another source.
+    """
+    if not is_run_folder(folder.path):
+        return
+    try:
+        before = Path(folder.about()["source"])
+    except InputError:
+        return  # damaged, and now written again
+    if before.resolve() != source.resolve():
+        raise InputError(f"{folder.path} holds the run of {before}; choose another --out folder for {source}, or remove that one first")
 
 
 def _no_out(target: Path) -> str:
@@ -107,8 +126,20 @@ def check_places(source: Path, out: Path) -> None:
 
 
 def read_settings(options: dict[str, Any], stored: dict[str, Any] | None = None) -> Settings:
-    """Settings of the command line over those of an earlier run (`stored`) or over a preset's."""
+    """Settings of the command line over those of an earlier run (`stored`) or over a preset's.
+
+    Raises:
+        InputError: they do not fit, or more threads are asked for than make sense here.
+    """
     pairs = options.get("pairs") or []
+    settings = _read_settings(options, stored, pairs)
+    most = max(LEAST_MOST_THREADS, MOST_A_CORE * (os.cpu_count() or 1))
+    if settings.threads is not None and settings.threads > most:
+        raise InputError(f"threads is {settings.threads}, and this machine has {os.cpu_count()} cores; give at most {most}")
+    return settings
+
+
+def _read_settings(options: dict[str, Any], stored: dict[str, Any] | None, pairs: list[str]) -> Settings:
     if options.get("preset") is not None or any(pair.startswith("preset=") for pair in pairs):
         stored = None  # a preset is a new start: the stored settings would hide what it sets
     preset = options.get("preset") or (stored or {}).get("preset") or "balanced"

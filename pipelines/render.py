@@ -21,7 +21,7 @@ def render(
         Path | None, typer.Option(help="An .mp4 file, or a folder for PNG pictures. Default: in DIR/renders.", show_default=False)
     ] = None,
     frames: Annotated[int, typer.Option(min=2, help="Pictures of the orbit.")] = 90,
-    fps: Annotated[float, typer.Option(min=1, help="Pictures a second of a video.")] = 30,
+    fps: Annotated[float, typer.Option(min=1, max=1000, help="Pictures a second of a video.")] = 30,
     image_size: Annotated[int | None, typer.Option(min=16, help="Long side of the pictures in pixels.", show_default=False)] = None,
     baked: Baked = False,
     device: Device = None,

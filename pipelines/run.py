@@ -29,6 +29,8 @@ from pipelines.options import (
 )
 from toolkit.errors import InputError
 
+MOST_SECONDS = 1e7  # a third of a year
+
 TotalBudget = Annotated[
     float | None,
     typer.Option(
@@ -70,6 +72,8 @@ def run(
     for name, value in options_given.items():
         if total_budget is not None and value is not None:
             raise InputError(f"--total-budget chooses what {name} would set; give one of them")
+    if total_budget is not None and not total_budget < MOST_SECONDS:  # not a number neither
+        raise InputError(f"--total-budget is {total_budget:g}; it must be a number of seconds, at most 10 million")
     flags = {"budget": budget, "image_size": image_size, "holdout": holdout, "device": device, "threads": threads, "seed": seed}
     flags |= {"engine": engine, "decoder": decoder, "poses.source": poses, "init": init, "finetune": finetune}
     options = {**gather(preset, config, pairs, **flags), "total_budget": total_budget}

@@ -69,7 +69,8 @@ class Stages:
     """The stages of one run folder, in the order in which they are asked for."""
 
     def __init__(self, folder: RunFolder, progress: ConsoleProgress, trusted: Iterable[str] = ()) -> None:
-        """Stages named in `trusted` are taken as they are, whatever settings and source say now, if the stages before them are the same."""
+        """Stages named in `trusted` are taken as they are, whatever settings and source say now, if the stages that went into them are the
+        same; that others would go into them now does not matter."""
         self.folder = folder
         self.progress = progress
         self.trusted = set(trusted)
@@ -112,7 +113,7 @@ class Stages:
         before = {other: self.records[other].made for other in after}
         key = fingerprint(name, version, __version__, uses, before)
         record = self.finished(name)
-        trusted = record is not None and name in self.trusted and record.after == before
+        trusted = record is not None and name in self.trusted and self.usable(name)
         if record is not None and (trusted or (record.key == key and not record.stopped)):
             try:
                 value = load()

@@ -32,7 +32,7 @@ def find_effects(job: Job, posed: Capture) -> Corrections:
     for wish, names in (("on", settings.on), ("off", settings.off)):
         if "background" in names and field.background == "auto":
             field.background = wish
-    if asleep(settings):
+    if asleep(settings) or _did_without(job):
         return Corrections()
     path = job.folder / NAME
     holdout = job.settings.capture.holdout
@@ -59,6 +59,13 @@ def find_effects(job: Job, posed: Capture) -> Corrections:
     corrections = Corrections.from_dict(data.get("corrections", {}) if isinstance(data, dict) else {})
     choose_field(field, data["effects"], settings.off)
     return corrections
+
+
+def _did_without(job: Job) -> bool:
+    """Whether what this folder has was made without looking for effects, by settings that were not kept: a total budget may leave no time
+    for it. Work on it goes on from there."""
+    scene = job.stages.record("scene")
+    return scene is not None and "effects" not in scene.after and "scene" in job.stages.trusted and job.stages.usable("scene")
 
 
 def refine(poses: PoseResult, corrections: Corrections) -> PoseResult:

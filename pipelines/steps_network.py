@@ -52,8 +52,8 @@ def uses_network(job: Job, views: Views) -> bool:
     if settings.field.init != "auto":
         return settings.field.init == "network"
     field = job.stages.record("field") if job.again else None
-    if field is not None and "network" in field.after:
-        return True  # what the folder has stands on it: --no-finetune, and all that was fitted from there
+    if field is not None and ("network" in field.after or not job.other_field):
+        return "network" in field.after  # as what the folder has, be it --no-finetune or fitted from there
     if job.plan is not None and settings.fit.finetune:
         return False  # the seconds of the whole run are planned, and the networks' are not among them
     if not settings.fit.finetune:

@@ -8,16 +8,17 @@ has most of the compiling in it, comes on top: within the seconds asked for it w
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import psutil
 
 from pipelines.page import PAGE
 from pipelines.textured import TEXTURE, TSDF_TEXTURE
-from toolkit.config import EXPORTS
+from toolkit.config import EXPORTS, settings_dict
+from toolkit.errors import FieldfuseError
 from toolkit.evaluate import budget as model
-from toolkit.files import read_json, write_json
+from toolkit.files import fingerprint, read_json, write_json
 
 if TYPE_CHECKING:
     from pipelines.job import Job
@@ -49,6 +50,7 @@ class TotalBudget:
         self.all_wanted = False  # nobody said what is to be exported
         self.again = False  # an earlier run of the same plan has decided everything
         self.name = ""
+        self.given = ""  # hash of what else the plan depends on: settings, machine, capture
 
     def elapsed(self) -> float:
         return time.monotonic() - self._began
@@ -70,6 +72,7 @@ class TotalBudget:
             self._began += self.self_test
             model.remember(self.name, self.speed)
         self.work = work_of(capture, settings)
+        self.given = fingerprint(settings_dict(settings), self.name, asdict(self.work))
         self.all_wanted = list(settings.export.formats) == list(EXPORTS)
         kept = self._kept(job)
         self._decide_effects(settings, kept)
@@ -274,18 +277,19 @@ class TotalBudget:
 
     def _keep(self, job: Job) -> None:
         assert self.choice is not None
-        write_json(job.folder / FILE, {"asked": self.asked, "source": str(job.source), "choice": self.choice.to_dict()})
+        kept = {"asked": self.asked, "source": str(job.source), "given": self.given, "choice": self.choice.to_dict()}
+        write_json(job.folder / FILE, kept)
 
     def _kept(self, job: Job) -> model.Choice | None:
-        """What an earlier run of this very plan decided."""
+        """What an earlier run of this very plan decided; None: there was none, or what it left is damaged."""
         path = job.folder / FILE
         if not path.is_file():
             return None
         try:
             kept = read_json(path)
-            if kept["asked"] == self.asked and kept["source"] == str(job.source):
-                return model.Choice(**kept["choice"])
-        except (KeyError, TypeError, ValueError):
+            if (kept["asked"], kept["source"], kept["given"]) == (self.asked, str(job.source), self.given):
+                return model.Choice.of(kept["choice"])
+        except (FieldfuseError, KeyError, TypeError, ValueError):
             pass
         return None
 

@@ -6,7 +6,8 @@ Only what differs from these defaults stands in `configs/*.yaml`.
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
 from dataclasses import field as default
 from importlib import resources
 from pathlib import Path
@@ -298,10 +299,23 @@ def load_settings(
             raise InputError(
                 f"{key} is {brief(repr(value))}; it must be one of {', '.join(choices)}" + (f" (did you mean {near[0]!r}?)" if near else "")
             )
-    settings = OmegaConf.to_object(config)
+    try:
+        settings = OmegaConf.to_object(config)
+    except OmegaConfBaseException as error:  # what "${…}" stands for is looked up now
+        raise InputError(f"a setting refers to what is not there, or does not fit: {first_line(error)}") from error
     assert isinstance(settings, Settings)
     _check_ranges(settings)
     return settings
+
+
+def _numbers(part: Any, of: str = "") -> Iterator[tuple[str, float]]:
+    """All numbers of the settings with their full names."""
+    for one in fields(part):
+        name, value = of + one.name, getattr(part, one.name)
+        if is_dataclass(value):
+            yield from _numbers(value, f"{name}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield name, value
 
 
 def _check_ranges(settings: Settings) -> None:
@@ -309,12 +323,16 @@ def _check_ranges(settings: Settings) -> None:
         "capture.image_size": settings.capture.image_size,
         "fit.budget": settings.fit.budget,
         "fit.passes": settings.fit.passes,
+        "fit.max_rays": settings.fit.max_rays,
+        "poses.image_size": settings.poses.image_size,
+        "poses.max_features": settings.poses.max_features,
         "threads": settings.threads,
         "field.channels": settings.field.channels,
         "field.hidden": settings.field.hidden,
         "field.resolution": settings.field.resolution,
         "capture.max_frames": settings.capture.max_frames,
         "tsdf.voxel_size": settings.tsdf.voxel_size,
+        "tsdf.depth_max": settings.tsdf.depth_max,
         "views.limit": settings.views.limit,
         "export.texture_size": settings.export.texture_size,
         "export.mesh_size": settings.export.mesh_size,
@@ -325,6 +343,9 @@ def _check_ranges(settings: Settings) -> None:
     for name, value in positive.items():
         if value is not None and not 0 < value < 1e9:
             raise InputError(f"{name} is {value:g}; it must be a positive number")
+    for name, number in _numbers(settings):
+        if not 0 <= number < 2**63:
+            raise InputError(f"{name} is {brief(str(number))}; it must be a number, and not below 0")
     for key, names, kind, known in (
         ("effects.on", settings.effects.on, "effect", EFFECTS),
         ("effects.off", settings.effects.off, "effect", EFFECTS),
@@ -342,6 +363,10 @@ def _check_ranges(settings: Settings) -> None:
         raise InputError(f"holdout is {settings.capture.holdout}; it must be 0 (no test views) or at least 2")
     if not 0 <= settings.export.smooth <= 100:
         raise InputError(f"export.smooth is {settings.export.smooth}; it must lie between 0 and 100")
+    if settings.seed >= 2**31:
+        raise InputError(f"seed is {brief(str(settings.seed))}; it must be less than {2**31}")
+    if settings.field.channels < 3:
+        raise InputError(f"field.channels is {settings.field.channels}; at least 3 are needed, since the first three stand for a colour")
     if not 1 <= settings.network.levels <= 4:
         raise InputError(f"network.levels is {settings.network.levels}; it must lie between 1 and 4")
     if settings.capture.image_size is not None and settings.capture.image_size < 16:

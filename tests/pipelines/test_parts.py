@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import pytest
 
+from pipelines.folder import FILES, SUBFOLDERS
 from pipelines.job import THREAD_VARIABLES, bound_threads
 from tests.pipelines.made import call, make_room
 from tests.pipelines.short import FAST, stages
@@ -91,6 +92,34 @@ def test_a_changed_budget_redoes_the_field_and_what_follows(tmp_path: Path, caps
     answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", *other, "--quiet")
     assert answer.code == 0, answer.err
     assert not (tmp_path / "out" / "exports" / "points.ply").exists()  # of another field
+
+
+def test_a_surface_made_later_leaves_the_field_as_it_is(tmp_path: Path, capsys: Capsys) -> None:
+    """`tsdf` matches pictures, which a fit would have known had it been asked for before; nobody asks for another fit."""
+    make_room(tmp_path / "room", 10)
+    out = tmp_path / "out"
+    first = json.loads(call(capsys, "run", tmp_path / "room", "--out", out, *FAST, "--quiet", "--json").out)
+    field = (out / "field.safetensors").read_bytes()
+    answer = call(capsys, "tsdf", out, "--threads", 1, "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    both = json.loads(answer.out)
+    assert (out / "field.safetensors").read_bytes() == field and stages(both)["field"] and stages(both)["export"]
+    assert both["evaluation"]["field"]["psnr"] == first["evaluation"]["field"]["psnr"] and both["evaluation"]["tsdf"]["psnr"] > 5
+    assert {"exports/points.ply", "tsdf/mesh.ply"} <= {entry["path"] for entry in both["exports"]}
+    # Whatever a run writes is known to belong to one, so that a folder with such files and no run is left alone.
+    assert {path.name for path in out.iterdir()} <= {*SUBFOLDERS, *FILES, "run.json", ".lock"}
+
+
+def test_a_folder_keeps_its_capture(tmp_path: Path, capsys: Capsys) -> None:
+    for name in ("room", "other"):
+        make_room(tmp_path / name, 6)
+    assert call(capsys, "poses", tmp_path / "room", "--out", tmp_path / "out", "--quiet").code == 0
+    before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    answer = call(capsys, "run", tmp_path / "other", "--out", tmp_path / "out", *FAST, "--quiet")
+    assert answer.code == 2 and "holds the run of" in answer.err and answer.err.count("\n") == 1
+    assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()} == before
+    (tmp_path / "link").symlink_to(tmp_path / "room")  # the same capture by another name
+    assert call(capsys, "poses", tmp_path / "link", "--out", tmp_path / "out", "--quiet").code == 0
 
 
 def test_a_field_without_surface_is_exported_as_far_as_it_goes(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:

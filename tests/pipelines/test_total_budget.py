@@ -16,13 +16,14 @@ from pipelines.total_budget import LONGEST_START, TotalBudget
 from tests.pipelines.made import call, make_room
 from toolkit.config import EXPORTS, load_settings
 from toolkit.evaluate import budget as model
-from toolkit.files import read_json
+from toolkit.files import read_json, write_json
 
 Capsys = pytest.CaptureFixture[str]
 
 
 def test_a_run_that_takes_what_was_asked_for(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(model, "EFFECTS_SHARE", 0.0)  # no time for them
     make_room(tmp_path / "room", 10)
     out = tmp_path / "out"
     command = ["run", tmp_path / "room", "--out", out, "--total-budget", "14", "--holdout", "5", "--threads", "1", "--quiet", "--json"]
@@ -49,6 +50,31 @@ def test_a_run_that_takes_what_was_asked_for(tmp_path: Path, capsys: Capsys, mon
     assert again["budget"]["reused"] and again["budget"]["choice"] == choice and again["budget"]["self_test_seconds"] == 0
     assert not any("this machine was measured" in note for note in again["notes"])
     assert all(stage["cached"] for stage in again["stages"])
+
+    # What was decided for want of time (no effects, no networks) holds for work on the folder, too: the field stays.
+    field = (out / "field.safetensors").read_bytes()
+    answer = call(capsys, "export", out, "--formats", "points", "--threads", "1", "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    made = {stage["name"] for stage in json.loads(answer.out)["stages"] if not stage["cached"]}
+    assert choice["effects"] is False and made == {"export"} and (out / "field.safetensors").read_bytes() == field
+
+
+def test_a_plan_is_kept_for_the_same_settings_and_dropped_when_it_is_damaged(tmp_path: Path) -> None:
+    plan, job = planned(60.0), SimpleNamespace(folder=tmp_path, source=Path("source"))
+    plan.choice = model.Choice(320, None, 20.0, 256, 20, None, 30, True, True, True)
+    assert plan._kept(job) is None  # type: ignore[arg-type]
+    plan.given = "these settings"
+    plan._keep(job)  # type: ignore[arg-type]
+    assert plan._kept(job) == plan.choice  # type: ignore[arg-type]
+    plan.given = "others"
+    assert plan._kept(job) is None  # type: ignore[arg-type]
+    plan.given = "these settings"
+    whole = read_json(tmp_path / "plan.json")
+    for name, value in (("image_size", None), ("image_size", "320"), ("fit_seconds", None), ("page", 1), ("resolution", -1), ("more", 1)):
+        write_json(tmp_path / "plan.json", {**whole, "choice": {**whole["choice"], name: value}})
+        assert plan._kept(job) is None, name  # type: ignore[arg-type]
+    (tmp_path / "plan.json").write_text('{"asked')
+    assert plan._kept(job) is None  # type: ignore[arg-type]
 
 
 UNITS = {"decode": 0.0042, "features": 0.19, "ray": 1.3e-6, "fit": 3.9e-6, "score": 0.81}  # of a machine

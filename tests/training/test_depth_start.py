@@ -170,6 +170,7 @@ def test_the_lattice_is_finer_where_nearly_everything_is_known() -> None:
     assert depth_start(full, SCENE, wanted("field.resolution=256"), "cpu").resolution == RESOLUTION_KNOWN
     assert depth_start(full, SCENE, wanted("field.resolution=64"), "cpu").resolution == 64
     assert depth_start(full, SCENE, wanted("field.resolution=48"), "cpu").resolution == 32
+    assert depth_start(full, SCENE, wanted("field.resolution=40"), "cpu").resolution == 32  # the only level of such a fit is 40
     assert depth_start(full, SCENE, wanted("field.resolution=160"), "cpu").resolution == 64  # 160 is the level after 64
     missing = int(160 * (1 - KNOWN)) + 2
     assert depth_start(blind(full, slice(0, missing)), SCENE, wanted("field.resolution=256"), "cpu").resolution == RESOLUTION

@@ -104,6 +104,9 @@ class Work:
         return self.width * self.height * factor * factor
 
 
+MOST = 1e9  # of any number that is chosen
+
+
 @dataclass
 class Choice:
     """Settings that fit into the seconds; None: not decided yet."""
@@ -121,6 +124,22 @@ class Choice:
 
     def to_dict(self) -> dict[str, Any]:
         return dict(vars(self))
+
+    @classmethod
+    def of(cls, data: dict[str, Any]) -> Choice:
+        """What `to_dict` gave when everything was decided.
+
+        Raises:
+            TypeError, ValueError: it is something else.
+        """
+        choice = cls(**data)
+        for name, value in vars(choice).items():
+            kinds: Any = {"fit_seconds": (int, float), "effects": bool, "texture": bool, "page": bool}.get(name, int)
+            if value is None and name in ("max_frames", "mesh_size", "effects", "texture", "page"):
+                continue
+            if not isinstance(value, kinds) or (kinds is not bool and (isinstance(value, bool) or not 0 <= value < MOST)):
+                raise ValueError(f"{name} is {value!r}")
+        return choice
 
 
 @dataclass

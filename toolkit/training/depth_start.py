@@ -153,7 +153,7 @@ def _resolution(space: Space, train: Views, scene: Scene, settings: Settings) ->
     shares = [0.0 if depth is None else float(np.mean(depth > 0)) for depth in train.depths]
     wanted = RESOLUTION_KNOWN if np.mean(shares) >= KNOWN else RESOLUTION
     rungs = levels(settings.field.resolution or finest_resolution(space, train, scene))
-    return max(rung for rung in rungs if rung <= wanted and rung & (rung - 1) == 0)
+    return max((rung for rung in rungs if rung <= wanted and rung & (rung - 1) == 0), default=COARSEST)
 
 
 def _asked(train: Views) -> Array:
