@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.options import Quiet, Threads
+from pipelines.options import Pairs, Quiet, Threads
 
 
 def train(
@@ -16,6 +16,7 @@ def train(
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint in the folder.")] = False,
     steps: Annotated[int | None, typer.Option(help="Stop after so many steps in all; the schedule stays.", min=1)] = None,
     threads: Threads = None,
+    pairs: Pairs = None,
     quiet: Quiet = False,
 ) -> None:
     """Train the networks that turn pictures into a field without fitting; writes `weights.safetensors`."""
@@ -24,19 +25,26 @@ def train(
     bound_threads({"flags": {"threads": threads}})
     from pipelines.console import make_progress
     from pipelines.job import set_threads
+    from toolkit.errors import Interrupted
     from toolkit.training.nerfusion.distributed import join_crew
     from toolkit.training.nerfusion.settings import load_train_settings
     from toolkit.training.nerfusion.train import WEIGHTS, Trainer
 
-    settings = load_train_settings(config)
+    settings = load_train_settings(config, pairs=pairs or ())
     set_threads(threads or settings.threads)
     with join_crew(settings.device) as crew:
         trainer = Trainer(settings, out, crew, resume)
+        if crew.leads and not quiet:
+            for note in trainer.notes:
+                typer.echo(f"note: {note}")
         progress = make_progress(quiet or not crew.leads)
         with progress.listening():
             progress.begin("training")
             taken = trainer.run(steps, progress)
+        stopped = progress.stopping() and taken < min(steps or settings.total_steps, settings.total_steps)
     if crew.leads and not quiet:
         if trainer.caution.met:
             typer.echo(f"note: {trainer.caution.met} steps were not finite and moved nothing, the last at {trainer.caution.last}")
         typer.echo(f"{out / WEIGHTS} ({taken} steps)")
+    if stopped:
+        raise Interrupted(f"stopped after {taken} steps; go on with --resume")

@@ -44,7 +44,7 @@ def require_folder(path: Path | str) -> Path:
     """
     path = Path(path).absolute()
     if not path.exists():
-        raise InputError(f"{path} does not exist; give a video, a folder of photos, or a capture folder")
+        raise InputError(f"{path} does not exist; give a folder that does")
     if not path.is_dir():
         raise InputError(f"{path} is not a folder; give the folder that holds the capture")
     try:

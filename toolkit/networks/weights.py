@@ -20,7 +20,7 @@ SHIPPED = Path(__file__).parent / "weights" / "nerfusion.safetensors"
 METADATA_KEY = "fieldfuse.networks"
 VERSION = 5  # 1: other normalisation in the encoder; 2: without agreement; 3: without the sweep; 4: density changed without bounds
 MAX_BYTES = 10 * 2**20
-LIMITS = {"direction": 0}  # least values; every other number is at least 1
+LIMITS = {"direction": 0, "channels": 4}  # least values (of channels: a density and a colour); every other number is at least 1
 CHOICES = {"encoder": TRUNKS, "decoder": ("deferred", "per_sample"), "fusion": ("gru", "mean")}
 
 

@@ -122,7 +122,7 @@ def settled(
         return [np.asarray(depth, dtype=np.float32) for depth in reliable]
     others = [[other for other in row if beside[other]] for row in beside]
     backed = any(depth is not None for depth in measured)
-    known = [where | _same(depth, one) for where, depth, one in zip(told, reliable, measured, strict=True)] if backed else told
+    known = [where | same_place(depth, one) for where, depth, one in zip(told, reliable, measured, strict=True)] if backed else told
     maps = _Maps(reliable, guesses, known, views, lenses, poses, others, progress)
     sure = maps.sure(CONFIRMED)
     points = points_of(sure, poses)
@@ -170,7 +170,7 @@ def _beside_what_is_sure(maps: _Maps) -> list[Array]:
     return maps.not_seen_through(maps.each(continued), [one.depth > 0 for one in sure])
 
 
-def _same(depth: Array, measured: Array | None) -> Array:
+def same_place(depth: Array, measured: Array | None) -> Array:
     """(H, W) bool where a sensor measured about this depth."""
     if measured is None:
         return np.zeros(depth.shape, bool)

@@ -35,6 +35,10 @@ def test_shipped_settings_load(path: Path) -> None:
         ({"sources": [{"kind": "imagenet", "path": "x"}]}, "known are"),
         ({"sources": [{"weight": 0.0}]}, "weight"),
         ({"optimiser": {"rate": -1.0}}, "rate"),
+        ({"record": {"validate_every": 0}}, "validate_every is 0"),
+        ({"record": {"health_every": 0}}, "health_every is 0"),
+        ({"pictures": {"long_side": [2, 3]}}, "at least 16"),
+        ({"stage": {"steps": -5}}, "0 or more"),
     ],
 )
 def test_wrong_settings_are_named(data: dict[str, object], words: str) -> None:
@@ -92,3 +96,24 @@ def test_the_command_trains_stops_and_goes_on(tmp_path: Path) -> None:
     assert more.exit_code == 0 and (out / "checkpoint-0000002.safetensors").is_file(), more.output
     again = CliRunner().invoke(app, ["train", "--config", str(config), "--out", str(out), "--steps", "2"])
     assert isinstance(again.exception, InputError) and "--resume" in str(again.exception)
+    # Other settings than those of the steps before are said; one that is not known is refused.
+    other = ["train", "--config", str(config), "--out", str(out), "--steps", "3", "--resume", "--set", "optimiser.rate=0.002"]
+    told = CliRunner().invoke(app, other)
+    assert told.exit_code == 0 and "optimiser.rate 0.003 → 0.002" in told.output and "record" not in told.output, told.output
+    wrong = CliRunner().invoke(app, [*other, "--set", "optimiser.speed=3"])
+    assert isinstance(wrong.exception, InputError) and "speed" in str(wrong.exception)
+
+
+def test_a_training_that_is_stopped_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from omegaconf import OmegaConf
+
+    from pipelines.cli import app
+    from pipelines.console import ConsoleProgress
+    from toolkit.errors import Interrupted
+
+    config = tmp_path / "tiny.yaml"
+    OmegaConf.save(OmegaConf.create(SMALL), config)
+    monkeypatch.setattr(ConsoleProgress, "stopping", lambda self: True)
+    stopped = CliRunner().invoke(app, ["train", "--config", str(config), "--out", str(tmp_path / "out"), "--quiet"])
+    assert isinstance(stopped.exception, Interrupted) and "after 1 steps; go on with --resume" in str(stopped.exception)
+    assert (tmp_path / "out" / "weights.safetensors").is_file()

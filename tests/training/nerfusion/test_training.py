@@ -26,7 +26,7 @@ from toolkit.training.nerfusion.checkpoint import checkpoint_settings, checkpoin
 from toolkit.training.nerfusion.curve import Curve, draw_curve
 from toolkit.training.nerfusion.distributed import Crew, join_crew
 from toolkit.training.nerfusion.health import ALIVE
-from toolkit.training.nerfusion.train import WEIGHTS, Trainer, learning_rate
+from toolkit.training.nerfusion.train import WEIGHTS, Trainer, learning_rate, make_model
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -146,6 +146,10 @@ def test_training_starts_from_given_weights(tmp_path: Path) -> None:
     first.run(until=2)
     second = Trainer(tiny_settings(start_from=str(tmp_path / "first" / WEIGHTS)), tmp_path / "second", Crew())
     assert second.step == 0 and same(state(first), state(second))
+    with pytest.raises(InputError, match="model: channels is 12, and 8 in the weights"):
+        make_model(tiny_settings(start_from=str(tmp_path / "first" / WEIGHTS), model={"channels": 12}))
+    with pytest.raises(InputError, match="pretrained and start_from"):
+        make_model(tiny_settings(start_from=str(tmp_path / "first" / WEIGHTS), pretrained=True))
 
 
 def test_the_learning_rate_warms_up_and_falls() -> None:

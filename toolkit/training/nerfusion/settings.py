@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from dataclasses import field as default
 from pathlib import Path
@@ -11,8 +12,9 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from toolkit.config import refuse_traps
-from toolkit.errors import InputError, first_line
+from toolkit.errors import InputError, brief, first_line
 
+LEAST_SIDE = 16  # pixels: the encoder halves pictures four times
 KINDS = ("procedural", "shards", "scannet", "dtu", "scanned_objects", "synthetic")
 
 
@@ -118,8 +120,10 @@ class TrainSettings:
         return self.stage.steps + self.stage.fused_steps
 
 
-def load_train_settings(path: Path | str | None = None, data: dict[str, Any] | None = None) -> TrainSettings:
-    """Defaults, then the YAML file, then `data`.
+def load_train_settings(
+    path: Path | str | None = None, data: dict[str, Any] | None = None, pairs: Sequence[str] = ()
+) -> TrainSettings:
+    """Defaults, then the YAML file, then `data`, then `pairs` (key=value).
 
     Raises:
         InputError: the file cannot be read, a key is not known, or a value does not fit.
@@ -132,6 +136,10 @@ def load_train_settings(path: Path | str | None = None, data: dict[str, Any] | N
             config = OmegaConf.merge(config, OmegaConf.create(text))
         if data is not None:
             config = OmegaConf.merge(config, OmegaConf.create(data))
+        for pair in pairs:
+            if "=" not in pair:
+                raise InputError(f"--set {brief(repr(pair))} is not key=value")
+            config = OmegaConf.merge(config, OmegaConf.from_dotlist([pair]))
         settings = OmegaConf.to_object(config)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read the training settings {path}: {getattr(error, 'strerror', None) or error}") from error
@@ -175,11 +183,19 @@ def _check(settings: TrainSettings) -> None:
         "window": settings.window,
         "total steps": settings.total_steps,
         "record.log_every": settings.record.log_every,
+        "record.health_every": settings.record.health_every,
+        "record.checkpoint_every": settings.record.checkpoint_every,
+        "record.validate_every": settings.record.validate_every,
         "record.keep": settings.record.keep,
     }
     for name, value in least.items():
         if value < 1:
             raise InputError(f"{name} is {value}; it must be at least 1")
+    if settings.pictures.long_side[0] < LEAST_SIDE:
+        raise InputError(f"pictures.long_side begins at {settings.pictures.long_side[0]} pixels; at least {LEAST_SIDE} are needed")
+    for name, steps in (("steps", settings.stage.steps), ("fused_steps", settings.stage.fused_steps)):
+        if steps < 0:
+            raise InputError(f"stage.{name} is {steps}; it must be 0 or more")
     if not 0 < settings.optimiser.rate < 1 or not settings.optimiser.clip > 0:
         raise InputError("optimiser.rate must lie between 0 and 1, and optimiser.clip above 0")
     for name, share in (("average", settings.optimiser.average), ("start_share", settings.optimiser.start_share)):

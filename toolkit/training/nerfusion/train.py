@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -14,7 +16,7 @@ from toolkit.networks.weights import SHIPPED, config_from, load_model, save_mode
 from toolkit.progress import SILENT, Progress
 from toolkit.training.nerfusion.average import Average
 from toolkit.training.nerfusion.caution import MOST, Caution, where_not_finite
-from toolkit.training.nerfusion.checkpoint import checkpoints, load_caution, load_checkpoint, save_checkpoint
+from toolkit.training.nerfusion.checkpoint import checkpoint_settings, checkpoints, load_caution, load_checkpoint, save_checkpoint
 from toolkit.training.nerfusion.curve import Curve
 from toolkit.training.nerfusion.distributed import Crew
 from toolkit.training.nerfusion.gates import GateWatch
@@ -32,10 +34,17 @@ def make_model(settings: TrainSettings) -> NerfusionModel:
     """The networks as the settings ask, started from `start_from` or by chance from `seed`.
 
     Raises:
-        InputError: a setting of the networks is not known, or the weights cannot be read.
+        InputError: a setting of the networks is not known or not that of the weights to start from, or these cannot be read.
     """
     if settings.start_from is not None:
-        return load_model(SHIPPED if settings.start_from == "shipped" else settings.start_from).train()
+        started = load_model(SHIPPED if settings.start_from == "shipped" else settings.start_from).train()
+        own = asdict(started.config)
+        for name, value in settings.model.items():
+            if own.get(name) != value:
+                raise InputError(f"model: {name} is {value}, and {own.get(name)} in the weights that start_from names; leave one out")
+        if settings.pretrained:
+            raise InputError("pretrained and start_from are both set; each says where the encoder's weights come from, leave one out")
+        return started
     try:
         config = config_from(dict(settings.model))
     except ValueError as error:
@@ -67,6 +76,20 @@ def clipped(model: NerfusionModel, most: float) -> float:
         return math.nan
 
 
+def _changes(before: dict[str, Any], now: dict[str, Any], of: str = "") -> list[str]:
+    """What differs between two runs' settings, but for where and how they run and what they record."""
+    out = []
+    for name, value in now.items():
+        if of + name in ("device", "threads", "record"):
+            continue
+        old = before.get(name)
+        if isinstance(value, dict) and isinstance(old, dict) and name != "model":
+            out += _changes(old, value, f"{of}{name}.")
+        elif old != value:
+            out.append(f"{of}{name} {old} → {value}")
+    return out
+
+
 class Trainer:
     """One training run in a folder.
 
@@ -87,12 +110,15 @@ class Trainer:
         self.stepper = Stepper(self.model, settings)
         self.curve = Curve(out)
         self.gates = GateWatch(self.model)
-        self.step, self.caution = 0, Caution()
+        self.step, self.caution, self.notes = 0, Caution(), list[str]()
         found = checkpoints(out)
         if resume and found:
             self.step = load_checkpoint(found[-1], self.model, self.adam, self.average)
             self.caution = load_caution(found[-1])
             self.curve.load(self.step)
+            changed = _changes(checkpoint_settings(found[-1]), train_settings_dict(settings))
+            if changed:
+                self.notes.append(f"settings are not those of the steps before, and go on as they are now: {', '.join(changed)}")
         elif found and crew.leads:
             raise InputError(f"{out} already holds a training run; go on with it by --resume, or choose another --out folder")
         self.cases: list[Case] = []
