@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,6 +74,7 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
 FIT_NOTES = "fit_notes.json"  # what a reader of the numbers has to know of the fit; there only when there is something
 LEFT_OUT = "left_out.safetensors"  # pixels that the fit did without, since they show what moves; there only when they were looked for
 FIT_MATCHED = "fit_matched.json"  # what the fit's quick matching found; there only when it was made
+NO_MATCHING = {"auto": "sensor", "any": "any", "sensor": "sensor"}  # `fit.depth_from` of a fit that goes on
 Fitted = tuple["Field", list[dict[str, Any]]]
 
 
@@ -86,7 +87,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     from pipelines.steps_network import direct_result, make_network_field, uses_network
     from pipelines.steps_stereo import views_for_fit
     from toolkit.render.field import Field
-    from toolkit.stereo.left_out import save_left_out
+    from toolkit.stereo.left_out import load_left_out, save_left_out
     from toolkit.training.guided import fit_guided
     from toolkit.training.network_start import network_start
     from toolkit.volume.grid_host import host_for
@@ -118,8 +119,13 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
             tell(result)
             return result.field, result.timeline
         field, timeline = load()
-        result = fit_guided(views, scene, settings, job.progress, host=host_for(settings.device), start=field)
-        tell(result)
+        # It knows where its surfaces are, and what moves was found: to match the pictures again takes a third of a short fit for nothing.
+        masks = load_left_out(job.folder / LEFT_OUT) if LEFT_OUT in start.outputs else None
+        alone = replace(settings, fit=replace(settings.fit, depth_from=NO_MATCHING.get(settings.fit.depth_from, "off"), moving="off"))
+        shown = views if masks is None else masks.without(views)
+        result = fit_guided(shown, scene, alone, job.progress, host=host_for(settings.device), start=field)
+        matched = read_kept(job.folder / FIT_MATCHED, MATCHED) if FIT_MATCHED in start.outputs else None
+        tell(replace(result, matched=matched, left_out=masks))
         spent = timeline[-1]["seconds"] if timeline else 0.0
         return result.field, timeline + result.after(spent)
 

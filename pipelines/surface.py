@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from toolkit.poses.scene import Scene
     from toolkit.render.field import Field
     from toolkit.stereo.match import StereoDepth
-    from toolkit.stereo.polish import Polisher
     from toolkit.tsdf.fuse import Points
     from toolkit.tsdf.mesh import Mesh
     from toolkit.tsdf.volume import TsdfVolume
@@ -211,21 +210,12 @@ def _volume_of(job: Job, field: Field, posed: Capture, scene: Scene, views: View
         shown.world_from_camera[chosen],
         lenses,
         region=(scene.centre - scene.half_size, scene.centre + scene.half_size),
-        polish=[partial(_polished, polisher, index, measured[at] if measured else None) for at, index in enumerate(chosen)],
+        polish=[partial(polisher.polished, index, measured=measured[at] if measured else None) for at, index in enumerate(chosen)],
         settle=lambda reliable, opaque, told: settled(
             reliable, opaque, told, seen, lenses, scene.median_depth, measured, progress=job.progress
         ),
         progress=job.progress,
     )
-
-
-def _polished(polisher: Polisher, index: int, measured: Array | None, depth: Array) -> tuple[Array, Array]:
-    """The depth as pictures tell it, but as the field has it where a sensor measured the same place: it was fitted to that."""
-    from toolkit.stereo.settle import same_place
-
-    polished, told = polisher.polished(index, depth)
-    there = same_place(depth, measured)
-    return np.where(there, depth, polished).astype(np.float32), told & ~there
 
 
 def finer_views(job: Job, posed: Capture, views: Views, train: Array) -> tuple[Views, list[Intrinsics]]:

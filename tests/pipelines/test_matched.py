@@ -59,7 +59,12 @@ def test_a_surface_from_pictures_alone(tmp_path: Path, capsys: Capsys) -> None:
     assert kept["evaluation"]["field"]["psnr"] > 8
 
 
-def test_without_being_asked_pictures_are_matched_for_the_fit_alone(tmp_path: Path, capsys: Capsys) -> None:
+def test_without_being_asked_pictures_are_matched_for_the_fit_alone(
+    tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("the pictures were matched again")
+
     make_corner(tmp_path / "corner", 6)
     out = tmp_path / "out"
     options = ["--holdout", "3", "--quiet", "--set", "init=classical", "--set", "fit.budget=2", "--set", "field.resolution=32"]
@@ -71,6 +76,14 @@ def test_without_being_asked_pictures_are_matched_for_the_fit_alone(tmp_path: Pa
         assert data["field"]["matched"]["views"] == 4 and 0 < data["field"]["matched"]["share"] < 1
         assert any("matching 4 training pictures" in note for note in data["notes"])
         assert call(capsys, "run", tmp_path / "corner", "--out", out, *options).code == 0  # what was made before is told again
+    # A fit that goes on does not match them again: what was found before is told.
+    before = data["field"]["matched"]
+    monkeypatch.setattr("toolkit.stereo.quick.guided", refuse)
+    answer = call(capsys, "finetune", out, "--budget", "0.5", "--threads", "1", "--quiet")
+    assert answer.code == 0, answer.err
+    after = read_json(out / "report.json")
+    assert after["field"]["matched"] == before and len(after["timeline"]) > len(data["timeline"])
+    monkeypatch.undo()
     assert call(capsys, "run", tmp_path / "corner", "--out", out, *options, "--set", "fit.depth_from=sensor").code == 0
     data = read_json(out / "report.json")
     assert "matched" not in data["field"] and not any("matching" in note for note in data["notes"])
@@ -99,6 +112,8 @@ def test_what_moves_is_left_out_and_told(tmp_path: Path, capsys: Capsys, monkeyp
         assert "Left out of the fit" in page and page.count("what is left out tinted") == 2
         assert load_left_out(out / "left_out.safetensors").to_dict() == told
         assert call(capsys, "run", tmp_path / "corner", "--out", out, *options).code == 0  # what was made before is told again
+    assert call(capsys, "finetune", out, "--budget", "0.3", "--quiet").code == 0  # going on, it leaves the same out
+    assert read_json(out / "report.json")["field"]["left_out"] == told and load_left_out(out / "left_out.safetensors").to_dict() == told
     texture = (out / "exports" / "textured.glb").read_bytes()
     assert call(capsys, "run", tmp_path / "corner", "--out", out, *options, "--set", "fit.moving=off").code == 0
     assert "left_out" not in read_json(out / "report.json")["field"] and not (out / "left_out.safetensors").exists()

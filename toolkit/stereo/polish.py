@@ -11,6 +11,7 @@ from toolkit.capture.types import Views
 from toolkit.stereo.cost import GreyView, grey_view
 from toolkit.stereo.match import inverse_depths, usable_neighbours
 from toolkit.stereo.refine import refined
+from toolkit.stereo.settle import same_place
 
 NEIGHBOURS = 6  # pictures that a view is compared with
 RECOGNISED = 0.3  # matching cost up to which a pixel was recognised in its neighbours; others keep the depth they had
@@ -31,10 +32,14 @@ class Polisher:
         self._grey: dict[int, GreyView] = {}
         self._neighbours = usable_neighbours(views.world_from_camera, self._cameras, median_depth, NEIGHBOURS) if len(views) > 1 else [[]]
 
-    def polished(self, index: int, depth: Array) -> tuple[Array, Array]:
+    def polished(self, index: int, depth: Array, measured: Array | None = None) -> tuple[Array, Array]:
         """(H, W) float32 depth of the view `index` along z, 0 = missing; moved by at most about a pixel of parallax, or as it was.
 
         And (H, W) bool, where it was recognised in other pictures: elsewhere, on bare walls, these tell nothing of the depth.
+
+        Args:
+            measured: (H, W), in whatever size, a sensor's depth that `depth` knew, 0 = missing. Where it measured the same place nothing is
+                moved: what errors poses and lenses have draw pictures away from it, and the surface is to lie on the sensor's.
         """
         near, far = self._range
         known = np.isfinite(depth) & (depth > 0)
@@ -45,7 +50,7 @@ class Polisher:
         planes = inverse_depths(view, others, near, far)
         start = 1 / np.where(known, depth, np.median(depth[known]))
         inverse, cost = refined(view, others, start, float(planes[1] - planes[0]))
-        moved = known & (cost <= RECOGNISED) & (inverse > 0)
+        moved = known & (cost <= RECOGNISED) & (inverse > 0) & ~same_place(depth, measured)
         return np.where(moved, 1 / np.maximum(inverse, 1e-12), np.where(known, depth, 0)).astype(np.float32), moved
 
     def _picture(self, index: int) -> GreyView:

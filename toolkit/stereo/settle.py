@@ -171,7 +171,7 @@ def _beside_what_is_sure(maps: _Maps) -> list[Array]:
 
 
 def same_place(depth: Array, measured: Array | None) -> Array:
-    """(H, W) bool where a sensor measured about this depth."""
+    """(H, W) bool where a sensor measured about this depth (H, W), which it may have done in another size; None: it measured nothing."""
     if measured is None:
         return np.zeros(depth.shape, bool)
     theirs = cv2.resize(measured, depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
