@@ -98,6 +98,26 @@ def effects_part(job: Job, background: bool | None) -> dict[str, Any] | None:
     return {"effects": effects, "seconds": data["seconds"], "looked_at": data["looked_at"], "dimmed": dimmed}
 
 
+def moved_cameras(job: Job, capture: Capture) -> list[str]:
+    """How far cameras that came with the capture were moved by what pictures show: what is exported lies with the moved ones."""
+    import numpy as np
+
+    given = {frame.name: frame.world_from_camera for frame in capture.frames if frame.world_from_camera is not None}
+    names = [name for name in (job.corrections.poses if job.corrections else {}) if name in given]
+    if job.corrections is None or not names:
+        return []
+    before, after = np.stack([given[name] for name in names]), np.stack([job.corrections.poses[name] for name in names])
+    way = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+    cosine = (np.einsum("nij,nij->n", before[:, :3, :3], after[:, :3, :3]) - 1) / 2
+    turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    length = f"{100 * np.median(way):.1f} cm" if capture.metric else f"{np.median(way):.3g} of the capture's units"
+    depth = "; a sensor's depth that is not registered with the colours fits those better" if capture.has_depth else ""
+    return [
+        f"the poses that came with the capture were refined by its pictures: cameras moved by {length} and turned by {np.median(turn):.2f}°"
+        f" in the median, and surfaces lie with them; --set effects.off=[poses] keeps the poses as they came{depth}"
+    ]
+
+
 def effects_warnings(job: Job) -> list[str]:
     """What a user has to know: effects that are there and cannot be corrected."""
     part = effects_part(job, None)

@@ -14,7 +14,7 @@ import numpy as np
 from pipelines.folder import command_line
 from pipelines.job import Job
 from pipelines.rendered import Pictures
-from pipelines.steps_effects import effects_part, effects_warnings
+from pipelines.steps_effects import effects_part, effects_warnings, moved_cameras
 from pipelines.steps_results import fit_left_out, fit_matched, fit_notes
 from pipelines.textured import TSDF_TEXTURE
 from toolkit import __version__
@@ -129,7 +129,8 @@ def unique(texts: list[str]) -> list[str]:
 
 def warnings_of(job: Job, capture: Capture, poses: PoseResult, scene: Scene, views: Views) -> list[str]:
     """Everything that a reader of the numbers has to know."""
-    texts = [*capture.warnings, *poses.warnings, *effects_warnings(job), *scene.warnings, *fit_notes(job)]
+    moved = moved_cameras(job, capture) if poses.source == "given" else []
+    texts = [*capture.warnings, *poses.warnings, *effects_warnings(job), *moved, *scene.warnings, *fit_notes(job)]
     if not np.any(views.test):
         texts.append(NO_TEST_VIEWS)
     elif poses.source == "sfm":

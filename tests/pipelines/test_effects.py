@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -10,9 +11,11 @@ import pytest
 from typer.testing import CliRunner
 
 from pipelines.kept import EFFECTS, fitting
+from pipelines.steps_effects import moved_cameras
 from toolkit.capture import open_capture
 from toolkit.capture.prepare import held_out
 from toolkit.config import load_settings
+from toolkit.effects.correct import Corrections
 from toolkit.effects.decide import asleep, decide, wish
 from toolkit.errors import InputError
 from toolkit.evaluate.effects_truth import known_light
@@ -118,3 +121,23 @@ def test_info_prints_the_evidence(captures: dict[str, Path]) -> None:
     assert shown.exit_code == 0, shown.output
     assert "exposure" in shown.output and "shared points looked at" in shown.output and "s of it for finding these points" in shown.output
     assert not list(captures["drift"].glob("effects.json"))
+
+
+def test_how_far_given_cameras_were_moved_is_told() -> None:
+    """Three cameras of four: moved by 1, 2 and 4 cm, turned by 0, 1 and 2 degrees."""
+    given = np.stack([np.eye(4)] * 4)
+    given[:, :3, 3] = np.arange(12).reshape(4, 3)
+    moved = given[:3].copy()
+    moved[:, 0, 3] += (0.01, 0.02, 0.04)
+    for index in (1, 2):
+        moved[index, :3, :3] = cv2.Rodrigues(np.deg2rad([0.0, index, 0.0]))[0]
+    names = ["a", "b", "c", "d"]
+    frames = [SimpleNamespace(name=name, world_from_camera=pose) for name, pose in zip(names, given, strict=True)]
+    capture = SimpleNamespace(frames=frames, metric=True, has_depth=True)
+    job = SimpleNamespace(corrections=Corrections(poses=dict(zip(names, moved, strict=False))))
+    (text,) = moved_cameras(job, capture)  # type: ignore[arg-type]
+    assert "moved by 2.0 cm and turned by 1.00°" in text and "effects.off=[poses]" in text and "sensor" in text
+    (text,) = moved_cameras(job, SimpleNamespace(frames=frames, metric=False, has_depth=False))  # type: ignore[arg-type]
+    assert "0.02 of the capture's units" in text and "sensor" not in text
+    for corrections in (None, Corrections()):
+        assert moved_cameras(SimpleNamespace(corrections=corrections), capture) == []  # type: ignore[arg-type]
