@@ -18,6 +18,7 @@ from toolkit.files import write_json
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Capture, Views
+    from toolkit.config import FitSettings
     from toolkit.poses.result import PoseResult
     from toolkit.poses.scene import Scene
     from toolkit.render.field import Field
@@ -75,6 +76,7 @@ FIT_NOTES = "fit_notes.json"  # what a reader of the numbers has to know of the 
 LEFT_OUT = "left_out.safetensors"  # pixels that the fit did without, since they show what moves; there only when they were looked for
 FIT_MATCHED = "fit_matched.json"  # what the fit's quick matching found; there only when it was made
 NO_MATCHING = {"auto": "sensor", "any": "any", "sensor": "sensor"}  # `fit.depth_from` of a fit that goes on
+GENTLE, GENTLEST = 30.0, 0.3  # seconds from which on it begins with steps as large as any fit's, and the least share of them
 Fitted = tuple["Field", list[dict[str, Any]]]
 
 
@@ -121,7 +123,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
         field, timeline = load()
         # It knows where its surfaces are, and what moves was found: to match the pictures again takes a third of a short fit for nothing.
         masks = load_left_out(job.folder / LEFT_OUT) if LEFT_OUT in start.outputs else None
-        alone = replace(settings, fit=replace(settings.fit, depth_from=NO_MATCHING.get(settings.fit.depth_from, "off"), moving="off"))
+        alone = replace(settings, fit=going_on(settings.fit))
         shown = views if masks is None else masks.without(views)
         result = fit_guided(shown, scene, alone, job.progress, host=host_for(settings.device), start=field)
         matched = read_kept(job.folder / FIT_MATCHED, MATCHED) if FIT_MATCHED in start.outputs else None
@@ -154,6 +156,14 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
         return value
     del value  # the file holds less precision than memory: what is shown and scored is what everybody can load
     return load()
+
+
+def going_on(fit: FitSettings) -> FitSettings:
+    """Settings of a fit that goes on from a fitted field: nothing is matched or looked for again, and a short one takes smaller steps: large
+    ones undo more of what is there than it has time to mend."""
+    share = min(1.0, max(GENTLEST, (fit.budget or GENTLE) / GENTLE))
+    rates = {name: share * getattr(fit, name) for name in ("rate_density", "rate_feature", "rate_decoder")}
+    return replace(fit, depth_from=NO_MATCHING.get(fit.depth_from, "off"), moving="off", **rates)
 
 
 def fit_notes(job: Job) -> list[str]:

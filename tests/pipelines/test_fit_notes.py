@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from pipelines.steps_results import going_on
 from tests.pipelines.made import CAMERA, call, make_room
 from tests.training.test_fit import ticking
 from tests.training.test_not_finite import spoiling
+from toolkit.config import load_settings
 from toolkit.files import read_json
 
 OPTIONS = (
@@ -52,3 +54,16 @@ def test_a_step_that_was_not_finite_is_told_in_the_report(
     assert call(capsys, "run", source, "--out", out, *OPTIONS, "--set", "seed=5").code == 0
     assert not [text for text in read_json(out / "report.json")["warnings"] if "not finite" in text]
     assert not (out / "fit_notes.json").exists()
+
+
+def test_a_fit_that_goes_on_matches_nothing_again_and_begins_gently_when_it_is_short() -> None:
+    for budget, share in ((3.0, 0.3), (15.0, 0.5), (30.0, 1.0), (None, 1.0)):
+        fit = load_settings("balanced").fit
+        fit.budget = budget
+        got = going_on(fit)
+        assert got.rate_density == pytest.approx(share * fit.rate_density) and got.rate_feature == pytest.approx(share * fit.rate_feature)
+        assert (got.depth_from, got.moving, got.budget, got.depth) == ("sensor", "off", budget, fit.depth)
+    fit.depth_from = "any"
+    assert going_on(fit).depth_from == "any"
+    fit.depth_from = "off"
+    assert going_on(fit).depth_from == "off"
