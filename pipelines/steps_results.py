@@ -159,8 +159,8 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
 
 
 def going_on(fit: FitSettings) -> FitSettings:
-    """Settings of a fit that goes on from a fitted field: nothing is matched or looked for again, and a short one takes smaller steps: large
-    ones undo more of what is there than it has time to mend."""
+    """Settings of a fit that goes on from a fitted field: nothing is matched or looked for again, and a short one takes smaller steps, as
+    large ones undo more of what is there than it has time to mend."""
     share = min(1.0, max(GENTLEST, (fit.budget or GENTLE) / GENTLE))
     rates = {name: share * getattr(fit, name) for name in ("rate_density", "rate_feature", "rate_decoder")}
     return replace(fit, depth_from=NO_MATCHING.get(fit.depth_from, "off"), moving="off", **rates)
