@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from toolkit.capture.types import Capture
 
 
+TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS"}
+
+
 def info(
     target: Annotated[Path, typer.Argument(metavar="SOURCE", help="A source, or the folder of an earlier run.", show_default=False)],
     fast: Annotated[bool, typer.Option("--fast", help="Read headers only; pictures are not looked at for damage.")] = False,
@@ -37,7 +40,7 @@ def info(
             from pipelines.effects_table import show
 
             show(data.pop("effects"))
-        for key, value in data.items():
+        for key, value in for_people(data).items():
             for line in lines(key, value):
                 typer.echo(line)
 
@@ -84,16 +87,51 @@ def run_facts(folder: Path) -> dict[str, Any]:
 
     run = RunFolder(folder)
     about = run.about()
+    page = run / "report.html"
     return {
         "run": str(folder),
         "source": about["source"],
         "command": about.get("command"),
         "version": about.get("version"),
+        "report": str(page) if page.is_file() else None,
+        "scores": scores_of(run / "evaluation.json"),
         "stages": [
             {"name": record.name, "seconds": record.seconds, "peak_memory_mb": record.peak_memory_mb, "stopped": record.stopped}
             for record in finished_stages(run)
         ],
     }
+
+
+def scores_of(path: Path) -> dict[str, dict[str, float]]:
+    """What was scored, and how well; empty when nothing was, or the file cannot be read: the run's other facts are told all the same."""
+    from pipelines.kept import EVALUATION, read_kept
+    from toolkit.errors import InputError
+
+    try:
+        scores = read_kept(path, EVALUATION)
+    except InputError:
+        return {}
+    return {
+        what: {name: score[name] for name in ("views", *TITLES) if score.get(name) is not None}
+        for what, score in scores.items()
+        if score is not None and score.get("psnr") is not None
+    }
+
+
+def for_people(data: dict[str, Any]) -> dict[str, Any]:
+    """Facts without what would stand there twice; stages and scores in a line each."""
+    shown = dict(data)
+    if isinstance(shown.get("extra"), dict):
+        shown["extra"] = {name: value for name, value in shown["extra"].items() if shown.get(name) != value}
+    if "stages" in shown:
+        told = [f"{one['name']} {one['seconds']:.1f} s{' (stopped early)' if one['stopped'] else ''}" for one in shown["stages"]]
+        shown["stages"] = ", ".join(told)
+    if "scores" in shown:
+        shown["scores"] = [
+            f"{what.replace('_', ' ')}: " + ", ".join(f"{TITLES.get(name, name)} {number(value)}" for name, value in of.items())
+            for what, of in shown["scores"].items()
+        ]
+    return shown
 
 
 def lines(key: str, value: Any) -> list[str]:
@@ -108,7 +146,7 @@ def lines(key: str, value: Any) -> list[str]:
         return [f"{name:<14} " + ", ".join(f"{inner} {number(entry)}" for inner, entry in part.items()) for part in shown]
     if isinstance(value, list):
         return [f"{name:<14} {entry}" for entry in value]
-    return [f"{name:<14} {'yes' if value is True else value}"]
+    return [f"{name:<14} {'yes' if value is True else number(value)}"]
 
 
 def number(value: Any) -> str:

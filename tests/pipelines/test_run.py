@@ -97,4 +97,8 @@ def test_info_on_source_and_run(done: Path, capsys: Capsys) -> None:
     text = call(capsys, "info", done.parent / "room", "--fast").out
     assert "transforms" in text and "fx 82.5" in text
     answer = call(capsys, "info", done, "--json")
-    assert [stage["name"] for stage in json.loads(answer.out)["stages"]][:2] == ["capture", "poses"]
+    told = json.loads(answer.out)
+    assert [stage["name"] for stage in told["stages"]][:2] == ["capture", "poses"]
+    assert told["scores"]["field"]["psnr"] == report(done)["evaluation"]["field"]["psnr"] and told["report"] == str(done / "report.html")
+    text = call(capsys, "info", done).out
+    assert "field: views 2, PSNR" in text and "capture" in text and text.count("stages") == 1
