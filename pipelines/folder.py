@@ -89,7 +89,8 @@ class RunFolder:
             raise OutputError(BUSY.format(self.path)) from error
         except OSError as error:
             self._unlock()
-            raise OutputError(f"cannot write to {self.path}: {error.strerror or error}; choose another --out folder") from error
+            reason = error.strerror or error
+            raise OutputError(f"cannot write to {self.path}: {reason}; make it writable, or choose another --out folder") from error
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:

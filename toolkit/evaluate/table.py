@@ -57,11 +57,11 @@ def facts(data: dict[str, Any]) -> list[str]:
             line += f", {poses['registered']} of {poses['total']} with a pose"
         lines.append(line)
     if field["voxels"] is not None:
-        lines.append(
-            f"field of {words.whole(field['voxels'])} voxels in {words.whole(field['blocks'])} blocks, {words.size(field['bytes'])}"
-        )
+        voxels, blocks = words.whole(field["voxels"]), words.whole(field["blocks"])
+        lines.append(f"field of {voxels} voxels in {blocks} blocks, {words.size(field['bytes'])} in memory")
     if data["seconds_total"] is not None:
-        lines.append(f"{words.duration(data['seconds_total'])} in all")
+        earlier = any(stage.get("cached") for stage in data.get("stages") or [])
+        lines.append(f"{words.duration(data['seconds_total'])} in all{', with what was made before' if earlier else ''}")
     return lines
 
 
