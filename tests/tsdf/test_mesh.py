@@ -147,6 +147,13 @@ def test_thinning_far_from_the_origin_is_thinning_at_it() -> None:
 def test_components_are_counted_as_open3d_and_trimesh_do() -> None:
     parts = joined(ball(1.0), ball(0.5, (5, 0, 0)), ball(0.2, (-5, 0, 0)))
     assert len(np.unique(parts.components())) == 3 == to_trimesh(parts).body_count
+    # What touches in a vertex alone, and an edge that three triangles share.
+    touching = Mesh.create(np.random.default_rng(0).normal(size=(8, 3)), [[0, 1, 2], [2, 3, 4], [3, 4, 5], [4, 3, 6], [7, 0, 1]])
+    for mesh in (parts, touching):
+        theirs = np.asarray(mesh.to_open3d().cluster_connected_triangles()[0])
+        both = np.unique(np.stack([mesh.components(), theirs]), axis=1)
+        assert both.shape[1] == len(np.unique(theirs)) == len(np.unique(mesh.components()))
+    assert len(np.unique(touching.components())) == 2
 
 
 def test_damaged_meshes_are_refused() -> None:

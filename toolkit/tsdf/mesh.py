@@ -9,6 +9,7 @@ import numpy as np
 import open3d as o3d
 import open3d.core as o3c
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from toolkit.camera import Array, Similarity
 from toolkit.errors import InputError
@@ -74,10 +75,14 @@ class Mesh:
 
     def components(self) -> Array:
         """(T,) int32: the connected component of each triangle (triangles that share an edge are connected), largest number unknown."""
-        if len(self.triangles) == 0:
-            return np.zeros(0, np.int32)
-        labels, _, _ = self.to_open3d().cluster_connected_triangles()
-        return np.asarray(labels, dtype=np.int32)
+        count = len(self.triangles)
+        from_, to = self.triangles.reshape(-1).astype(np.int64), np.roll(self.triangles, -1, axis=1).reshape(-1)
+        edges = np.minimum(from_, to) * len(self.vertices) + np.maximum(from_, to)
+        order = np.argsort(edges)
+        shared = np.flatnonzero(np.diff(edges[order]) == 0)
+        pairs = order[shared] // 3, order[shared + 1] // 3
+        graph = sparse.coo_matrix((np.ones(len(shared), np.int8), pairs), shape=(count, count))
+        return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
 
     def cleaned(self, min_share: float = 0.0, min_area_share: float = 0.0) -> Mesh:
         """Without degenerate and repeated triangles, small components, and vertices that nothing uses.
@@ -90,8 +95,7 @@ class Mesh:
         """
         degenerate = (self.triangles[:, [0, 1, 2]] == self.triangles[:, [1, 2, 0]]).any(axis=1) | (self.areas() <= 0)
         mesh = replace(self, triangles=self.triangles[~degenerate])
-        _, first = np.unique(np.sort(mesh.triangles, axis=1), axis=0, return_index=True)
-        mesh = replace(mesh, triangles=mesh.triangles[np.sort(first)])
+        mesh = replace(mesh, triangles=mesh.triangles[_first_of_each(np.sort(mesh.triangles, axis=1))])
         if (min_share > 0 or min_area_share > 0) and len(mesh.triangles):
             label = mesh.components()
             count = np.bincount(label)
@@ -207,6 +211,14 @@ def places(positions: Array, *others: Array | None) -> Array:
         columns = np.concatenate([positions, *(np.asarray(other, np.float64) for other in others if other is not None)], axis=1)
         order = np.lexsort(columns.T[::-1])
     return np.asarray(order)
+
+
+def _first_of_each(rows: Array) -> Array:
+    """Ascending indices of the rows (N, C) that equal none before them."""
+    order = np.lexsort(rows.T)  # stable, so that of equal rows the first comes first
+    new = np.ones(len(rows), bool)
+    new[1:] = (np.diff(rows[order], axis=0) != 0).any(axis=1)
+    return np.sort(order[new])
 
 
 def as_bytes(colours: Array) -> Array:
