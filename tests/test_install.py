@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import configparser
 import os
 import re
@@ -195,3 +196,23 @@ def test_a_python_without_venv_is_told(tmp_path: Path) -> None:
     )
     assert done.returncode == 1
     assert "python3-venv" in done.stderr and "package manager" in done.stderr
+
+
+def test_what_is_imported_is_installed_without_the_tests() -> None:
+    """Every package that toolkit or pipelines import is asked for by setup.cfg, also without what only tests need: else what passes here
+    fails on a user's machine."""
+    parsed = setup()
+    extras = parsed["options.extras_require"]
+    asked = names(parsed["options"]["install_requires"]).union(*(names(extras[name]) for name in extras if name != "test"))
+    asked |= {"llvmlite", "markupsafe", "triton", "pyyaml"}  # numba, jinja2, torch and omegaconf are made of these
+    found: dict[str, str] = {}
+    for path in [*(ROOT / "toolkit").rglob("*.py"), *(ROOT / "pipelines").rglob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            said = [one.name for one in node.names] if isinstance(node, ast.Import) else []
+            said += [node.module] if isinstance(node, ast.ImportFrom) and node.level == 0 and node.module else []
+            found |= {name.split(".")[0]: str(path) for name in said}
+    known, plain = metadata.packages_distributions(), {re.sub(r"[-_.]+", "-", name).lower() for name in asked}
+    assert "test" in extras and len(plain) > 15 and {"numpy", "torch", "numba"} <= set(found)
+    for name in sorted(set(found) - set(sys.stdlib_module_names) - {"toolkit", "pipelines", "configs"}):
+        given = {re.sub(r"[-_.]+", "-", one).lower() for one in known.get(name, [name])}
+        assert given & plain, f"{name} is imported in {found[name]}, and nothing that setup.cfg asks for brings it"

@@ -8,8 +8,7 @@ import fast_simplification
 import numpy as np
 import open3d as o3d
 import open3d.core as o3c
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
+from numba import njit
 
 from toolkit.camera import Array, Similarity
 from toolkit.errors import InputError
@@ -75,14 +74,15 @@ class Mesh:
 
     def components(self) -> Array:
         """(T,) int32: the connected component of each triangle (triangles that share an edge are connected), largest number unknown."""
-        count = len(self.triangles)
+        edges, order = self._edges()
+        shared = np.flatnonzero(np.diff(edges[order]) == 0)
+        return _components(len(self.triangles), order[shared] // 3, order[shared + 1] // 3)
+
+    def _edges(self) -> tuple[Array, Array]:
+        """(3 T,) int64 a number of each triangle's edges, the same for the same two vertices, and the order that sorts them."""
         from_, to = self.triangles.reshape(-1).astype(np.int64), np.roll(self.triangles, -1, axis=1).reshape(-1)
         edges = np.minimum(from_, to) * len(self.vertices) + np.maximum(from_, to)
-        order = np.argsort(edges)
-        shared = np.flatnonzero(np.diff(edges[order]) == 0)
-        pairs = order[shared] // 3, order[shared + 1] // 3
-        graph = sparse.coo_matrix((np.ones(len(shared), np.int8), pairs), shape=(count, count))
-        return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
+        return edges, np.argsort(edges)
 
     def cleaned(self, min_share: float = 0.0, min_area_share: float = 0.0) -> Mesh:
         """Without degenerate and repeated triangles, small components, and vertices that nothing uses.
@@ -127,19 +127,23 @@ class Mesh:
         Vertices of open borders stay where they are, so that what was seen in part does not shrink. Colours stay with their vertices.
         """
         count = len(self.vertices)
-        if rounds == 0 or count == 0:
+        if rounds == 0 or len(self.triangles) == 0:
             return self
         from_, to = self.triangles.reshape(-1), np.roll(self.triangles, -1, axis=1).reshape(-1)
-        directed = sparse.csr_matrix((np.ones(len(from_), np.float32), (from_, to)), shape=(count, count))
-        edges = directed + directed.T  # 2 between two triangles, 1 at a border
-        of_vertex = np.repeat(np.arange(count), np.diff(edges.indptr))
-        fixed = np.ones(count, bool)  # and what no triangle uses
-        fixed[of_vertex] = False
-        fixed[of_vertex[edges.data < 2]] = True
-        share = np.asarray(edges.sum(axis=1)).reshape(-1, 1)
+        edges, order = self._edges()
+        again = np.diff(edges[order]) == 0
+        alone = order[~(np.concatenate([[False], again]) | np.concatenate([again, [False]]))]  # edges of one triangle: a border
+        # An edge between two triangles is met from both, so that each neighbour counts twice; those of borders do not matter.
+        share = np.bincount(from_, minlength=count) + np.bincount(to, minlength=count)
+        moves = share > 0
+        moves[from_[alone]] = moves[to[alone]] = False
         vertices = self.vertices
         for _ in range(rounds):
-            vertices = np.where(fixed[:, None], self.vertices, edges @ vertices / np.maximum(share, 1))
+            sums = [
+                np.bincount(from_, vertices[to, axis], minlength=count) + np.bincount(to, vertices[from_, axis], minlength=count)
+                for axis in range(3)
+            ]
+            vertices = np.where(moves[:, None], np.stack(sums, axis=1) / np.maximum(share, 1)[:, None], self.vertices)
         normals = None if self.normals is None else replace(self, vertices=vertices, normals=None).with_normals().normals
         return replace(self, vertices=vertices, normals=normals)
 
@@ -211,6 +215,30 @@ def places(positions: Array, *others: Array | None) -> Array:
         columns = np.concatenate([positions, *(np.asarray(other, np.float64) for other in others if other is not None)], axis=1)
         order = np.lexsort(columns.T[::-1])
     return np.asarray(order)
+
+
+@njit(cache=True, nogil=True)
+def _components(count: int, left: Array, right: Array) -> Array:
+    """(count,) int32 numbers of the components of a graph of `count` nodes with the edges left (E,) – right (E,)."""
+    root = np.arange(count)
+    for at in range(len(left)):
+        a, b = left[at], right[at]
+        while root[a] != a:
+            root[a] = root[root[a]]
+            a = root[a]
+        while root[b] != b:
+            root[b] = root[root[b]]
+            b = root[b]
+        root[max(a, b)] = min(a, b)
+    out = np.empty(count, np.int32)
+    found = 0
+    for at in range(count):  # a root comes before what hangs on it
+        if root[at] == at:
+            out[at] = found
+            found += 1
+        else:
+            out[at] = out[root[at]]
+    return out
 
 
 def _first_of_each(rows: Array) -> Array:
