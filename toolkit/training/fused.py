@@ -53,7 +53,7 @@ class FusedOptimiser:
         self._take_decoder(field)
         self.blind = blind(field.decoder).numpy()
         self.moments = [(np.zeros_like(weight), np.zeros_like(weight)) for weight in self._weights()]
-        # As rows of numbers, for what treats all of them alike: one call for all is a twentieth of what one for each would take.
+        # As rows of numbers, for what treats all of them alike in one call.
         self.weights = _rows(self._weights())
         self.first, self.second = (_rows(moment) for moment in zip(*self.moments, strict=True))
         self.weight_sums = [_rows(self._weight_gradients(thread)) for thread in range(self.threads)]

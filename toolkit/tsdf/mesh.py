@@ -1,4 +1,4 @@
-"""A triangle mesh in plain NumPy: move it between frames, remove what is not surface, thin it out."""
+"""A triangle mesh in NumPy arrays: move it between frames, remove what is not surface, smooth it, thin it out."""
 
 from __future__ import annotations
 

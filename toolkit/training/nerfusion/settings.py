@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from toolkit.config import refuse_traps
 from toolkit.errors import InputError, brief, first_line
 
-LEAST_SIDE = 16  # pixels: the encoder halves pictures four times
+LEAST_SIDE = 16  # pixels; sides are rounded to multiples of 8, and less than one would be no picture
 KINDS = ("procedural", "shards", "scannet", "dtu", "scanned_objects", "synthetic")
 
 
