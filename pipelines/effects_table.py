@@ -16,6 +16,8 @@ def effects_facts(target: Path, quiet: bool) -> dict[str, Any]:
     from pipelines.folder import is_run_folder
     from pipelines.kept import EFFECTS, read_kept
     from toolkit.capture import open_capture
+    from toolkit.effects.depth_camera import look_for_offset
+    from toolkit.effects.registration import DEPTH_OFFSET
     from toolkit.effects.survey import survey
     from toolkit.errors import InputError
 
@@ -33,11 +35,16 @@ def effects_facts(target: Path, quiet: bool) -> dict[str, Any]:
     progress = make_progress(quiet)
     with progress.listening():
         progress.begin("effects")
-        found = survey(capture.with_frames(posed), progress=progress)
-    progress.finish("effects", found.seconds, False)
+        shown = capture.with_frames(posed)
+        found = survey(shown, progress=progress)
+        findings = dict(found.findings)
+        if shown.has_depth:
+            with found.paid.by(DEPTH_OFFSET):
+                findings[DEPTH_OFFSET] = look_for_offset(shown, range(len(posed)), found.seen, progress)[0]
+    progress.finish("effects", found.seconds + found.paid.of(DEPTH_OFFSET), False)
     return {
-        "effects": [{**finding.to_dict(), "seconds": found.paid.of(name)} for name, finding in found.findings.items()],
-        "seconds": round(found.seconds, 3),
+        "effects": [{**finding.to_dict(), "seconds": found.paid.of(name)} for name, finding in findings.items()],
+        "seconds": round(found.seconds + found.paid.of(DEPTH_OFFSET), 3),
         "looked_at": found.facts,
     }
 

@@ -54,7 +54,7 @@ def find_effects(job: Job, posed: Capture) -> Corrections:
         load=lambda: read_kept(path, EFFECTS),
         uses=[asdict(settings), holdout, [frame.name for frame in posed.frames], pixel_state(posed)],
         after=["poses"],
-        version=2,
+        version=3 if posed.has_depth else 2,
     )
     corrections = Corrections.from_dict(data.get("corrections", {}) if isinstance(data, dict) else {})
     choose_field(field, data["effects"], settings.off)
@@ -111,10 +111,27 @@ def moved_cameras(job: Job, capture: Capture) -> list[str]:
     cosine = (np.einsum("nij,nij->n", before[:, :3, :3], after[:, :3, :3]) - 1) / 2
     turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     length = f"{100 * np.median(way):.1f} cm" if capture.metric else f"{np.median(way):.3g} of the capture's units"
-    depth = "; a sensor's depth that is not registered with the colours fits those better" if capture.has_depth else ""
+    unregistered = capture.has_depth and job.corrections.depth is None
+    depth = "; a sensor's depth that is not registered with the colours fits those better" if unregistered else ""
     return [
         f"the poses that came with the capture were refined by its pictures: cameras moved by {length} and turned by {np.median(turn):.2f}°"
         f" in the median, and surfaces lie with them; --set effects.off=[poses] keeps the poses as they came{depth}"
+    ]
+
+
+def moved_depth(job: Job, capture: Capture) -> list[str]:
+    """How far the depth camera stands from the pictures', where depth is carried from the one to the other."""
+    import numpy as np
+
+    found = job.corrections.depth if job.corrections else None
+    if found is None:
+        return []
+    way = np.linalg.norm(found[:3, 3])
+    turn = np.degrees(np.arccos(np.clip((np.trace(found[:3, :3]) - 1) / 2, -1, 1)))
+    length = f"{100 * way:.1f} cm" if capture.metric else f"{way:.3g} of the capture's units"
+    return [
+        f"the depth camera was found to stand {length} beside the pictures' and to be turned by {turn:.2f}°, and its depth is carried over;"
+        " --set effects.off=[depth_offset] uses depth as it came"
     ]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from pipelines.folder import command_line
 from pipelines.job import Job
 from pipelines.rendered import Pictures
-from pipelines.steps_effects import effects_part, effects_warnings, moved_cameras
+from pipelines.steps_effects import effects_part, effects_warnings, moved_cameras, moved_depth
 from pipelines.steps_results import fit_left_out, fit_matched, fit_notes
 from pipelines.textured import TSDF_TEXTURE
 from toolkit import __version__
@@ -130,6 +130,7 @@ def unique(texts: list[str]) -> list[str]:
 def warnings_of(job: Job, capture: Capture, poses: PoseResult, scene: Scene, views: Views) -> list[str]:
     """Everything that a reader of the numbers has to know."""
     moved = moved_cameras(job, capture) if poses.source == "given" else []
+    moved += moved_depth(job, capture)
     texts = [*capture.warnings, *poses.warnings, *effects_warnings(job), *moved, *scene.warnings, *fit_notes(job)]
     if not np.any(views.test):
         texts.append(NO_TEST_VIEWS)

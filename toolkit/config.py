@@ -168,7 +168,17 @@ SHORT_NAMES = {
     "init": "field.init",
     "finetune": "fit.finetune",
 }
-EFFECTS = ("exposure", "vignetting", "distortion", "rolling_shutter", "view_dependence", "background", "motion_blur", "poses")
+EFFECTS = (
+    "exposure",
+    "vignetting",
+    "distortion",
+    "rolling_shutter",
+    "view_dependence",
+    "background",
+    "motion_blur",
+    "poses",
+    "depth_offset",
+)
 CHOICES = {
     "preset": ("fast", "balanced", "quality"),
     "engine": ("auto", "numba", "triton", "torch"),

@@ -55,7 +55,8 @@ def load_depth(frame: Frame, capture: Capture) -> Array:
     """The frame's depth map, (H, W) float32 along z in units of the input's poses, 0 = missing.
 
     Stored values are divided by `capture.depth_scale`. 0, negative, NaN and infinite values are missing, so is 65535 in 16-bit pictures,
-    and so is where the frame's confidence is 0. Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, and .npy arrays.
+    and so is where the frame's confidence is 0. Where the depth camera stands beside the picture's, the map is carried to where that
+    stands (`carried`). Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, and .npy arrays.
 
     Raises:
         InputError: naming the file, when it is missing, damaged, or not one value a pixel.
@@ -82,7 +83,13 @@ def load_depth(frame: Frame, capture: Capture) -> Array:
             )
         missing |= confidence == 0
     depth[missing] = 0
-    return depth
+    camera = frame.depth_intrinsics or frame.intrinsics
+    if frame.depth_pose is None or camera is None:
+        return depth
+    from toolkit.capture.carried import carried  # here: its kernels take a second to load, and few captures need them
+
+    height, width = depth.shape
+    return carried(depth, camera.scaled(width, height), frame.depth_pose)
 
 
 def load_mask(frame: Frame) -> Array | None:

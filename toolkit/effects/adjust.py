@@ -107,6 +107,18 @@ def scatter(residual: Array) -> float:
     return float(np.median(np.linalg.norm(residual, axis=1)) / 1.1774) if len(residual) else np.inf
 
 
+def uncertainty(problem: Problem) -> Array:
+    """(O,) deviation of points along the viewing direction of the pictures that show them, by how well rays meet; units of the poses."""
+    by_point = _slopes(problem, frozenset())[0]
+    count = len(problem.points)
+    ends = np.searchsorted(problem.point, np.arange(count))
+    certain = _sum(np.einsum("oai,oaj->oij", by_point, by_point), ends, count)
+    certain += (1e-9 * np.trace(certain, axis1=1, axis2=2)[:, None, None] + 1e-12) * np.eye(3)
+    spread = np.linalg.inv(certain) * scatter(residuals(problem)) ** 2
+    along = problem.poses[problem.frame][:, :3, 2]
+    return np.sqrt(np.einsum("oi,oij,oj->o", along, spread[problem.point], along))
+
+
 def adjust(problem: Problem, unknown: frozenset[str] = frozenset(), steps: int = STEPS, belief: Belief | None = None) -> Fitted:
     """Fit the points and what is `unknown` beside them; poses that are unknown stay near those of `belief`, if there is one."""
     damping, current = 1e-3, problem

@@ -27,6 +27,7 @@ class Corrections:
     dimmed: float = 1.0  # canonical light is divided by this besides, so that little of it is clipped
     lens: tuple[float, float] | None = None  # k1, k2 beyond the given lens
     poses: dict[str, Array] = field(default_factory=dict)  # (4, 4) world_from_camera
+    depth: Array | None = None  # (4, 4) the picture's camera from the depth camera, where depth was not brought to the pictures
     weight: dict[str, float] = field(default_factory=dict)  # of frames that count for less in the fit: share of their pixels, 0 to 1
 
     @property
@@ -50,13 +51,17 @@ class Corrections:
         return self.coloured or bool(self.weight)
 
     def on_capture(self, capture: Capture) -> Capture:
-        """The capture with the refined lens and poses."""
-        if not self.geometric:
+        """The capture with the refined lens and poses, and with the depth camera where it stands."""
+        if not self.geometric and self.depth is None:
             return capture
         frames = []
         for frame in capture.frames:
             camera = frame.intrinsics if self.lens is None or frame.intrinsics is None else bent(frame.intrinsics, self.lens)
-            frames.append(replace(frame, intrinsics=camera, world_from_camera=self.poses.get(frame.name, frame.world_from_camera)))
+            depth = frame.depth_pose
+            if self.depth is not None and frame.depth is not None:
+                depth = self.depth if depth is None else self.depth @ depth
+            pose = self.poses.get(frame.name, frame.world_from_camera)
+            frames.append(replace(frame, intrinsics=camera, world_from_camera=pose, depth_pose=depth))
         return capture.with_frames(frames)
 
     def on_views(self, views: Views) -> Views:
@@ -90,6 +95,7 @@ class Corrections:
             "dimmed": self.dimmed,
             "lens": None if self.lens is None else list(self.lens),
             "poses": {name: pose.tolist() for name, pose in self.poses.items()},
+            "depth": None if self.depth is None else self.depth.tolist(),
             "weight": dict(self.weight),
         }
 
@@ -103,6 +109,7 @@ class Corrections:
         try:
             gain = {str(name): tuple(positive(value) for value in values) for name, values in data["gain"].items()}
             poses = {str(name): np.array(pose, dtype=np.float64).reshape(4, 4) for name, pose in data["poses"].items()}
+            depth = None if data.get("depth") is None else np.array(data["depth"], dtype=np.float64).reshape(4, 4)
             corner = None if data["corner"] is None else positive(data["corner"])
             dimmed = positive(data.get("dimmed", 1.0))
             lens = None if data["lens"] is None else (float(data["lens"][0]), float(data["lens"][1]))
@@ -113,10 +120,11 @@ class Corrections:
                 raise ValueError("a weight is not a share")
             if any(len(values) != 3 for values in gain.values()):
                 raise ValueError("a gain is not a number for each channel")
-            if any(not np.isfinite(pose).all() for pose in poses.values()) or (lens is not None and not np.isfinite(lens).all()):
+            told = [*poses.values(), *(one for one in (depth, lens) if one is not None)]
+            if any(not np.isfinite(numbers).all() for numbers in told):
                 raise ValueError("a pose or the lens is not finite")
             exact = {name: (values[0], values[1], values[2]) for name, values in gain.items()}
-            return cls(exact, corner=corner, dimmed=dimmed, lens=lens, poses=poses, weight=weight)
+            return cls(exact, corner=corner, dimmed=dimmed, lens=lens, poses=poses, depth=depth, weight=weight)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
             raise InputError(f"effects.json is not what the effects stage writes ({first_line(error)}); remove it and run again") from error
 

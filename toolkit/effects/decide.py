@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,12 @@ from toolkit.config import EffectsSettings, FieldSettings
 from toolkit.effects import light, vignetting
 from toolkit.effects.adjust import LENS, POSES, ROWS, adjust
 from toolkit.effects.correct import Corrections, correctable
+from toolkit.effects.depth_camera import NOTHING, look_for_offset
 from toolkit.effects.light import EXPOSURE, VIGNETTING
 from toolkit.effects.motion_blur import POWER
 from toolkit.effects.paid import POINTS, Paid
 from toolkit.effects.refine import refined_poses
+from toolkit.effects.registration import DEPTH_OFFSET
 from toolkit.effects.sightings import Look, Sightings, gather
 from toolkit.effects.survey import BLUR, FAR, VIEWS, Finding, Survey, survey
 from toolkit.progress import SILENT, Progress
@@ -100,7 +102,13 @@ def decide(capture: Capture, test: Array, settings: EffectsSettings, progress: P
     found = found or survey(capture, train, progress, known=known, quick=not settings.on)
     decisions = [_decision(finding, wish(settings, name), capture, found) for name, finding in found.findings.items()]
     on = frozenset(decision.finding.effect for decision in decisions if decision.on)
-    corrections = _corrections(capture, test, found, on, progress, known)
+    corrections, seen = _corrections(capture, test, found, on, progress, known)
+    if capture.has_depth:
+        with found.paid.by(DEPTH_OFFSET):
+            finding, pose = look_for_offset(corrections.on_capture(capture), train, seen, progress, known)
+        decision = _of_depth(finding, wish(settings, DEPTH_OFFSET), pose is not None)
+        decisions.append(decision)
+        corrections = replace(corrections, depth=pose if decision.on else None)
     return Decided(tuple(decisions), corrections, time.monotonic() - began, found.facts, found.paid)
 
 
@@ -137,10 +145,22 @@ def _decision(finding: Finding, wished: str, capture: Capture, found: Survey) ->
     return Decision(finding, wished, True, "" if finding.there else "switched on by hand, nothing speaks for it")
 
 
+def _of_depth(finding: Finding, wished: str, told: bool) -> Decision:
+    """Depth is used where it was measured, or is carried to where the pictures were taken."""
+    if not (wished == "on" or (wished == "auto" and finding.there)):
+        return Decision(finding, wished, False, "there, and switched off" if finding.there and wished == "off" else "")
+    if not told:
+        return Decision(finding, wished, False, f"cannot be worked out: {NOTHING}")
+    return Decision(finding, wished, True, "" if finding.there else "switched on by hand, nothing speaks for it")
+
+
 def _corrections(
     capture: Capture, test: Array, found: Survey, on: frozenset[str], progress: Progress, known: dict[int, Look]
-) -> Corrections:
-    """Per-frame corrections need every frame: then all are looked at, and only then."""
+) -> tuple[Corrections, Sightings | None]:
+    """Corrections, and what was seen in most pictures.
+
+    Per-frame corrections need every frame: then all are looked at, and only then.
+    """
     seen, corner = found.seen, found.light.corner if found.light is not None and VIGNETTING in on else None
     lens = None
     if found.explained is not None and LENS in on:
@@ -148,10 +168,11 @@ def _corrections(
         with found.paid.by(LENS):
             lens = (explained.problem if LENS in explained.kept else adjust(explained.problem, explained.kept | {LENS}).problem).lens
     if seen is None or not on & {EXPOSURE, POSES, BLUR}:
-        return Corrections(corner=corner, dimmed=room_for_light(seen, corner, {}), lens=lens)
+        return Corrections(corner=corner, dimmed=room_for_light(seen, corner, {}), lens=lens), seen
     gain: dict[str, Gain] = {}
     poses: dict[str, Array] = {}
     weight: dict[str, float] = {}
+    every: Sightings | None = None
     if BLUR in on:
         weight = _weights([frame.name for frame, held in zip(capture.frames, test, strict=True) if not held], seen.names, found.sharpness)
     if on & {EXPOSURE, POSES}:
@@ -170,7 +191,7 @@ def _corrections(
             poses = dict(zip(every.names, moved, strict=True))
             lens = beyond if LENS in on else None
     dimmed = room_for_light(seen, corner, gain)
-    return Corrections(gain, corner=corner, dimmed=dimmed, lens=lens, poses=poses, weight=weight)
+    return Corrections(gain, corner=corner, dimmed=dimmed, lens=lens, poses=poses, weight=weight), every or seen
 
 
 def room_for_light(seen: Sightings | None, corner: float | None, gain: dict[str, Gain]) -> float:

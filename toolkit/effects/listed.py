@@ -16,6 +16,7 @@ from toolkit.effects import (
     background,
     compression,
     depth_noise,
+    depth_offset,
     distortion,
     exposure,
     highlights,
@@ -37,6 +38,7 @@ MODULES: dict[str, ModuleType] = {
     "rolling_shutter": rolling_shutter,
     "motion_blur": motion_blur,
     "sensor_noise": sensor_noise,
+    "depth_offset": depth_offset,
     "depth_noise": depth_noise,
     "compression": compression,
 }
@@ -57,6 +59,7 @@ class Effects:
     exposure: exposure.Exposure | None = None
     sensor_noise: sensor_noise.SensorNoise | None = None
     compression: compression.Compression | None = None
+    depth_offset: depth_offset.DepthOffset | None = None
     depth_noise: depth_noise.DepthNoise | None = None
 
     def names(self) -> tuple[str, ...]:

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics
+from toolkit.camera import Array, Intrinsics, invert
 from toolkit.effects import (
     compression,
     depth_noise,
+    depth_offset,
     distortion,
     exposure,
     motion_blur,
@@ -113,6 +114,9 @@ class Film:
             seen = still.depth.cpu().numpy()
             passed = (seen > 0) & ((depth == 0) | (seen < depth - PASSED))
             facts["passers"] = {"share": float(passed.mean())}
+        if effects.depth_offset is not None and self.has_depth:
+            still = take(there, plain(self.eye), (pose @ invert(depth_offset.forward(effects.depth_offset)))[None])
+            seen = still.depth.cpu().numpy()
         return Shot(
             index=index,
             seconds=seconds,

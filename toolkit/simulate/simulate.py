@@ -46,8 +46,9 @@ def prepare(settings: SceneFile, beside: Path, effects: Effects) -> Film:
     Raises:
         InputError: as for `open_scene`, or the path does not fit into the scene, or the lens not over the picture.
     """
-    if effects.depth_noise is not None and not settings.depth:
-        raise InputError("depth_noise is listed, but the capture has no depth; set `depth: true` in the scene file")
+    for name in ("depth_noise", "depth_offset"):
+        if getattr(effects, name) is not None and not settings.depth:
+            raise InputError(f"{name} is listed, but the capture has no depth; set `depth: true` in the scene file")
     scene = open_scene(settings, beside)
     motion = plan(scene, settings.path, np.random.default_rng([settings.seed, PATH]))
     if effects.background is not None:

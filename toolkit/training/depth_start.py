@@ -40,7 +40,7 @@ from toolkit.volume.topology import BLOCK, Topology
 
 Tensor = torch.Tensor
 RESOLUTION = 64  # voxels a side, where a part of the pictures' depth is known …
-KNOWN, RESOLUTION_KNOWN = 0.95, 128  # … and where that much of it is: what nobody knows is found on coarse lattices
+KNOWN, RESOLUTION_KNOWN = 0.9, 128  # … and where that much of it is: what nobody knows is found on coarse lattices
 THICK = 1.5  # raw density of what was measured
 MOST_VIEWS = 80  # pictures with depth that are asked, and as many without, evenly spread: more say the same
 PIECE = 4096  # voxels of the coarsest lattice whose parts are asked for at a time: memory is bounded
