@@ -82,6 +82,29 @@ class Intrinsics:
             raise InputError(f"{where}: the lens model {self.lens!r} takes at most {most} coefficients, here are {given}; correct them")
         return self
 
+    def centred(self, where: str, slack: float = 0.0) -> Intrinsics:
+        """Self, when its principal point lies in the picture, or at most `slack` of a side outside it.
+
+        Not part of `checked`: what was cut out of a larger picture may have it elsewhere. Read from a file, such a point mostly tells
+        that the intrinsics are for pictures of another size.
+
+        Raises:
+            InputError: naming `where` the camera came from, and what is probably wrong.
+        """
+        point = f"{where}: the principal point ({self.cx:g}, {self.cy:g})"
+        if abs(self.cx) < 2 and abs(self.cy) < 2 and min(self.width, self.height) >= 16:
+            raise InputError(
+                f"{point} lies in the corner of the {self.width}×{self.height} picture; the intrinsics seem to be shares of the picture's "
+                "size: give them in pixels"
+            )
+        across, down = self.cx / self.width, self.cy / self.height
+        if not (-slack <= across <= 1 + slack and -slack <= down <= 1 + slack):
+            raise InputError(
+                f"{point} lies outside the {self.width}×{self.height} picture; the intrinsics are probably for pictures of another size: "
+                "give these, or intrinsics for the size at hand"
+            )
+        return self
+
     def to_dict(self) -> dict[str, Any]:
         return {**asdict(self), "distortion": list(self.distortion)}
 
