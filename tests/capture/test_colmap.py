@@ -138,6 +138,17 @@ def test_smaller_pictures_scale_the_camera(tmp_path: Path) -> None:
     assert "scaled to fit" in capture.warnings[0]
 
 
+def test_a_principal_point_far_outside_is_refused(tmp_path: Path) -> None:
+    """Just beside it is well: pictures are cropped."""
+    write_colmap_txt(tmp_path)
+    path = tmp_path / "sparse/0/cameras.txt"
+    path.write_text("7 PINHOLE 80 60 71 73 100 27.5\n")
+    assert open_capture(tmp_path).frames[0].intrinsics.cx == 100
+    path.write_text("7 PINHOLE 80 60 71 73 169 110\n")
+    with pytest.raises(InputError, match=r"cameras\.txt, camera 7: the principal point \(169, 110\) lies outside the 80×60 picture"):
+        open_capture(tmp_path)
+
+
 def test_a_name_that_leads_outside_is_refused(tmp_path: Path) -> None:
     write_colmap_txt(tmp_path)
     path = tmp_path / "sparse/0/images.txt"

@@ -108,6 +108,17 @@ def test_listed_files_that_do_not_exist_are_counted(root: Path) -> None:
         read_transforms(root)
 
 
+def test_intrinsics_for_larger_pictures_need_their_size(root: Path) -> None:
+    larger = {"fl_x": 2 * 71.0, "fl_y": 2 * 73.0, "cx": 2 * 42.25, "cy": 2 * 27.5}
+    edit(root, lambda data: data.update(larger, w=160, h=120))
+    assert pixel_error(read_transforms(root), eyes(), OFF_CENTRE) < 1e-3
+    edit(root, lambda data: (data.pop("w"), data.pop("h")))
+    with pytest.raises(InputError, match="2 times as large"):
+        read_transforms(root)
+    edit(root, lambda data: data.update(fl_x=71.0, fl_y=73.0, cx=70.0, cy=27.5))  # far from the centre, and no size explains it
+    assert read_transforms(root).frames[0].intrinsics.cx == 70
+
+
 def test_smaller_pictures_scale_the_camera_and_say_so(root: Path) -> None:
     for index, eye in enumerate(eyes()):
         save_picture(root / f"images/{index:04d}.png", render(eye, half_size(OFF_CENTRE))[0])
@@ -206,6 +217,11 @@ def first(data: dict) -> dict:
         (lambda d: d.update(fl_x="wide"), "'fl_x' must be a finite number"),
         (lambda d: d.update(cx=float("inf")), "'cx' must be a finite number"),
         (lambda d: d.update(k1=True), "'k1' must be a finite number"),
+        (lambda d: d.update(cx=169.0, cy=110.0), r"principal point \(169, 110\) lies outside the 80×60 picture"),
+        (lambda d: d.update(cy=-1.0), "outside the 80×60 picture"),
+        (lambda d: d.update(cx=0.51, cy=0.49), "shares of the picture's size"),
+        (lambda d: (d.pop("w"), d.pop("h"), d.update(cx=2 * 42.25, cy=2 * 27.5)), "2 times as large as the 80×60 one at hand; add 'w'"),
+        (lambda d: (d.pop("w"), d.pop("h"), d.update(cx=4 * 42.25, cy=4 * 27.5)), "a picture 4 times as large"),
         (lambda d: d.update(w=1e30), "picture size"),
         (lambda d: d.update(w=-80), "picture size"),
         (lambda d: d.update(w=60, h=80), "another shape"),

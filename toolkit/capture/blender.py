@@ -45,7 +45,7 @@ def read_blender(path: Path | str) -> Capture:
             if image is None:
                 continue
             header = picture_header(image)
-            described = nerf_json.camera(data, entry, header.size, where)
+            described = nerf_json.picture_camera(data, entry, header.size, where)
             intrinsics = fitted(described, header.size, where)
             scaled += intrinsics is not described
             alpha |= header.alpha

@@ -96,4 +96,4 @@ def find_json(root: Path) -> tuple[Intrinsics, dict[str, Any]] | None:
     fx, fy, cx, cy = values
     if fx is None or fy is None or cx is None or cy is None:
         raise InputError(f"{where} must hold 'fx', 'fy', 'cx', 'cy' or an 'intrinsic_matrix'; correct it")
-    return sensor(round(width), round(height), fx, fy, cx, cy).checked(where), data
+    return sensor(round(width), round(height), fx, fy, cx, cy).checked(where).centred(where), data

@@ -21,6 +21,7 @@ from toolkit.errors import InputError, first_line
 
 MAX_TEXT = 2**30
 MAX_SIDE = 1_000_000
+BESIDE = 0.5  # of a picture's side by which a principal point may lie outside: pictures may have been cropped once their camera was known
 # number, name, parameters
 MODELS = (
     (0, "SIMPLE_PINHOLE", 3),
@@ -123,7 +124,7 @@ def intrinsics_of(model: str, width: int, height: int, values: list[float], wher
     fx, fy, cx, cy, *lens = head
     if LENS_OF[model] != PINHOLE:
         lens += [0.0] * (4 - len(lens))
-    return Intrinsics(width, height, fx, fy, cx, cy, LENS_OF[model], tuple(lens)).checked(where)
+    return Intrinsics(width, height, fx, fy, cx, cy, LENS_OF[model], tuple(lens)).checked(where).centred(where, BESIDE)
 
 
 def _image(name: str, camera: int, quaternion: list[float], translation: list[float], where: str) -> ModelImage:

@@ -15,6 +15,7 @@ from toolkit.capture.listing import PICTURES, is_file
 from toolkit.errors import InputError
 
 MAX_SIDE = 1_000_000  # pixels
+SAME_FACTOR = 0.1  # how far a principal point may lie from a larger picture's centre to be taken for it
 MODELS = {
     "OPENCV": OPENCV,
     "SIMPLE_RADIAL": OPENCV,
@@ -134,6 +135,27 @@ def camera(shared: Mapping[str, Any], entry: Mapping[str, Any], size: tuple[int,
     lens, distortion = _lens(shared, entry, value, where)
     cx, cy = (width / 2 if cx is None else cx), (height / 2 if cy is None else cy)
     return Intrinsics(width, height, fx, fy, cx, cy, lens, distortion).checked(where)
+
+
+def picture_camera(shared: Mapping[str, Any], entry: Mapping[str, Any], size: tuple[int, int], where: str) -> Intrinsics:
+    """The same of a picture that is there, `size` (width, height) large: its principal point has to lie in it.
+
+    Raises:
+        InputError: as `camera`; the principal point lies outside, or the json seems to be for a picture of another size.
+    """
+    described = camera(shared, entry, size, where)
+    if all(data.get(key) is None for data in (shared, entry) for key in ("w", "h")):
+        # Without 'w' and 'h' nothing else tells that the pictures were made smaller since.
+        factor = round(2 * described.cx / described.width)
+        if factor >= 2 and all(
+            abs(2 * at / length / factor - 1) < SAME_FACTOR
+            for at, length in ((described.cx, described.width), (described.cy, described.height))
+        ):
+            raise InputError(
+                f"{where}: the principal point ({described.cx:g}, {described.cy:g}) is the centre of a picture {factor} times as large as "
+                f"the {described.width}×{described.height} one at hand; add 'w' and 'h', the size that the intrinsics are for"
+            )
+    return described.centred(where)
 
 
 def _focal(focal: float | None, angle: float | None, length: int, where: str) -> float | None:

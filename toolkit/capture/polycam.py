@@ -65,10 +65,10 @@ def _frame(picture: Path, camera: Path, name: str) -> Frame:
     told: dict[str, float] = {key: value for key, value in values.items() if value is not None}
     if not (1 <= told["width"] <= MAX_SIDE and 1 <= told["height"] <= MAX_SIDE):
         raise InputError(f"{where}: the picture's size {told['width']:g}×{told['height']:g} cannot be; correct it")
-    lens = Intrinsics(round(told["width"]), round(told["height"]), told["fx"], told["fy"], told["cx"], told["cy"]).checked(where)
+    lens = Intrinsics(round(told["width"]), round(told["height"]), told["fx"], told["fy"], told["cx"], told["cy"])
     pose: Array = np.eye(4)
     pose[:3] = [[told[f"t_{row}{column}"] for column in range(4)] for row in range(3)]
-    intrinsics = fitted(lens, picture_header(picture).size, str(picture))
+    intrinsics = fitted(lens.checked(where).centred(where), picture_header(picture).size, str(picture))
     root = picture.parent.parent
     depth: Path | None = root / "depth" / f"{picture.stem}.png"
     depth = depth if depth is not None and is_file(depth) else None

@@ -93,7 +93,7 @@ def _frame(root: Path, data: dict[str, Any], entry: dict[str, Any], index: int, 
         tally.missing += 1
         return None
     header = picture_header(image)
-    described = nerf_json.camera(data, entry, header.size, where)
+    described = nerf_json.picture_camera(data, entry, header.size, where)
     intrinsics = fitted(described, header.size, where)
     tally.scaled += intrinsics is not described
     tally.alpha |= header.alpha
