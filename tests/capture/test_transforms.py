@@ -179,6 +179,27 @@ def test_masks_splits_and_points(root: Path) -> None:
         read_transforms(root)
 
 
+@pytest.mark.parametrize("spelling", ["images/{}", "./images/{}", "images\\{}", "images//../images/{}"])
+def test_splits_in_other_spellings(root: Path, spelling: str) -> None:
+    def change(data: dict) -> None:
+        names = [spelling.format(f"{index:04d}.png") for index in range(5)]
+        data.update(train_filenames=names[:3], test_filenames=names[3:], val_filenames=[])
+
+    edit(root, change)
+    capture = read_transforms(root)
+    assert [frame.split for frame in capture.frames] == ["train"] * 3 + ["test"] * 2
+    assert capture.warnings == ()
+
+
+def test_a_split_that_names_no_frame_is_told(root: Path) -> None:
+    edit(root, lambda data: data.update(train_filenames=["a.png"], test_filenames=["b.png"], val_filenames=["images/0001.png"]))
+    capture = read_transforms(root)
+    assert [frame.split for frame in capture.frames] == [None, "test", None, None, None], "validation stands in for a missing test"
+    assert capture.warnings == tuple(
+        f"'{split}_filenames' of transforms.json names none of its frames and is left out of account" for split in ("train", "test")
+    )
+
+
 def test_pictures_with_alpha(root: Path) -> None:
     assert not read_transforms(root).alpha
     cv2.imwrite(str(root / "images/0002.png"), np.zeros((60, 80, 4), np.uint8))
