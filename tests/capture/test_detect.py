@@ -126,6 +126,15 @@ def test_a_cropped_picture_does_not_pass_as_a_resized_one(tmp_path: Path, layout
         open_capture(tmp_path)
 
 
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_what_macos_leaves_beside_files_is_not_read(tmp_path: Path, layout: str) -> None:
+    LAYOUTS[layout][1](tmp_path)
+    for path in [path for path in tmp_path.rglob("*") if path.is_file()]:
+        path.with_name(f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    capture = open_capture(tmp_path)
+    assert (capture.kind, len(capture.frames)) == (LAYOUTS[layout][0], len(eyes()))
+
+
 def test_sequences_in_folders_are_read_together(tmp_path: Path) -> None:
     write_seven_scenes(tmp_path, "seq-01")
     write_seven_scenes(tmp_path, "seq-02")

@@ -71,6 +71,11 @@ def pictures_in(folder: Path, suffixes: Sequence[str] = PICTURES) -> list[Path]:
     return sorted(found, key=lambda path: natural_key(path.name))
 
 
+def files_in(folder: Path, pattern: str) -> list[Path]:
+    """Files directly in `folder` that fit the `pattern`. Hidden ones are left out, as macOS puts them beside others (`._pose.txt`)."""
+    return [path for path in folder.glob(pattern) if not path.name.startswith(".") and path.is_file()]
+
+
 def unique_names(paths: Sequence[Path]) -> list[str]:
     """A short name for each picture: its stem; with its folders, then its suffix, where stems repeat."""
     stems = [path.stem for path in paths]

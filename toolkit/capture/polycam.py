@@ -12,7 +12,17 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.camera import Array, Intrinsics, checked_pose, world_from_opengl
-from toolkit.capture.listing import assemble, fitted, is_file, picture_header, pictures_in, read_object, require_folder, unique_names
+from toolkit.capture.listing import (
+    assemble,
+    files_in,
+    fitted,
+    is_file,
+    picture_header,
+    pictures_in,
+    read_object,
+    require_folder,
+    unique_names,
+)
 from toolkit.capture.nerf_json import MAX_SIDE, number
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
@@ -27,7 +37,7 @@ def _folders(path: Path) -> tuple[Path, Path] | None:
     root = path if path.name == KEYFRAMES else path / KEYFRAMES
     for prefix in (BETTER, ""):
         images, cameras = root / f"{prefix}images", root / f"{prefix}cameras"
-        if images.is_dir() and cameras.is_dir() and any(cameras.glob("*.json")):
+        if images.is_dir() and cameras.is_dir() and files_in(cameras, "*.json"):
             return images, cameras
     return None
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from toolkit.camera import Intrinsics
 from toolkit.capture.calibration import read_matrix_for, sensor
-from toolkit.capture.listing import assemble, picture_header, pictures_in, require_folder, same_count
+from toolkit.capture.listing import assemble, files_in, picture_header, pictures_in, require_folder, same_count
 from toolkit.capture.seven_scenes import FrameFiles, first_sizes, frame_files, frame_folders, frame_names, posed_frames
 from toolkit.capture.seven_scenes_cameras import INFO
 from toolkit.capture.types import Capture
@@ -61,7 +61,7 @@ def read_scannet(path: Path | str) -> Capture:
 def _exported(root: Path) -> list[FrameFiles]:
     colours = pictures_in(root / "color")
     depths = {path.stem: path for path in pictures_in(root / "depth")}
-    poses = {path.stem: path for path in (root / "pose").glob("*.txt")}
+    poses = {path.stem: path for path in files_in(root / "pose", "*.txt")}
     same_count(len(colours), len(poses), root)
     found = []
     for colour in colours:
