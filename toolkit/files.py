@@ -71,7 +71,7 @@ def read_json(path: Path | str, max_bytes: int = MAX_JSON_BYTES) -> Any:
         if size > max_bytes:
             most = f"{max_bytes / 2**20:.0f} MB"
             raise InputError(f"{path} holds {size / 2**20:.0f} MB of JSON, more than the {most} that is read; remove what is not needed")
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))  # with or without the mark that Windows' programs put first
     except RecursionError as error:
         raise InputError(f"{path} is nested too deeply to be read as JSON; check how it was written") from error
     except ValueError as error:  # not JSON, not UTF-8, or a number of thousands of digits

@@ -135,6 +135,14 @@ def test_what_macos_leaves_beside_files_is_not_read(tmp_path: Path, layout: str)
     assert (capture.kind, len(capture.frames)) == (LAYOUTS[layout][0], len(eyes()))
 
 
+@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name not in ("colmap bin", "llff", "dtu")])  # these have no text
+def test_text_with_the_mark_that_windows_writes_first(tmp_path: Path, layout: str) -> None:
+    camera = LAYOUTS[layout][1](tmp_path)
+    for path in [path for path in tmp_path.rglob("*") if path.suffix in (".json", ".txt", ".csv", ".log")]:
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    assert pixel_error(open_capture(tmp_path), true_eyes(layout), camera) < 1e-3
+
+
 def test_sequences_in_folders_are_read_together(tmp_path: Path) -> None:
     write_seven_scenes(tmp_path, "seq-01")
     write_seven_scenes(tmp_path, "seq-02")

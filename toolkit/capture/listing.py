@@ -160,9 +160,9 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
     try:
         if path.stat().st_size > max_bytes:
             raise InputError(f"{path} is larger than {max_bytes / 2**20:.0f} MB, too large for a text file of a capture")
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # with or without the mark that Windows' programs put first
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file; check how it was written") from error
+        raise InputError(f"{path} is not a text file in UTF-8; check how it was written") from error
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 
