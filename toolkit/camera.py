@@ -24,6 +24,7 @@ PINHOLE = "pinhole"
 OPENCV = "opencv"  # k1, k2, p1, p2[, k3[, k4, k5, k6]] as in OpenCV
 FISHEYE = "fisheye"  # k1, k2, k3, k4 of OpenCV's equidistant model
 LENSES = (PINHOLE, OPENCV, FISHEYE)
+FARTHEST = 1e12  # of a camera from the origin, in any unit: geocentric millimetres stay below 1e10
 RIGID = 1e-14  # how far RᵀR of a rotation in float64 is from the identity by rounding alone
 
 
@@ -229,7 +230,7 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     What is rigid to the last digits stays as it is: a pose that was written and read back is the same pose.
 
     Raises:
-        InputError: wrong shape, not finite, singular, mirrored or not rigid (beyond `tolerance`).
+        InputError: wrong shape, not finite, singular, mirrored, not rigid (beyond `tolerance`) or astronomically far away.
     """
     try:
         pose = np.asarray(pose, dtype=np.float64)
@@ -252,6 +253,7 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
         )
     if not off <= tolerance:  # NaN, too
         raise InputError(f"{where}: the pose is not rigid (its rotation is scaled or sheared by more than {tolerance:g}); correct it")
+    checked_place(pose[:3, 3], where)
     out = np.eye(4)
     if off > RIGID:
         u, _, vt = np.linalg.svd(rotation)
@@ -259,6 +261,19 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     out[:3, :3] = rotation
     out[:3, 3] = pose[:3, 3]
     return out
+
+
+def checked_place(place: Array, where: str) -> None:
+    """Look at the translation (3,) of a pose, or of its inverse: what is astronomically far leaves no digits for all else.
+
+    Raises:
+        InputError: further than `FARTHEST` from the origin.
+    """
+    farthest = float(np.abs(place).max())
+    if not farthest <= FARTHEST:
+        raise InputError(
+            f"{where}: the pose's translation is {farthest:g}, further than {FARTHEST:g} from the origin; remove this frame or correct it"
+        )
 
 
 @dataclass(frozen=True)

@@ -93,6 +93,11 @@ def inside(root: Path, relative: str) -> Path:
         raise InputError(f"the path {brief(repr(relative))} listed in {root} is not usable ({first_line(error)})") from error
     if _circular(resolved):
         raise InputError(f"the path {brief(repr(relative))} listed in {root} is not usable (its links lead in a circle)")
+    if not resolved.is_relative_to(root) and Path(os.path.normpath(root / relative)).is_relative_to(root):
+        raise InputError(
+            f"{brief(repr(relative))} is a link, or lies in a linked folder, that leads outside the capture folder {root}; only files "
+            "inside it are read: copy there what it links to"
+        )
     if not resolved.is_relative_to(root):
         raise InputError(f"the path {brief(repr(relative))} leads outside the capture folder {root}; only files inside it are read")
     return resolved

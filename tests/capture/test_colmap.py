@@ -238,7 +238,7 @@ def test_broken_text_is_refused(tmp_path: Path, name: str, old: str, new: str, m
         open_capture(tmp_path)
 
 
-@pytest.mark.parametrize("numbers", ["0 0 0 0 1 2 3", "nan 0 0 0 1 2 3", "1 0 0 0 inf 2 3"])
+@pytest.mark.parametrize("numbers", ["0 0 0 0 1 2 3", "1 0 0 0 1e200 2 3", "nan 0 0 0 1 2 3", "1 0 0 0 inf 2 3"])
 def test_poses_that_are_none(tmp_path: Path, numbers: str) -> None:
     write_colmap_txt(tmp_path)
     path = tmp_path / "sparse/0/images.txt"

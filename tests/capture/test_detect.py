@@ -8,10 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.capture.layouts import LAYOUTS, true_eyes, write_colmap_bin, write_llff, write_seven_scenes, write_transforms
+from tests.capture.films import film
+from tests.capture.layouts import EIGHTH_525, LAYOUTS, true_eyes, write_colmap_bin, write_llff, write_seven_scenes, write_transforms
 from tests.capture.made import colour_difference, eyes, pixel_error, render, reprojection, save_picture
 from toolkit.camera import Intrinsics
 from toolkit.capture import open_capture
+from toolkit.capture.checks import check_capture
 from toolkit.capture.detect import READERS, detect_kind
 from toolkit.capture.images import load_image
 from toolkit.capture.listing import fitted, natural_key, unique_names
@@ -96,6 +98,27 @@ def test_a_folder_with_one_video_is_that_video(tmp_path: Path) -> None:
     (tmp_path / "second.avi").write_bytes((tmp_path / "clip.avi").read_bytes())
     with pytest.raises(InputError, match="2 videos"):
         open_capture(tmp_path)
+
+
+def test_one_picture_beside_a_video_is_its_cover(tmp_path: Path) -> None:
+    film(tmp_path / "clip.mp4", [render(eye, EIGHTH_525)[0] for eye in eyes()], fps=10)
+    save_picture(tmp_path / "cover.jpg", render(eyes()[0], EIGHTH_525)[0])
+    capture = check_capture(open_capture(tmp_path))
+    assert (capture.kind, len(capture.frames)) == ("video", 5)
+    assert capture.warnings == ("the video clip.mp4 is used; the one picture beside it, cover.jpg, is left out",)
+    (tmp_path / "second.mp4").write_bytes((tmp_path / "clip.mp4").read_bytes())
+    with pytest.raises(InputError, match="2 videos"):
+        open_capture(tmp_path)
+    save_picture(tmp_path / "photo.jpg", render(eyes()[1], EIGHTH_525)[0])
+    assert open_capture(tmp_path).kind == "photos"
+
+
+@pytest.mark.parametrize("name", ["one.jpg", "ONE.PNG", "one.heic", "one.CR2"])
+def test_one_picture_is_no_capture(tmp_path: Path, name: str) -> None:
+    save_picture(tmp_path / "one.jpg", render(eyes()[0], EIGHTH_525)[0])
+    (tmp_path / "one.jpg").rename(tmp_path / name)
+    with pytest.raises(InputError, match=rf"{name} is one picture, .*; give the folder"):
+        open_capture(tmp_path / name)
 
 
 def test_nothing_there_is_said_in_one_sentence(tmp_path: Path) -> None:

@@ -226,6 +226,7 @@ def first(data: dict) -> dict:
         (lambda d: first(d).pop("transform_matrix"), "no 'transform_matrix'"),
         (lambda d: first(d)["transform_matrix"][0].pop(), "not a 4×4 matrix"),
         (lambda d: first(d).update(transform_matrix=[[1, 0], [0, 1]]), "shape"),
+        (lambda d: first(d)["transform_matrix"][0].__setitem__(3, 1e200), r"frame 0 .*translation is 1e\+200"),
         (lambda d: first(d).update(transform_matrix=[["a"] * 4] * 4), "not a 4×4 matrix"),
         (lambda d: first(d).update(transform_matrix=[[float("nan")] * 4] * 4), r"frame 0 .*not finite"),
         (lambda d: first(d).update(transform_matrix=[[0.0] * 4] * 4), r"frame 0 .*singular"),

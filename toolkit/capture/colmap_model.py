@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, invert
+from toolkit.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, checked_place, invert
 from toolkit.capture.listing import read_text
 from toolkit.capture.quaternion import rigid
 from toolkit.errors import InputError, first_line
@@ -130,7 +130,9 @@ def intrinsics_of(model: str, width: int, height: int, values: list[float], wher
 def _image(name: str, camera: int, quaternion: list[float], translation: list[float], where: str) -> ModelImage:
     if not np.isfinite(translation).all():
         raise InputError(f"{where}: the pose of {name!r} holds a value that is not finite; remove this image from the model")
-    camera_from_world = rigid(np.array(quaternion), np.array(translation), f"{where}, image {name!r}")
+    where = f"{where}, image {name!r}"
+    checked_place(np.array(translation), where)
+    camera_from_world = rigid(np.array(quaternion), np.array(translation), where)
     return ModelImage(name, camera, invert(camera_from_world))
 
 
