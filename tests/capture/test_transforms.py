@@ -73,7 +73,8 @@ def test_a_camera_angle_alone_gives_the_focal_length(root: Path) -> None:
         ({"camera_model": "OPENCV", "k1": 0.1, "k3": 0.3, "p2": 2e-3}, OPENCV, (0.1, 0.0, 0.0, 2e-3, 0.3)),
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4}, FISHEYE, (0.1, 0.2, 0.3, 0.4)),
         ({"is_fisheye": True, "k1": 0.1}, FISHEYE, (0.1, 0.0, 0.0, 0.0)),
-        ({"camera_model": "PINHOLE", "k1": 0.1}, PINHOLE, ()),
+        ({"camera_model": "PINHOLE", "k1": 0.1}, OPENCV, (0.1, 0.0, 0.0, 0.0)),
+        ({"camera_model": "PINHOLE", "k1": 0.0, "k4": 0}, PINHOLE, ()),
         ({"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0}, PINHOLE, ()),
     ],
 )
@@ -81,6 +82,16 @@ def test_lenses(root: Path, fields: dict[str, Any], lens: str, distortion: tuple
     edit(root, lambda data: data.update(fields))
     intrinsics = read_transforms(root).frames[0].intrinsics
     assert (intrinsics.lens, intrinsics.distortion) == (lens, distortion)
+
+
+def test_a_pinhole_with_lens_coefficients_is_told(root: Path) -> None:
+    edit(root, lambda data: data.update(camera_model="SIMPLE_PINHOLE", k1=0.1))
+    assert read_transforms(root).warnings == (
+        "5 pictures with a PINHOLE camera and lens coefficients (k1, …), which are applied as in nerfstudio; "
+        "remove them from the json if the pictures are undistorted already",
+    )
+    edit(root, lambda data: data.update(camera_model="OPENCV"))
+    assert read_transforms(root).warnings == ()
 
 
 def test_names_without_suffix_and_with_backslashes(root: Path) -> None:

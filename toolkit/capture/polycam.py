@@ -35,11 +35,9 @@ LENS = ("fx", "fy", "cx", "cy", "width", "height")
 def _folders(path: Path) -> tuple[Path, Path] | None:
     """Where the pictures and the cameras lie; `path` is what was exported, or its `keyframes/`."""
     root = path if path.name == KEYFRAMES else path / KEYFRAMES
-    for prefix in (BETTER, ""):
-        images, cameras = root / f"{prefix}images", root / f"{prefix}cameras"
-        if images.is_dir() and cameras.is_dir() and files_in(cameras, "*.json"):
-            return images, cameras
-    return None
+    pairs = [(root / f"{prefix}images", root / f"{prefix}cameras") for prefix in (BETTER, "")]
+    usable = [(images, cameras) for images, cameras in pairs if images.is_dir() and cameras.is_dir() and files_in(cameras, "*.json")]
+    return next((pair for pair in usable if pictures_in(pair[0])), usable[0] if usable else None)
 
 
 def looks_like_polycam(path: Path) -> bool:

@@ -29,6 +29,7 @@ class _Tally:
     depth_missing: int = 0
     mask_missing: int = 0
     scaled: int = 0
+    bent: int = 0
     alpha: bool = False
     files: list[Path] = field(default_factory=list)
 
@@ -42,7 +43,7 @@ class _Tally:
             out.append(f"{counted(self.mask_missing, 'listed mask')} not found")
         if self.scaled:
             out.append(f"{counted(self.scaled, 'picture')} of another size than the json tells; intrinsics were scaled to fit")
-        return out
+        return out + nerf_json.bent_remarks(self.bent)
 
 
 def looks_like_transforms(path: Path) -> bool:
@@ -97,6 +98,7 @@ def _frame(root: Path, data: dict[str, Any], entry: dict[str, Any], index: int, 
     described = nerf_json.picture_camera(data, entry, header.size, where)
     intrinsics = fitted(described, header.size, where)
     tally.scaled += intrinsics is not described
+    tally.bent += described.distorted and nerf_json.says_pinhole(data, entry)
     tally.alpha |= header.alpha
     tally.files.append(image)
     depth, depth_intrinsics = None, None
