@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import os
 import re
 import shlex
 import sys
 import traceback
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -20,6 +22,7 @@ from toolkit.files import read_json, remove, write_json
 
 LOCK = ".lock"
 RUN = "run.json"
+ATTEMPTS = 10  # to lock a folder that another command is removing
 STAGES = "stages"
 ERROR_LOG = "error.log"
 SUBFOLDERS = (STAGES, "frames", "sparse", "renders", "tsdf", "stereo", "tsdf_stereo", "compare", "tradeoff", "exports")
@@ -72,15 +75,17 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path.absolute()
         self._lock: IO[str] | None = None
+        self._made: list[Path] = []  # folders that were not there before, the innermost first
+        self._held_run = False
 
     def __truediv__(self, name: str) -> Path:
         return self.path / name
 
     def __enter__(self) -> RunFolder:
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            self._lock = (self.path / LOCK).open("a", encoding="utf-8")
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._made = [place for place in (self.path, *self.path.parents) if not place.exists()]
+            self._take_lock()
+            self._held_run = is_run_folder(self.path)
             self._check_ours()
             self._remove_leftovers()
             remove(self.path / ERROR_LOG)
@@ -102,13 +107,48 @@ class RunFolder:
                     ) from error
                 self._log(error)
         finally:
+            if isinstance(error, InputError):
+                self._take_back()
             self._unlock()
+
+    def _take_lock(self) -> None:
+        """Make the folder and lock it.
+
+        A command that was refused may be removing both (`_take_back`): then what was locked is no longer the file in the folder.
+
+        Raises:
+            BlockingIOError: another command holds the lock.
+        """
+        for _ in range(ATTEMPTS):
+            self.path.mkdir(parents=True, exist_ok=True)
+            with suppress(FileNotFoundError):  # gone again
+                self._lock = (self.path / LOCK).open("a", encoding="utf-8")
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if os.path.samestat(os.fstat(self._lock.fileno()), (self.path / LOCK).stat()):
+                    return
+            self._unlock()
+        raise BlockingIOError
+
+    def _take_back(self) -> None:
+        """Remove what says that a run is here, and folders made for it, where the input was refused before anything else was written."""
+        if self._held_run:
+            return
+        with suppress(OSError):  # the refusal is what has to be told
+            if not self._results():
+                remove(self.path / RUN)
+                remove(self.path / LOCK)  # still held: whoever opened it in between sees that it is gone
+                for place in self._made:
+                    place.rmdir()  # never one that holds something
+
+    def _results(self) -> list[str]:
+        """Names of a run's files and folders that are there, `run.json` aside."""
+        return [name for name in (*SUBFOLDERS, *FILES) if (self.path / name).exists()]
 
     def _check_ours(self) -> None:
         """A folder with files of the same names as a run's, but without a run in it, is somebody's data."""
-        if is_run_folder(self.path):
+        if self._held_run:
             return
-        foreign = [name for name in (*SUBFOLDERS, *FILES) if (self.path / name).exists()]
+        foreign = self._results()
         if foreign:
             self._unlock()
             remove(self.path / LOCK)

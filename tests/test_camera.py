@@ -278,6 +278,16 @@ def test_unusable_poses(pose: Array, text: str) -> None:
         checked_pose(pose, "frame 7")
 
 
+@pytest.mark.parametrize("far", [1e200, -1e13])
+def test_a_pose_astronomically_far_away_is_refused(far: float) -> None:
+    pose = np.eye(4)
+    pose[1, 3] = far
+    with pytest.raises(InputError, match=r"frame 7: the pose's translation is .*further than 1e\+12"):
+        checked_pose(pose, "frame 7")
+    pose[1, 3] = -6.4e9  # millimetres from the middle of the earth
+    np.testing.assert_array_equal(checked_pose(pose, "frame 7"), pose)
+
+
 # ---------------------------------------------------------------------------------------------------- similarities
 
 

@@ -138,6 +138,18 @@ def test_paths_that_lead_outside_are_refused(tmp_path: Path, name: str) -> None:
         inside(root, name)
 
 
+def test_links_that_lead_outside_are_told_as_links(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "a.jpg").write_text("a")
+    (tmp_path / "in" / "a.jpg").symlink_to(tmp_path / "a.jpg")
+    (tmp_path / "in" / "folder").symlink_to(tmp_path)
+    for name in ("a.jpg", "folder/a.jpg"):
+        with pytest.raises(InputError, match=rf"'{name}' is a link, .* leads outside the capture folder .*: copy there what it links to"):
+            inside(tmp_path / "in", name)
+    (tmp_path / "in" / "b.jpg").symlink_to(tmp_path / "in" / "c.jpg")
+    assert inside(tmp_path / "in", "b.jpg") == tmp_path / "in" / "c.jpg"
+
+
 def test_links_in_a_circle_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a").symlink_to(tmp_path / "b")
     (tmp_path / "b").symlink_to(tmp_path / "a")

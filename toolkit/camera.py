@@ -24,6 +24,7 @@ PINHOLE = "pinhole"
 OPENCV = "opencv"  # k1, k2, p1, p2[, k3[, k4, k5, k6]] as in OpenCV
 FISHEYE = "fisheye"  # k1, k2, k3, k4 of OpenCV's equidistant model
 LENSES = (PINHOLE, OPENCV, FISHEYE)
+FARTHEST = 1e12  # of a camera from the origin, in any unit: geocentric millimetres stay below 1e10
 RIGID = 1e-14  # how far RᵀR of a rotation in float64 is from the identity by rounding alone
 
 
@@ -80,6 +81,29 @@ class Intrinsics:
         if len(self.distortion) > most and any(self.distortion[most:]):
             given = len(self.distortion)
             raise InputError(f"{where}: the lens model {self.lens!r} takes at most {most} coefficients, here are {given}; correct them")
+        return self
+
+    def centred(self, where: str, slack: float = 0.0) -> Intrinsics:
+        """Self, when its principal point lies in the picture, or at most `slack` of a side outside it.
+
+        Not part of `checked`: what was cut out of a larger picture may have it elsewhere. Read from a file, such a point mostly tells
+        that the intrinsics are for pictures of another size.
+
+        Raises:
+            InputError: naming `where` the camera came from, and what is probably wrong.
+        """
+        point = f"{where}: the principal point ({self.cx:g}, {self.cy:g})"
+        if abs(self.cx) < 2 and abs(self.cy) < 2 and min(self.width, self.height) >= 16:
+            raise InputError(
+                f"{point} lies in the corner of the {self.width}×{self.height} picture; the intrinsics seem to be shares of the picture's "
+                "size: give them in pixels"
+            )
+        across, down = self.cx / self.width, self.cy / self.height
+        if not (-slack <= across <= 1 + slack and -slack <= down <= 1 + slack):
+            raise InputError(
+                f"{point} lies outside the {self.width}×{self.height} picture; the intrinsics are probably for pictures of another size: "
+                "give these, or intrinsics for the size at hand"
+            )
         return self
 
     def to_dict(self) -> dict[str, Any]:
@@ -206,7 +230,7 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     What is rigid to the last digits stays as it is: a pose that was written and read back is the same pose.
 
     Raises:
-        InputError: wrong shape, not finite, singular, mirrored or not rigid (beyond `tolerance`).
+        InputError: wrong shape, not finite, singular, mirrored, not rigid (beyond `tolerance`) or astronomically far away.
     """
     try:
         pose = np.asarray(pose, dtype=np.float64)
@@ -229,6 +253,7 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
         )
     if not off <= tolerance:  # NaN, too
         raise InputError(f"{where}: the pose is not rigid (its rotation is scaled or sheared by more than {tolerance:g}); correct it")
+    checked_place(pose[:3, 3], where)
     out = np.eye(4)
     if off > RIGID:
         u, _, vt = np.linalg.svd(rotation)
@@ -236,6 +261,19 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     out[:3, :3] = rotation
     out[:3, 3] = pose[:3, 3]
     return out
+
+
+def checked_place(place: Array, where: str) -> None:
+    """Look at the translation (3,) of a pose, or of its inverse: what is astronomically far leaves no digits for all else.
+
+    Raises:
+        InputError: further than `FARTHEST` from the origin.
+    """
+    farthest = float(np.abs(place).max())
+    if not farthest <= FARTHEST:
+        raise InputError(
+            f"{where}: the pose's translation is {farthest:g}, further than {FARTHEST:g} from the origin; remove this frame or correct it"
+        )
 
 
 @dataclass(frozen=True)

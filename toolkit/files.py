@@ -71,7 +71,7 @@ def read_json(path: Path | str, max_bytes: int = MAX_JSON_BYTES) -> Any:
         if size > max_bytes:
             most = f"{max_bytes / 2**20:.0f} MB"
             raise InputError(f"{path} holds {size / 2**20:.0f} MB of JSON, more than the {most} that is read; remove what is not needed")
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))  # with or without the mark that Windows' programs put first
     except RecursionError as error:
         raise InputError(f"{path} is nested too deeply to be read as JSON; check how it was written") from error
     except ValueError as error:  # not JSON, not UTF-8, or a number of thousands of digits
@@ -93,6 +93,11 @@ def inside(root: Path, relative: str) -> Path:
         raise InputError(f"the path {brief(repr(relative))} listed in {root} is not usable ({first_line(error)})") from error
     if _circular(resolved):
         raise InputError(f"the path {brief(repr(relative))} listed in {root} is not usable (its links lead in a circle)")
+    if not resolved.is_relative_to(root) and Path(os.path.normpath(root / relative)).is_relative_to(root):
+        raise InputError(
+            f"{brief(repr(relative))} is a link, or lies in a linked folder, that leads outside the capture folder {root}; only files "
+            "inside it are read: copy there what it links to"
+        )
     if not resolved.is_relative_to(root):
         raise InputError(f"the path {brief(repr(relative))} leads outside the capture folder {root}; only files inside it are read")
     return resolved

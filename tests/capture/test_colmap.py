@@ -138,6 +138,60 @@ def test_smaller_pictures_scale_the_camera(tmp_path: Path) -> None:
     assert "scaled to fit" in capture.warnings[0]
 
 
+def rename_images(root: Path, new: str) -> None:
+    path = root / "sparse/0/images.txt"
+    path.write_text(re.sub(r"view (\d)\.png", lambda found: new.format(found[1]), path.read_text()))
+
+
+@pytest.mark.parametrize("name", ["view_{}.png", "of_day_1/view_{}.png", "of_day_1\\view_{}.png", "of day 1\\view {}.png"])
+def test_names_as_other_programs_write_them(tmp_path: Path, name: str) -> None:
+    write_colmap_txt(tmp_path)
+    rename_images(tmp_path, name)
+    if "day" in name:
+        (tmp_path / "images").rename(tmp_path / "pictures")
+        (tmp_path / "images").mkdir()
+        (tmp_path / "pictures").rename(tmp_path / "images/of day  1")
+        if " " in name:
+            (tmp_path / "images/of day  1").rename(tmp_path / "images/of day 1")
+    capture = open_capture(tmp_path)
+    assert pixel_error(capture, eyes(), OFF_CENTRE) < 1e-3
+    assert capture.warnings == ()
+
+
+def test_an_underscore_stands_for_a_space_only_where_one_picture_fits(tmp_path: Path) -> None:
+    write_colmap_txt(tmp_path)
+    rename_images(tmp_path, "view_{}.png")
+    shutil.copy(tmp_path / "images/view 1.png", tmp_path / "images/view  1.png")
+    (tmp_path / "images/view 2.png").rename(tmp_path / "images/view_2.png")
+    shutil.copy(tmp_path / "images/view_2.png", tmp_path / "images/view 2.png")
+    capture = open_capture(tmp_path)
+    assert [frame.image.name for frame in capture.frames] == ["view 0.png", "view 3.png", "view 4.png", "view_2.png"]
+    assert capture.extra["missing"] == 1
+    path = tmp_path / "sparse/0/images.txt"
+    path.write_text(path.read_text().replace("view_0.png", "view 3.png"))  # named as it is: not another image's
+    assert [frame.image.name for frame in open_capture(tmp_path).frames] == ["view 3.png", "view 4.png", "view_2.png"]
+
+
+def test_a_link_among_names_with_spaces_leads_nowhere_else(tmp_path: Path) -> None:
+    write_colmap_txt(tmp_path / "in")
+    rename_images(tmp_path / "in", "view_{}.png")
+    (tmp_path / "in/images/view 0.png").rename(tmp_path / "other.png")
+    (tmp_path / "in/images/view 0.png").symlink_to(tmp_path / "other.png")
+    with pytest.raises(InputError, match="outside the capture folder"):
+        open_capture(tmp_path / "in")
+
+
+def test_a_principal_point_far_outside_is_refused(tmp_path: Path) -> None:
+    """Just beside it is well: pictures are cropped."""
+    write_colmap_txt(tmp_path)
+    path = tmp_path / "sparse/0/cameras.txt"
+    path.write_text("7 PINHOLE 80 60 71 73 100 27.5\n")
+    assert open_capture(tmp_path).frames[0].intrinsics.cx == 100
+    path.write_text("7 PINHOLE 80 60 71 73 169 110\n")
+    with pytest.raises(InputError, match=r"cameras\.txt, camera 7: the principal point \(169, 110\) lies outside the 80×60 picture"):
+        open_capture(tmp_path)
+
+
 def test_a_name_that_leads_outside_is_refused(tmp_path: Path) -> None:
     write_colmap_txt(tmp_path)
     path = tmp_path / "sparse/0/images.txt"
@@ -184,7 +238,7 @@ def test_broken_text_is_refused(tmp_path: Path, name: str, old: str, new: str, m
         open_capture(tmp_path)
 
 
-@pytest.mark.parametrize("numbers", ["0 0 0 0 1 2 3", "nan 0 0 0 1 2 3", "1 0 0 0 inf 2 3"])
+@pytest.mark.parametrize("numbers", ["0 0 0 0 1 2 3", "1 0 0 0 1e200 2 3", "nan 0 0 0 1 2 3", "1 0 0 0 inf 2 3"])
 def test_poses_that_are_none(tmp_path: Path, numbers: str) -> None:
     write_colmap_txt(tmp_path)
     path = tmp_path / "sparse/0/images.txt"

@@ -8,10 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.capture.layouts import LAYOUTS, true_eyes, write_colmap_bin, write_llff, write_seven_scenes, write_transforms
+from tests.capture.films import film
+from tests.capture.layouts import EIGHTH_525, LAYOUTS, true_eyes, write_colmap_bin, write_llff, write_seven_scenes, write_transforms
 from tests.capture.made import colour_difference, eyes, pixel_error, render, reprojection, save_picture
 from toolkit.camera import Intrinsics
 from toolkit.capture import open_capture
+from toolkit.capture.checks import check_capture
 from toolkit.capture.detect import READERS, detect_kind
 from toolkit.capture.images import load_image
 from toolkit.capture.listing import fitted, natural_key, unique_names
@@ -98,6 +100,27 @@ def test_a_folder_with_one_video_is_that_video(tmp_path: Path) -> None:
         open_capture(tmp_path)
 
 
+def test_one_picture_beside_a_video_is_its_cover(tmp_path: Path) -> None:
+    film(tmp_path / "clip.mp4", [render(eye, EIGHTH_525)[0] for eye in eyes()], fps=10)
+    save_picture(tmp_path / "cover.jpg", render(eyes()[0], EIGHTH_525)[0])
+    capture = check_capture(open_capture(tmp_path))
+    assert (capture.kind, len(capture.frames)) == ("video", 5)
+    assert capture.warnings == ("the video clip.mp4 is used; the one picture beside it, cover.jpg, is left out",)
+    (tmp_path / "second.mp4").write_bytes((tmp_path / "clip.mp4").read_bytes())
+    with pytest.raises(InputError, match="2 videos"):
+        open_capture(tmp_path)
+    save_picture(tmp_path / "photo.jpg", render(eyes()[1], EIGHTH_525)[0])
+    assert open_capture(tmp_path).kind == "photos"
+
+
+@pytest.mark.parametrize("name", ["one.jpg", "ONE.PNG", "one.heic", "one.CR2"])
+def test_one_picture_is_no_capture(tmp_path: Path, name: str) -> None:
+    save_picture(tmp_path / "one.jpg", render(eyes()[0], EIGHTH_525)[0])
+    (tmp_path / "one.jpg").rename(tmp_path / name)
+    with pytest.raises(InputError, match=rf"{name} is one picture, .*; give the folder"):
+        open_capture(tmp_path / name)
+
+
 def test_nothing_there_is_said_in_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
         open_capture(tmp_path / "absent")
@@ -124,6 +147,23 @@ def test_a_cropped_picture_does_not_pass_as_a_resized_one(tmp_path: Path, layout
     save_picture(victim, np.zeros((60, 50, 3), np.uint8))
     with pytest.raises(InputError):
         open_capture(tmp_path)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_what_macos_leaves_beside_files_is_not_read(tmp_path: Path, layout: str) -> None:
+    LAYOUTS[layout][1](tmp_path)
+    for path in [path for path in tmp_path.rglob("*") if path.is_file()]:
+        path.with_name(f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    capture = open_capture(tmp_path)
+    assert (capture.kind, len(capture.frames)) == (LAYOUTS[layout][0], len(eyes()))
+
+
+@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name not in ("colmap bin", "llff", "dtu")])  # these have no text
+def test_text_with_the_mark_that_windows_writes_first(tmp_path: Path, layout: str) -> None:
+    camera = LAYOUTS[layout][1](tmp_path)
+    for path in [path for path in tmp_path.rglob("*") if path.suffix in (".json", ".txt", ".csv", ".log")]:
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    assert pixel_error(open_capture(tmp_path), true_eyes(layout), camera) < 1e-3
 
 
 def test_sequences_in_folders_are_read_together(tmp_path: Path) -> None:

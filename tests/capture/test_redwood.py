@@ -122,3 +122,11 @@ def test_living_room() -> None:
     capture = open_capture(shared_data("redwood_livingroom1"))
     assert (capture.kind, len(capture.frames), capture.depth_scale) == ("redwood", 105, 1000)
     assert (capture.frames[0].intrinsics.cx, capture.frames[0].intrinsics.cy) == (320, 240)
+
+
+def test_a_principal_point_outside_the_picture(tmp_path: Path) -> None:
+    write_redwood(tmp_path)
+    camera = {"width": 80, "height": 60, "fx": 71, "fy": 73, "cx": 169, "cy": 110}
+    (tmp_path / "camera_intrinsics.json").write_text(json.dumps(camera))
+    with pytest.raises(InputError, match=r"camera_intrinsics\.json.*outside the 80×60 picture"):
+        open_capture(tmp_path)

@@ -73,7 +73,8 @@ def test_a_camera_angle_alone_gives_the_focal_length(root: Path) -> None:
         ({"camera_model": "OPENCV", "k1": 0.1, "k3": 0.3, "p2": 2e-3}, OPENCV, (0.1, 0.0, 0.0, 2e-3, 0.3)),
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4}, FISHEYE, (0.1, 0.2, 0.3, 0.4)),
         ({"is_fisheye": True, "k1": 0.1}, FISHEYE, (0.1, 0.0, 0.0, 0.0)),
-        ({"camera_model": "PINHOLE", "k1": 0.1}, PINHOLE, ()),
+        ({"camera_model": "PINHOLE", "k1": 0.1}, OPENCV, (0.1, 0.0, 0.0, 0.0)),
+        ({"camera_model": "PINHOLE", "k1": 0.0, "k4": 0}, PINHOLE, ()),
         ({"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0}, PINHOLE, ()),
     ],
 )
@@ -81,6 +82,16 @@ def test_lenses(root: Path, fields: dict[str, Any], lens: str, distortion: tuple
     edit(root, lambda data: data.update(fields))
     intrinsics = read_transforms(root).frames[0].intrinsics
     assert (intrinsics.lens, intrinsics.distortion) == (lens, distortion)
+
+
+def test_a_pinhole_with_lens_coefficients_is_told(root: Path) -> None:
+    edit(root, lambda data: data.update(camera_model="SIMPLE_PINHOLE", k1=0.1))
+    assert read_transforms(root).warnings == (
+        "5 pictures with a PINHOLE camera and lens coefficients (k1, …), which are applied as in nerfstudio; "
+        "remove them from the json if the pictures are undistorted already",
+    )
+    edit(root, lambda data: data.update(camera_model="OPENCV"))
+    assert read_transforms(root).warnings == ()
 
 
 def test_names_without_suffix_and_with_backslashes(root: Path) -> None:
@@ -106,6 +117,17 @@ def test_listed_files_that_do_not_exist_are_counted(root: Path) -> None:
         path.unlink()
     with pytest.raises(InputError, match="none of the 5 pictures"):
         read_transforms(root)
+
+
+def test_intrinsics_for_larger_pictures_need_their_size(root: Path) -> None:
+    larger = {"fl_x": 2 * 71.0, "fl_y": 2 * 73.0, "cx": 2 * 42.25, "cy": 2 * 27.5}
+    edit(root, lambda data: data.update(larger, w=160, h=120))
+    assert pixel_error(read_transforms(root), eyes(), OFF_CENTRE) < 1e-3
+    edit(root, lambda data: (data.pop("w"), data.pop("h")))
+    with pytest.raises(InputError, match="2 times as large"):
+        read_transforms(root)
+    edit(root, lambda data: data.update(fl_x=71.0, fl_y=73.0, cx=70.0, cy=27.5))  # far from the centre, and no size explains it
+    assert read_transforms(root).frames[0].intrinsics.cx == 70
 
 
 def test_smaller_pictures_scale_the_camera_and_say_so(root: Path) -> None:
@@ -168,6 +190,27 @@ def test_masks_splits_and_points(root: Path) -> None:
         read_transforms(root)
 
 
+@pytest.mark.parametrize("spelling", ["images/{}", "./images/{}", "images\\{}", "images//../images/{}"])
+def test_splits_in_other_spellings(root: Path, spelling: str) -> None:
+    def change(data: dict) -> None:
+        names = [spelling.format(f"{index:04d}.png") for index in range(5)]
+        data.update(train_filenames=names[:3], test_filenames=names[3:], val_filenames=[])
+
+    edit(root, change)
+    capture = read_transforms(root)
+    assert [frame.split for frame in capture.frames] == ["train"] * 3 + ["test"] * 2
+    assert capture.warnings == ()
+
+
+def test_a_split_that_names_no_frame_is_told(root: Path) -> None:
+    edit(root, lambda data: data.update(train_filenames=["a.png"], test_filenames=["b.png"], val_filenames=["images/0001.png"]))
+    capture = read_transforms(root)
+    assert [frame.split for frame in capture.frames] == [None, "test", None, None, None], "validation stands in for a missing test"
+    assert capture.warnings == tuple(
+        f"'{split}_filenames' of transforms.json names none of its frames and is left out of account" for split in ("train", "test")
+    )
+
+
 def test_pictures_with_alpha(root: Path) -> None:
     assert not read_transforms(root).alpha
     cv2.imwrite(str(root / "images/0002.png"), np.zeros((60, 80, 4), np.uint8))
@@ -194,6 +237,7 @@ def first(data: dict) -> dict:
         (lambda d: first(d).pop("transform_matrix"), "no 'transform_matrix'"),
         (lambda d: first(d)["transform_matrix"][0].pop(), "not a 4×4 matrix"),
         (lambda d: first(d).update(transform_matrix=[[1, 0], [0, 1]]), "shape"),
+        (lambda d: first(d)["transform_matrix"][0].__setitem__(3, 1e200), r"frame 0 .*translation is 1e\+200"),
         (lambda d: first(d).update(transform_matrix=[["a"] * 4] * 4), "not a 4×4 matrix"),
         (lambda d: first(d).update(transform_matrix=[[float("nan")] * 4] * 4), r"frame 0 .*not finite"),
         (lambda d: first(d).update(transform_matrix=[[0.0] * 4] * 4), r"frame 0 .*singular"),
@@ -206,6 +250,11 @@ def first(data: dict) -> dict:
         (lambda d: d.update(fl_x="wide"), "'fl_x' must be a finite number"),
         (lambda d: d.update(cx=float("inf")), "'cx' must be a finite number"),
         (lambda d: d.update(k1=True), "'k1' must be a finite number"),
+        (lambda d: d.update(cx=169.0, cy=110.0), r"principal point \(169, 110\) lies outside the 80×60 picture"),
+        (lambda d: d.update(cy=-1.0), "outside the 80×60 picture"),
+        (lambda d: d.update(cx=0.51, cy=0.49), "shares of the picture's size"),
+        (lambda d: (d.pop("w"), d.pop("h"), d.update(cx=2 * 42.25, cy=2 * 27.5)), "2 times as large as the 80×60 one at hand; add 'w'"),
+        (lambda d: (d.pop("w"), d.pop("h"), d.update(cx=4 * 42.25, cy=4 * 27.5)), "a picture 4 times as large"),
         (lambda d: d.update(w=1e30), "picture size"),
         (lambda d: d.update(w=-80), "picture size"),
         (lambda d: d.update(w=60, h=80), "another shape"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import re
 import resource
 import shutil
@@ -13,9 +14,11 @@ import cv2
 import numpy as np
 import pytest
 
+from pipelines.folder import RunFolder, is_run_folder
 from pipelines.render_path import read_cameras
 from tests.pipelines.made import CAMERA, Answer, call, circle, make_room, save_picture, shoot, spawn, write_transforms
-from toolkit.errors import InputError
+from toolkit.config import load_settings
+from toolkit.errors import InputError, OutputError
 
 Capsys = pytest.CaptureFixture[str]
 
@@ -192,7 +195,7 @@ def test_run_says_what_is_wrong_with_the_source(case: str, tmp_path: Path, capsy
     answer = call(capsys, "run", source, "--out", tmp_path / "out", "--quiet", "--set", "tsdf.enabled=auto")
     assert answer.code == 2, answer
     assert re.search(words, answer.sentence()), answer.err
-    assert not (tmp_path / "out" / "error.log").exists()
+    assert not (tmp_path / "out").exists(), "nothing half-written"
 
 
 def run_made(capsys: Capsys, tmp_path: Path, *arguments: object) -> Answer:
@@ -261,6 +264,49 @@ def test_out_folder_is_the_source(tmp_path: Path, capsys: Capsys) -> None:
     answer = run_made(capsys, tmp_path, "--out", tmp_path / "room")
     assert answer.code == 2
     assert "source itself" in answer.sentence()
+
+
+def test_a_refusal_leaves_folders_as_they_were(tmp_path: Path, capsys: Capsys) -> None:
+    source, mine = one_photo(tmp_path / "source"), tmp_path / "mine"
+    mine.mkdir()
+    (mine / "notes.txt").write_text("mine")
+    for out in (mine, mine / "new", mine / "deep" / "new"):
+        assert call(capsys, "run", source, "--out", out, "--quiet").code == 2
+        assert [path.name for path in mine.iterdir()] == ["notes.txt"]
+
+
+def test_a_refusal_leaves_an_earlier_run(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "out") as folder:
+        folder.start(tmp_path, load_settings())
+    with pytest.raises(InputError), RunFolder(tmp_path / "out"):
+        raise InputError("another source")
+    assert is_run_folder(tmp_path / "out")
+    (tmp_path / "new").mkdir()
+    with pytest.raises(InputError), RunFolder(tmp_path / "new") as folder:
+        folder.start(tmp_path, load_settings())
+        (folder / "frames").mkdir()
+        raise InputError("found late")
+    assert is_run_folder(tmp_path / "new"), "what was written belongs to it"
+
+
+def test_a_lock_that_was_taken_back_is_not_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another command opens the lock, a refused one removes it with its folder, and only then it is locked."""
+    folder, lock, real = tmp_path / "out", tmp_path / "out" / ".lock", fcntl.flock
+
+    def late(file: Any, how: int) -> None:
+        if not removed:
+            removed.append(lock)
+            lock.unlink()
+            folder.rmdir()
+        real(file, how)
+
+    removed: list[Path] = []
+    monkeypatch.setattr(fcntl, "flock", late)
+    with RunFolder(folder):
+        assert removed and lock.is_file()
+        with pytest.raises(OutputError, match="another fieldfuse command"), RunFolder(folder):
+            pass
+    assert lock.is_file()
 
 
 def test_out_folder_of_somebody_else(tmp_path: Path, capsys: Capsys) -> None:

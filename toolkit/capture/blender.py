@@ -32,7 +32,7 @@ def read_blender(path: Path | str) -> Capture:
     test = "test" if _json(root, "test").is_file() or not _json(root, "val").is_file() else "val"
     files: list[Path] = []
     frames: list[Frame] = []
-    listed, scaled, alpha = 0, 0, False
+    listed, scaled, bent, alpha = 0, 0, 0, False
     for split, source in (("train", "train"), ("test", test)):
         json_path = _json(root, source)
         if split == "test" and not json_path.is_file():
@@ -45,9 +45,10 @@ def read_blender(path: Path | str) -> Capture:
             if image is None:
                 continue
             header = picture_header(image)
-            described = nerf_json.camera(data, entry, header.size, where)
+            described = nerf_json.picture_camera(data, entry, header.size, where)
             intrinsics = fitted(described, header.size, where)
             scaled += intrinsics is not described
+            bent += described.distorted and nerf_json.says_pinhole(data, entry)
             alpha |= header.alpha
             files.append(image)
             frames.append(Frame(name="", image=image, intrinsics=intrinsics, world_from_camera=nerf_json.pose(entry, where), split=split))
@@ -57,5 +58,6 @@ def read_blender(path: Path | str) -> Capture:
     warnings = [f"{missing} of the {listed} listed pictures do not exist; the other {len(frames)} are used"] if missing else []
     if scaled:
         warnings.append(f"{counted(scaled, 'picture')} of another size than the json tells; intrinsics were scaled to fit")
+    warnings += nerf_json.bent_remarks(bent)
     named = [replace(frame, name=name) for frame, name in zip(frames, unique_names(files), strict=True)]
     return assemble("blender", root, named, warnings, alpha=alpha, up=(0.0, 0.0, 1.0), extra={"listed": listed, "missing": missing})

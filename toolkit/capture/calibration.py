@@ -5,11 +5,12 @@ Sensors are calibrated with OpenCV or Open3D, whose pixel centres are whole numb
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from toolkit.camera import Array, Intrinsics
-from toolkit.capture.listing import read_matrix, read_object
+from toolkit.capture.listing import fitted, read_matrix, read_object
 from toolkit.capture.nerf_json import MAX_SIDE, number
 from toolkit.errors import InputError
 
@@ -21,6 +22,7 @@ def sensor(width: int, height: int, fx: float, fy: float, cx: float, cy: float) 
     return Intrinsics(width, height, fx, fy, cx + 0.5, cy + 0.5)
 
 
+CENTRAL = 0.25  # how far twice the principal point of a sensor may lie from its picture's size, as a share of that
 PRIMESENSE = sensor(640, 480, 525.0, 525.0, 319.5, 239.5)  # default of Open3D and of ROS
 
 
@@ -45,6 +47,25 @@ def read_matrix_file(path: Path, width: int, height: int, shift: float = 0.5) ->
         InputError: not such a file.
     """
     return from_matrix(read_matrix(path, (3, 3), (4, 4), (3, 4)), width, height, str(path), shift)
+
+
+def read_matrix_for(path: Path, size: tuple[int, int], usual: tuple[int, int], shift: float = 0.5) -> tuple[Intrinsics, bool]:
+    """The camera in such a file for pictures of `size` (width, height), and whether it had to be scaled from the sensor's `usual` size.
+
+    The file does not say which of the two it is for; the size does whose centre is nearer to the principal point.
+
+    Raises:
+        InputError: not such a file, for pictures of another shape, or with a principal point outside the picture.
+    """
+    camera = read_matrix_file(path, *size, shift)
+    whole = replace(camera, width=usual[0], height=usual[1])
+    scaled = size != usual and _off_centre(whole) < min(_off_centre(camera), CENTRAL)
+    return (fitted(whole, size, str(path)) if scaled else camera).centred(str(path)), scaled
+
+
+def _off_centre(camera: Intrinsics) -> float:
+    """How far twice the principal point lies from the picture's size, as a share of it."""
+    return max(abs(2 * camera.cx / camera.width - 1), abs(2 * camera.cy / camera.height - 1))
 
 
 def find_json(root: Path) -> tuple[Intrinsics, dict[str, Any]] | None:
@@ -75,4 +96,4 @@ def find_json(root: Path) -> tuple[Intrinsics, dict[str, Any]] | None:
     fx, fy, cx, cy = values
     if fx is None or fy is None or cx is None or cy is None:
         raise InputError(f"{where} must hold 'fx', 'fy', 'cx', 'cy' or an 'intrinsic_matrix'; correct it")
-    return sensor(round(width), round(height), fx, fy, cx, cy).checked(where), data
+    return sensor(round(width), round(height), fx, fy, cx, cy).checked(where).centred(where), data

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from toolkit import files
 from toolkit.capture.colmap_model import Model, holds_model, read_model
+from toolkit.capture.colmap_names import locate
 from toolkit.capture.listing import (
     assemble,
     counted,
     fitted,
-    is_file,
     natural_key,
     picture_header,
     pictures_in,
@@ -93,7 +92,7 @@ def _locate(root: Path, model: Model) -> tuple[dict[int, Path], list[int]]:
     """Image index → its file, from the folder that holds most of them; and the indices that were found."""
     best: dict[int, Path] = {}
     for folder in image_folders(root):
-        found = {index: path for index, entry in enumerate(model.images) if is_file(path := files.inside(folder, entry.name))}
+        found = locate(folder, [entry.name for entry in model.images])
         if len(found) > len(best):
             best = found
     if not best:

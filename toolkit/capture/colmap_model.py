@@ -14,13 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, invert
+from toolkit.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, checked_place, invert
 from toolkit.capture.listing import read_text
 from toolkit.capture.quaternion import rigid
 from toolkit.errors import InputError, first_line
 
 MAX_TEXT = 2**30
 MAX_SIDE = 1_000_000
+BESIDE = 0.5  # of a picture's side by which a principal point may lie outside: pictures may have been cropped once their camera was known
 # number, name, parameters
 MODELS = (
     (0, "SIMPLE_PINHOLE", 3),
@@ -123,13 +124,15 @@ def intrinsics_of(model: str, width: int, height: int, values: list[float], wher
     fx, fy, cx, cy, *lens = head
     if LENS_OF[model] != PINHOLE:
         lens += [0.0] * (4 - len(lens))
-    return Intrinsics(width, height, fx, fy, cx, cy, LENS_OF[model], tuple(lens)).checked(where)
+    return Intrinsics(width, height, fx, fy, cx, cy, LENS_OF[model], tuple(lens)).checked(where).centred(where, BESIDE)
 
 
 def _image(name: str, camera: int, quaternion: list[float], translation: list[float], where: str) -> ModelImage:
     if not np.isfinite(translation).all():
         raise InputError(f"{where}: the pose of {name!r} holds a value that is not finite; remove this image from the model")
-    camera_from_world = rigid(np.array(quaternion), np.array(translation), f"{where}, image {name!r}")
+    where = f"{where}, image {name!r}"
+    checked_place(np.array(translation), where)
+    camera_from_world = rigid(np.array(quaternion), np.array(translation), where)
     return ModelImage(name, camera, invert(camera_from_world))
 
 

@@ -8,20 +8,21 @@ The order is deliberate: what somebody wrote for this very purpose goes before w
 4. DTU's `cameras*.npz`;
 5. a COLMAP model before LLFF's `poses_bounds.npy`: sets that have both keep lens and points only in the model, but only
    when its pictures are there (sets at 1/8 size often come without them);
-6. photos; 7. one video alone in a folder.
+6. photos; 7. one video in a folder, alone or with one picture (its cover).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from toolkit.capture.blender import looks_like_blender, read_blender
 from toolkit.capture.colmap import image_folders, looks_like_colmap, read_colmap
 from toolkit.capture.dtu import looks_like_dtu, read_dtu
-from toolkit.capture.listing import counted, pictures_in, require_folder
+from toolkit.capture.listing import PICTURES, counted, pictures_in, require_folder
 from toolkit.capture.llff import looks_like_llff, read_llff
-from toolkit.capture.photos import looks_like_photos, read_photos
+from toolkit.capture.photos import looks_like_photos, photo_files, read_photos
 from toolkit.capture.polycam import looks_like_polycam, read_polycam
 from toolkit.capture.redwood import looks_like_redwood, read_redwood
 from toolkit.capture.scannet import looks_like_scannet, read_scannet
@@ -42,6 +43,11 @@ def _colmap_without_llff(path: Path) -> bool:
     return not looks_like_llff(path) or any(pictures_in(folder) for folder in image_folders(path))
 
 
+def _photos_without_film(path: Path) -> bool:
+    """One picture beside a film is its cover, not a capture."""
+    return looks_like_photos(path) and (len(photo_files(path)) > 1 or not pictures_in(path, VIDEO_SUFFIXES))
+
+
 READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ...] = (
     ("transforms", looks_like_transforms, read_transforms),
     ("blender", looks_like_blender, read_blender),
@@ -54,7 +60,7 @@ READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ..
     ("dtu", looks_like_dtu, read_dtu),
     ("colmap", _colmap_without_llff, read_colmap),
     ("llff", looks_like_llff, read_llff),
-    ("photos", looks_like_photos, read_photos),
+    ("photos", _photos_without_film, read_photos),
 )
 
 
@@ -73,6 +79,8 @@ def read_source(path: Path) -> Capture:
     if path.is_file():
         if path.suffix.lower() == ".json":
             return read_blender(path.parent) if path.name.startswith("transforms_") else read_transforms(path)
+        if path.suffix.lower() in (*PICTURES, *CAMERA_RAW):
+            raise InputError(f"{path} is one picture, and one cannot show depth; give the folder that holds all of them")
         return read_video(path)
     folder = require_folder(path)
     try:
@@ -83,7 +91,10 @@ def read_source(path: Path) -> Capture:
     except OSError as error:
         raise InputError(f"cannot read {error.filename or folder}: {error.strerror or error}") from error
     if len(videos) == 1:
-        return read_video(videos[0])
+        video = read_video(videos[0])
+        beside = photo_files(folder)
+        remarks = [f"the video {videos[0].name} is used; the one picture beside it, {beside[0].name}, is left out"] if beside else []
+        return replace(video, warnings=(*video.warnings, *remarks))
     if videos:
         raise InputError(f"{folder} holds {len(videos)} videos; give one of them, for instance {videos[0]}")
     raw = pictures_in(folder, CAMERA_RAW)

@@ -71,6 +71,11 @@ def pictures_in(folder: Path, suffixes: Sequence[str] = PICTURES) -> list[Path]:
     return sorted(found, key=lambda path: natural_key(path.name))
 
 
+def files_in(folder: Path, pattern: str) -> list[Path]:
+    """Files directly in `folder` that fit the `pattern`. Hidden ones are left out, as macOS puts them beside others (`._pose.txt`)."""
+    return [path for path in folder.glob(pattern) if not path.name.startswith(".") and path.is_file()]
+
+
 def unique_names(paths: Sequence[Path]) -> list[str]:
     """A short name for each picture: its stem; with its folders, then its suffix, where stems repeat."""
     stems = [path.stem for path in paths]
@@ -155,9 +160,9 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
     try:
         if path.stat().st_size > max_bytes:
             raise InputError(f"{path} is larger than {max_bytes / 2**20:.0f} MB, too large for a text file of a capture")
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # with or without the mark that Windows' programs put first
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file; check how it was written") from error
+        raise InputError(f"{path} is not a text file in UTF-8; check how it was written") from error
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 

@@ -11,10 +11,11 @@ import numpy as np
 
 from toolkit import files
 from toolkit.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, checked_pose, world_from_opengl
-from toolkit.capture.listing import PICTURES, is_file
+from toolkit.capture.listing import PICTURES, counted, is_file
 from toolkit.errors import InputError
 
 MAX_SIDE = 1_000_000  # pixels
+SAME_FACTOR = 0.1  # how far a principal point may lie from a larger picture's centre to be taken for it
 MODELS = {
     "OPENCV": OPENCV,
     "SIMPLE_RADIAL": OPENCV,
@@ -23,8 +24,9 @@ MODELS = {
     "PERSPECTIVE": OPENCV,
     "OPENCV_FISHEYE": FISHEYE,
     "FISHEYE": FISHEYE,
-    "PINHOLE": PINHOLE,
-    "SIMPLE_PINHOLE": PINHOLE,
+    # nerfstudio and instant-ngp apply coefficients of these too, so a file that has some was made for that.
+    "PINHOLE": OPENCV,
+    "SIMPLE_PINHOLE": OPENCV,
 }
 
 
@@ -136,6 +138,42 @@ def camera(shared: Mapping[str, Any], entry: Mapping[str, Any], size: tuple[int,
     return Intrinsics(width, height, fx, fy, cx, cy, lens, distortion).checked(where)
 
 
+def picture_camera(shared: Mapping[str, Any], entry: Mapping[str, Any], size: tuple[int, int], where: str) -> Intrinsics:
+    """The same of a picture that is there, `size` (width, height) large: its principal point has to lie in it.
+
+    Raises:
+        InputError: as `camera`; the principal point lies outside, or the json seems to be for a picture of another size.
+    """
+    described = camera(shared, entry, size, where)
+    if all(data.get(key) is None for data in (shared, entry) for key in ("w", "h")):
+        # Without 'w' and 'h' nothing else tells that the pictures were made smaller since.
+        factor = round(2 * described.cx / described.width)
+        if factor >= 2 and all(
+            abs(2 * at / length / factor - 1) < SAME_FACTOR
+            for at, length in ((described.cx, described.width), (described.cy, described.height))
+        ):
+            raise InputError(
+                f"{where}: the principal point ({described.cx:g}, {described.cy:g}) is the centre of a picture {factor} times as large as "
+                f"the {described.width}×{described.height} one at hand; add 'w' and 'h', the size that the intrinsics are for"
+            )
+    return described.centred(where)
+
+
+def says_pinhole(shared: Mapping[str, Any], entry: Mapping[str, Any]) -> bool:
+    """Whether a camera model without a lens is named, whatever coefficients stand beside it."""
+    return str(entry.get("camera_model", shared.get("camera_model"))).upper() in ("PINHOLE", "SIMPLE_PINHOLE")
+
+
+def bent_remarks(count: int) -> list[str]:
+    """What to say when `count` pictures have such a camera and a lens all the same."""
+    if not count:
+        return []
+    return [
+        f"{counted(count, 'picture')} with a PINHOLE camera and lens coefficients (k1, …), which are applied as in nerfstudio; "
+        "remove them from the json if the pictures are undistorted already"
+    ]
+
+
 def _focal(focal: float | None, angle: float | None, length: int, where: str) -> float | None:
     if focal is not None:
         return focal
@@ -154,8 +192,6 @@ def _lens(shared: Mapping[str, Any], entry: Mapping[str, Any], value: Any, where
     if not isinstance(name, str) or name.upper() not in MODELS:
         raise InputError(f"{where}: the camera model {str(name)[:40]!r} is not known; undistort the pictures to PINHOLE or OPENCV first")
     k1, k2, k3, k4, k5, k6, p1, p2 = (value(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"))
-    if MODELS[name.upper()] == PINHOLE:
-        return PINHOLE, ()
     if MODELS[name.upper()] == FISHEYE:
         return FISHEYE, (k1, k2, k3, k4)
     if name.upper() == "FULL_OPENCV":

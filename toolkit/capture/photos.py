@@ -30,6 +30,11 @@ def looks_like_photos(path: Path) -> bool:
     return any(pictures_in(path / folder) for folder in FOLDERS)
 
 
+def photo_files(root: Path) -> list[Path]:
+    """The pictures of whichever of `FOLDERS` holds most."""
+    return max((pictures_in(root / folder) for folder in FOLDERS), key=len)
+
+
 def read_photos(path: Path | str) -> Capture:
     """Photos directly in the folder, or in its `images/` or `input/` (whichever holds most).
 
@@ -37,7 +42,7 @@ def read_photos(path: Path | str) -> Capture:
         InputError: missing or empty folder, no photo, or a file that is not a picture.
     """
     root = require_folder(path)
-    pictures = max((pictures_in(root / folder) for folder in FOLDERS), key=len)
+    pictures = photo_files(root)
     if not pictures:
         raise InputError(f"no photo (jpg, heic, png, webp, bmp, tif) was found in {root}; give the folder that holds them")
     pictures, remarks = _once_each(pictures)

@@ -12,7 +12,17 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.camera import Array, Intrinsics, checked_pose, world_from_opengl
-from toolkit.capture.listing import assemble, fitted, is_file, picture_header, pictures_in, read_object, require_folder, unique_names
+from toolkit.capture.listing import (
+    assemble,
+    files_in,
+    fitted,
+    is_file,
+    picture_header,
+    pictures_in,
+    read_object,
+    require_folder,
+    unique_names,
+)
 from toolkit.capture.nerf_json import MAX_SIDE, number
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
@@ -25,11 +35,9 @@ LENS = ("fx", "fy", "cx", "cy", "width", "height")
 def _folders(path: Path) -> tuple[Path, Path] | None:
     """Where the pictures and the cameras lie; `path` is what was exported, or its `keyframes/`."""
     root = path if path.name == KEYFRAMES else path / KEYFRAMES
-    for prefix in (BETTER, ""):
-        images, cameras = root / f"{prefix}images", root / f"{prefix}cameras"
-        if images.is_dir() and cameras.is_dir() and any(cameras.glob("*.json")):
-            return images, cameras
-    return None
+    pairs = [(root / f"{prefix}images", root / f"{prefix}cameras") for prefix in (BETTER, "")]
+    usable = [(images, cameras) for images, cameras in pairs if images.is_dir() and cameras.is_dir() and files_in(cameras, "*.json")]
+    return next((pair for pair in usable if pictures_in(pair[0])), usable[0] if usable else None)
 
 
 def looks_like_polycam(path: Path) -> bool:
@@ -65,10 +73,10 @@ def _frame(picture: Path, camera: Path, name: str) -> Frame:
     told: dict[str, float] = {key: value for key, value in values.items() if value is not None}
     if not (1 <= told["width"] <= MAX_SIDE and 1 <= told["height"] <= MAX_SIDE):
         raise InputError(f"{where}: the picture's size {told['width']:g}×{told['height']:g} cannot be; correct it")
-    lens = Intrinsics(round(told["width"]), round(told["height"]), told["fx"], told["fy"], told["cx"], told["cy"]).checked(where)
+    lens = Intrinsics(round(told["width"]), round(told["height"]), told["fx"], told["fy"], told["cx"], told["cy"])
     pose: Array = np.eye(4)
     pose[:3] = [[told[f"t_{row}{column}"] for column in range(4)] for row in range(3)]
-    intrinsics = fitted(lens, picture_header(picture).size, str(picture))
+    intrinsics = fitted(lens.checked(where).centred(where), picture_header(picture).size, str(picture))
     root = picture.parent.parent
     depth: Path | None = root / "depth" / f"{picture.stem}.png"
     depth = depth if depth is not None and is_file(depth) else None

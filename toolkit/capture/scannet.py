@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
-from toolkit.camera import Intrinsics, checked_pose
-from toolkit.capture.calibration import read_matrix_file, sensor
-from toolkit.capture.listing import assemble, counted, fitted, picture_header, pictures_in, read_matrix, require_folder, same_count
-from toolkit.capture.seven_scenes import FrameFiles, frame_files, frame_folders, frame_names
-from toolkit.capture.types import Capture, Frame
+from toolkit.camera import Intrinsics
+from toolkit.capture.calibration import read_matrix_for, sensor
+from toolkit.capture.listing import assemble, files_in, picture_header, pictures_in, require_folder, same_count
+from toolkit.capture.seven_scenes import FrameFiles, first_sizes, frame_files, frame_folders, frame_names, posed_frames
+from toolkit.capture.seven_scenes_cameras import INFO
+from toolkit.capture.types import Capture
 from toolkit.errors import InputError
 
 COLOUR_CAMERA = sensor(1296, 968, 1165.72, 1165.74, 647.5, 483.5)  # nominal centre
@@ -24,6 +23,8 @@ DEPTH_CAMERA = sensor(640, 480, 577.87, 577.87, 319.5, 239.5)
 def looks_like_scannet(path: Path) -> bool:
     if (path / "pose").is_dir() and (path / "color").is_dir():
         return True
+    if (path / INFO).is_file():  # BundleFusion's, which brings its cameras
+        return False
     # A sample shares its file names with 7-Scenes; there colour and depth have one size, here they differ.
     for folder in frame_folders(path):
         for colour in sorted(folder.glob("frame-*.color.*")):
@@ -43,43 +44,24 @@ def read_scannet(path: Path | str) -> Capture:
     found = _exported(root) if (root / "pose").is_dir() else frame_files(root)
     names = frame_names(found) if not (root / "pose").is_dir() else [entry.stem for entry in found]
     colour_camera, depth_camera, warnings = _cameras(root, found)
-    frames, lost = [], 0
-    for entry, name in zip(found, names, strict=True):
-        pose = read_matrix(entry.pose, (4, 4))
-        if np.isinf(pose).any():
-            lost += 1
-            continue
-        frames.append(
-            Frame(
-                name=name,
-                image=entry.colour,
-                intrinsics=fitted(colour_camera, picture_header(entry.colour).size, str(entry.colour)),
-                world_from_camera=checked_pose(pose, str(entry.pose)),
-                depth=entry.depth,
-                depth_intrinsics=None if entry.depth is None else fitted(depth_camera, picture_header(entry.depth).size, str(entry.depth)),
-            )
-        )
-    if not frames:
-        raise InputError(f"all {counted(lost, 'pose')} in {root} are -inf (tracking lost); no frame is left to use")
-    if lost:
-        warnings.append(f"{counted(lost, 'frame')} left out because tracking was lost there (pose -inf)")
+    frames, remarks = posed_frames(found, names, colour_camera, depth_camera, root)
     return assemble(
         "scannet",
         root,
         frames,
-        warnings,
+        [*warnings, *remarks],
         ordered=True,
         metric=True,
         depth_scale=1000.0,
         up=(0.0, 0.0, 1.0),
-        extra={"listed": len(found), "lost": lost},
+        extra={"listed": len(found), "lost": len(found) - len(frames)},
     )
 
 
 def _exported(root: Path) -> list[FrameFiles]:
     colours = pictures_in(root / "color")
     depths = {path.stem: path for path in pictures_in(root / "depth")}
-    poses = {path.stem: path for path in (root / "pose").glob("*.txt")}
+    poses = {path.stem: path for path in files_in(root / "pose", "*.txt")}
     same_count(len(colours), len(poses), root)
     found = []
     for colour in colours:
@@ -93,21 +75,18 @@ def _exported(root: Path) -> list[FrameFiles]:
 
 def _cameras(root: Path, found: list[FrameFiles]) -> tuple[Intrinsics, Intrinsics, list[str]]:
     """Colour and depth camera, from `intrinsic/` (or beside the frames), else the sensor's usual ones with a warning."""
-    colour_size = picture_header(found[0].colour).size
-    depth_path = next((entry.depth for entry in found if entry.depth is not None), None)
-    depth_size = picture_header(depth_path).size if depth_path is not None else (640, 480)
+    colour_size, depth_size = first_sizes(found)
     warnings = []
     cameras: list[Intrinsics] = []
-    for which, size, usual in (("color", colour_size, COLOUR_CAMERA), ("depth", depth_size, DEPTH_CAMERA)):
+    for which, size, usual in (("color", colour_size, COLOUR_CAMERA), ("depth", depth_size or (640, 480), DEPTH_CAMERA)):
         name = f"intrinsic_{which}.txt"
         file = next((path for path in (root / "intrinsic" / name, root / name) if path.is_file()), None)
         if file is None:
             cameras.append(usual)
             warnings.append(f"no {name} was found; the sensor's usual {'colour' if which == 'color' else 'depth'} camera is used")
             continue
-        camera = read_matrix_file(file, *size)
-        if camera.cx > size[0] and which == "color":  # pictures were exported smaller than the sensor's 1296×968
-            camera = fitted(read_matrix_file(file, COLOUR_CAMERA.width, COLOUR_CAMERA.height), size, str(file))
-            warnings.append(f"{name} is for {COLOUR_CAMERA.width}×{COLOUR_CAMERA.height} pictures; scaled to {size[0]}×{size[1]}")
+        camera, scaled = read_matrix_for(file, size, (usual.width, usual.height))
+        if scaled:  # pictures were exported smaller than the sensor's
+            warnings.append(f"{name} is for {usual.width}×{usual.height} pictures; scaled to {size[0]}×{size[1]}")
         cameras.append(camera)
     return cameras[0], cameras[1], warnings

@@ -2,7 +2,7 @@
 
 `pose.txt` is world_from_camera in OpenCV axes, metres; depth in millimetres, 0 and 65535 mean missing. The set ships one focal
 length, 585, which fits its depth; its colour pictures are not registered to the depth and fit 525 (both are confirmed by
-reprojection in the tests). A `camera-intrinsics.txt` replaces the depth camera.
+reprojection in the tests). Other cameras: `seven_scenes_cameras`. Frames whose tracking was lost have a pose of -inf and are dropped.
 """
 
 from __future__ import annotations
@@ -10,16 +10,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from toolkit.camera import Intrinsics, checked_pose
-from toolkit.capture.calibration import read_matrix_file
-from toolkit.capture.listing import assemble, fitted, picture_header, pictures_in, read_matrix, require_folder, same_count, unique_names
+from toolkit.capture.listing import (
+    assemble,
+    counted,
+    fitted,
+    picture_header,
+    pictures_in,
+    read_matrix,
+    require_folder,
+    same_count,
+    unique_names,
+)
+from toolkit.capture.seven_scenes_cameras import read_cameras
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
-
-# Both are nominal: the principal point is the picture's centre, so no half pixel is added.
-DEPTH_CAMERA = Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0)
-COLOUR_CAMERA = Intrinsics(640, 480, 525.0, 525.0, 320.0, 240.0)
-CAMERA_FILES = ("camera-intrinsics.txt", "camera_intrinsics.txt")
 
 
 @dataclass(frozen=True)
@@ -67,6 +74,41 @@ def frame_names(found: list[FrameFiles]) -> list[str]:
     return unique_names([entry.colour.with_name(f"{entry.stem}{entry.colour.suffix}") for entry in found])
 
 
+def posed_frames(
+    found: list[FrameFiles], names: list[str], colour: Intrinsics, depth: Intrinsics, root: Path
+) -> tuple[list[Frame], list[str]]:
+    """The frames that have a pose, and a remark on those that were lost (-inf). The cameras are scaled to the pictures' sizes.
+
+    Raises:
+        InputError: all are lost, a pose is not rigid, or a picture has another shape than its camera.
+    """
+    frames = []
+    for entry, name in zip(found, names, strict=True):
+        pose = read_matrix(entry.pose, (4, 4))
+        if np.isinf(pose).any():
+            continue
+        frames.append(
+            Frame(
+                name=name,
+                image=entry.colour,
+                intrinsics=fitted(colour, picture_header(entry.colour).size, str(entry.colour)),
+                world_from_camera=checked_pose(pose, str(entry.pose)),
+                depth=entry.depth,
+                depth_intrinsics=None if entry.depth is None else fitted(depth, picture_header(entry.depth).size, str(entry.depth)),
+            )
+        )
+    lost = len(found) - len(frames)
+    if not frames:
+        raise InputError(f"all {counted(lost, 'pose')} in {root} are -inf (tracking lost); no frame is left to use")
+    return frames, [f"{counted(lost, 'frame')} left out because tracking was lost there (pose -inf)"] if lost else []
+
+
+def first_sizes(found: list[FrameFiles]) -> tuple[tuple[int, int], tuple[int, int] | None]:
+    """Size (width, height) of the first picture, and of the first depth picture, if there is one."""
+    depth = next((entry.depth for entry in found if entry.depth is not None), None)
+    return picture_header(found[0].colour).size, None if depth is None else picture_header(depth).size
+
+
 def looks_like_seven_scenes(path: Path) -> bool:
     return any(next(folder.glob("frame-*.pose.txt"), None) is not None for folder in frame_folders(path))
 
@@ -75,24 +117,10 @@ def read_seven_scenes(path: Path | str) -> Capture:
     """RGB-D frames with poses in metres.
 
     Raises:
-        InputError: no frames, a pose is missing or not rigid, or the camera file is not usable.
+        InputError: no frames, a pose is missing or not rigid, all are lost, or the camera file is not usable.
     """
     root = require_folder(path)
     found = frame_files(root)
-    depth_camera = next((read_matrix_file(file, 640, 480, 0.0) for name in CAMERA_FILES if (file := root / name).is_file()), DEPTH_CAMERA)
-    frames = []
-    for entry, name in zip(found, frame_names(found), strict=True):
-        depth_intrinsics = None
-        if entry.depth is not None:
-            depth_intrinsics = fitted(depth_camera, picture_header(entry.depth).size, str(entry.depth))
-        frames.append(
-            Frame(
-                name=name,
-                image=entry.colour,
-                intrinsics=fitted(COLOUR_CAMERA, picture_header(entry.colour).size, str(entry.colour)),
-                world_from_camera=checked_pose(read_matrix(entry.pose, (4, 4)), str(entry.pose)),
-                depth=entry.depth,
-                depth_intrinsics=depth_intrinsics,
-            )
-        )
-    return assemble("7scenes", root, frames, ordered=True, metric=True, depth_scale=1000.0)
+    cameras = read_cameras(root, *first_sizes(found))
+    frames, remarks = posed_frames(found, frame_names(found), cameras.colour, cameras.depth, root)
+    return assemble("7scenes", root, frames, [*cameras.warnings, *remarks], ordered=True, metric=True, depth_scale=cameras.depth_scale)

@@ -8,6 +8,7 @@ Stored depth is in the earlier frame's unit: `applied_scale` is part of `depth_s
 
 from __future__ import annotations
 
+import posixpath
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ class _Tally:
     depth_missing: int = 0
     mask_missing: int = 0
     scaled: int = 0
+    bent: int = 0
     alpha: bool = False
     files: list[Path] = field(default_factory=list)
 
@@ -41,7 +43,7 @@ class _Tally:
             out.append(f"{counted(self.mask_missing, 'listed mask')} not found")
         if self.scaled:
             out.append(f"{counted(self.scaled, 'picture')} of another size than the json tells; intrinsics were scaled to fit")
-        return out
+        return out + nerf_json.bent_remarks(self.bent)
 
 
 def looks_like_transforms(path: Path) -> bool:
@@ -59,7 +61,7 @@ def read_transforms(path: Path | str) -> Capture:
     data = read_object(json_path)
     root = json_path.parent
     entries = nerf_json.frame_list(data, json_path)
-    splits = _splits(data, json_path)
+    splits, remarks = _splits(data, entries, json_path)
     tally = _Tally()
     frames = [frame for index, entry in enumerate(entries) if (frame := _frame(root, data, entry, index, splits, tally)) is not None]
     if not frames and tally.missing:
@@ -77,7 +79,7 @@ def read_transforms(path: Path | str) -> Capture:
         "transforms",
         root,
         _kept(named),
-        tally.warnings(len(entries)),
+        [*tally.warnings(len(entries)), *remarks],
         depth_scale=_depth_scale(data, applied_scale or 1.0, json_path),
         alpha=tally.alpha,
         points=_points(root, data, json_path),
@@ -93,9 +95,10 @@ def _frame(root: Path, data: dict[str, Any], entry: dict[str, Any], index: int, 
         tally.missing += 1
         return None
     header = picture_header(image)
-    described = nerf_json.camera(data, entry, header.size, where)
+    described = nerf_json.picture_camera(data, entry, header.size, where)
     intrinsics = fitted(described, header.size, where)
     tally.scaled += intrinsics is not described
+    tally.bent += described.distorted and nerf_json.says_pinhole(data, entry)
     tally.alpha |= header.alpha
     tally.files.append(image)
     depth, depth_intrinsics = None, None
@@ -119,21 +122,31 @@ def _frame(root: Path, data: dict[str, Any], entry: dict[str, Any], index: int, 
         depth=depth,
         depth_intrinsics=depth_intrinsics,
         mask=mask,
-        split=splits.get(listed),
+        split=splits.get(_plain(listed)),
     )
 
 
-def _splits(data: dict[str, Any], json_path: Path) -> dict[str, str]:
-    """nerfstudio's optional `train_filenames`, `val_filenames`, `test_filenames` → split by listed path."""
+def _splits(data: dict[str, Any], entries: list[dict[str, Any]], json_path: Path) -> tuple[dict[str, str], list[str]]:
+    """nerfstudio's optional `train_filenames`, `val_filenames`, `test_filenames` → split by path, and remarks on lists without a frame."""
     out: dict[str, str] = {}
+    remarks = []
+    listed = {_plain(entry["file_path"]) for entry in entries}
     for split in ("train", "val", "test"):
         names = data.get(f"{split}_filenames") or []
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise InputError(f"{json_path}: '{split}_filenames' must be a list of file names; correct it")
-        out.update(dict.fromkeys(names, split))
+        known = listed.intersection(map(_plain, names))
+        if names and not known:
+            remarks.append(f"'{split}_filenames' of {json_path.name} names none of its frames and is left out of account")
+        out.update(dict.fromkeys(known, split))
     if "test" not in out.values():
         out = {name: "test" if split == "val" else split for name, split in out.items()}
-    return out
+    return out, remarks
+
+
+def _plain(path: str) -> str:
+    """One spelling of a listed path: `./images/a.jpg` and `images\\a.jpg` are `images/a.jpg`."""
+    return posixpath.normpath(path.replace("\\", "/"))
 
 
 def _kept(frames: list[Frame]) -> list[Frame]:

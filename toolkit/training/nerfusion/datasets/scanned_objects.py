@@ -12,7 +12,7 @@ import numpy as np
 
 from toolkit.camera import checked_pose
 from toolkit.capture.calibration import from_matrix
-from toolkit.capture.listing import assemble, picture_header, pictures_in, read_matrix, require_folder, same_count
+from toolkit.capture.listing import assemble, files_in, picture_header, pictures_in, read_matrix, require_folder, same_count
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 from toolkit.training.nerfusion.captured import CapturedScene
@@ -40,7 +40,7 @@ def read_scanned_object(folder: Path | str) -> Capture:
     """
     root = require_folder(folder)
     pictures = pictures_in(root / "rgb")
-    same_count(len(pictures), len(list((root / "pose").glob("*.txt"))), root)
+    same_count(len(pictures), len(files_in(root / "pose", "*.txt")), root)
     frames, alpha = [], 0
     for picture in pictures:
         pose, camera = root / "pose" / f"{picture.stem}.txt", root / "intrinsics" / f"{picture.stem}.txt"
