@@ -34,7 +34,7 @@ def load_image(frame: Frame, *, exif: bool = False) -> Array:
         InputError: naming the file, when it is missing, no picture, cut short or too large.
     """
     if frame.video_index is not None:
-        for _, picture in iterate_video(frame.image, {frame.video_index}):
+        for _, picture in iterate_video(frame.image, {frame.video_index}, as_stored=frame.as_stored):
             return picture
         raise InputError(f"frame {frame.video_index} of the video {frame.image} cannot be decoded; the file may be damaged")
     picture, orientation = read_picture(frame.image)
