@@ -51,6 +51,16 @@ def read_picture(path: Path) -> tuple[Array, int]:
     return to_srgb(to_rgba(picture), header.profile), 1 if header.format == heif.FORMAT else header.orientation
 
 
+def see_through(path: Path) -> bool:
+    """Whether some pixel of a picture is not opaque.
+
+    Raises:
+        InputError: naming the file.
+    """
+    picture = to_rgba(_decode(path)[0])
+    return picture.shape[2] == 4 and bool((picture[:, :, 3] < 255).any())
+
+
 def load_depth(frame: Frame, capture: Capture) -> Array:
     """The frame's depth map, (H, W) float32 along z in units of the input's poses, 0 = missing.
 
