@@ -46,11 +46,12 @@ def find_capture(job: Job) -> Capture:
         save=save,
         load=lambda: capture_from_dict(read_json(path)),
         uses=source_state(job.source, job.folder.path),
+        version=2,
     )
 
 
 def choose_frames(job: Job, capture: Capture) -> Capture:
-    """Pictures of a video, and JPEGs of HEIF pictures; other captures pass as they are."""
+    """Pictures of a video, and JPEGs of HEIF and mirrored pictures; other captures pass as they are."""
     from toolkit.capture.convert import convert_pictures, to_convert
     from toolkit.capture.select import select_frames
     from toolkit.capture.storage import capture_from_dict, capture_to_dict

@@ -109,17 +109,17 @@ def summarise_poses(job: Job, capture: Capture, poses: PoseResult) -> dict[str, 
 
 
 def put_cameras(folder: Path, poses: PoseResult, posed: Capture) -> None:
-    """Cameras as transforms.json and COLMAP text, to be put into the capture's folder: pictures are named as they lie there."""
+    """Cameras as transforms.json and COLMAP text, to be put into the capture's folder: for the pictures as they lie there."""
     from toolkit.capture.convert import all_converted
     from toolkit.capture.select import SELECTED
+    from toolkit.capture.stored import stored_cameras
     from toolkit.export.cameras import write_cameras
 
     made_here = SELECTED in posed.extra or all_converted(posed)  # then the pictures lie in the run's folder
     root = posed.frames[0].image.parent.parent if made_here else posed.root
     files = [frame.image.relative_to(root).as_posix() if frame.image.is_relative_to(root) else str(frame.image) for frame in posed.frames]
     # Those of the frames that take part, which may be fewer than have a pose.
-    intrinsics = [frame.intrinsics for frame in posed.frames if frame.intrinsics is not None]
-    world_from_camera = np.array([frame.world_from_camera for frame in posed.frames])
+    intrinsics, world_from_camera = stored_cameras(posed)
     write_cameras(folder, files, intrinsics, world_from_camera, poses.points)
 
 

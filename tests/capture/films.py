@@ -59,3 +59,14 @@ def turn(path: Path, degrees: int) -> Path:
     data[place : place + 36] = struct.pack(">9i", cosine << 16, sine << 16, 0, -sine << 16, cosine << 16, 0, 0, 0, 1 << 30)
     path.write_bytes(bytes(data))
     return path
+
+
+def hide_first(path: Path) -> Path:
+    """Let the edit list of an mp4 (ISO/IEC 14496-12, 8.6.6) begin with the second frame, as where the first is stamped before zero."""
+    data = bytearray(path.read_bytes())
+    (step,) = struct.unpack_from(">I", data, data.find(b"stts") + 16)  # behind version and flags, number of entries, number of frames
+    place = data.find(b"elst")
+    assert place > 0 and struct.unpack_from(">IIIi", data, place + 4)[::3] == (0, 0)  # version 0, and from the very beginning
+    struct.pack_into(">i", data, place + 16, step)
+    path.write_bytes(bytes(data))
+    return path

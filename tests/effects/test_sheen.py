@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.effects.walls import AWAY, FRAMES, problem_of, wall
+from tests.effects.walls import AWAY, FRAMES, WIDTH, problem_of, wall
 from toolkit.effects.evidence import HeldOut
 from toolkit.effects.light import EXPOSURE, VIGNETTING, Light
 from toolkit.effects.sheen import THRESHOLD, shiny
@@ -38,6 +38,21 @@ def test_light_that_wanders_over_a_wall_is_found_and_held_out_pictures_agree(see
     assert found.before is not None and found.after is not None and found.after < 0.5 * found.before
     drift = np.exp2(0.3 * np.sin(np.arange(FRAMES)))
     assert looked(wall(lamp=0.08, gain=drift, seed=seed), replace(PLAIN, kept=frozenset({EXPOSURE}))).found
+
+
+@pytest.mark.parametrize("lamp", [0.0, 0.08])
+def test_pictures_of_several_shapes(lamp: float) -> None:
+    """Upright ones among lying ones: every second shows only the middle of what it did."""
+    seen = wall(lamp=lamp)
+    cut = 40
+    cameras = [replace(c, width=c.width - 2 * cut, cx=c.cx - cut) if k % 2 else c for k, c in enumerate(seen.cameras)]
+    pictures = tuple(picture[:, cut:-cut] if k % 2 else picture for k, picture in enumerate(seen.pictures))
+    odd = seen.frame % 2 == 1
+    pixel = seen.pixel - np.where(odd, cut, 0)[:, None] * [1, 0]
+    kept = ~odd | ((pixel[:, 0] > 2) & (pixel[:, 0] < WIDTH - 2 * cut - 2))
+    parts = {name: getattr(seen, name)[kept] for name in ("frame", "point")}
+    mixed = replace(seen, cameras=cameras, pictures=pictures, pixel=pixel[kept], **parts)
+    assert looked(mixed).found == (lamp > 0)
 
 
 def test_wrong_depths_are_no_highlights_and_nothing_is_told_of_too_little() -> None:

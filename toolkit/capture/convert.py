@@ -1,5 +1,5 @@
-"""HEIF pictures written once as JPEG: they take ten times as long to decode, which every stage would do again, and few other programs
-read them."""
+"""Pictures written once as JPEG. HEIF: it takes ten times as long to decode, which every stage would do again, and few other programs
+read it. Photos that EXIF mirrors: no camera could be exported for what their files hold."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from pathlib import Path
 import cv2
 
 from toolkit.capture.checks import check_capture
+from toolkit.capture.headers import orientation_of
 from toolkit.capture.heif import file_is_heif
-from toolkit.capture.images import read_picture
+from toolkit.capture.images import read_picture, turns_by_exif, upright
 from toolkit.capture.listing import counted, picture_header, unique_names
+from toolkit.capture.stored import MIRRORED
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError, OutputError, first_line
 from toolkit.files import atomic_path, fingerprint, read_json, write_json
@@ -27,8 +29,13 @@ MARKER = "converted.json"  # beside them: what each was made of
 
 
 def to_convert(capture: Capture) -> list[int]:
-    """Indices of the frames whose pictures are HEIF."""
-    return [i for i, frame in enumerate(capture.frames) if frame.video_index is None and file_is_heif(frame.image)]
+    """Indices of the frames whose pictures are HEIF, or photos that are to be mirrored."""
+    exif = turns_by_exif(capture)
+    return [
+        i
+        for i, frame in enumerate(capture.frames)
+        if frame.video_index is None and (file_is_heif(frame.image) or (exif and orientation_of(frame.image) in MIRRORED))
+    ]
 
 
 def all_converted(capture: Capture) -> bool:
@@ -37,7 +44,8 @@ def all_converted(capture: Capture) -> bool:
 
 
 def convert_pictures(capture: Capture, out: Path, threads: int, progress: Progress = SILENT) -> Capture:
-    """The capture with every HEIF picture replaced by a JPEG (with alpha: PNG) of the same name and size in `out/frames`, in sRGB.
+    """The capture with every picture that `to_convert` names replaced by an upright JPEG (with alpha: PNG) of the same name in
+    `out/frames`, in sRGB.
 
     What is there and is of the same file is not written again, so a killed run goes on where it stopped.
 
@@ -71,13 +79,13 @@ def convert_pictures(capture: Capture, out: Path, threads: int, progress: Progre
 
 
 def write_picture(source: Path, target: Path) -> Path:
-    """A HEIF picture as `target` with `.jpg` added, or `.png` where it has alpha; which of the two is told.
+    """A picture, upright, as `target` with `.jpg` added, or `.png` where it has alpha; which of the two is told.
 
     Raises:
         InputError: it cannot be decoded.
         OutputError: it cannot be written.
     """
-    picture = read_picture(source)[0]
+    picture = upright(*read_picture(source))
     alpha = picture.shape[2] == 4
     path = target.with_name(f"{target.name}.{'png' if alpha else 'jpg'}")
     order = cv2.COLOR_RGBA2BGRA if alpha else cv2.COLOR_RGB2BGR

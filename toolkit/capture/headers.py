@@ -84,6 +84,22 @@ def read_header(data: bytes, path: Path) -> Header:
     return Header(width, height, kind, orientation, profile)
 
 
+def orientation_of(path: Path) -> int:
+    """The EXIF orientation by which the picture in a file is to be turned, with only its header read. 1 also for HEIF, which is decoded as
+    it is to be seen, and for a file that cannot be read, which whoever reads it will tell."""
+    if heif.file_is_heif(path):
+        return 1
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path) as picture:
+                # Of a PNG, Pillow looks behind the pixels, and decodes them for that; with this it does where there is something to find.
+                found = picture.format != "PNG" or b"exif" in path.read_bytes().lower()
+                return _orientation(picture) if found else 1
+    except Exception:  # Pillow's parsers raise many families on damaged headers
+        return 1
+
+
 def _cut_short(path: Path) -> InputError:
     return InputError(f"the picture {path} is cut short (the file ends before the picture does); copy it again or remove it")
 

@@ -34,7 +34,7 @@ def load_image(frame: Frame, *, exif: bool = False) -> Array:
         InputError: naming the file, when it is missing, no picture, cut short or too large.
     """
     if frame.video_index is not None:
-        for _, picture in iterate_video(frame.image, {frame.video_index}):
+        for _, picture in iterate_video(frame.image, {frame.video_index}, as_stored=frame.as_stored):
             return picture
         raise InputError(f"frame {frame.video_index} of the video {frame.image} cannot be decoded; the file may be damaged")
     picture, orientation = read_picture(frame.image)
@@ -49,6 +49,16 @@ def read_picture(path: Path) -> tuple[Array, int]:
     """
     picture, header = _decode(path)
     return to_srgb(to_rgba(picture), header.profile), 1 if header.format == heif.FORMAT else header.orientation
+
+
+def see_through(path: Path) -> bool:
+    """Whether some pixel of a picture is not opaque.
+
+    Raises:
+        InputError: naming the file.
+    """
+    picture = to_rgba(_decode(path)[0])
+    return picture.shape[2] == 4 and bool((picture[:, :, 3] < 255).any())
 
 
 def load_depth(frame: Frame, capture: Capture) -> Array:

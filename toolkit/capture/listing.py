@@ -221,7 +221,7 @@ def same_count(pictures: int, poses: int, where: Path) -> None:
 
 
 def assemble(kind: str, root: Path, frames: list[Frame], remarks: Sequence[str] = (), **facts: Any) -> Capture:
-    """The capture, frames in natural order of their names.
+    """The capture, frames in natural order of their names. Unless `facts` say it, `alpha` is what a few of its pictures say.
 
     Raises:
         InputError: no frame is left, or two frames have one name.
@@ -232,5 +232,9 @@ def assemble(kind: str, root: Path, frames: list[Frame], remarks: Sequence[str] 
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"{root}: the picture {twice!r} is listed twice; list each picture once")
+    if "alpha" not in facts:
+        from toolkit.capture.alpha import cut_out  # here: it reads pictures by what stands above
+
+        facts["alpha"] = cut_out(frames)
     ordered = sorted(frames, key=lambda frame: natural_key(frame.name))
     return replace(Capture(kind=kind, root=root, frames=tuple(ordered)), warnings=tuple(remarks), **facts)

@@ -68,7 +68,8 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
     stride = stride_of(announced, float(capture.extra.get("fps") or 0))
     # What is posed has as many frames as poses, and not what the video may have beyond them.
     wanted = range(0, announced, stride) if stride > 1 or capture.posed else None
-    measure = _measured(video, announced, wanted, Path(out) / "selection.json", progress)
+    as_stored = capture.frames[0].as_stored
+    measure = _measured(video, as_stored, announced, wanted, Path(out) / "selection.json", progress)
     readable = min(len(measure.sharpness) * stride, announced)
     if readable < 2:
         raise InputError(
@@ -84,14 +85,19 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
     chosen = [index * stride for index in best]
     folder = Path(out) / "frames"
     names = [f"frame_{index:06d}" for index in chosen]
-    _write(video, chosen, folder, announced, progress)
+    _write(video, as_stored, chosen, folder, announced, progress)
     known = {frame.video_index: frame for frame in capture.frames}
     frames = [
-        replace(known.get(index, Frame("", video)), name=name, image=(folder / f"{name}.jpg").resolve(), video_index=None)
+        replace(known.get(index, Frame("", video)), name=name, image=(folder / f"{name}.jpg").resolve(), video_index=None, as_stored=False)
         for index, name in zip(chosen, names, strict=True)
     ]
     extra = {**capture.extra, SELECTED: readable, "video": str(video)}
     remarks = _remarks(measure, best, readable, announced)
+    if as_stored and len(measure.sharpness) < len(range(0, announced, stride)):
+        remarks.append(
+            f"about {readable} of the {announced} frames of {video} that have a pose can be decoded; if those that are missing do not lie "
+            "at its end, pictures and poses do not belong together, and --poses sfm finds others"
+        )
     picked = replace(capture, frames=tuple(frames), ordered=True, extra=extra, warnings=(*capture.warnings, *remarks))
     return check_capture(picked, progress)
 
@@ -171,9 +177,9 @@ def displacement(before: Array, after: Array) -> float:
     return float(min(np.mean(np.clip(length, 0, np.quantile(length, 0.9))) / long_side, JUMP))
 
 
-def _measured(video: Path, announced: int, wanted: range | None, path: Path, progress: Progress) -> Measure:
+def _measured(video: Path, as_stored: bool, announced: int, wanted: range | None, path: Path, progress: Progress) -> Measure:
     """The measurement kept at `path` when it is of this very file, else a new one, kept there."""
-    key = fingerprint(VERSION, video, *([] if wanted is None else [wanted.stop, wanted.step]))
+    key = fingerprint(*_origin(video, as_stored), *([] if wanted is None else [wanted.stop, wanted.step]))
     if path.is_file():
         try:
             kept = read_json(path)
@@ -186,16 +192,21 @@ def _measured(video: Path, announced: int, wanted: range | None, path: Path, pro
                 return measure
         except (InputError, KeyError, TypeError, ValueError):
             log.info("%s is not readable, frames are measured again", path)
-    measure = measure_frames(iterate_video(video, wanted), announced, progress)
+    measure = measure_frames(iterate_video(video, wanted, as_stored=as_stored), announced, progress)
     write_json(path, {"key": key, **{name: [round(value, 6) for value in values] for name, values in asdict(measure).items()}})
     return measure
 
 
-def _write(video: Path, chosen: list[int], folder: Path, announced: int, progress: Progress) -> None:
+def _origin(video: Path, as_stored: bool) -> list[Any]:
+    """What tells this video's frames from others."""
+    return [VERSION, video, *(["as stored"] if as_stored else [])]
+
+
+def _write(video: Path, as_stored: bool, chosen: list[int], folder: Path, announced: int, progress: Progress) -> None:
     """Write the chosen frames that are not there yet, and remove frames of an earlier choice."""
     wanted = {index: folder / f"frame_{index:06d}.jpg" for index in chosen}
     marker = folder / "source.json"
-    origin: dict[str, Any] = {"video": fingerprint(VERSION, video), "quality": QUALITY}
+    origin: dict[str, Any] = {"video": fingerprint(*_origin(video, as_stored)), "quality": QUALITY}
     try:
         same = marker.is_file() and read_json(marker) == origin
     except InputError:
@@ -206,7 +217,7 @@ def _write(video: Path, chosen: list[int], folder: Path, announced: int, progres
     if not same:
         write_json(marker, origin)
     missing = {index for index, path in wanted.items() if not path.is_file()}
-    for index, picture in iterate_video(video, missing):
+    for index, picture in iterate_video(video, missing, as_stored=as_stored):
         progress.check()
         progress.update(announced + index, 2 * announced, f"writing frame {index}")
         with atomic_path(wanted[index]) as temporary:

@@ -74,6 +74,7 @@ def _frame_to_dict(frame: Frame) -> dict[str, Any]:
         "split": frame.split,
         "video_index": frame.video_index,
         "focal_prior": frame.focal_prior,
+        "as_stored": frame.as_stored,
         "confidence": None if frame.confidence is None else str(frame.confidence),
         "depth_pose": None if frame.depth_pose is None else np.asarray(frame.depth_pose, dtype=np.float64).tolist(),
     }
@@ -91,6 +92,7 @@ def _frame_from_dict(data: dict[str, Any]) -> Frame:
         split=data["split"],
         video_index=data["video_index"],
         focal_prior=data["focal_prior"],
+        as_stored=bool(data.get("as_stored", False)),
         confidence=None if data.get("confidence") is None else Path(data["confidence"]),
         depth_pose=_pose(data.get("depth_pose")),
     )

@@ -30,7 +30,6 @@ class _Tally:
     mask_missing: int = 0
     scaled: int = 0
     bent: int = 0
-    alpha: bool = False
     files: list[Path] = field(default_factory=list)
 
     def warnings(self, listed: int) -> list[str]:
@@ -81,7 +80,6 @@ def read_transforms(path: Path | str) -> Capture:
         _kept(named),
         [*tally.warnings(len(entries)), *remarks],
         depth_scale=_depth_scale(data, applied_scale or 1.0, json_path),
-        alpha=tally.alpha,
         points=_points(root, data, json_path),
         extra=extra,
     )
@@ -99,7 +97,6 @@ def _frame(root: Path, data: dict[str, Any], entry: dict[str, Any], index: int, 
     intrinsics = fitted(described, header.size, where)
     tally.scaled += intrinsics is not described
     tally.bent += described.distorted and nerf_json.says_pinhole(data, entry)
-    tally.alpha |= header.alpha
     tally.files.append(image)
     depth, depth_intrinsics = None, None
     depth_listed = next((entry[key] for key in DEPTH_KEYS if entry.get(key) is not None), None)

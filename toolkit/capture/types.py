@@ -28,6 +28,7 @@ class Frame:
     split: str | None = None  # "train" or "test" when the source says so
     video_index: int | None = None  # frame number when `image` is a video
     focal_prior: float | None = None  # pixels, from EXIF, when intrinsics are unknown
+    as_stored: bool = False  # of a video: its frames are not turned, and those count too that its edit list hides
     confidence: Path | None = None  # picture of the depth map's size; 0 = the sensor does not believe this depth itself
     depth_pose: Array | None = None  # (4, 4) picture's camera from the depth camera, units of the poses; None: both at the same place
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import os
+import threading
 from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
@@ -21,22 +23,27 @@ from toolkit.errors import InputError
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".wmv")
 MOST_FRAMES = 2_000_000  # eighteen hours at 30 a second
 SMALLEST_FRAME = 8  # bytes
+OPENING = threading.Lock()  # one video is opened at a time: what OpenCV reads of the environment then is the whole process's
+_OPTIONS, _EVERY_FRAME = "OPENCV_FFMPEG_CAPTURE_OPTIONS", "ignore_editlist;1"
 _PLAYLISTS = (b"#EXTM3U", b"ffconcat")  # text that makes FFmpeg open other files or addresses
 
 
-def read_video(path: Path) -> Capture:
+def read_video(path: Path, *, as_stored: bool = False) -> Capture:
     """Describe a video: one `Frame` for each frame it announces, cameras and poses unknown.
 
     Only the header and the first frame are decoded; the announced number of frames is not a promise, `iterate_video` yields
     what can really be read. Frames are upright: rotation metadata is applied by the decoder, and `extra["rotation"]` only tells
     what it was. `extra` also has `fps`, `width`, `height` (upright) and `seconds`.
 
+    `as_stored` is for videos whose frames were noted down one by one while they were taken: frames are then as they were written, not
+    turned, and those count too that the file's edit list hides from a player.
+
     Raises:
         InputError: no such file, not a video, cut short, or no frame can be decoded.
     """
     path = Path(path).resolve()
     _check_container(path)
-    stream = _open(path)
+    stream = _open(path, as_stored)
     try:
         ok, first = stream.read()
         if not ok or first is None:
@@ -52,7 +59,7 @@ def read_video(path: Path) -> Capture:
     finally:
         stream.release()
     fps = float(fps) if math.isfinite(fps) and 0 < fps < 1e4 else 0.0
-    frames = tuple(Frame(name=f"frame_{index:06d}", image=path, video_index=index) for index in range(count))
+    frames = tuple(Frame(name=f"frame_{index:06d}", image=path, video_index=index, as_stored=as_stored) for index in range(count))
     extra = {
         "fps": fps,
         "rotation": int(rotation) % 360 if math.isfinite(rotation) else 0,
@@ -63,8 +70,8 @@ def read_video(path: Path) -> Capture:
     return Capture(kind="video", root=path.parent, frames=frames, ordered=True, extra=extra)
 
 
-def iterate_video(path: Path, indices: Collection[int] | None = None) -> Iterator[tuple[int, Array]]:
-    """Decode a video from its start and yield (index, picture), picture (H, W, 3) uint8 RGB, upright.
+def iterate_video(path: Path, indices: Collection[int] | None = None, *, as_stored: bool = False) -> Iterator[tuple[int, Array]]:
+    """Decode a video from its start and yield (index, picture), picture (H, W, 3) uint8 RGB, upright (or `as_stored`, see `read_video`).
 
     Frames are counted in decoding order rather than sought by time, so an index always means the same picture. With `indices`
     only those are converted and yielded, and decoding ends after the last of them.
@@ -74,7 +81,7 @@ def iterate_video(path: Path, indices: Collection[int] | None = None) -> Iterato
     """
     wanted = None if indices is None else set(indices)
     last = -1 if wanted is None else max(wanted, default=-1)
-    stream = _open(Path(path))
+    stream = _open(Path(path), as_stored)
     try:
         index = 0
         while (wanted is None or index <= last) and stream.grab():
@@ -95,22 +102,40 @@ def to_rgb(picture: Array) -> Array:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGRA2RGB if picture.shape[2] == 4 else cv2.COLOR_BGR2RGB))
 
 
-def _open(path: Path) -> cv2.VideoCapture:
+def _open(path: Path, as_stored: bool = False) -> cv2.VideoCapture:
     # FFmpeg only: other backends would take a single picture, or a name with "%03d", for a video.
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
+    with OPENING, _options(as_stored):
+        level = cv2.utils.logging.getLogLevel()
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        try:
+            stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        finally:
+            cv2.utils.logging.setLogLevel(level)
     if not stream.isOpened():
         stream.release()
         raise InputError(
             f"{path} is not a video that can be read; give an mp4, mov, avi or mkv file (one that was not cut off while copying)"
         )
     # The one place where rotation metadata is applied: the decoder turns each frame before it hands it out.
-    stream.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+    stream.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0 if as_stored else 1)
     return stream
+
+
+@contextmanager
+def _options(every_frame: bool) -> Iterator[None]:
+    """What OpenCV tells FFmpeg while a video is opened: it takes this from the environment only. Other options there stay."""
+    before = os.environ.get(_OPTIONS)
+    if not every_frame:
+        yield
+        return
+    os.environ[_OPTIONS] = f"{before}|{_EVERY_FRAME}" if before else _EVERY_FRAME
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_OPTIONS]
+        else:
+            os.environ[_OPTIONS] = before
 
 
 def _count(stream: cv2.VideoCapture) -> int:

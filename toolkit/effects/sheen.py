@@ -130,7 +130,8 @@ def _excess(seen: Sightings, problem: Problem, depth: Array, pictures: list[_Pic
         there, still = _sampled(pictures[int(other)].log, at)
         shape, level = _split(there)
         same = ((shape - texture) ** 2).mean(1) < SAME * (texture**2).mean(1) + NOISE
-        centre = np.clip(np.nan_to_num(at[:, len(around) // 2]).round(), 0, [width - 1, height - 1]).astype(int)
+        rim = np.array(pictures[int(other)].dark.shape[::-1]) - 1  # pictures may have several shapes
+        centre = np.clip(np.nan_to_num(at[:, len(around) // 2]).round(), 0, rim).astype(int)
         told = able & inside & still & same & (zoom > 1 / ZOOM) & (zoom < ZOOM)
         told &= pictures[int(other)].dark[centre[:, 1], centre[:, 0]] > DARKEST
         if uneven:

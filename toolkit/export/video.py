@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from toolkit.camera import Array
+from toolkit.capture.video import OPENING
 from toolkit.errors import InputError, OutputError
 from toolkit.files import atomic_path
 from toolkit.tsdf.mesh import as_bytes
@@ -116,7 +117,8 @@ def write_video(path: Path | str, frames: Iterable[Array], fps: float = 30.0, co
 
 def frame_count(path: Path) -> int:
     """Frames that a video's header promises, 0 when it cannot be opened."""
-    reader = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    with OPENING:
+        reader = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         return int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
     finally:

@@ -32,6 +32,7 @@ class Picture:
     mask: str | None = None
     video_index: int | None = None
     focal_prior: float | None = None
+    as_stored: bool = False
 
     def frame(self) -> Frame:
         """As the capture's readers want it."""
@@ -41,7 +42,13 @@ class Picture:
             mask=None if self.mask is None else Path(self.mask),
             video_index=self.video_index,
             focal_prior=self.focal_prior,
+            as_stored=self.as_stored,
         )
+
+    def key(self) -> dict[str, Any]:
+        """Of what is seen in it."""
+        # Named only where it is so: what was found for other pictures before there was such a thing stays good.
+        return {name: value for name, value in asdict(self).items() if name != "as_stored" or value}
 
 
 @dataclass(frozen=True)
@@ -87,7 +94,7 @@ class Job:
 
     def key(self) -> str:
         """Of what features and matches depend on: not on threads, not on what the mapper is told."""
-        pictures = [[asdict(picture), Path(picture.image)] for picture in self.pictures]
+        pictures = [[picture.key(), Path(picture.image)] for picture in self.pictures]
         flat = [part for pair in pictures for part in pair]
         how = [self.sequential, self.one_camera, self.exif, self.image_size, self.max_features, self.seed, self.oblique]
         return fingerprint(VERSION, *how, *flat)
@@ -110,6 +117,7 @@ def plan(capture: Capture, folder: Path, settings: PosesSettings, seed: int, thr
             mask=None if frame.mask is None else str(frame.mask),
             video_index=frame.video_index,
             focal_prior=frame.focal_prior,
+            as_stored=frame.as_stored,
         )
         for frame in capture.frames
     )
