@@ -209,7 +209,7 @@ def _volume_of(job: Job, field: Field, posed: Capture, scene: Scene, views: View
         lambda lens, pose: render_view(field, at_most(lens, RENDERED_SIDE), pose, view),
         shown.world_from_camera[chosen],
         lenses,
-        region=(scene.centre - scene.half_size, scene.centre + scene.half_size),
+        region=scene.surface_box(),
         polish=[partial(polisher.polished, index, measured=measured[at] if measured else None) for at, index in enumerate(chosen)],
         settle=lambda reliable, opaque, told: settled(
             reliable, opaque, told, seen, lenses, scene.median_depth, measured, progress=job.progress

@@ -172,6 +172,13 @@ def test_working_frame_has_z_up_depth_one_and_a_half_and_the_region_at_its_centr
     assert 0 < scene.near < 1.5 < scene.far and scene.has_background
 
 
+@pytest.mark.parametrize(("layout", "grown"), [("object", 1.2), ("forward", 1.2), ("room", 1.0)])
+def test_surfaces_may_stand_out_of_the_region_but_in_rooms(layout, grown, scene):
+    low, high = replace(scene, layout=layout).surface_box()
+    np.testing.assert_allclose((low + high) / 2, scene.centre, atol=1e-12)
+    np.testing.assert_allclose((high - low) / 2, grown * scene.half_size)
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000), st.floats(-3, 3), st.floats(0, 7e6))
 def test_undoing_the_working_frame_is_the_identity(seed, log_scale, far):

@@ -44,7 +44,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 ALL = ["distortion", "exposure", "vignetting", "highlights", "background", "rolling_shutter", {"motion_blur": {"samples": 2}}]
-ALL += ["passers", "sensor_noise", "depth_noise", "compression"]
+ALL += ["passers", "sensor_noise", "depth_offset", "depth_noise", "compression"]
 
 
 def test_readers_open_it_and_it_says_what_the_truth_says(tmp_path: Path) -> None:

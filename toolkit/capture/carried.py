@@ -39,7 +39,7 @@ def carried(depth: Array, camera: Intrinsics, moved: Array) -> Array:
         u, v = bent[:, 0].reshape(u.shape), bent[:, 1].reshape(v.shape)
     out = np.zeros_like(depth)
     _nearest_of_each(u * np.float32(camera.fx) + np.float32(camera.cx), v * np.float32(camera.fy) + np.float32(camera.cy), z, there, out)
-    for axis in (0, 1):
+    for axis in (0, 1, 0, 1):  # where two lines cross, more than one pixel is open
         _close(out, axis)
     return out
 

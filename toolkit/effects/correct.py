@@ -27,8 +27,8 @@ class Corrections:
     dimmed: float = 1.0  # canonical light is divided by this besides, so that little of it is clipped
     lens: tuple[float, float] | None = None  # k1, k2 beyond the given lens
     poses: dict[str, Array] = field(default_factory=dict)  # (4, 4) world_from_camera
-    depth: Array | None = None  # (4, 4) the picture's camera from the depth camera, where depth was not brought to the pictures
     weight: dict[str, float] = field(default_factory=dict)  # of frames that count for less in the fit: share of their pixels, 0 to 1
+    depth: Array | None = None  # (4, 4) the picture's camera from the depth camera, where depth was not brought to the pictures
 
     @property
     def geometric(self) -> bool:

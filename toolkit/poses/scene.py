@@ -14,11 +14,12 @@ from toolkit.poses.cloud import Cloud, cloud_of_depth, cloud_of_points
 from toolkit.poses.gravity import camera_frame, tight_turn, turn_about_z
 from toolkit.poses.hull import silhouette_cloud
 from toolkit.poses.points import triangulate
-from toolkit.poses.region import FORWARD, Layout, box, layout, points_of_interest
+from toolkit.poses.region import FORWARD, ROOM, Layout, box, layout, points_of_interest
 from toolkit.progress import SILENT, Progress
 
 MEDIAN_DEPTH = 1.5  # working units, for captures without scale
 BEYOND = 0.05  # share of observations outside the region that makes a background
+SURFACE = 1.2  # times the region: what stands out of it is part of what is looked at, and has few points (noses, rims)
 FEW_POINTS = 30  # fewer cannot describe a scene
 
 
@@ -40,6 +41,12 @@ class Scene:
     points_source: str = ""  # source | depth | triangulated | silhouettes
     points: int = 0  # how many told the above
     warnings: list[str] = field(default_factory=list)
+
+    def surface_box(self) -> tuple[Array, Array]:
+        """(3,) lowest and (3,) highest corner of the box in which a surface is taken from a field: the region, and for what is looked at
+        from around or from one side a margin. In a room the region holds the walls."""
+        half = self.half_size * (1.0 if self.layout == ROOM else SURFACE)
+        return self.centre - half, self.centre + half
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON."""
