@@ -84,6 +84,25 @@ def test_nothing_is_found_where_nothing_is_nor_a_scale_taken_for_it() -> None:
     assert found is not None and not found.there
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_the_unit_of_length_does_not_matter(unit: float) -> None:
+    true = depth_offset.forward(depth_offset.PRESETS["medium"])
+    some = observations(true)
+    one, other = solved(some), solved(replace(some, places=unit * some.places, values=np.float32(unit) * some.values))
+    assert one is not None and other is not None
+    np.testing.assert_allclose(other.depth_from_picture[:3, :3], one.depth_from_picture[:3, :3], atol=1e-3)
+    np.testing.assert_allclose(other.depth_from_picture[:3, 3] / unit, one.depth_from_picture[:3, 3], atol=2e-3)
+    assert other.gain == pytest.approx(one.gain, abs=0.01)
+
+
+def test_a_wall_straight_ahead_without_noise_moves_nothing() -> None:
+    some = observations(np.eye(4), noise=0)
+    flat = replace(some, places=2 * some.places / some.places[:, 2:], values=np.full_like(some.values, 2))
+    found = solved(flat)
+    assert found is not None and not found.there
+    np.testing.assert_allclose(found.depth_from_picture, np.eye(4), atol=1e-6)
+
+
 def test_a_third_of_wrong_points_does_no_harm() -> None:
     true = depth_offset.forward(depth_offset.PRESETS["medium"])
     some = observations(true)

@@ -37,6 +37,7 @@ STEPS = 30  # for each of them
 NOTHING = 0.003  # share of depth: residuals below this weigh the same
 BELIEF = 0.05  # radians, and shares of the usual depth: how far off the depth camera may be
 ALL, SCALE = np.arange(7), np.array([6])
+EXACT = 1e-6  # share of depth: nothing is told more surely, so that a wall seen straight on, exactly, moves nothing
 SLACK = 1e-3  # relative fall below which a stage is done
 
 
@@ -207,7 +208,7 @@ def _descend(found: Observations, x: Array, usual: float, cut: float, over: floa
         if use.sum() < FEWEST // 4:
             return x
         heavy = slope[use] / np.maximum(np.abs(off[use]), NOTHING)[:, None]
-        hold = float(np.median(np.abs(off[use]))) / BELIEF**2
+        hold = max(float(np.median(np.abs(off[use]))), EXACT) / BELIEF**2
         normal, downhill = heavy.T @ slope[use] + hold * np.eye(len(free)), heavy.T @ off[use] + hold * x[free]
         for _ in range(6):
             moved = x.copy()
