@@ -51,6 +51,11 @@ def test_a_loss_too_small_for_float32_is_compared_as_it_is() -> None:
     assert errors["loss"] < 1e-30 and by_size(torch.tensor([0.5]), [1e-77]) == 0.5
 
 
+def test_a_loss_below_the_digits_of_its_sums_is_told_to_these() -> None:
+    """A weight of 4e-16 before one of 1: the loss is 8e-16, of sums whose last digit is 2e-16."""
+    assert distortion_errors([([4e-16, 1.0], [0.0, 1.0], [0.0, 0.0])])["loss"] < 1e-6
+
+
 @QUICK
 @given(st.sampled_from([8, 16, 32]), st.floats(0, 1), st.integers(0, 1000), st.floats(0.2, 30), st.floats(-6, 6), st.integers(1, 8))
 def test_marching(resolution: int, share: float, seed: int, away: float, power: float, fine: int) -> None:

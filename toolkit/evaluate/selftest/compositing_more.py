@@ -15,6 +15,10 @@ from toolkit.render.field import density
 from toolkit.render.march import first_of_ray
 
 
+# What comes to less, of weights and places of about 1, is told by the double sums to some 1e-16, not to a share of itself.
+LEAST = 1e-9
+
+
 def distortion_errors(rays: list[tuple[list[float], list[float], list[float]]]) -> dict[str, float]:
     """Errors of the distortion loss and its gradient, by the largest entry; rays are (weights, places ascending, lengths)."""
     ray = torch.tensor([index for index, (w, _, _) in enumerate(rays) for _ in w], dtype=torch.int64)
@@ -25,8 +29,9 @@ def distortion_errors(rays: list[tuple[list[float], list[float], list[float]]]) 
         for parts in zip(*(values.double().split(sizes) for values in (weight, place, length)), strict=True)
     ]
     loss, gradient = distortion(weight, place, length, first_of_ray(ray), ray, len(rays))
+    losses = [one for one, _ in exact]
     return {
-        "loss": by_size(loss, [one for one, _ in exact]),
+        "loss": absolute(loss, losses) / LEAST if max(losses, default=0.0) < LEAST else by_size(loss, losses),
         "gradient": by_size(gradient, [value for _, values in exact for value in values]),
         "values that are not finite": not_finite(loss, gradient),
         "negative losses": float((loss < 0).sum()),
