@@ -43,6 +43,8 @@ class Job:
     keys: KeyFrames | None = None  # the key frames, once chosen
     corrections: Corrections | None = None  # of effects, once found
     network: NetworkField | None = None  # the networks' field, once this command has made or loaded it
+    formats: list[str] | None = None  # to be exported this time, whatever the settings say
+    alone: bool = False  # exports are all that was asked for
     plan: TotalBudget | None = None  # chooses settings as the run goes on, so that it takes as long as was asked for
 
 

@@ -14,6 +14,7 @@ from pipelines.kept import EVALUATION, EXPORT_FACTS, MATCHED, NOTES, TIMELINE, r
 from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture, write_pngs
 from pipelines.room import require_pictures, require_scores
 from pipelines.steps_capture import last_of, pixel_state
+from toolkit.errors import InputError
 from toolkit.files import write_json
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
     )
 
 
+GONE = "of an earlier field, and removed: {}; `fieldfuse export {} --formats …` makes of this one what the run is not asked for"
 FIT_NOTES = "fit_notes.json"  # what a reader of the numbers has to know of the fit; there only when there is something
 LEFT_OUT = "left_out.safetensors"  # pixels that the fit did without, since they show what moves; there only when they were looked for
 FIT_MATCHED = "fit_matched.json"  # what the fit's quick matching found; there only when it was made
@@ -214,18 +216,32 @@ def render_test_views(job: Job, field: Field, views: Views) -> Pictures:
 
 def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, scene: Scene, views: Views) -> dict[str, Any]:
     """Points, meshes, cameras, the page and video, in the input's own frame; answers the mesh's facts. Files of the same field that were
-    made before, in other formats, stay."""
+    made before, in other formats, stay.
+
+    Raises:
+        InputError: nothing else was asked for, and none of it could be made.
+    """
     facts_path = job.folder / "exports" / "facts.json"
     made: list[Path] = []
+    old, whole = job.stages.record("export"), True
 
     def make() -> dict[str, Any]:
         from pipelines.surface import export_field
 
-        before = read_kept(facts_path, EXPORT_FACTS) if job.stages.usable("export") else None
-        facts, paths = export_field(job, job.folder / "exports", field, poses, posed, scene, views)
-        made.extend(paths)
+        nonlocal whole
+        fits = job.stages.usable("export")
+        before = read_kept(facts_path, EXPORT_FACTS) if fits else None
+        exported = export_field(job, job.folder / "exports", field, poses, posed, scene, views)
+        facts, whole = exported.facts, exported.whole
+        if job.alone and not exported.made:
+            raise InputError(f"nothing was exported: {'; '.join(facts['notes'])}")
+        made.extend(exported.files)
         if before is not None and facts["mesh"] is None:
             facts["mesh"] = before["mesh"]
+        if old is not None and not fits:
+            kept = {path.relative_to(job.folder.path).as_posix() for path in made}
+            gone = sorted({Path(path).name for path in set(old.outputs) - kept if path.startswith("exports/")} - {facts_path.name})
+            facts["notes"] += [GONE.format(", ".join(gone), job.folder.path)] if gone else []
         return facts
 
     def save(facts: dict[str, Any]) -> list[Path]:
@@ -239,6 +255,8 @@ def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, sc
         load=lambda: read_kept(facts_path, EXPORT_FACTS),
         uses=asdict(job.settings.export),
         adds=True,
+        part=job.formats is not None,
+        whole=lambda: whole,
         version=2,
         after=["field", "poses", "scene", "views"],
     )

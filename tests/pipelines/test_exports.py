@@ -1,0 +1,95 @@
+"""What `fieldfuse export` adds, what a run is asked for from then on, and what becomes of it when the capture is gone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.pipelines.made import call, make_room
+from tests.pipelines.short import ALONE, stages
+from toolkit.files import read_json
+
+Capsys = pytest.CaptureFixture[str]
+FEW = ["--image-size", "48", "--budget", "1", *ALONE, "--set", "field.resolution=16", "--set", "export.mesh_views=3", "--quiet", "--json"]
+WISH = ["--set", "export.formats=[points,cameras]"]
+AGAIN = ["--threads", "1", "--quiet", "--json"]
+
+
+@pytest.fixture
+def out(tmp_path: Path, capsys: Capsys) -> Path:
+    """A run on pictures half as wide as the photos are, so that meshes need the photos."""
+    make_room(tmp_path / "room", 10)
+    answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", *FEW, *WISH)
+    assert answer.code == 0, answer.err
+    return tmp_path / "out"
+
+
+def files(out: Path) -> set[str]:
+    return {path.name for path in (out / "exports").iterdir()} - {"facts.json"}
+
+
+def test_formats_of_one_command_are_not_those_of_the_run(out: Path, capsys: Capsys) -> None:
+    asked = {"points.ply", "cameras"}
+    assert files(out) == asked
+    answer = call(capsys, "export", out, "--formats", "ply", *AGAIN)
+    assert answer.code == 0 and not stages(json.loads(answer.out))["export"], answer.err
+    assert files(out) == asked | {"mesh.ply"} and (out / "mesh.ply").is_file()
+    assert read_json(out / "run.json")["settings"]["export"]["formats"] == ["points", "cameras"]
+    # What the run was asked for is there all the time, and is reused.
+    assert stages(json.loads(call(capsys, "export", out, *AGAIN).out))["export"]
+    again = json.loads(call(capsys, "run", out.parent / "room", "--out", out, *FEW, *WISH).out)
+    assert all(stages(again).values()), stages(again)
+    assert files(out) == asked | {"mesh.ply"}
+    # Of the next field it is made; what was added for once is removed, and that is told.
+    answer = call(capsys, "finetune", out, "--budget", 0.5, *AGAIN)
+    assert answer.code == 0, answer.err
+    assert files(out) == asked
+    assert any(note.startswith("of an earlier field, and removed: mesh.ply; `fieldfuse") for note in json.loads(answer.out)["warnings"])
+
+
+def test_a_part_is_not_taken_for_the_whole(out: Path, capsys: Capsys) -> None:
+    (out / "exports" / "points.ply").unlink()
+    assert call(capsys, "export", out, "--formats", "cameras", *AGAIN).code == 0
+    assert files(out) == {"cameras"}
+    assert call(capsys, "export", out, *AGAIN).code == 0
+    assert files(out) == {"cameras", "points.ply"}
+    answer = call(capsys, "export", out, "--formats", "textur")
+    assert answer.code == 2 and "--formats: there is no format 'textur' (did you mean 'texture'?)" in answer.sentence()
+
+
+def test_without_the_capture_nothing_is_lost_and_all_is_told(out: Path, capsys: Capsys) -> None:
+    room, away = out.parent / "room", out.parent / "away"
+    room.rename(away)
+    for formats in ("ply", "texture", "points,texture"):
+        answer = call(capsys, "export", out, "--formats", formats, "--threads", 1, "--quiet")
+        assert answer.code == 2 and "nothing was exported: points and meshes were left out: the folder of the capture, " in answer.err
+        assert f"{room}, is not there any more" in answer.err and "put it back" in answer.sentence()
+    answer = call(capsys, "export", out, "--formats", "glb,cameras", *AGAIN)
+    assert answer.code == 0, answer.err
+    assert any(f"the folder of the capture, {room}, is not there any more" in note for note in json.loads(answer.out)["warnings"])
+
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    answer = call(capsys, "finetune", out, "--budget", 0.5, "--threads", 1, "--quiet")
+    assert answer.code == 2 and "put it back" in answer.sentence() and "--set 'export.formats=[cameras]'" in answer.err
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    answer = call(capsys, "finetune", out, "--budget", 0.5, "--set", "export.formats=[cameras]", *AGAIN)
+    assert answer.code == 0 and files(out) == {"cameras"}, answer.err
+    assert any("of an earlier field, and removed: points.ply; " in note for note in json.loads(answer.out)["warnings"])
+
+    away.rename(room)
+    assert call(capsys, "export", out, "--set", "export.formats=[glb,cameras]", *AGAIN).code == 0
+    assert files(out) == {"cameras", "mesh.glb"}
+
+
+def test_what_could_not_be_made_without_the_capture_is_made_when_it_is_back(out: Path, capsys: Capsys) -> None:
+    room, away = out.parent / "room", out.parent / "away"
+    room.rename(away)
+    wish = ["--set", "export.formats=[glb,cameras]"]
+    for _ in range(2):
+        answer = call(capsys, "export", out, *wish, *AGAIN)
+        assert answer.code == 0 and "mesh.glb" not in files(out), answer.err
+    away.rename(room)
+    assert call(capsys, "export", out, *AGAIN).code == 0
+    assert files(out) >= {"cameras", "mesh.glb"}
