@@ -257,7 +257,7 @@ def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, sc
         adds=True,
         part=job.formats is not None,
         whole=lambda: whole,
-        version=2,
+        version=3,
         after=["field", "poses", "scene", "views"],
     )
 
