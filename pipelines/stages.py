@@ -65,6 +65,21 @@ def finished_stages(folder: RunFolder) -> list[Record]:
     return [record for record in found if record is not None]
 
 
+def outdated(records: Iterable[Record]) -> set[str]:
+    """Names of those stages that stand, directly or not, on another result than the one that is there now, or on one that is gone."""
+    known = {record.name: record for record in records}
+    old: set[str] = set()
+    while True:  # what stands on something old is old itself
+        more = {
+            name
+            for name, record in known.items()
+            if any(other in old or other not in known or known[other].made != made for other, made in record.after.items())
+        }
+        if more == old:
+            return old
+        old = more
+
+
 class Stages:
     """The stages of one run folder, in the order in which they are asked for."""
 

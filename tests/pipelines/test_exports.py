@@ -7,6 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from pipelines.console import make_progress
+from pipelines.job import open_job
+from pipelines.options import gather
+from pipelines.reconstruct import BEFORE, stand
+from pipelines.steps_results import fit_radiance_field
 from tests.pipelines.made import call, make_room
 from tests.pipelines.short import ALONE, stages
 from toolkit.files import read_json
@@ -47,6 +52,27 @@ def test_formats_of_one_command_are_not_those_of_the_run(out: Path, capsys: Caps
     assert answer.code == 0, answer.err
     assert files(out) == asked
     assert any(note.startswith("of an earlier field, and removed: mesh.ply; `fieldfuse") for note in json.loads(answer.out)["warnings"])
+
+
+def test_info_tells_what_is_of_an_earlier_field(out: Path, capsys: Capsys) -> None:
+    def told() -> tuple[list[str], set[str]]:
+        data = json.loads(call(capsys, "info", out, "--json").out)
+        return data["outdated"], {stage["name"] for stage in data["stages"] if stage["outdated"]}
+
+    assert told() == ([], set())
+    # As far as a `finetune` comes that is interrupted after its fit.
+    with open_job(out, None, gather(None, None, None, budget=0.3), make_progress(True), BEFORE) as job:
+        _, _, _, scene, views = stand(job)
+        fit_radiance_field(job, views, scene, go_on=True)
+    sentences, stale = told()
+    assert stale == {"render", "evaluate", "export"} and len(sentences) == 2
+    text = call(capsys, "info", out).out
+    assert f"`fieldfuse evaluate {out}` renews them" in text and f"`fieldfuse export {out}` renews them" in text
+    assert "render" in text and text.count("(out of date)") == 3
+    assert call(capsys, "export", out, *AGAIN).code == 0
+    assert told()[1] == {"render"}  # what is scored of a field is not made by an export
+    assert call(capsys, "evaluate", out, *AGAIN).code == 0
+    assert told() == ([], set())
 
 
 def test_a_part_is_not_taken_for_the_whole(out: Path, capsys: Capsys) -> None:
