@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 OUTDATED = (
     ({"field"}, "the field is of earlier pictures or poses; `fieldfuse finetune {}` fits it to those that are there now"),
     ({"tsdf", "tsdf_texture"}, "the TSDF surface is of earlier pictures or poses; `fieldfuse tsdf {}` renews it"),
-    ({"render", "evaluate"}, "scores, their pictures and the report are of an earlier field or surface; `fieldfuse evaluate {}` renews them"),
+    ({"render", "evaluate"}, "scores, pictures and the report are of an earlier field or surface; `fieldfuse evaluate {}` renews them"),
     ({"export"}, "the exports are of an earlier field; `fieldfuse export {}` renews them"),
 )
 TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS"}

@@ -94,7 +94,7 @@ def open_job(
 
 
 def _check_same_source(folder: RunFolder, source: Path) -> None:
-    """What another capture's run took long to make is not replaced because of a folder's name.
+    """What another capture's run took long to make is not replaced because of a folder's name. A capture that was moved is the same one.
 
     Raises:
         InputError: the folder holds a run of another source.
@@ -105,8 +105,19 @@ def _check_same_source(folder: RunFolder, source: Path) -> None:
         before = Path(folder.about()["source"])
     except InputError:
         return  # damaged, and now written again
-    if before.resolve() != source.resolve():
-        raise InputError(f"{folder.path} holds the run of {before}; choose another --out folder for {source}, or remove that one first")
+    if before.resolve() == source.resolve():
+        return
+    if not before.exists():
+        from pipelines.moved import follow, same_capture
+
+        if same_capture(folder, source):
+            follow(folder, before, source)
+            return
+        raise InputError(
+            f"{folder.path} holds the run of {before}, which is not there any more, and the files of {source} are not the same (by names, "
+            "sizes and times: move it, or copy it with its times); choose another --out folder, or remove that one first"
+        )
+    raise InputError(f"{folder.path} holds the run of {before}; choose another --out folder for {source}, or remove that one first")
 
 
 def _no_out(target: Path) -> str:

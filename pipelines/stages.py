@@ -65,6 +65,11 @@ def finished_stages(folder: RunFolder) -> list[Record]:
     return [record for record in found if record is not None]
 
 
+def stage_key(name: str, uses: Any, before: dict[str, str] | None = None, version: int = 1) -> str:
+    """Hash of all that goes into a stage; `before`: results of stages before it, by their identities."""
+    return fingerprint(name, version, __version__, uses, before or {})
+
+
 def outdated(records: Iterable[Record]) -> set[str]:
     """Names of those stages that stand, directly or not, on another result than the one that is there now, or on one that is gone."""
     known = {record.name: record for record in records}
@@ -131,7 +136,7 @@ class Stages:
             FieldfuseError: from the stage itself.
         """
         before = {other: self.records[other].made for other in after}
-        key = fingerprint(name, version, __version__, uses, before)
+        key = stage_key(name, uses, before, version)
         record = self.finished(name)
         trusted = record is not None and name in self.trusted and self.usable(name)
         if record is not None and not part and (trusted or (record.key == key and not record.stopped)):

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 MESHES = ("ply", "obj", "glb")  # as `export.formats` has them
 TEXTURE = "texture"
 SURFACES = {"points", *MESHES, TEXTURE}
-GONE = "the folder of the capture, {}, is not there any more, and its pictures are needed; put it back and run the command again"
+GONE = (
+    "the folder of the capture, {}, is not there any more, and its pictures are needed; put it back (or repeat the run's own command with "
+    "its new place) and run the command again"
+)
 LOST = "the capture's picture {} is not there any more; put it back and run the command again"
 WITHOUT = "the finer field's points and meshes cannot be made: {}, or leave them out with --set 'export.formats=[{}]'"
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,8 +13,10 @@ from pipelines.console import make_progress
 from pipelines.job import open_job
 from pipelines.options import gather
 from pipelines.reconstruct import BEFORE, stand
+from pipelines.steps_capture import choose_frames, find_capture
 from pipelines.steps_results import fit_radiance_field
-from tests.pipelines.made import call, make_room
+from tests.capture.films import film
+from tests.pipelines.made import call, circle, make_room, shoot
 from tests.pipelines.short import ALONE, stages
 from toolkit.files import read_json
 
@@ -107,6 +111,39 @@ def test_without_the_capture_nothing_is_lost_and_all_is_told(out: Path, capsys: 
     away.rename(room)
     assert call(capsys, "export", out, "--set", "export.formats=[glb,cameras]", *AGAIN).code == 0
     assert files(out) == {"cameras", "mesh.glb"}
+
+
+def test_a_capture_that_was_moved_is_the_same_one(out: Path, capsys: Capsys) -> None:
+    room, away = out.parent / "room", out.parent / "elsewhere" / "hall"
+    shutil.copytree(room, out.parent / "double")
+    away.parent.mkdir()
+    arguments = ["--out", out, *FEW, *WISH]
+    answer = call(capsys, "run", out.parent / "double", *arguments)
+    assert answer.code == 2 and "choose another --out folder" in answer.sentence()  # the run's own capture is still there
+    room.rename(away)
+    picture = out.parent / "double" / "images" / "003.png"
+    os.utime(picture, ns=(0, 0))
+    answer = call(capsys, "run", out.parent / "double", *arguments)
+    assert answer.code == 2 and "is not there any more, and the files of" in answer.sentence()
+    answer = call(capsys, "run", away, *arguments)
+    assert answer.code == 0 and all(stages(json.loads(answer.out)).values()), answer.err
+    assert read_json(out / "run.json")["source"] == str(away) and str(room) not in (out / "capture.json").read_text()
+    answer = call(capsys, "export", out, "--formats", "ply", *AGAIN)  # needs its pictures
+    assert answer.code == 0 and "mesh.ply" in files(out), answer.err
+
+
+def test_a_video_that_was_moved_keeps_its_frames(tmp_path: Path) -> None:
+    seen = [shoot(pose)[0] for pose in circle(60, 0.25)]
+    before, now = film(tmp_path / "films" / "walk.mp4", seen), tmp_path / "kept" / "walk.mp4"
+    now.parent.mkdir()
+    for source in (before, now):
+        with open_job(source, tmp_path / "out", gather(), make_progress(True)) as job:
+            chosen = choose_frames(job, find_capture(job))
+        assert job.stages.cached == dict.fromkeys(("capture", "frames"), source == now)
+        assert chosen.root == source.parent and {frame.image.parent for frame in chosen.frames} == {tmp_path / "out" / "frames"}
+        if source == before:
+            before.rename(now)
+    assert str(before) not in (tmp_path / "out" / "capture.json").read_text()
 
 
 def test_what_could_not_be_made_without_the_capture_is_made_when_it_is_back(out: Path, capsys: Capsys) -> None:
