@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from toolkit.keyframes import KeyFrames
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+CAMERAS = "transforms.json"
 MOST_A_CORE, LEAST_MOST_THREADS = 4, 64  # threads that may be asked for: more of them only wait for each other
 SHORT_SPIN = "1000"  # turns, microseconds
 
@@ -66,6 +67,7 @@ def open_job(
         InputError: neither a source with `out` nor a run's folder; settings that do not fit.
         OutputError: the folder cannot be used.
     """
+    _check_no_run(target, out)
     again = out is None and is_run_folder(target)
     if out is None and not again:
         raise InputError(_no_out(target))
@@ -91,6 +93,21 @@ def open_job(
             _check_same_source(folder, source)
         folder.start(source, settings)
         yield Job(folder, source, settings, progress, Stages(folder, progress, trusted if again else ()), again, other, other_network)
+
+
+def _check_no_run(target: Path, out: Path | None) -> None:
+    """A run's folder is no capture, but where it has cameras that were put there for its frames (docs/conventions.md).
+
+    Raises:
+        InputError: a run's folder where a source is wanted.
+    """
+    if out is None or not is_run_folder(target) or (target / CAMERAS).is_file():
+        return
+    try:
+        source = RunFolder(target).about()["source"]
+    except InputError:
+        source = "a capture that it no longer names"
+    raise InputError(f"{target} is the folder of a run (of {source}); leave --out away to work on it, or give its capture")
 
 
 def _check_same_source(folder: RunFolder, source: Path) -> None:

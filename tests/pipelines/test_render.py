@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.pipelines.made import call
+from toolkit.files import read_json, write_json
 
 Capsys = pytest.CaptureFixture[str]
 
@@ -29,6 +30,35 @@ def test_render_paths(done: Path, tmp_path: Path, capsys: Capsys) -> None:
     answer = call(capsys, "render", done, "--cameras", cameras, "--to", tmp_path / "given", "--image-size", 24, "--quiet")
     assert answer.code == 0, answer.err
     assert len(list((tmp_path / "given").iterdir())) == 16
+
+
+def test_pictures_of_two_commands_are_not_mixed(done: Path, tmp_path: Path, capsys: Capsys) -> None:
+    cameras = read_json(done / "exports" / "cameras" / "transforms.json")
+    place = done / "renders" / "cameras"
+    for first, count in ((0, 5), (6, 2)):
+        write_json(tmp_path / "path.json", {**cameras, "frames": cameras["frames"][first : first + count]})
+        answer = call(capsys, "render", done, "--cameras", tmp_path / "path.json", "--image-size", 24, "--quiet", "--json")
+        assert answer.code == 0 and json.loads(answer.out)["others"] == 0, answer.err
+        names = [Path(frame["file_path"]).stem for frame in cameras["frames"][first : first + count]]
+        assert sorted(path.name for path in place.iterdir()) == [f"{index:04d}_{name}.png" for index, name in enumerate(names)]
+    assert not list(place.parent.glob(".tmp*"))
+    # A folder of one's own keeps what it holds, and that is told.
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "0009_before.png").write_bytes(b"another picture")
+    answer = call(capsys, "render", done, "--cameras", tmp_path / "path.json", "--to", mine, "--image-size", 24)
+    assert answer.code == 0 and f"note: {mine} holds 1 other pictures" in answer.out and (mine / "0009_before.png").is_file()
+    (tmp_path / "file").write_text("in the way")
+    answer = call(capsys, "render", done, "--cameras", tmp_path / "path.json", "--to", tmp_path / "file" / "x", "--image-size", 24)
+    assert answer.code == 2 and "cannot write" in answer.sentence() and "--out" not in answer.err
+
+
+def test_the_folder_of_a_run_is_no_capture(done: Path, tmp_path: Path, capsys: Capsys) -> None:
+    for name in ("run", "render", "export", "poses"):
+        answer = call(capsys, name, done, "--out", tmp_path / "x")
+        room = done.parent / "room"
+        assert answer.code == 2 and f"{done} is the folder of a run (of {room}); leave --out away to work on it" in answer.sentence()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_baked_field_is_made_once_and_looks_like_the_field(done: Path, tmp_path: Path, capsys: Capsys) -> None:
