@@ -107,7 +107,7 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
             job.plan.choose_fit(job, views, scene)
         field, timeline = fit_radiance_field(job, views, scene, go_on)
         if "render" in goals or stages.usable("render"):
-            pictures["field"] = render_test_views(job, field, views)
+            pictures["field"] = render_test_views(job, field, views, scene)
         # Who has asked to stop waits for the report, not for a video.
         if stages.usable("export") or ("export" in goals and not stages.stopped()):
             if job.plan is not None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipelines.job import Job, set_seeds
 from pipelines.kept import EVALUATION, EXPORT_FACTS, MATCHED, NOTES, TIMELINE, read_kept
-from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture, write_pngs
+from pipelines.rendered import Pictures, depth_steps, load_pictures, save_pictures, to_picture, write_pngs
 from pipelines.room import require_pictures, require_scores
 from pipelines.steps_capture import last_of, pixel_state
 from toolkit.errors import InputError
@@ -60,7 +60,7 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
 
     def save(pictures: Pictures) -> list[Path]:
         save_pictures(kept, pictures)
-        return [kept, *made, *write_pngs(kept.parent, name, pictures, views.exposure)]
+        return [kept, *made, *write_pngs(kept.parent, name, pictures, views.exposure, depth_steps(scene))]
 
     return job.stages.run(
         name,
@@ -68,7 +68,7 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
         save=save,
         load=lambda: load_pictures(kept),
         uses=[asdict(job.settings.tsdf), pixel_state(posed), depth_from, job.settings.export.smooth],
-        version=2,
+        version=3,
         after=["scene", "views", *(["stereo"] if matched is not None else [])],
     )
 
@@ -188,7 +188,7 @@ def fit_left_out(job: Job) -> LeftOut | None:
     return load_left_out(job.folder / LEFT_OUT) if record is not None and LEFT_OUT in record.outputs else None
 
 
-def render_test_views(job: Job, field: Field, views: Views) -> Pictures:
+def render_test_views(job: Job, field: Field, views: Views, scene: Scene) -> Pictures:
     """The field's pictures at the held-out views."""
     from toolkit.render.image import make_renderer, render_view
 
@@ -209,9 +209,9 @@ def render_test_views(job: Job, field: Field, views: Views) -> Pictures:
 
     def save(pictures: Pictures) -> list[Path]:
         save_pictures(kept, pictures)
-        return [kept, *write_pngs(kept.parent, "field", pictures, views.exposure)]
+        return [kept, *write_pngs(kept.parent, "field", pictures, views.exposure, depth_steps(scene))]
 
-    return job.stages.run("render", make=make, save=save, load=lambda: load_pictures(kept), after=["field", "views"], version=2)
+    return job.stages.run("render", make=make, save=save, load=lambda: load_pictures(kept), after=["field", "views"], version=3)
 
 
 def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, scene: Scene, views: Views) -> dict[str, Any]:
