@@ -131,7 +131,7 @@ def run_variant(suite: Suite, variant: Variant, source: Path, place: Path, optio
         views = make_views(job, posed, scene)
         if variant.fitted:
             field, _ = fit_radiance_field(job, views, scene)
-            voxels, pictures = field.voxels, render_test_views(job, field, views)
+            voxels, pictures = field.voxels, render_test_views(job, field, views, scene)
         else:
             pictures = render_directly(job, views, scene)
             voxels = pictures.facts["voxels"]

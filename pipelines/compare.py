@@ -99,7 +99,7 @@ def compare_run(target: Path, out: Path | None, options: dict[str, Any], depth: 
         surfaces = {SURFACES[kind]: kind for kind in choose_surfaces(depth, posed, truth)}
         pictures = {name: fuse_tsdf(job, posed, scene, views, name, kind) for name, kind in surfaces.items()}
         field, _ = fit_radiance_field(job, views, scene)
-        pictures = {"field": render_test_views(job, field, views), **not_fitted(job, views, scene), **pictures}
+        pictures = {"field": render_test_views(job, field, views, scene), **not_fitted(job, views, scene), **pictures}
         facts = export_results(job, field, poses, posed, scene, views)
         everything = Compared(capture, poses, posed, scene, views, field, pictures, truth)
         found = measure(job, everything)

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
-from toolkit.config import EXPORTS
+from toolkit.config import EXPORTS, require_formats
 from toolkit.errors import InputError
 
 
@@ -23,12 +23,17 @@ def export(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Write the field as files for other programs, in the input's own frame and scale, into DIR/exports."""
+    """Write the field as files for other programs, in the input's own frame and scale, into DIR/exports.
+
+    --formats is for this time: what else the run was asked for is not forgotten, and files that are there of the same field stay.
+    """
     from pipelines.reconstruct import BEFORE
     from pipelines.work import work
 
     wanted = None if formats is None else [name.strip() for name in formats.split(",") if name.strip()]
     if wanted == []:
         raise InputError(f"--formats names none; give some of {', '.join(EXPORTS)}, separated by commas")
-    options = gather(None, config, pairs, threads=threads, **{"export.formats": wanted})
+    require_formats(wanted or [], "--formats")
+    # Wanted now and not from now on: it is no setting of the run.
+    options = {**gather(None, config, pairs, threads=threads), "formats": wanted}
     work(target, out, options, ("export",), quiet=quiet, as_json=json, trusted=(*BEFORE, "field"))

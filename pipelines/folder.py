@@ -18,7 +18,7 @@ from typing import IO, Any
 from toolkit import __version__
 from toolkit.config import Settings, settings_dict
 from toolkit.errors import FieldfuseError, InputError, Interrupted, OutputError, first_line
-from toolkit.files import read_json, remove, write_json
+from toolkit.files import atomic_path, read_json, remove, write_json
 
 LOCK = ".lock"
 RUN = "run.json"
@@ -77,6 +77,7 @@ class RunFolder:
         self._lock: IO[str] | None = None
         self._made: list[Path] = []  # folders that were not there before, the innermost first
         self._held_run = False
+        self._before: bytes | None = None  # run.json of the command before
 
     def __truediv__(self, name: str) -> Path:
         return self.path / name
@@ -178,6 +179,7 @@ class RunFolder:
 
     def start(self, source: Path, settings: Settings) -> None:
         """Write run.json: what is run with what. Written before anything else, so that the folder is known as ours."""
+        self._before = (self.path / RUN).read_bytes() if is_run_folder(self.path) else None
         write_json(
             self.path / RUN,
             {
@@ -188,6 +190,12 @@ class RunFolder:
                 "settings": settings_dict(settings),
             },
         )
+
+    def restore(self) -> None:
+        """Write run.json as it was before `start`, for a command that is refused before it has changed anything."""
+        if self._before is not None:
+            with atomic_path(self.path / RUN) as temporary:
+                temporary.write_bytes(self._before)
 
     def about(self) -> dict[str, Any]:
         """What run.json says.

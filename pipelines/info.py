@@ -13,6 +13,12 @@ if TYPE_CHECKING:
     from toolkit.capture.types import Capture
 
 
+OUTDATED = (
+    ({"field"}, "the field is of earlier pictures or poses; `fieldfuse finetune {}` fits it to those that are there now"),
+    ({"tsdf", "tsdf_texture"}, "the TSDF surface is of earlier pictures or poses; `fieldfuse tsdf {}` renews it"),
+    ({"render", "evaluate"}, "scores, pictures and the report are of an earlier field or surface; `fieldfuse evaluate {}` renews them"),
+    ({"export"}, "the exports are of an earlier field; `fieldfuse export {}` renews them"),
+)
 TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS"}
 
 
@@ -83,11 +89,12 @@ def lenses(capture: Capture) -> list[dict[str, Any]]:
 def run_facts(folder: Path) -> dict[str, Any]:
     """What a run's folder holds."""
     from pipelines.folder import RunFolder
-    from pipelines.stages import finished_stages
+    from pipelines.stages import finished_stages, outdated
 
     run = RunFolder(folder)
     about = run.about()
-    page = run / "report.html"
+    page, records = run / "report.html", finished_stages(run)
+    old = outdated(records)
     return {
         "run": str(folder),
         "source": about["source"],
@@ -95,9 +102,16 @@ def run_facts(folder: Path) -> dict[str, Any]:
         "version": about.get("version"),
         "report": str(page) if page.is_file() else None,
         "scores": scores_of(run / "evaluation.json"),
+        "outdated": [text.format(folder) for stages, text in OUTDATED if stages & old],
         "stages": [
-            {"name": record.name, "seconds": record.seconds, "peak_memory_mb": record.peak_memory_mb, "stopped": record.stopped}
-            for record in finished_stages(run)
+            {
+                "name": record.name,
+                "seconds": record.seconds,
+                "peak_memory_mb": record.peak_memory_mb,
+                "stopped": record.stopped,
+                "outdated": record.name in old,
+            }
+            for record in records
         ],
     }
 
@@ -124,7 +138,8 @@ def for_people(data: dict[str, Any]) -> dict[str, Any]:
     if isinstance(shown.get("extra"), dict):
         shown["extra"] = {name: value for name, value in shown["extra"].items() if shown.get(name) != value}
     if "stages" in shown:
-        told = [f"{one['name']} {one['seconds']:.1f} s{' (stopped early)' if one['stopped'] else ''}" for one in shown["stages"]]
+        words = {"stopped": " (stopped early)", "outdated": " (out of date)"}
+        told = [f"{one['name']} {one['seconds']:.1f} s" + "".join(words[name] for name in words if one[name]) for one in shown["stages"]]
         shown["stages"] = ", ".join(told)
     if "scores" in shown:
         shown["scores"] = [

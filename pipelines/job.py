@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from toolkit.keyframes import KeyFrames
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+CAMERAS = "transforms.json"
 MOST_A_CORE, LEAST_MOST_THREADS = 4, 64  # threads that may be asked for: more of them only wait for each other
 SHORT_SPIN = "1000"  # turns, microseconds
 
@@ -43,6 +44,8 @@ class Job:
     keys: KeyFrames | None = None  # the key frames, once chosen
     corrections: Corrections | None = None  # of effects, once found
     network: NetworkField | None = None  # the networks' field, once this command has made or loaded it
+    formats: list[str] | None = None  # to be exported this time, whatever the settings say
+    alone: bool = False  # exports are all that was asked for
     plan: TotalBudget | None = None  # chooses settings as the run goes on, so that it takes as long as was asked for
 
 
@@ -64,6 +67,7 @@ def open_job(
         InputError: neither a source with `out` nor a run's folder; settings that do not fit.
         OutputError: the folder cannot be used.
     """
+    _check_no_run(target, out)
     again = out is None and is_run_folder(target)
     if out is None and not again:
         raise InputError(_no_out(target))
@@ -91,8 +95,23 @@ def open_job(
         yield Job(folder, source, settings, progress, Stages(folder, progress, trusted if again else ()), again, other, other_network)
 
 
+def _check_no_run(target: Path, out: Path | None) -> None:
+    """A run's folder is no capture, but where it has cameras that were put there for its frames (docs/conventions.md).
+
+    Raises:
+        InputError: a run's folder where a source is wanted.
+    """
+    if out is None or not is_run_folder(target) or (target / CAMERAS).is_file():
+        return
+    try:
+        source = RunFolder(target).about()["source"]
+    except InputError:
+        source = "a capture that it no longer names"
+    raise InputError(f"{target} is the folder of a run (of {source}); leave --out away to work on it, or give its capture")
+
+
 def _check_same_source(folder: RunFolder, source: Path) -> None:
-    """What another capture's run took long to make is not replaced because of a folder's name.
+    """What another capture's run took long to make is not replaced because of a folder's name. A capture that was moved is the same one.
 
     Raises:
         InputError: the folder holds a run of another source.
@@ -103,8 +122,19 @@ def _check_same_source(folder: RunFolder, source: Path) -> None:
         before = Path(folder.about()["source"])
     except InputError:
         return  # damaged, and now written again
-    if before.resolve() != source.resolve():
-        raise InputError(f"{folder.path} holds the run of {before}; choose another --out folder for {source}, or remove that one first")
+    if before.resolve() == source.resolve():
+        return
+    if not before.exists():
+        from pipelines.moved import follow, same_capture
+
+        if same_capture(folder, source):
+            follow(folder, before, source)
+            return
+        raise InputError(
+            f"{folder.path} holds the run of {before}, which is not there any more, and the files of {source} are not the same (by names, "
+            "sizes and times: move it, or copy it with its times); choose another --out folder, or remove that one first"
+        )
+    raise InputError(f"{folder.path} holds the run of {before}; choose another --out folder for {source}, or remove that one first")
 
 
 def _no_out(target: Path) -> str:

@@ -15,7 +15,8 @@ from pipelines.steps_network import make_network_field, render_network_views, us
 from pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views, score_pictures, wants_tsdf
 from pipelines.steps_stereo import reuse_matched
 from pipelines.summary import put_report, summarise_poses
-from pipelines.textured import TEXTURE, TSDF_TEXTURE, texture_tsdf
+from pipelines.taken import TEXTURE, require_originals
+from pipelines.textured import TSDF_TEXTURE, texture_tsdf
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Capture, Views
@@ -44,6 +45,7 @@ def run_job(
 
             job.plan = TotalBudget(options["total_budget"])
         wanted = frozenset(goals)
+        job.formats, job.alone = options.get("formats"), wanted == {"export"}
         return reconstruct(job, wanted, go_on) if wanted else reconstruct_poses(job)
 
 
@@ -83,6 +85,8 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
     # What the networks left is what a fit begins with, whether the folder's field was fitted or not.
     stages.trust(FOR_FIELD if "field" not in goals or (go_on and not job.other_network) else ())
     capture, poses, posed, scene, views = stand(job)
+    if job.again and {"field", "export"} <= goals:
+        require_originals(job, posed, views)
     choose_keyframes(job, scene, views)
 
     timeline: list[dict[str, Any]] = []
@@ -103,7 +107,7 @@ def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> d
             job.plan.choose_fit(job, views, scene)
         field, timeline = fit_radiance_field(job, views, scene, go_on)
         if "render" in goals or stages.usable("render"):
-            pictures["field"] = render_test_views(job, field, views)
+            pictures["field"] = render_test_views(job, field, views, scene)
         # Who has asked to stop waits for the report, not for a video.
         if stages.usable("export") or ("export" in goals and not stages.stopped()):
             if job.plan is not None:

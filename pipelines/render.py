@@ -46,3 +46,5 @@ def render(
         typer.echo(writer.dumps(data, indent=1))
     elif not quiet:
         typer.echo(f"{data['pictures']} pictures of {data['width']}×{data['height']} in {data['seconds']:.1f} s: {data['to']}")
+        if data["others"]:
+            typer.echo(f"note: {data['to']} holds {data['others']} other pictures, which are not of this command")

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import re
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,12 +22,13 @@ from pipelines.steps_results import fit_radiance_field
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture import nerf_json
 from toolkit.errors import InputError
-from toolkit.files import read_json
+from toolkit.files import read_json, remove
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Views
 
 VIDEO = (".mp4",)
+NUMBERED = re.compile(r"\d{4,}_.*\.png")
 MAX_CAMERAS = 100_000
 
 
@@ -44,7 +49,7 @@ def render_run(
     """Render what is asked for; the field of a run's folder is taken as it is.
 
     Returns:
-        how many `pictures` of which `width` and `height`, the `seconds` it took, and the path `to`.
+        how many `pictures` of which `width` and `height`, the `seconds` it took, the path `to`, and how many `others` lie there besides.
 
     Raises:
         InputError: an unknown path of cameras, cameras that cannot be used, a folder without a field and without its source.
@@ -65,20 +70,31 @@ def render_run(
         else:
             names, lenses, poses = orbit_cameras(ready, scene, frames)
         lenses = [sized(lens, image_size) for lens in lenses]
-        place = to or job.folder / "renders" / (
+        own = job.folder / "renders" / (
             "orbit.mp4" if given is None and views == "orbit" else "cameras" if given is not None else "test"
         )
+        place = to or own
         require_pictures(lenses, kept=False)
         start = time.monotonic()
         job.progress.begin("render")
-        write(job, camera_of(job, field, ready, scene, baked), names, lenses, poses, place, fps)
+        others = write(job, camera_of(job, field, ready, scene, baked), names, lenses, poses, place, fps, alone=to is None)
         seconds = time.monotonic() - start
         job.progress.finish("render", seconds, False)
-    return {"pictures": len(names), "width": lenses[0].width, "height": lenses[0].height, "seconds": round(seconds, 3), "to": str(place)}
+    size = {"width": lenses[0].width, "height": lenses[0].height}
+    return {"pictures": len(names), **size, "seconds": round(seconds, 3), "to": str(place), "others": others}
 
 
-def write(job: Job, camera: Camera, names: list[str], lenses: list[Intrinsics], poses: Array, to: Path, fps: float) -> None:
-    """Render every camera and write it as it comes."""
+def write(
+    job: Job, camera: Camera, names: list[str], lenses: list[Intrinsics], poses: Array, to: Path, fps: float, alone: bool = False
+) -> int:
+    """Render every camera and write it as it comes.
+
+    Args:
+        alone: the pictures take the place of those that an earlier command left in the folder, when all are rendered.
+
+    Returns:
+        how many other pictures lie in the folder.
+    """
     frames = pictures(camera, lenses, poses, job.progress)
     if to.suffix.lower() in VIDEO:
         from toolkit.export.video import write_video
@@ -86,9 +102,29 @@ def write(job: Job, camera: Camera, names: list[str], lenses: list[Intrinsics], 
         if len({(lens.width, lens.height) for lens in lenses}) > 1:
             raise InputError("a video needs pictures of one size and these cameras differ; give a folder with --to, or --image-size")
         write_video(to, frames, fps)
-        return
-    for index, (name, frame) in enumerate(zip(names, frames, strict=True)):
-        write_png(to / f"{index:04d}_{file_name(Path(name).stem)}.png", frame)
+        return 0
+    with _replacing(to) if alone else nullcontext(to) as folder:
+        written = {
+            write_png(folder / f"{index:04d}_{file_name(Path(name).stem)}.png", frame).name
+            for index, (name, frame) in enumerate(zip(names, frames, strict=True))
+        }
+    return sum(path.name not in written for path in to.glob("*.png"))
+
+
+@contextmanager
+def _replacing(place: Path) -> Iterator[Path]:
+    """A folder beside `place`, whose pictures take the place of the numbered ones there at the end; whatever else is there stays."""
+    temporary = place.with_name(f".tmp-{os.getpid()}-{place.name}")
+    try:
+        yield temporary
+        place.mkdir(parents=True, exist_ok=True)
+        for path in place.iterdir():
+            if NUMBERED.fullmatch(path.name):
+                remove(path)
+        for path in temporary.iterdir():
+            path.replace(place / path.name)
+    finally:
+        remove(temporary)
 
 
 def sized(lens: Intrinsics, long_side: int | None) -> Intrinsics:

@@ -6,7 +6,7 @@ import json
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -18,7 +18,11 @@ from toolkit.errors import InputError, OutputError, first_line
 from toolkit.files import atomic_path
 from toolkit.tone import exposed
 
+if TYPE_CHECKING:
+    from toolkit.poses.scene import Scene
+
 Array = NDArray[Any]
+DEEPEST = 2**16 - 1  # steps
 
 
 @dataclass
@@ -98,12 +102,27 @@ def file_name(name: str) -> str:
     return re.sub(r"[^\w.-]+", "_", name).strip("._") or "view"
 
 
-def write_pngs(folder: Path, prefix: str, pictures: Pictures, exposure: float) -> list[Path]:
-    """`<prefix>_<name>.png`, brighter by `exposure`, and `<prefix>_<name>_depth.png` (16 bit, thousandths of a working unit)."""
+def depth_step(scene: Scene) -> float:
+    """What one step of a depth picture is, in the input's unit: a thousandth (a millimetre of what is metric), or, where what is not metric
+    reaches farther than 65.535 units, the tenfold as often as it has to be."""
+    step = 0.001
+    while not scene.metric and scene.far / scene.working_from_input.scale > DEEPEST * step:
+        step *= 10
+    return step
+
+
+def depth_steps(scene: Scene) -> float:
+    """How many steps of a depth picture a working unit has."""
+    return 1 / (scene.working_from_input.scale * depth_step(scene))
+
+
+def write_pngs(folder: Path, prefix: str, pictures: Pictures, exposure: float, steps: float = 1000) -> list[Path]:
+    """`<prefix>_<name>.png`, brighter by `exposure`, and `<prefix>_<name>_depth.png` (16 bit, so many `steps` a working unit; 0: none, and
+    the largest number: that far or farther)."""
     written: list[Path] = []
     for index, (name, picture) in enumerate(zip(pictures.names, pictures.pictures, strict=True)):
         stem = f"{prefix}_{index:03d}_{file_name(Path(name).stem)}"
-        depth = np.clip(np.nan_to_num(picture.depth) * 1000, 0, 65535).astype(np.uint16)
+        depth = np.clip(np.nan_to_num(picture.depth) * steps + 0.5, 0, DEEPEST).astype(np.uint16)
         written += [write_png(folder / f"{stem}.png", exposed(picture.rgb, exposure)), write_png(folder / f"{stem}_depth.png", depth)]
     return written
 

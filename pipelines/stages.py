@@ -65,6 +65,26 @@ def finished_stages(folder: RunFolder) -> list[Record]:
     return [record for record in found if record is not None]
 
 
+def stage_key(name: str, uses: Any, before: dict[str, str] | None = None, version: int = 1) -> str:
+    """Hash of all that goes into a stage; `before`: results of stages before it, by their identities."""
+    return fingerprint(name, version, __version__, uses, before or {})
+
+
+def outdated(records: Iterable[Record]) -> set[str]:
+    """Names of those stages that stand, directly or not, on another result than the one that is there now, or on one that is gone."""
+    known = {record.name: record for record in records}
+    old: set[str] = set()
+    while True:  # what stands on something old is old itself
+        more = {
+            name
+            for name, record in known.items()
+            if any(other in old or other not in known or known[other].made != made for other, made in record.after.items())
+        }
+        if more == old:
+            return old
+        old = more
+
+
 class Stages:
     """The stages of one run folder, in the order in which they are asked for."""
 
@@ -91,6 +111,8 @@ class Stages:
         keeps: bool = False,
         rounded: bool = False,
         adds: bool = False,
+        part: bool = False,
+        whole: Callable[[], bool] = lambda: True,
     ) -> T:
         """The stage's result: loaded when it is finished and nothing that went in has changed, else made and recorded.
 
@@ -103,6 +125,9 @@ class Stages:
             in_place: `make` itself writes into the folder, so an older result is gone once it starts.
             keeps: `make` may return early when the user asks to stop; what it has is kept.
             adds: files of the result before that are not written again stay, as long as the stages `after` are still the same.
+            part: `make` makes only a part of the result, whether there is one or not.
+            whole: asked when `make` is done: whether it made all that it was asked for. A part that is added to a whole leaves it whole;
+                else it is made again when the whole is asked for.
             rounded: the files hold less precision than memory: the result is what they hold, so that a run that was killed later and
                 goes on has the same one.
 
@@ -111,10 +136,10 @@ class Stages:
             FieldfuseError: from the stage itself.
         """
         before = {other: self.records[other].made for other in after}
-        key = fingerprint(name, version, __version__, uses, before)
+        key = stage_key(name, uses, before, version)
         record = self.finished(name)
         trusted = record is not None and name in self.trusted and self.usable(name)
-        if record is not None and (trusted or (record.key == key and not record.stopped)):
+        if record is not None and not part and (trusted or (record.key == key and not record.stopped)):
             try:
                 value = load()
             except InputError:
@@ -124,7 +149,7 @@ class Stages:
                 self._note(record, cached=True)
                 return value
         self.progress.check()
-        value = self._make(name, key, before, make, save, in_place, keeps, adds)
+        value = self._make(name, key, before, make, save, in_place, keeps, adds, lambda: not part and whole())
         return load() if rounded else value
 
     def _make(
@@ -137,8 +162,10 @@ class Stages:
         in_place: bool,
         keeps: bool,
         adds: bool,
+        whole: Callable[[], bool],
     ) -> T:
         old = self.record(name)
+        had_all = adds and (finished := self.finished(name)) is not None and finished.key == key and not finished.stopped
         if in_place:
             remove(self._path(name))
         self.progress.begin(name)
@@ -156,6 +183,8 @@ class Stages:
         outputs = {path.relative_to(self.folder.path).as_posix(): path.stat().st_size for path in paths}
         if adds and old and old.after == before:
             outputs = {path: size for path, size in old.outputs.items() if (self.folder / path).is_file()} | outputs
+        if not whole() and not had_all:
+            key = fingerprint(key, "a part")
         record = Record(
             name, key, uuid.uuid4().hex[:16], round(time.monotonic() - start, 3), round(memory.megabytes, 1), outputs, before, stopped
         )

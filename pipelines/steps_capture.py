@@ -230,11 +230,11 @@ def make_views(job: Job, posed: Capture, scene: Scene, corrections: Corrections 
 
 
 def source_state(source: Path, without: Path) -> str:
-    """Hash of names, sizes and times of all files of the source; `without` (the run's own folder) does not count."""
+    """Hash of names, sizes and times of all files of the source, wherever it lies; `without` (the run's own folder) does not count."""
     if source.is_file() and source.suffix.lower() != ".json":
-        return fingerprint(source)
+        return fingerprint(_state(source, source.parent))
     root = source.parent if source.is_file() else source
-    return fingerprint(str(source), [_state(path) for path in _files(root, without)])
+    return fingerprint(source.name if source.is_file() else "", [_state(path, root) for path in _files(root, without)])
 
 
 def _files(root: Path, without: Path) -> Iterable[Path]:
@@ -248,14 +248,16 @@ def _files(root: Path, without: Path) -> Iterable[Path]:
 
 
 def pixel_state(capture: Capture) -> str:
-    """Hash of the files that hold the capture's pictures, wherever they are."""
+    """Hash of the files that hold the capture's pictures; those in its folder are the same ones wherever that lies."""
     paths = {path for frame in capture.frames for path in (frame.image, frame.depth, frame.mask, frame.confidence) if path is not None}
-    return fingerprint([_state(path) for path in sorted(paths)])
+    return fingerprint([_state(path, capture.root) for path in sorted(paths)])
 
 
-def _state(path: Path) -> list[Any]:
+def _state(path: Path, root: Path) -> list[Any]:
+    """Its name below `root` (in full, if it lies elsewhere), size and time."""
+    name = next((path.relative_to(base).as_posix() for base in (root, root.resolve()) if path.is_relative_to(base)), str(path))
     try:
         stat = path.stat()
     except OSError:
-        return [str(path), None]
-    return [str(path), stat.st_size, stat.st_mtime_ns]
+        return [name, None]
+    return [name, stat.st_size, stat.st_mtime_ns]

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipelines.job import Job, set_seeds
 from pipelines.kept import NETWORK, read_kept
-from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture, write_png, write_pngs
+from pipelines.rendered import Pictures, depth_steps, load_pictures, save_pictures, to_picture, write_png, write_pngs
 from pipelines.room import require_pictures
 from pipelines.steps_capture import choose_keyframes
 from toolkit.errors import InputError
@@ -185,7 +185,8 @@ def render_network_views(job: Job, made: NetworkField, views: Views, scene: Scen
 
     def save(pictures: Pictures) -> list[Path]:
         save_pictures(kept, pictures)
-        return [kept, *([job.folder / DIRECT] if keep else []), *write_pngs(kept.parent, "network", pictures, views.exposure)]
+        shown = write_pngs(kept.parent, "network", pictures, views.exposure, depth_steps(scene))
+        return [kept, *([job.folder / DIRECT] if keep else []), *shown]
 
     uses = [job.settings.engine, keep]
-    return job.stages.run("direct", make, save, load=lambda: load_pictures(kept), uses=uses, after=["network", "views", "scene"], version=2)
+    return job.stages.run("direct", make, save, load=lambda: load_pictures(kept), uses=uses, after=["network", "views", "scene"], version=3)

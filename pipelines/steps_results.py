@@ -11,9 +11,10 @@ import numpy as np
 
 from pipelines.job import Job, set_seeds
 from pipelines.kept import EVALUATION, EXPORT_FACTS, MATCHED, NOTES, TIMELINE, read_kept
-from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture, write_pngs
+from pipelines.rendered import Pictures, depth_steps, load_pictures, save_pictures, to_picture, write_pngs
 from pipelines.room import require_pictures, require_scores
 from pipelines.steps_capture import last_of, pixel_state
+from toolkit.errors import InputError
 from toolkit.files import write_json
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
 
     def save(pictures: Pictures) -> list[Path]:
         save_pictures(kept, pictures)
-        return [kept, *made, *write_pngs(kept.parent, name, pictures, views.exposure)]
+        return [kept, *made, *write_pngs(kept.parent, name, pictures, views.exposure, depth_steps(scene))]
 
     return job.stages.run(
         name,
@@ -67,11 +68,12 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
         save=save,
         load=lambda: load_pictures(kept),
         uses=[asdict(job.settings.tsdf), pixel_state(posed), depth_from, job.settings.export.smooth],
-        version=2,
+        version=3,
         after=["scene", "views", *(["stereo"] if matched is not None else [])],
     )
 
 
+GONE = "of an earlier field, and removed: {}; `fieldfuse export {} --formats …` makes of this one what the run is not asked for"
 FIT_NOTES = "fit_notes.json"  # what a reader of the numbers has to know of the fit; there only when there is something
 LEFT_OUT = "left_out.safetensors"  # pixels that the fit did without, since they show what moves; there only when they were looked for
 FIT_MATCHED = "fit_matched.json"  # what the fit's quick matching found; there only when it was made
@@ -186,7 +188,7 @@ def fit_left_out(job: Job) -> LeftOut | None:
     return load_left_out(job.folder / LEFT_OUT) if record is not None and LEFT_OUT in record.outputs else None
 
 
-def render_test_views(job: Job, field: Field, views: Views) -> Pictures:
+def render_test_views(job: Job, field: Field, views: Views, scene: Scene) -> Pictures:
     """The field's pictures at the held-out views."""
     from toolkit.render.image import make_renderer, render_view
 
@@ -207,25 +209,39 @@ def render_test_views(job: Job, field: Field, views: Views) -> Pictures:
 
     def save(pictures: Pictures) -> list[Path]:
         save_pictures(kept, pictures)
-        return [kept, *write_pngs(kept.parent, "field", pictures, views.exposure)]
+        return [kept, *write_pngs(kept.parent, "field", pictures, views.exposure, depth_steps(scene))]
 
-    return job.stages.run("render", make=make, save=save, load=lambda: load_pictures(kept), after=["field", "views"], version=2)
+    return job.stages.run("render", make=make, save=save, load=lambda: load_pictures(kept), after=["field", "views"], version=3)
 
 
 def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, scene: Scene, views: Views) -> dict[str, Any]:
     """Points, meshes, cameras, the page and video, in the input's own frame; answers the mesh's facts. Files of the same field that were
-    made before, in other formats, stay."""
+    made before, in other formats, stay.
+
+    Raises:
+        InputError: nothing else was asked for, and none of it could be made.
+    """
     facts_path = job.folder / "exports" / "facts.json"
     made: list[Path] = []
+    old, whole = job.stages.record("export"), True
 
     def make() -> dict[str, Any]:
         from pipelines.surface import export_field
 
-        before = read_kept(facts_path, EXPORT_FACTS) if job.stages.usable("export") else None
-        facts, paths = export_field(job, job.folder / "exports", field, poses, posed, scene, views)
-        made.extend(paths)
+        nonlocal whole
+        fits = job.stages.usable("export")
+        before = read_kept(facts_path, EXPORT_FACTS) if fits else None
+        exported = export_field(job, job.folder / "exports", field, poses, posed, scene, views)
+        facts, whole = exported.facts, exported.whole
+        if job.alone and not exported.made:
+            raise InputError(f"nothing was exported: {'; '.join(facts['notes'])}")
+        made.extend(exported.files)
         if before is not None and facts["mesh"] is None:
             facts["mesh"] = before["mesh"]
+        if old is not None and not fits:
+            kept = {path.relative_to(job.folder.path).as_posix() for path in made}
+            gone = sorted({Path(path).name for path in set(old.outputs) - kept if path.startswith("exports/")} - {facts_path.name})
+            facts["notes"] += [GONE.format(", ".join(gone), job.folder.path)] if gone else []
         return facts
 
     def save(facts: dict[str, Any]) -> list[Path]:
@@ -239,7 +255,9 @@ def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, sc
         load=lambda: read_kept(facts_path, EXPORT_FACTS),
         uses=asdict(job.settings.export),
         adds=True,
-        version=2,
+        part=job.formats is not None,
+        whole=lambda: whole,
+        version=3,
         after=["field", "poses", "scene", "views"],
     )
 

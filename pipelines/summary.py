@@ -13,7 +13,7 @@ import numpy as np
 
 from pipelines.folder import command_line
 from pipelines.job import Job
-from pipelines.rendered import Pictures
+from pipelines.rendered import Pictures, depth_step
 from pipelines.steps_effects import effects_part, effects_warnings, moved_cameras, moved_depth
 from pipelines.steps_results import fit_left_out, fit_matched, fit_notes
 from pipelines.textured import TSDF_TEXTURE
@@ -220,6 +220,7 @@ def put_report(
             "test": int(np.sum(views.test)),
             "width": views.intrinsics[0].width,
             "height": views.intrinsics[0].height,
+            "depth_step": depth_step(scene),
         },
         "field": describe_field(field, matched, left_out),
         "notes": [

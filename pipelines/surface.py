@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,8 +17,8 @@ from pipelines.rendered import Pictures, to_picture
 from pipelines.room import PICTURE_BYTES, SURFACE_BYTES, pixels, require_pictures
 from pipelines.steps_results import fit_left_out
 from pipelines.summary import put_cameras
-from pipelines.taken import as_taken
-from pipelines.textured import TEXTURE, put_textured
+from pipelines.taken import MESHES, SURFACES, TEXTURE, as_taken, missing_originals, needs_originals
+from pipelines.textured import TEXTURED, put_textured
 from toolkit import memory
 from toolkit.camera import Array, Intrinsics, Similarity
 from toolkit.errors import InputError
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 SMALL_PART = 0.002  # components of a mesh with less than this share of its area are specks
 MOST_TRIANGLES = 2_000_000
-MESHES = ("ply", "obj", "glb")
 RENDERED_SIDE = 400  # pixels; pictures tell what is finer (`export.mesh_size`), and rendering it takes long
 VIDEO_SIDE = 640
 FPS = 30
@@ -113,23 +112,36 @@ def put_points(path: Path, points: Points, input_from_working: Similarity, expos
     return path
 
 
-def export_field(
-    job: Job, folder: Path, field: Field, poses: PoseResult, posed: Capture, scene: Scene, views: Views
-) -> tuple[dict[str, Any], list[Path]]:
-    """What the settings' `export.formats` name, in the input's frame.
+@dataclass
+class Exported:
+    """What `export_field` has written."""
 
-    Returns:
-        facts (of the mesh: triangles, watertight, …; `notes` on what was left out), and the files written.
-    """
+    facts: dict[str, Any]  # of the mesh: triangles, watertight, …; `notes` on what was left out
+    files: list[Path]
+    made: set[str]  # formats
+    whole: bool  # False: something was left out for want of the capture's pictures, and can be made when they are there again
+
+
+def export_field(job: Job, folder: Path, field: Field, poses: PoseResult, posed: Capture, scene: Scene, views: Views) -> Exported:
+    """What this command or the settings' `export.formats` name, in the input's frame."""
     from toolkit.export.video import write_video
 
-    formats = set(job.settings.export.formats)
+    formats = set(job.settings.export.formats if job.formats is None else job.formats)
     facts: dict[str, Any] = {"mesh": None, "notes": []}
     written: list[Path] = []
-    if formats & {"points", *MESHES, TEXTURE}:
+    undone: set[str] = set()
+    for what, names, side in needs_originals(job, formats):
+        gone = missing_originals(job, posed, views, side)
+        if gone is not None and names - undone:
+            undone |= names
+            facts["notes"].append(f"{what} left out: {gone}")
+    whole = not undone
+    if surfaces := (formats - undone) & SURFACES:
         try:
-            facts["mesh"], written = export_surface(job, folder, formats, field, posed, scene, views, facts["notes"])
+            facts["mesh"], written = export_surface(job, folder, surfaces, field, posed, scene, views, facts["notes"])
+            undone |= {TEXTURE} - {TEXTURE for path in written if path.name == TEXTURED}
         except InputError as error:
+            undone |= surfaces
             facts["notes"].append(f"points and meshes were left out: {error}")
     if "cameras" in formats:
         put_cameras(folder / "cameras", poses, posed)
@@ -138,6 +150,7 @@ def export_field(
         try:
             written.append(put_page(job, folder / NAME, field, views, scene))
         except InputError as error:
+            undone.add(PAGE)
             facts["notes"].append(f"the page to walk through was left out: {error}")
     if "video" in formats:
         _, lenses, around = orbit_cameras(views, scene, job.settings.export.video_frames)
@@ -147,7 +160,7 @@ def export_field(
         require_pictures(lenses, kept=False, advice="leave video out of export.formats")
         write_video(folder / "orbit.mp4", pictures(camera, lenses, around, job.progress), FPS)
         written.append(folder / "orbit.mp4")
-    return facts, written
+    return Exported(facts, written, formats - undone, whole)
 
 
 def export_surface(
@@ -182,7 +195,7 @@ def export_surface(
         try:
             left_out = fit_left_out(job)  # who passed belongs into a texture as little as into the field
             shown = views if left_out is None else left_out.without(views)
-            written.append(put_textured(job, folder / "textured.glb", whole, posed, scene, shown))
+            written.append(put_textured(job, folder / TEXTURED, whole, posed, scene, shown))
         except InputError as error:
             notes.append(f"the texture was left out: {error}")
     return facts, written

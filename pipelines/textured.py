@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from toolkit.poses.scene import Scene
     from toolkit.tsdf.mesh import Mesh
 
-TEXTURE = "texture"  # as `export.formats` has it
 TSDF_TEXTURE = "tsdf_texture"  # the stage
+TEXTURED = "textured.glb"
 TRIANGLES = 80_000  # detail is in the texture
 TEXEL_BYTES = 40  # while a texture is made and packed
 
 
 def texture_tsdf(job: Job, posed: Capture, scene: Scene, views: Views) -> None:
     """`tsdf/textured.glb`, a stage of its own: what the TSDF's seconds are compared with has no texture in it."""
-    path = job.folder / "tsdf" / "textured.glb"
+    path = job.folder / "tsdf" / TEXTURED
 
     def make() -> Path:
         from toolkit.evaluate.geometry import read_mesh

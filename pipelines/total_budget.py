@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 import psutil
 
 from pipelines.page import PAGE
-from pipelines.textured import TEXTURE, TSDF_TEXTURE
+from pipelines.taken import TEXTURE
+from pipelines.textured import TSDF_TEXTURE
 from toolkit.config import EXPORTS, settings_dict
 from toolkit.errors import FieldfuseError
 from toolkit.evaluate import budget as model

@@ -6,7 +6,7 @@ Only what differs from these defaults stands in `configs/*.yaml`.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from dataclasses import field as default
 from importlib import resources
@@ -328,6 +328,23 @@ def _numbers(part: Any, of: str = "") -> Iterator[tuple[str, float]]:
             yield name, value
 
 
+def require_formats(names: Iterable[str], where: str = "export.formats") -> None:
+    """Refuse what is no export.
+
+    Raises:
+        InputError: naming the nearest one.
+    """
+    _check_names(where, names, "format", EXPORTS)
+
+
+def _check_names(where: str, names: Iterable[str], kind: str, known: tuple[str, ...]) -> None:
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f" (did you mean {near[0]!r}?)" if near else ""
+            raise InputError(f"{where}: there is no {kind} {brief(repr(name))}{hint}; known are {', '.join(known)}")
+
+
 def _check_ranges(settings: Settings) -> None:
     positive = {
         "capture.image_size": settings.capture.image_size,
@@ -356,16 +373,9 @@ def _check_ranges(settings: Settings) -> None:
     for name, number in _numbers(settings):
         if not 0 <= number < 2**63:
             raise InputError(f"{name} is {brief(str(number))}; it must be a number, and not below 0")
-    for key, names, kind, known in (
-        ("effects.on", settings.effects.on, "effect", EFFECTS),
-        ("effects.off", settings.effects.off, "effect", EFFECTS),
-        ("export.formats", settings.export.formats, "format", EXPORTS),
-    ):
-        for name in names:
-            if name not in known:
-                near = difflib.get_close_matches(name, known, n=1)
-                hint = f" (did you mean {near[0]!r}?)" if near else ""
-                raise InputError(f"{key}: there is no {kind} {name!r}{hint}; known are {', '.join(known)}")
+    _check_names("effects.on", settings.effects.on, "effect", EFFECTS)
+    _check_names("effects.off", settings.effects.off, "effect", EFFECTS)
+    require_formats(settings.export.formats)
     both = sorted(set(settings.effects.on) & set(settings.effects.off))
     if both:
         raise InputError(f"effects.on and effects.off both name {both[0]!r}; it can be in one of them")

@@ -36,9 +36,9 @@ def atomic_path(target: Path | str) -> Iterator[Path]:
         yield temporary
         temporary.replace(target)
     except OSError as error:
-        raise OutputError(f"cannot write {target}: {error.strerror or error}; free space or choose another --out folder") from error
+        raise OutputError(f"cannot write {target}: {error.strerror or error}; free space or choose another folder") from error
     except SafetensorError as error:  # says of a full disk what an OSError would
-        raise OutputError(f"cannot write {target}: {first_line(error)}; free space or choose another --out folder") from error
+        raise OutputError(f"cannot write {target}: {first_line(error)}; free space or choose another folder") from error
     finally:
         with suppress(OSError):  # what went wrong is already on its way up
             remove(temporary)

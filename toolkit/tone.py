@@ -96,6 +96,12 @@ def encode(linear: Array) -> Array:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
+def shares(numbers: Array) -> Array:
+    """Colours as files keep them, whole numbers up to the largest of their type or fractions → float64 in [0, 1]."""
+    most = np.iinfo(numbers.dtype).max if numbers.dtype.kind in "iu" else 1
+    return np.asarray(np.clip(numbers.astype(np.float64) / most, 0, 1))
+
+
 def stored(linear: Array) -> Array:
     """Linear light → uint8 sRGB, through a table that is fine enough for 8 bits: steps of the square root, which is nearly even in sRGB."""
     root = np.sqrt(np.clip(linear, 0, 1))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -15,20 +17,32 @@ from toolkit.errors import InputError, OutputError
 from toolkit.export.mesh import FORMATS, mesh_facts, write_mesh
 from toolkit.export.ply import single_precision
 from toolkit.export.points import write_points
+from toolkit.tone import encode, shares
 from toolkit.tsdf.mesh import Mesh
 
 
 def with_open3d(path: Path) -> tuple[Array, Array, Array]:
     mesh = o3d.io.read_triangle_mesh(str(path))
     assert mesh.has_vertex_colors()
-    return np.asarray(mesh.vertices), np.asarray(mesh.triangles), np.round(np.asarray(mesh.vertex_colors) * 255).astype(int)
+    return np.asarray(mesh.vertices), np.asarray(mesh.triangles), as_srgb(path, np.asarray(mesh.vertex_colors))
 
 
 def with_trimesh(path: Path) -> tuple[Array, Array, Array]:
+    if path.suffix == ".glb":  # has a material, and colours beside it, which trimesh loses where it makes one mesh of a scene
+        scene = trimesh.load_scene(path, process=False)
+        place, name = scene.graph[scene.graph.nodes_geometry[0]]
+        mesh = scene.geometry[name]
+        colours = mesh.visual.vertex_attributes["color"]
+        return mesh.vertices @ place[:3, :3].T + place[:3, 3], np.asarray(mesh.faces), as_srgb(path, shares(np.asarray(colours)[:, :3]))
     mesh = trimesh.load(path, force="mesh", process=False)
     assert isinstance(mesh, trimesh.Trimesh)
     assert mesh.visual.kind == "vertex"
     return np.asarray(mesh.vertices), np.asarray(mesh.faces), np.asarray(mesh.visual.vertex_colors)[:, :3].astype(int)
+
+
+def as_srgb(path: Path, colours: Array) -> Array:
+    """Colours in [0, 1] as the file has them → sRGB, whole numbers up to 255; glTF's are linear."""
+    return np.round((encode(colours) if path.suffix == ".glb" else colours) * 255).astype(int)
 
 
 READERS = {"open3d": with_open3d, "trimesh": with_trimesh}
@@ -84,6 +98,30 @@ def test_normals_survive_in_ply_and_obj(tmp_path: Path) -> None:
         read = o3d.io.read_triangle_mesh(str(path))
         assert mesh.normals is not None
         assert np.allclose(np.asarray(read.vertex_normals)[np.asarray(read.triangles)], mesh.normals[mesh.triangles], atol=1e-4)
+
+
+def test_glb_has_linear_colours_and_a_material_that_takes_no_light(tmp_path: Path) -> None:
+    """Read by the specification alone (glTF 2.0, 3.7.2.1 and 3.9.2)."""
+    mesh = coloured_ball()
+    write_mesh(tmp_path / "mesh.glb", mesh)
+    data = (tmp_path / "mesh.glb").read_bytes()
+    length = struct.unpack("<I", data[12:16])[0]
+    tree, chunk = json.loads(data[20 : 20 + length]), data[28 + length :]
+    primitive = tree["meshes"][0]["primitives"][0]
+    assert set(primitive["attributes"]) == {"POSITION", "NORMAL", "COLOR_0"}
+    assert tree["materials"][primitive["material"]]["pbrMetallicRoughness"] == {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    assert tree["materials"][primitive["material"]]["extensions"] == {"KHR_materials_unlit": {}}
+    assert tree["extensionsUsed"] == ["KHR_materials_unlit"]
+    accessor = tree["accessors"][primitive["attributes"]["COLOR_0"]]
+    assert (accessor["componentType"], accessor["type"], accessor["normalized"]) == (5123, "VEC4", True)  # unsigned short
+    assert accessor["count"] == len(mesh.vertices)
+    view = tree["bufferViews"][accessor["bufferView"]]
+    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+    assert start % 4 == 0
+    linear = np.frombuffer(chunk, "<u2", 4 * accessor["count"], start).reshape(-1, 4) / 65535
+    assert (linear[:, 3] == 1).all()
+    write_mesh(tmp_path / "mesh.ply", mesh)
+    assert np.abs(encode(linear[:, :3]) - with_trimesh(tmp_path / "mesh.ply")[2] / 255).max() < 0.1 / 255  # far below a step, in the darks
 
 
 def test_facts_agree_with_trimesh() -> None:

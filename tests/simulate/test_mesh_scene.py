@@ -15,11 +15,13 @@ from toolkit.camera import Intrinsics
 from toolkit.effects.background import Background
 from toolkit.effects.highlights import Highlights
 from toolkit.errors import InputError
+from toolkit.export.mesh import write_mesh
 from toolkit.simulate.eye import eye_of, take
 from toolkit.simulate.mesh_scene import MeshScene, load_mesh_scene
 from toolkit.simulate.paths import PathSettings, plan
 from toolkit.simulate.settings import scene_file
 from toolkit.simulate.simulate import simulate
+from toolkit.tsdf.mesh import Mesh
 
 trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("open3d")
@@ -80,6 +82,18 @@ def test_colours_of_vertices(tmp_path: Path) -> None:
     rgb, depth, _ = picture(load_mesh_scene(tmp_path / "box.ply"))
     assert depth[30, 40] == pytest.approx(2.5)
     assert rgb[30, 40, 1] > 0.2 and rgb[30, 40, 0] == rgb[30, 40, 2] == 0
+
+
+def test_an_exported_mesh_has_its_colours_in_every_format(tmp_path: Path) -> None:
+    """sRGB in PLY, linear and beside a material in GLB."""
+    box = trimesh.creation.box((1, 1, 1))
+    mesh = Mesh.create(box.vertices, box.faces, np.tile([200, 100, 20], (8, 1)))
+    shown = []
+    for suffix in (".ply", ".glb"):
+        write_mesh(tmp_path / f"box{suffix}", mesh)
+        shown.append(picture(load_mesh_scene(tmp_path / f"box{suffix}"))[0][30, 40])
+    np.testing.assert_allclose(shown[0], shown[1], atol=1e-3)
+    assert shown[0][0] > 2 * shown[0][1] > 4 * shown[0][2] > 0
 
 
 def test_parts_stand_where_the_file_puts_them(tmp_path: Path) -> None:

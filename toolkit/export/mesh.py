@@ -18,16 +18,19 @@ from toolkit.errors import InputError
 from toolkit.export.atlas import Atlas
 from toolkit.export.ply import single_precision, write_ply
 from toolkit.files import atomic_path
+from toolkit.tone import LINEAR
 from toolkit.tsdf.mesh import Mesh
 
 FORMATS = (".ply", ".obj", ".glb")
 JPEG_QUALITY = 95
 ROWS_AT_ONCE = 100_000
+COLOUR, MOST = "_COLOUR", 2**16 - 1  # what trimesh calls them, and full light
 
 
 def write_mesh(path: Path | str, mesh: Mesh, working_from_input: Similarity | None = None) -> None:
     """Write a mesh in the format that the suffix names: .ply, .obj (colours behind the positions, `v x y z r g b`) or .glb.
 
+    Colours are sRGB, but linear in .glb, as glTF has them; what is lit is in them, so there its material takes no light.
     With `working_from_input` the mesh is in the working frame and is brought back to the input's; without it it is written as it is.
     Axes are kept as they are in every format: glTF viewers take y as up, so a z-up model lies on its side there and is right again in
     tools that read it back.
@@ -86,7 +89,7 @@ def write_textured(path: Path | str, mesh: Mesh, atlas: Atlas, texture: Array, w
 
 
 def _unlit(tree: dict[str, Any]) -> None:
-    """Mark the materials of a glTF file as such that show their texture whatever the light."""
+    """Mark the materials of a glTF file as such that show their colours whatever the light."""
     for material in tree["materials"]:
         material["extensions"] = {"KHR_materials_unlit": {}}
     tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", []), "KHR_materials_unlit"})
@@ -138,7 +141,20 @@ def _write_glb(path: Path, mesh: Mesh) -> None:
         raise InputError(f"the mesh has no triangles, which {path.name} cannot hold; write it as .ply or check the depth it was made from")
     # glTF positions are float32: a model far from its origin keeps its place in the node, whose matrix is written in full.
     offset = np.zeros(3) if single_precision(mesh.vertices) else mesh.bounds().mean(axis=0)
-    data = _as_glb(to_trimesh(mesh, offset), offset, include_normals=mesh.normals is not None)
+    solid = to_trimesh(mesh, offset)
+    solid.visual = TextureVisuals(material=PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0))
+    # glTF multiplies light by them, so they are linear; in 8 bits the dark ones would lie in bands.
+    linear = np.round(LINEAR[mesh.colours].astype(np.float64) * MOST).astype(np.uint16)
+    solid.vertex_attributes[COLOUR] = np.concatenate([linear, np.full((len(linear), 1), MOST, np.uint16)], axis=1)
+
+    def name_colours(tree: dict[str, Any]) -> None:
+        """trimesh writes colours of vertices in 8 bits, and other numbers of vertices as they are."""
+        attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+        attributes["COLOR_0"] = attributes.pop(COLOUR)
+        tree["accessors"][attributes["COLOR_0"]]["normalized"] = True
+        _unlit(tree)
+
+    data = _as_glb(solid, offset, include_normals=mesh.normals is not None, tree_postprocessor=name_colours)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 

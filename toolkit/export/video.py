@@ -111,7 +111,7 @@ def write_video(path: Path | str, frames: Iterable[Array], fps: float = 30.0, co
             writer.close()
         # OpenCV drops pictures without a word when the disk is full; a video that does not hold them all is not kept.
         if frame_count(temporary) != count:
-            raise OutputError(f"the video {path} could not be written whole; free space or choose another --out folder")
+            raise OutputError(f"the video {path} could not be written whole; free space or choose another folder")
     return used
 
 

@@ -17,11 +17,13 @@ from toolkit.errors import InputError
 from toolkit.simulate.atlas import Atlas
 from toolkit.simulate.cast import FAR
 from toolkit.simulate.seen import Mesh, Rays, Seen
+from toolkit.tone import shares
 
 Tensor = torch.Tensor
 
 LARGEST = 1e18  # of what is read; its square must be a float32
-SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
+GLTF = (".glb", ".gltf")
+SUFFIXES = (*GLTF, ".obj", ".ply")
 TEXTURE_SIDE = 1024  # pixels: larger textures are halved to it
 SUN = (0.35, 0.25, 0.9)  # towards the light
 SUN_LIGHT, SKY_LIGHT, GROUND_LIGHT = 0.38, 0.5, 0.34  # linear
@@ -153,7 +155,7 @@ def load_mesh_scene(path: Path | str, up: str = "z", scale: float = 1.0) -> Mesh
         raise InputError(f"{path} holds no triangles; point clouds cannot be filmed")
     turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) if up == "y" else np.eye(3)
     try:
-        pictures, joined = _joined(parts, turn * scale)
+        pictures, joined = _joined(parts, turn * scale, path.suffix.lower() in GLTF)
     except Exception as error:  # textures are read where they are first looked at
         raise InputError(f"{path} has surfaces or textures that cannot be read ({type(error).__name__}); save it again") from error
     if not all((np.abs(joined[name]) < LARGEST).all() for name in ("vertices", "places", "tint")):  # NaN is not, either
@@ -163,14 +165,14 @@ def load_mesh_scene(path: Path | str, up: str = "z", scale: float = 1.0) -> Mesh
     return MeshScene(atlas=Atlas(pictures, mirrored=False), **joined)
 
 
-def _joined(parts: list[tuple[Array, Any]], turn: Array) -> tuple[list[Array], dict[str, Array]]:
+def _joined(parts: list[tuple[Array, Any]], turn: Array, gltf: bool) -> tuple[list[Array], dict[str, Array]]:
     """All textures, and the columns of `MeshScene` over all parts; `turn` (3, 3) goes from the file's axes and unit to metres."""
     pictures: list[Array] = [np.ones((4, 4, 3), dtype=np.float32)]
     known: dict[int, int] = {}
     columns: dict[str, list[Array]] = {name: [] for name in ("vertices", "triangles", "texture", "places", "tint", "gloss")}
     count = 0
     for place, part in parts:
-        number, tint, gloss = _surface(part, pictures, known)
+        number, tint, gloss = _surface(part, pictures, known, gltf)
         vertices = np.asarray(part.vertices) @ place[:3, :3].T + place[:3, 3]
         places = getattr(part.visual, "uv", None)
         places = np.zeros((len(part.vertices), 2)) if places is None or len(places) != len(part.vertices) else np.asarray(places)
@@ -184,13 +186,20 @@ def _joined(parts: list[tuple[Array, Any]], turn: Array) -> tuple[list[Array], d
     return pictures, {name: np.concatenate(values) for name, values in columns.items()}
 
 
-def _surface(part: Any, pictures: list[Array], known: dict[int, int]) -> tuple[int, Array, float]:
-    """Texture number, linear tint of each vertex (V, 3) and gloss of one part; new textures are added to `pictures`."""
+def _surface(part: Any, pictures: list[Array], known: dict[int, int], gltf: bool) -> tuple[int, Array, float]:
+    """Texture number, linear tint of each vertex (V, 3) and gloss of one part; new textures are added to `pictures`.
+
+    Colours of vertices are sRGB, but linear in glTF, where they multiply the material's.
+    """
     white = np.ones((len(part.vertices), 3))
     material = getattr(part.visual, "material", None)
     if material is None:  # colours by vertex or by face
-        colours = np.asarray(part.visual.vertex_colors)[:, :3] / 255.0 if part.visual.defined else white * 0.7
-        return 0, _linear(colours), 0.0
+        if not part.visual.defined:
+            return 0, _linear(white * 0.7), 0.0
+        colours = shares(np.asarray(part.visual.vertex_colors)[:, :3])
+        return 0, colours if gltf else _linear(colours), 0.0
+    if gltf and (kept := part.visual.vertex_attributes.get("color")) is not None and len(kept) == len(white):
+        white = shares(np.asarray(kept)[:, :3])
     image = getattr(material, "baseColorTexture", None)
     image = getattr(material, "image", None) if image is None else image
     factor = getattr(material, "baseColorFactor", None)
