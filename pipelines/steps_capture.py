@@ -46,7 +46,6 @@ def find_capture(job: Job) -> Capture:
         save=save,
         load=lambda: capture_from_dict(read_json(path)),
         uses=source_state(job.source, job.folder.path),
-        version=2,
     )
 
 

@@ -14,7 +14,6 @@ from toolkit.render.composite import distortion, ray_sum, thickness_gradient, we
 from toolkit.render.field import density
 from toolkit.render.march import first_of_ray
 
-
 # What comes to less, of weights and places of about 1, is told by the double sums to some 1e-16, not to a share of itself.
 LEAST = 1e-9
 
