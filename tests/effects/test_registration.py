@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from toolkit.camera import Array, Intrinsics, invert, pixel_grid
+from toolkit.camera import OPENCV, Array, Intrinsics, invert, pixel_grid
 from toolkit.capture import open_capture
 from toolkit.capture.images import load_depth
 from toolkit.capture.prepare import held_out
@@ -93,6 +93,18 @@ def test_the_unit_of_length_does_not_matter(unit: float) -> None:
     np.testing.assert_allclose(other.depth_from_picture[:3, :3], one.depth_from_picture[:3, :3], atol=1e-3)
     np.testing.assert_allclose(other.depth_from_picture[:3, 3] / unit, one.depth_from_picture[:3, 3], atol=2e-3)
     assert other.gain == pytest.approx(one.gain, abs=0.01)
+
+
+def test_each_frame_may_have_its_own_camera_and_a_lens() -> None:
+    true = depth_offset.forward(depth_offset.PRESETS["medium"])
+    some = observations(true)
+    one = solved(some)
+    cameras = tuple(replace(CAMERA, fx=140.0 + 1e-9 * number) for number in range(4))
+    other = solved(replace(some, cameras=cameras))
+    lens = solved(replace(some, cameras=(replace(CAMERA, lens=OPENCV, distortion=(1e-9, 0.0, 0.0, 0.0)),) * 4))
+    assert one is not None and other is not None and lens is not None
+    for found in (other, lens):
+        np.testing.assert_allclose(found.depth_from_picture, one.depth_from_picture, atol=1e-3)
 
 
 def test_a_wall_straight_ahead_without_noise_moves_nothing() -> None:

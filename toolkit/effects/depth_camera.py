@@ -33,7 +33,7 @@ def look_for_offset(
         capture: with the poses and lenses that depth is going to be used with.
         train: frames that may be looked at.
         seen: what was found in its pictures, whatever poses and lenses it had then; a quick look at few of them is followed by a closer
-            one where it comes near to speaking for an offset.
+            one where it comes near to speaking for an offset, or tells nothing.
 
     Raises:
         InputError: a picture or a depth map cannot be read.
@@ -51,7 +51,7 @@ def look_for_offset(
 
     found = None if seen is None else found_by(seen)
     quick = seen is not None and len(seen.names) <= FIRST_FRAMES < len(allowed)
-    if quick and found is not None and found.gain > CLOSE * MARGIN:
+    if quick and (found is None or found.gain > CLOSE * MARGIN):
         closely = [allowed[k] for k in choose(len(allowed), MOST_FRAMES)]
         found = found_by(gather(capture, closely, progress, known=known))
     if found is None:

@@ -91,11 +91,11 @@ class Observations:
         places = scale * self.places @ depth_from_picture[:3, :3].T + depth_from_picture[:3, 3]
         front = np.flatnonzero(places[:, 2] > 0)
         ideal, mine = places[front, :2] / places[front, 2:], self.map[front]
-        pixels = np.empty_like(ideal)
-        for camera in dict.fromkeys(self.cameras):
+        for camera in dict.fromkeys(camera for camera in self.cameras if camera.distorted):
             one = np.array([other == camera for other in self.cameras])[mine]
-            pixels[one] = distort(camera, ideal[one]) * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-        pixels = (pixels - 0.5) / self.step[mine, None]
+            ideal[one] = distort(camera, ideal[one])
+        lens = np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in self.cameras])[mine]  # each frame may have its own
+        pixels = (ideal * lens[:, :2] + lens[:, 2:] - 0.5) / self.step[mine, None]
         inside = (pixels >= 0).all(axis=1) & (pixels < self.size[mine] - 1).all(axis=1)
         front, pixels, mine = front[inside], pixels[inside], mine[inside]
         whole = pixels.astype(np.intp)
