@@ -18,6 +18,7 @@ from toolkit.config import EffectsSettings
 from toolkit.effects import depth_offset
 from toolkit.effects.correct import Corrections
 from toolkit.effects.decide import Decided, decide
+from toolkit.effects.depth_maps import DepthMaps
 from toolkit.effects.registration import DEPTH_OFFSET, FEWEST, Observations, solved
 from toolkit.simulate import procedural
 from toolkit.simulate.materials import texture_bank
@@ -57,7 +58,11 @@ def observations(depth_from_picture: Array, noise: float = 0.005, count: int = 1
     start = np.arange(maps) * CAMERA.width * CAMERA.height
     size = np.tile([CAMERA.width, CAMERA.height], (maps, 1))
     parts = np.concatenate(places), np.concatenate(point), np.concatenate(owner), np.concatenate(values)
-    return Observations(*parts, start, size, np.ones(maps), (CAMERA,) * maps)
+    return Observations(*parts[:3], DepthMaps(parts[3], start, size, np.ones(maps), (CAMERA,) * maps))
+
+
+def with_values(some: Observations, values: Array) -> Observations:
+    return replace(some, maps=replace(some.maps, values=values))
 
 
 def apart(one: Array, other: Array) -> tuple[float, float]:
@@ -88,7 +93,7 @@ def test_nothing_is_found_where_nothing_is_nor_a_scale_taken_for_it() -> None:
 def test_the_unit_of_length_does_not_matter(unit: float) -> None:
     true = depth_offset.forward(depth_offset.PRESETS["medium"])
     some = observations(true)
-    one, other = solved(some), solved(replace(some, places=unit * some.places, values=np.float32(unit) * some.values))
+    one, other = solved(some), solved(with_values(replace(some, places=unit * some.places), np.float32(unit) * some.maps.values))
     assert one is not None and other is not None
     np.testing.assert_allclose(other.depth_from_picture[:3, :3], one.depth_from_picture[:3, :3], atol=1e-3)
     np.testing.assert_allclose(other.depth_from_picture[:3, 3] / unit, one.depth_from_picture[:3, 3], atol=2e-3)
@@ -100,8 +105,9 @@ def test_each_frame_may_have_its_own_camera_and_a_lens() -> None:
     some = observations(true)
     one = solved(some)
     cameras = tuple(replace(CAMERA, fx=140.0 + 1e-9 * number) for number in range(4))
-    other = solved(replace(some, cameras=cameras))
-    lens = solved(replace(some, cameras=(replace(CAMERA, lens=OPENCV, distortion=(1e-9, 0.0, 0.0, 0.0)),) * 4))
+    other = solved(replace(some, maps=replace(some.maps, cameras=cameras)))
+    bent = (replace(CAMERA, lens=OPENCV, distortion=(1e-9, 0.0, 0.0, 0.0)),) * 4
+    lens = solved(replace(some, maps=replace(some.maps, cameras=bent)))
     assert one is not None and other is not None and lens is not None
     for found in (other, lens):
         np.testing.assert_allclose(found.depth_from_picture, one.depth_from_picture, atol=1e-3)
@@ -109,7 +115,7 @@ def test_each_frame_may_have_its_own_camera_and_a_lens() -> None:
 
 def test_a_wall_straight_ahead_without_noise_moves_nothing() -> None:
     some = observations(np.eye(4), noise=0)
-    flat = replace(some, places=2 * some.places / some.places[:, 2:], values=np.full_like(some.values, 2))
+    flat = with_values(replace(some, places=2 * some.places / some.places[:, 2:]), np.full_like(some.maps.values, 2))
     found = solved(flat)
     assert found is not None and not found.there
     np.testing.assert_allclose(found.depth_from_picture, np.eye(4), atol=1e-6)
@@ -128,7 +134,7 @@ def test_a_third_of_wrong_points_does_no_harm() -> None:
 def test_too_little_tells_nothing() -> None:
     some = observations(np.eye(4))
     assert solved(some.some(np.arange(FEWEST - 1))) is None
-    assert solved(replace(some, values=np.zeros_like(some.values))) is None
+    assert solved(with_values(some, np.zeros_like(some.maps.values))) is None
 
 
 def filmed(tmp_path: Path, *effects: str) -> Path:

@@ -38,6 +38,8 @@ class Problem:
     row: Array  # (O,) −1/2 … 1/2
     motion: Array  # (F, 6) Ω (radians) and V while the rows are read, camera axes
     lens: tuple[float, float] = (0.0, 0.0)  # k1, k2
+    depth: Array | None = None  # (O,) by a sensor, along the camera's axis; NaN: not known
+    depth_weight: float = 1.0  # working pixels that being off by all of the depth counts as
 
     def only(self, points: Array) -> Problem:
         """The problem of some points (P,) bool."""
@@ -50,6 +52,7 @@ class Problem:
             point=number[self.point[keep]],
             place=self.place[keep],
             row=self.row[keep],
+            depth=None if self.depth is None else self.depth[keep],
         )
 
     def like(self, other: Problem) -> Problem:
@@ -102,6 +105,13 @@ def residuals(problem: Problem) -> Array:
     return np.asarray((predict(problem)[1] - problem.place) * problem.focal[problem.frame, None])
 
 
+def depth_residuals(problem: Problem) -> Array:
+    """(O,) predicted over measured depth − 1, in working pixels; 0 where nothing was measured."""
+    if problem.depth is None:
+        return np.zeros(len(problem.place))
+    return np.nan_to_num(problem.depth_weight * (predict(problem)[0][:, 2] / problem.depth - 1))
+
+
 def scatter(residual: Array) -> float:
     """Deviation of residuals (O, 2) by the median of their lengths (Rayleigh: median = 1.1774 deviations)."""
     return float(np.median(np.linalg.norm(residual, axis=1)) / 1.1774) if len(residual) else np.inf
@@ -109,7 +119,7 @@ def scatter(residual: Array) -> float:
 
 def uncertainty(problem: Problem) -> Array:
     """(O,) deviation of points along the viewing direction of the pictures that show them, by how well rays meet; units of the poses."""
-    by_point = _slopes(problem, frozenset())[0]
+    by_point = _slopes(replace(problem, depth=None), frozenset())[0]
     count = len(problem.points)
     ends = np.searchsorted(problem.point, np.arange(count))
     certain = _sum(np.einsum("oai,oaj->oij", by_point, by_point), ends, count)
@@ -122,12 +132,12 @@ def uncertainty(problem: Problem) -> Array:
 def adjust(problem: Problem, unknown: frozenset[str] = frozenset(), steps: int = STEPS, belief: Belief | None = None) -> Fitted:
     """Fit the points and what is `unknown` beside them; poses that are unknown stay near those of `belief`, if there is one."""
     damping, current = 1e-3, problem
-    left = residuals(current)
-    width = TUNING * max(scatter(left), 1e-3)
+    left = _left(current)
+    width = TUNING * max(scatter(left[:, :2]), 1e-3)
     cost = _cost(left, width, current, belief)
     for _ in range(steps):
         moved = _step(current, left, width, unknown, damping, belief)
-        new = residuals(moved)
+        new = _left(moved)
         value = _cost(new, width, moved, belief)
         if not value < cost:
             damping *= 10
@@ -136,26 +146,43 @@ def adjust(problem: Problem, unknown: frozenset[str] = frozenset(), steps: int =
             continue
         done = value > (1 - SLACK) * cost
         current, left, damping = moved, new, max(damping / 5, 1e-7)
-        width = TUNING * max(scatter(left), 1e-3)
+        width = TUNING * max(scatter(left[:, :2]), 1e-3)
         cost = _cost(left, width, current, belief)
         if done:
             break
-    return Fitted(current, left, scatter(left))
+    return Fitted(current, left[:, :2], scatter(left[:, :2]))
+
+
+def _left(problem: Problem) -> Array:
+    """(O, 2) residuals, (O, 3) where a sensor measured depth."""
+    seen = residuals(problem)
+    return seen if problem.depth is None else np.column_stack([seen, depth_residuals(problem)])
 
 
 def _cost(residual: Array, width: float, problem: Problem | None = None, belief: Belief | None = None) -> float:
     """Huber's cost, and that of the belief, over the number of residuals."""
-    size = np.linalg.norm(residual, axis=1)
+    size = _sizes(residual)
     held = belief.cost(problem.poses) / max(len(size), 1) if belief is not None and problem is not None else 0.0
-    return float(np.where(size < width, 0.5 * size**2, width * (size - 0.5 * width)).mean()) + held
+    return float(np.where(size < width, 0.5 * size**2, width * (size - 0.5 * width)).sum(axis=1).mean()) + held
+
+
+def _sizes(residual: Array) -> Array:
+    """(O, 1) how far places are off, (O, 2) with depths."""
+    return np.column_stack([np.linalg.norm(residual[:, :2], axis=1), np.abs(residual[:, 2:])])
+
+
+def _weights(residual: Array, width: float) -> Array:
+    """(O, 2 or 3) of Huber: both numbers of a place share one."""
+    weight = np.minimum(1, width / np.maximum(_sizes(residual), 1e-12))
+    return np.column_stack([weight[:, :1], weight])
 
 
 def _step(problem: Problem, left: Array, width: float, unknown: frozenset[str], damping: float, belief: Belief | None = None) -> Problem:
     """One damped Gauss-Newton step."""
     by_point, by_camera, columns, count = _slopes(problem, unknown)
-    weight = np.minimum(1, width / np.maximum(np.linalg.norm(left, axis=1), 1e-12))
+    weight = _weights(left, width)[:, :, None]
     points = len(problem.points)
-    heavy = by_point * weight[:, None, None]
+    heavy = by_point * weight
     ends = np.searchsorted(problem.point, np.arange(points))
     v = _sum(np.einsum("oai,oaj->oij", heavy, by_point), ends, points)
     g = _sum(np.einsum("oai,oa->oi", heavy, left), ends, points)
@@ -164,7 +191,7 @@ def _step(problem: Problem, left: Array, width: float, unknown: frozenset[str], 
     if count == 0:
         return replace(problem, points=problem.points - np.einsum("pij,pj->pi", inverse, g))
     matrix, right = np.zeros((count, count)), np.zeros(count)
-    weighted = by_camera * weight[:, None, None]
+    weighted = by_camera * weight
     np.add.at(right, columns, np.einsum("oac,oa->oc", weighted, left))
     block = np.einsum("oac,oad->ocd", weighted, by_camera)
     np.add.at(matrix, (columns[:, :, None], columns[:, None, :]), block)
@@ -198,7 +225,8 @@ def _sum(values: Array, ends: Array, points: int) -> Array:
 
 
 def _slopes(problem: Problem, unknown: frozenset[str]) -> tuple[Array, Array, Array, int]:
-    """Derivatives of the residuals by the points (O, 2, 3) and by what else is unknown (O, 2, K), its columns (O, K), and their number."""
+    """Derivatives of what is left (R = 2 or 3) by the points (O, R, 3) and by what else is unknown (O, R, K), its columns (O, K), and
+    their number."""
     camera, _ = predict(problem)
     z = np.maximum(camera[:, 2], 1e-9)
     x = camera[:, :2] / z[:, None]
@@ -210,6 +238,10 @@ def _slopes(problem: Problem, unknown: frozenset[str]) -> tuple[Array, Array, Ar
     flat[:, 0, 0] = flat[:, 1, 1] = 1 / z
     flat[:, :, 2] = -x / z[:, None]
     by_place = np.einsum("oab,obc->oac", lens, flat) * problem.focal[problem.frame, None, None]  # of camera axes
+    if problem.depth is not None:
+        deep = np.zeros((len(x), 1, 3))
+        deep[:, 0, 2] = np.nan_to_num(problem.depth_weight / problem.depth)
+        by_place = np.concatenate([by_place, deep], axis=1)
     by_point = np.einsum("oac,oic->oai", by_place, problem.poses[problem.frame, :3, :3])
     parts, columns = [], []
     frames = len(problem.poses)
@@ -221,8 +253,9 @@ def _slopes(problem: Problem, unknown: frozenset[str]) -> tuple[Array, Array, Ar
         first = 6 * frames
     if LENS in unknown:
         focal = problem.focal[problem.frame, None]
-        grown = np.stack([x * r2[:, None], x * r2[:, None] ** 2], axis=2)
-        parts.append(grown * focal[:, :, None])
+        grown = np.zeros((len(x), by_place.shape[1], 2))
+        grown[:, :2] = np.stack([x * r2[:, None], x * r2[:, None] ** 2], axis=2) * focal[:, :, None]
+        parts.append(grown)
         columns.append(np.broadcast_to(first + np.arange(2), (len(x), 2)))
         first += 2
     if ROWS in unknown:
@@ -230,7 +263,7 @@ def _slopes(problem: Problem, unknown: frozenset[str]) -> tuple[Array, Array, Ar
         columns.append(first + 6 * problem.frame[:, None] + np.arange(6))
         first += 6 * frames
     if not parts:
-        return by_point, np.zeros((len(x), 2, 0)), np.zeros((len(x), 0), np.int64), 0
+        return by_point, np.zeros((len(x), by_place.shape[1], 0)), np.zeros((len(x), 0), np.int64), 0
     return by_point, np.concatenate(parts, axis=2), np.concatenate(columns, axis=1), first
 
 
@@ -287,14 +320,15 @@ def resect(problem: Problem, frame: int, steps: int = 10) -> Array:
         row=problem.row[keep],
         focal=problem.focal[[frame]],
         motion=problem.motion[[frame]],
+        depth=None,
     )
     left = residuals(alone)
     for _ in range(steps):
         width = TUNING * max(scatter(left), 1e-3)
         _, slope, _, _ = _slopes(alone, frozenset({POSES}))
-        weight = np.minimum(1, width / np.maximum(np.linalg.norm(left, axis=1), 1e-12))
-        matrix = np.einsum("o,oac,oad->cd", weight, slope, slope)
-        step = -np.linalg.solve(matrix + 1e-9 * np.trace(matrix) * np.eye(6), np.einsum("o,oac,oa->c", weight, slope, left))
+        weight = _weights(left, width)
+        matrix = np.einsum("oa,oac,oad->cd", weight, slope, slope)
+        step = -np.linalg.solve(matrix + 1e-9 * np.trace(matrix) * np.eye(6), np.einsum("oa,oac,oa->c", weight, slope, left))
         moved = _with(alone, step, frozenset({POSES}))
         new = residuals(moved)
         if not _cost(new, width) < _cost(left, width):

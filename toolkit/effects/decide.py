@@ -21,6 +21,7 @@ from toolkit.effects.motion_blur import POWER
 from toolkit.effects.paid import POINTS, Paid
 from toolkit.effects.refine import refined_poses
 from toolkit.effects.registration import DEPTH_OFFSET
+from toolkit.effects.sensed import Agreed
 from toolkit.effects.sightings import Look, Sightings, gather
 from toolkit.effects.survey import BLUR, FAR, VIEWS, Finding, Survey, survey
 from toolkit.progress import SILENT, Progress
@@ -102,7 +103,10 @@ def decide(capture: Capture, test: Array, settings: EffectsSettings, progress: P
     found = found or survey(capture, train, progress, known=known, quick=not settings.on)
     decisions = [_decision(finding, wish(settings, name), capture, found) for name, finding in found.findings.items()]
     on = frozenset(decision.finding.effect for decision in decisions if decision.on)
-    corrections, seen = _corrections(capture, test, found, on, progress, known)
+    corrections, seen, agreed = _corrections(capture, test, found, on, progress, known)
+    if agreed is not None:
+        held = {POSES: agreed.note}
+        decisions = [replace(one, note=held.get(one.finding.effect, one.note)) for one in decisions]
     if capture.has_depth:
         with found.paid.by(DEPTH_OFFSET):
             finding, pose = look_for_offset(corrections.on_capture(capture), train, seen, progress, known)
@@ -156,8 +160,8 @@ def _of_depth(finding: Finding, wished: str, told: bool) -> Decision:
 
 def _corrections(
     capture: Capture, test: Array, found: Survey, on: frozenset[str], progress: Progress, known: dict[int, Look]
-) -> tuple[Corrections, Sightings | None]:
-    """Corrections, and what was seen in most pictures.
+) -> tuple[Corrections, Sightings | None, Agreed | None]:
+    """Corrections, what was seen in most pictures, and how poses agree with a sensor's depth where it took part.
 
     Per-frame corrections need every frame: then all are looked at, and only then.
     """
@@ -168,11 +172,12 @@ def _corrections(
         with found.paid.by(LENS):
             lens = (explained.problem if LENS in explained.kept else adjust(explained.problem, explained.kept | {LENS}).problem).lens
     if seen is None or not on & {EXPOSURE, POSES, BLUR}:
-        return Corrections(corner=corner, dimmed=room_for_light(seen, corner, {}), lens=lens), seen
+        return Corrections(corner=corner, dimmed=room_for_light(seen, corner, {}), lens=lens), seen, None
     gain: dict[str, Gain] = {}
     poses: dict[str, Array] = {}
     weight: dict[str, float] = {}
     every: Sightings | None = None
+    agreed: Agreed | None = None
     if BLUR in on:
         weight = _weights([frame.name for frame, held in zip(capture.frames, test, strict=True) if not held], seen.names, found.sharpness)
     if on & {EXPOSURE, POSES}:
@@ -187,11 +192,11 @@ def _corrections(
         if POSES in on:
             kept = found.explained.kept if found.explained is not None else frozenset[str]()
             with found.paid.by(POSES):
-                moved, beyond = refined_poses(every, ~test, kept | on)
-            poses = dict(zip(every.names, moved, strict=True))
-            lens = beyond if LENS in on else None
+                refined = refined_poses(every, ~test, kept | on, capture, progress)
+            poses = dict(zip(every.names, refined.poses, strict=True))
+            lens, agreed = refined.lens if LENS in on else None, refined.agreed
     dimmed = room_for_light(seen, corner, gain)
-    return Corrections(gain, corner=corner, dimmed=dimmed, lens=lens, poses=poses, weight=weight), every or seen
+    return Corrections(gain, corner=corner, dimmed=dimmed, lens=lens, poses=poses, weight=weight), every or seen, agreed
 
 
 def room_for_light(seen: Sightings | None, corner: float | None, gain: dict[str, Gain]) -> float:

@@ -1,10 +1,8 @@
 """Where the depth camera stands beside the camera of the pictures, by points that pictures share and whose depth the sensor tells.
 
-    X_d = R·s·X + t,    r = D(π(X_d)) / (X_d)_z − 1
-
-X: a point in the axes of the picture's camera; D: the depth map; s: the scale, so that poses which are a little too large or small do
-not pass for an offset. Least is Σ min(|r|, c) over all observations, by Gauss-Newton's method with weights 1/|r|. A depth map has steps
-and noise, so its slopes are taken over several pixels, fewer as c falls. Half of the points judges what fits the other half.
+Least is Σ min(|r|, c) over all observations (r: `depth_maps`), by Gauss-Newton's method with weights 1/|r|; with a scale, so that poses
+which are a little too large or small do not pass for an offset. A depth map has steps and noise, so its slopes are taken over several
+pixels, fewer as c falls. Half of the points judges what fits the other half.
 """
 
 from __future__ import annotations
@@ -15,23 +13,20 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, distort
-from toolkit.capture.images import load_depth
-from toolkit.capture.listing import fitted
+from toolkit.camera import Array
 from toolkit.capture.types import Capture
 from toolkit.effects.adjust import Problem, predict, residuals, uncertainty
+from toolkit.effects.depth_maps import DepthMaps, read
 from toolkit.progress import SILENT, Progress
 
 DEPTH_OFFSET = "depth_offset"
 MARGIN = 0.12  # least relative fall of what held-out points are off …
 LEAST = 0.0005  # … and least fall, as a share of depth
 MAPS = 120  # depth maps that are looked at
-SIDE = 320  # pixels of them along the long side
 FEWEST, MOST = 300, 6000  # observations
 FOLDS = 2  # each of which is judged by what fits the others
 MEETS = 2.0  # times the median distance between where a point is seen and where it should be: what is off by more is no point
 SURE = 0.005  # share of its depth within which rays must meet
-SMOOTH = 0.05  # share of depth within which four pixels are of one surface
 STAGES = ((0.2, 0.012), (0.1, 0.006), (0.06, 0.003))  # c; radians and shares of the usual depth that slopes are taken over
 STEPS = 30  # for each of them
 NOTHING = 0.003  # share of depth: residuals below this weigh the same
@@ -70,43 +65,19 @@ class Registration:
 
 @dataclass(frozen=True)
 class Observations:
-    """Points in the axes of the cameras of pictures, and the depth maps beside these, one after the other in memory."""
+    """Points in the axes of the cameras of pictures, and the depth maps beside these."""
 
     places: Array  # (N, 3)
     point: Array  # (N,) int which points they are
     map: Array  # (N,) int which map is theirs
-    values: Array  # (sum of pixels,) float32 of all maps, 0 = missing
-    start: Array  # (M,) where each map begins
-    size: Array  # (M, 2) its width and height
-    step: Array  # (M,) pixels of its camera from one of its pixels to the next
-    cameras: tuple[Intrinsics, ...]  # (M,)
+    maps: DepthMaps
 
     def some(self, which: Array) -> Observations:
-        kept = self.places[which], self.point[which], self.map[which]
-        return Observations(*kept, self.values, self.start, self.size, self.step, self.cameras)
+        return Observations(self.places[which], self.point[which], self.map[which], self.maps)
 
     def off(self, depth_from_picture: Array, scale: float) -> Array:
         """(N,) r; NaN: the four pixels around are not all known, or not of one surface."""
-        out = np.full(len(self.places), np.nan)
-        places = scale * self.places @ depth_from_picture[:3, :3].T + depth_from_picture[:3, 3]
-        front = np.flatnonzero(places[:, 2] > 0)
-        ideal, mine = places[front, :2] / places[front, 2:], self.map[front]
-        for camera in dict.fromkeys(camera for camera in self.cameras if camera.distorted):
-            one = np.array([other == camera for other in self.cameras])[mine]
-            ideal[one] = distort(camera, ideal[one])
-        lens = np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in self.cameras])[mine]  # each frame may have its own
-        pixels = (ideal * lens[:, :2] + lens[:, 2:] - 0.5) / self.step[mine, None]
-        inside = (pixels >= 0).all(axis=1) & (pixels < self.size[mine] - 1).all(axis=1)
-        front, pixels, mine = front[inside], pixels[inside], mine[inside]
-        whole = pixels.astype(np.intp)
-        a, b = (pixels - whole).T
-        width = self.size[mine, 0]
-        first = self.start[mine] + whole[:, 1] * width + whole[:, 0]
-        corners = self.values[np.stack([first, first + 1, first + width, first + width + 1])]
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        told = (corners[0] * (1 - a) + corners[1] * a) * (1 - b) + (corners[2] * (1 - a) + corners[3] * a) * b
-        out[front] = np.where((low > 0) & (high - low < SMOOTH * high), told / places[front, 2] - 1, np.nan)
-        return out
+        return self.maps.off(self.places, self.map, depth_from_picture, scale)
 
 
 def register(capture: Capture, indices: Sequence[int], problem: Problem, progress: Progress = SILENT) -> Registration | None:
@@ -128,32 +99,26 @@ def observed(capture: Capture, indices: Sequence[int], problem: Problem, progres
     Raises:
         InputError: a depth map cannot be read.
     """
-    places, off = predict(problem)[0], np.linalg.norm(residuals(problem), axis=1)
-    if not len(off):
-        return None
-    good = (off < MEETS * np.median(off)) & (places[:, 2] > 0) & (uncertainty(problem) < SURE * np.maximum(places[:, 2], 0))
-    deep = [number for number, index in enumerate(indices) if capture.frames[index].depth is not None and (problem.frame == number).any()]
-    chosen = [deep[k] for k in np.unique(np.linspace(0, len(deep) - 1, min(MAPS, len(deep))).round().astype(int))] if deep else []
-    use = good & np.isin(problem.frame, chosen)
+    chosen = deep_frames(capture, indices, problem)
+    use = sure(problem) & np.isin(problem.frame, chosen)
     if use.sum() < FEWEST:
         return None
-    maps, sizes, steps, cameras = [], [], [], []
-    for number in chosen:
-        progress.check()
-        frame = capture.frames[indices[number]]
-        depth, camera = load_depth(frame, capture), frame.depth_intrinsics or frame.intrinsics
-        assert camera is not None  # of a frame with points
-        cameras.append(fitted(camera, (depth.shape[1], depth.shape[0]), str(frame.depth)))
-        step = max(1, round(max(depth.shape) / SIDE))
-        depth = depth[::step, ::step]
-        maps.append(depth.ravel())
-        sizes.append((depth.shape[1], depth.shape[0]))
-        steps.append(step)
-    start = np.cumsum([0, *(len(one) for one in maps)])[:-1]
-    which = np.searchsorted(chosen, problem.frame[use])
-    return Observations(
-        places[use], problem.point[use], which, np.concatenate(maps), start, np.array(sizes), np.array(steps, float), tuple(cameras)
-    )
+    maps = read(capture, [indices[number] for number in chosen], progress)
+    return Observations(predict(problem)[0][use], problem.point[use], np.searchsorted(chosen, problem.frame[use]), maps)
+
+
+def deep_frames(capture: Capture, indices: Sequence[int], problem: Problem, most: int = MAPS) -> list[int]:
+    """Up to `most` frames of the problem that have depth and show points, evenly spread, ascending."""
+    deep = [number for number, index in enumerate(indices) if capture.frames[index].depth is not None and (problem.frame == number).any()]
+    return [deep[k] for k in np.unique(np.linspace(0, len(deep) - 1, min(most, len(deep))).round().astype(int))] if deep else []
+
+
+def sure(problem: Problem) -> Array:
+    """(O,) bool: observations of points that are where they should be, and whose rays meet within `SURE` of their depth."""
+    if not len(problem.frame):
+        return np.zeros(0, dtype=bool)
+    depth, off = predict(problem)[0][:, 2], np.linalg.norm(residuals(problem), axis=1)
+    return np.asarray((off < MEETS * np.median(off)) & (depth > 0) & (uncertainty(problem) < SURE * np.maximum(depth, 0)))
 
 
 def solved(found: Observations) -> Registration | None:

@@ -1,0 +1,173 @@
+"""Refined poses that agree with a sensor's depth: where pictures hardly tell a turn from a move, nor the scale, depth does.
+
+    least Σ ρ(q̂ − q) + Σ ρ(w·(ẑ / z − 1)) + belief,    w = scatter of places / scatter of depths
+
+q: where points are seen; z: their depth as the sensor tells it (`adjust.Problem.depth`), with its camera where points say it stands
+(`registration`); w follows from what both leave, so that a coarse sensor says little. Poses, points and the sensor's camera are found in
+turns. Two things judge: what one depth map sees has to be where others see it, better than before; and where points are seen must not
+be explained worse by the cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from toolkit.camera import Array, invert
+from toolkit.capture.types import Capture
+from toolkit.effects.adjust import LENS, Belief, Problem, adjust, predict, residuals, scatter
+from toolkit.effects.correct import Corrections, correctable
+from toolkit.effects.depth_maps import DepthMaps, read
+from toolkit.effects.registration import FEWEST, Observations, deep_frames, solved, sure
+from toolkit.progress import SILENT, Progress
+
+MAPS = 300  # depth maps that take part
+ROUNDS = 3
+STEPS = 60
+MARGIN = 0.01  # least relative fall of what depth maps are off each other
+WORSE = 0.03  # relative growth of what places are off that is nothing
+PARTNERS = 6  # maps that each is held against, of those with the most points in common
+COMMON = 12  # points without which they are none
+ACROSS = 16  # pixels of a map along its long side that are asked
+UNITS = 0.1  # a scale further from 1 than by this is another unit of length, or no depth of this scene
+WRONG = 0.06  # share of depth off by which it is that of something else
+CUT = 0.03  # share of depth beyond which being off counts no more
+SHARP = 0.005  # share of depth: no sensor is believed to be better
+
+
+@dataclass(frozen=True)
+class Agreed:
+    """Poses, points and what else was unknown where depth agrees, too."""
+
+    problem: Problem
+    belief: Belief  # at the sensor's scale
+    before: float  # what depth maps are off each other without it, share of depth
+    after: float
+
+    @property
+    def note(self) -> str:
+        return (
+            f"held to the sensor's depth, too: its maps are {100 * self.after:.2f}% of depth off each other, "
+            f"{100 * self.before:.2f}% by pictures alone"
+        )
+
+
+def agreeing(
+    capture: Capture, problem: Problem, unknown: frozenset[str], belief: Belief, progress: Progress = SILENT
+) -> Agreed | None:
+    """The problem where depth takes part; None: depth tells nothing, or does not agree with what pictures tell.
+
+    Args:
+        capture: whose frames are those of the problem, in their order.
+        problem: refined by pictures alone.
+        belief: where its poses were taken to be.
+
+    Raises:
+        InputError: a depth map cannot be read.
+    """
+    frames = deep_frames(capture, range(len(capture.frames)), problem, MAPS)
+    if not frames:
+        return None
+    if LENS in unknown and all(frame.intrinsics is None or correctable(frame.intrinsics) for frame in capture.frames):
+        capture = Corrections(lens=problem.lens).on_capture(capture)  # where depth shares the camera of the pictures, its lens is theirs
+    sensor = Sensor(frames, read(capture, frames, progress))
+    start = sensor.standing(problem)
+    known = sensor.depth(problem, start)
+    ratio = known / predict(problem)[0][:, 2]
+    if np.isfinite(ratio).sum() < FEWEST or abs(scale := float(np.nanmedian(ratio)) - 1) > UNITS:
+        return None
+    grown, held_to = scaled(problem, belief, 1 + scale)
+    moved, standing = _in_turns(grown, sensor, unknown, held_to, start)
+    before, after = sensor.both_off(problem, start, moved, standing)
+    places = [adjust(one).scatter for one in (problem, moved)]
+    if not after < (1 - MARGIN) * before or places[1] > (1 + WORSE) * places[0]:
+        return None
+    return Agreed(moved, held_to, before, after)
+
+
+class Sensor:
+    """The depth maps of some frames of a problem."""
+
+    def __init__(self, frames: Sequence[int], maps: DepthMaps) -> None:
+        self.frames, self.maps = np.asarray(frames), maps
+
+    def depth(self, problem: Problem, standing: Array) -> Array:
+        """(O,) what the sensor tells on the way to each point, z in the picture's camera; NaN: nothing.
+
+        Args:
+            standing: (4, 4) the sensor's camera from the picture's.
+        """
+        out = np.full(len(problem.frame), np.nan)
+        places = predict(problem)[0]
+        mine = np.isin(problem.frame, self.frames) & (places[:, 2] > 0)
+        out[mine] = self.maps.along(places[mine], np.searchsorted(self.frames, problem.frame[mine]), standing)
+        return out
+
+    def standing(self, problem: Problem) -> Array:
+        """(4, 4) where its camera stands, if that is to be told, else where the picture's does."""
+        use = sure(problem) & np.isin(problem.frame, self.frames)
+        if use.sum() < FEWEST:
+            return np.eye(4)
+        seen = Observations(predict(problem)[0][use], problem.point[use], np.searchsorted(self.frames, problem.frame[use]), self.maps)
+        found = solved(seen)
+        return found.depth_from_picture if found is not None and found.there else np.eye(4)
+
+    def both_off(self, one: Problem, first: Array, other: Problem, second: Array) -> tuple[float, float]:
+        """What maps are off each other in the mean, shares of depth up to `CUT`, with the cameras of two problems, at the same pixels."""
+        pairs = self._pairs(one)
+        off = [self._apart(pairs, problem.poses @ invert(standing)) for problem, standing in ((one, first), (other, second))]
+        same = np.isfinite(off[0]) & np.isfinite(off[1])
+        if not same.any():
+            return 0.0, 0.0
+        return float(np.minimum(np.abs(off[0][same]), CUT).mean()), float(np.minimum(np.abs(off[1][same]), CUT).mean())
+
+    def _pairs(self, problem: Problem) -> list[tuple[int, int]]:
+        """Maps (numbers of `frames`) that see the same, by the points that their frames share."""
+        seen = np.zeros((len(self.frames), len(problem.points)), dtype=np.float32)
+        mine = np.isin(problem.frame, self.frames)
+        seen[np.searchsorted(self.frames, problem.frame[mine]), problem.point[mine]] = 1
+        shared = seen @ seen.T
+        np.fill_diagonal(shared, 0)
+        best = np.argsort(-shared, axis=1, kind="stable")[:, :PARTNERS]
+        return [(one, int(other)) for one, row in enumerate(best) for other in row if shared[one, other] >= COMMON]
+
+    def _apart(self, pairs: Sequence[tuple[int, int]], poses: Array) -> Array:
+        """(N,) what the first of each pair sees is off the second's depth; poses: (F, 4, 4) of the sensor's camera in all frames."""
+        off = [np.zeros(0)]
+        for one, other in pairs:
+            to_other = invert(poses[self.frames[other]]) @ poses[self.frames[one]]
+            places = self.maps.surface(one, ACROSS) @ to_other[:3, :3].T + to_other[:3, 3]
+            off.append(self.maps.off(places, np.full(len(places), other), np.eye(4)))
+        return np.concatenate(off)
+
+
+def scaled(problem: Problem, belief: Belief, scale: float) -> tuple[Problem, Belief]:
+    """Cameras and points, and where cameras are believed to be, grown about the cameras' middle."""
+    middle = problem.poses[:, :3, 3].mean(axis=0)
+
+    def grown(poses: Array) -> Array:
+        out = poses.copy()
+        out[:, :3, 3] = middle + scale * (poses[:, :3, 3] - middle)
+        return out
+
+    points = middle + scale * (problem.points - middle)
+    motion = problem.motion * np.array([1, 1, 1, scale, scale, scale])
+    return replace(problem, poses=grown(problem.poses), points=points, motion=motion), replace(belief, poses=grown(belief.poses))
+
+
+def _in_turns(problem: Problem, sensor: Sensor, unknown: frozenset[str], belief: Belief, standing: Array) -> tuple[Problem, Array]:
+    """Poses by depth, and the sensor's camera by poses."""
+    for _ in range(ROUNDS):
+        depth = sensor.depth(problem, standing)
+        off = np.abs(predict(problem)[0][:, 2] / depth - 1)
+        right = off < WRONG
+        if not right.any():
+            break
+        noise = max(float(np.median(off[right])) / 0.6745, SHARP)
+        weight = scatter(residuals(problem)) / noise
+        told = replace(problem, depth=np.where(right, depth, np.nan), depth_weight=weight)
+        problem = replace(adjust(told, unknown, STEPS, belief).problem, depth=None)
+        standing = sensor.standing(problem)
+    return problem, standing
