@@ -89,7 +89,7 @@ def bench_suite(
     Raises:
         InputError: no such scene or variant.
     """
-    from toolkit.errors import InputError, Interrupted, OutputError
+    from toolkit.errors import FieldfuseError, Interrupted, OutputError
     from toolkit.evaluate.suites import suite_of
 
     suite = suite_of(name)
@@ -105,7 +105,7 @@ def bench_suite(
                 row = run_variant(suite, variant, source, place, options, progress)
             except (Interrupted, OutputError):
                 raise
-            except InputError as error:
+            except FieldfuseError as error:  # one scene that cannot be placed does not keep the others from being measured
                 row = {"error": " ".join(str(error).split())}
             rows.append({"scene": scene, "variant": variant.key, "error": None, **row})
             found = put(suite, rows, out, options)

@@ -36,17 +36,17 @@ def few_views(
 ) -> None:
     """Held-out quality of 3, 6, 12 … training views: networks alone, and fits from their start and from the classical one.
 
-    Rows that OUT/few_views.json has already are not measured again, so an interrupted table goes on when the command is repeated.
+    Rows that OUT/few_views.json has already are not measured again, so an interrupted table goes on when the command is repeated. With
+    other settings, or after the capture has changed, all are.
     """
-    from pipelines.kept import FEW_VIEWS, read_kept
     from toolkit.evaluate.few_views import few_views_rows, few_views_table
     from toolkit.training.from_network import load_networks
 
     seconds, measured = numbers(budgets, "budgets"), part_of(starts)
     counts = [None if part == ALL else int(part) for part in wanted(views)]
     with opened(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as (job, posed, corrections):
-        path = job.folder.path / f"{FILE}.json"
-        rows: list[dict[str, Any]] = read_kept(path, FEW_VIEWS)["rows"] if path.is_file() else []
+        of = state_of(job)
+        rows = rows_of(job, of)
         model = load_networks(job.settings.network.weights, job.settings.device)
         for count in counts:
             job.progress.begin(f"{count or ALL} views")
@@ -54,7 +54,7 @@ def few_views(
             done = {(row["views"], row["start"], row["budget"]) for row in rows}
             for row in few_views_rows(ground, model, seconds, done, measured, job.progress):
                 rows.append(row)
-                keep_rows(job, FILE, rows, few_views_table(rows))
+                keep_rows(job, FILE, rows, few_views_table(rows), of=of)
                 job.progress.say(f"{row['views']} views, {row['start']}, {row['budget']:g} s: {row['psnr']:.2f} dB")
     tell(few_views_table(rows), quiet)
 
@@ -164,12 +164,35 @@ def ground_of(job: Job, posed: Capture, count: int | None, corrections: Correcti
     return Ground(corrections.on_views(views), scene, job.settings)
 
 
-def keep_rows(job: Job, name: str, rows: list[dict[str, Any]], table: str) -> None:
+def state_of(job: Job) -> str:
+    """Changes with whatever rows depend on, but for what they say of themselves: settings, weights, and what was made of the capture."""
+    from pipelines.direct_field import weights_state
+    from toolkit.config import settings_dict
+    from toolkit.files import fingerprint
+
+    settings = settings_dict(job.settings)
+    settings["fit"] = {key: value for key, value in settings["fit"].items() if key != "budget"}
+    return fingerprint(settings, weights_state(job.settings), {name: record.made for name, record in job.stages.records.items()})
+
+
+def rows_of(job: Job, state: str) -> list[dict[str, Any]]:
+    """Rows that an earlier call kept; none when they are of another `state`."""
+    from pipelines.kept import FEW_VIEWS, read_kept
+
+    path = job.folder / f"{FILE}.json"
+    kept: dict[str, Any] = read_kept(path, FEW_VIEWS) if path.is_file() else {"rows": []}
+    if kept["rows"] and kept.get("of") != state:
+        job.progress.say("the rows that are there are of other settings or another state of the capture, and are measured again")
+        return []
+    return list(kept["rows"])
+
+
+def keep_rows(job: Job, name: str, rows: list[dict[str, Any]], table: str, **more: str) -> None:
     from toolkit.config import settings_dict
     from toolkit.evaluate.speed import machine
     from toolkit.files import atomic_path, write_json
 
-    about = {"source": str(job.source), "machine": machine(1), "settings": settings_dict(job.settings), "rows": rows}
+    about = {"source": str(job.source), "machine": machine(1), "settings": settings_dict(job.settings), **more, "rows": rows}
     write_json(job.folder / f"{name}.json", about)
     with atomic_path(job.folder / f"{name}.md") as temporary:
         temporary.write_text(table, encoding="utf-8")

@@ -203,6 +203,12 @@ def test_the_sources_split_wins(tmp_path: Path) -> None:
         assert held_out(capture_of(tmp_path, frames), holdout).tolist() == [False, True, False, True]
 
 
+def test_training_pictures_alone_are_no_split(tmp_path: Path) -> None:
+    frames = frames_named(["a", "b", "c", "d"], ["train"] * 4)  # of a folder that has a transforms_train.json and nothing else
+    assert held_out(capture_of(tmp_path, frames), 2).tolist() == [True, False, True, False]
+    assert not held_out(capture_of(tmp_path, frames), 0).any()
+
+
 @given(st.integers(0, 60), st.integers(0, 20))
 def test_held_out_counts(count: int, holdout: int) -> None:
     test = held_out(capture_of(Path("/nowhere"), frames_named([f"{i}" for i in range(count)])), holdout)

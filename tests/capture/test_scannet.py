@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.capture.layouts import OFF_CENTRE, rows, whole_centres, write_scannet, write_seven_scenes
+from tests.capture.layouts import OFF_CENTRE, SCANNET_COLOUR, rows, whole_centres, write_scannet, write_seven_scenes
 from tests.capture.made import Pinhole, eyes, pixel_error, render, save_picture
 from tests.conftest import shared_data
 from toolkit.capture import open_capture
@@ -45,6 +45,16 @@ def test_nan_is_not_the_mark_of_lost_frames(tmp_path: Path) -> None:
     (tmp_path / "pose/10.txt").write_text(rows(np.full((4, 4), np.nan)))
     with pytest.raises(InputError, match=r"10\.txt.*not finite"):
         open_capture(tmp_path)
+
+
+def test_the_subset_of_25000_frames_names_its_cameras_otherwise(tmp_path: Path) -> None:
+    write_scannet(tmp_path)
+    for which in ("color", "depth"):
+        (tmp_path / f"intrinsic/intrinsic_{which}.txt").rename(tmp_path / f"intrinsics_{which}.txt")
+    (tmp_path / "intrinsic").rmdir()
+    capture = open_capture(tmp_path)
+    assert capture.warnings == () and pixel_error(capture, eyes(), SCANNET_COLOUR) < 1e-3
+    assert capture.frames[0].depth_intrinsics.cx == pytest.approx(OFF_CENTRE.cx)
 
 
 def test_pictures_exported_smaller_than_the_sensors(tmp_path: Path) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.capture.layouts import LAYOUTS
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 from toolkit.evaluate.suites import SUITES, suite_of
@@ -67,6 +69,29 @@ def test_scenes_are_found_by_name(tmp_path: Path) -> None:
         suite.variant("baked")
     with pytest.raises(InputError, match="there is no benchmark 'imagenet'; known are nerf-synthetic, dtu, scannet, llff, posed"):
         suite_of("imagenet")
+
+
+def test_scenes_of_every_posed_layout_are_found(tmp_path: Path) -> None:
+    posed = [name for name in LAYOUTS if name != "photos"]
+    for name in posed:
+        LAYOUTS[name][1](tmp_path / name)
+    (tmp_path / "photos").mkdir()
+    shutil.copy(next((tmp_path / "tum" / "rgb").iterdir()), tmp_path / "photos" / "a.png")
+    assert {name for name, _ in suite_of("posed").find(tmp_path)} == set(posed)
+    assert suite_of("posed").find(tmp_path / "tum") == [("tum", tmp_path / "tum")]
+
+
+def test_scannets_rooms_bring_their_split(tmp_path: Path) -> None:
+    frames = [Frame(f"{index:03d}", tmp_path / "images" / f"{index:03d}.jpg") for index in range(12)]
+    capture, pick = Capture("colmap", tmp_path, tuple(frames)), suite_of("scannet").variant("fitted").pick
+    (tmp_path / "train.txt").write_text("010.jpg\n001.jpg\n007.jpg\n")
+    assert names(pick(capture), "test") == [0, 8]  # one list alone is none
+    (tmp_path / "test.txt").write_text("004.jpg\n002.png\n\n")
+    assert names(pick(capture), "train") == [1, 7, 10] and names(pick(capture), "test") == [2, 4]
+    assert len(pick(capture).frames) == 5
+    (tmp_path / "test.txt").write_text("004.jpg\n012.jpg\n")
+    with pytest.raises(InputError, match=r"test\.txt names 012\.jpg, which is not among the pictures with a pose"):
+        pick(capture)
 
 
 def test_all_suites_are_described() -> None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.pipelines.made import call, make_room
-from toolkit.files import read_json
+from toolkit.files import read_json, write_json
 
 Capsys = pytest.CaptureFixture[str]
 
@@ -37,6 +38,19 @@ def test_posed_captures_are_measured_and_their_table_written(tmp_path: Path, cap
     page.write_text("# Results\n")
     assert call(capsys, "bench", "table", out / "results.json", "--into", page, "--name", "rooms").code == 0
     assert "<!-- measured: rooms -->" in page.read_text() and "| room |" in page.read_text()
+
+
+def test_a_scene_whose_poses_do_not_fit_is_a_row_too(tmp_path: Path, capsys: Capsys) -> None:
+    for scene in ("a", "b"):
+        make_room(tmp_path / "data" / scene, 4)
+        listed = read_json(tmp_path / "data" / scene / "transforms.json")
+        for number, frame in enumerate(listed["frames"]):  # all cameras at one place, which do not look where the pictures were taken
+            frame["transform_matrix"] = np.eye(4).tolist()
+            frame["transform_matrix"][0][3] = 0.01 * number
+        write_json(tmp_path / "data" / scene / "transforms.json", listed)
+    answer = call(capsys, "bench", "posed", tmp_path / "data", "--out", tmp_path / "out", "--variants", "fitted", "--quiet", "--json")
+    assert answer.code == 0, answer.err
+    assert [row["scene"] for row in json.loads(answer.out)["rows"] if "check the poses" in row["error"]] == ["a", "b"]
 
 
 @pytest.mark.slow

@@ -25,10 +25,11 @@ _MAX_SAMPLES = 4  # samples a pixel and side taken through the lens; what shrink
 def held_out(capture: Capture, holdout: int) -> Array:
     """(N,) bool, True for test views: the source's own split when it has one, else every `holdout`-th frame by name (0, n, 2n, …).
 
-    A `holdout` of 0 gives no test views, unless the source has a split.
+    A `holdout` of 0 gives no test views, unless the source has a split. Training pictures alone (a `transforms_train.json` without others)
+    are no split.
     """
     frames = capture.frames
-    if any(frame.split is not None for frame in frames):
+    if any(frame.split == "test" for frame in frames):
         return np.array([frame.split == "test" for frame in frames], dtype=bool)
     test = np.zeros(len(frames), dtype=bool)
     if holdout > 0:

@@ -1,7 +1,8 @@
 """ScanNet: the exported layout (`color/`, `depth/`, `pose/`, `intrinsic/`) and loose `frame-*.color.jpg` samples of it.
 
 Poses are world_from_camera in OpenCV axes, metres, z up; frames whose tracking was lost have a pose of -inf and are dropped.
-Depth is in millimetres, through a camera of its own. Samples come without cameras: the sensor's usual ones then stand in.
+Depth is in millimetres, through a camera of its own. ScanNet's subset of 25,000 frames has `intrinsics_color.txt` and
+`intrinsics_depth.txt` beside the folders. Samples come without cameras: the sensor's usual ones then stand in.
 """
 
 from __future__ import annotations
@@ -80,13 +81,14 @@ def _cameras(root: Path, found: list[FrameFiles]) -> tuple[Intrinsics, Intrinsic
     cameras: list[Intrinsics] = []
     for which, size, usual in (("color", colour_size, COLOUR_CAMERA), ("depth", depth_size or (640, 480), DEPTH_CAMERA)):
         name = f"intrinsic_{which}.txt"
-        file = next((path for path in (root / "intrinsic" / name, root / name) if path.is_file()), None)
+        places = (root / "intrinsic" / name, root / name, root / f"intrinsics_{which}.txt")
+        file = next((path for path in places if path.is_file()), None)
         if file is None:
             cameras.append(usual)
             warnings.append(f"no {name} was found; the sensor's usual {'colour' if which == 'color' else 'depth'} camera is used")
             continue
         camera, scaled = read_matrix_for(file, size, (usual.width, usual.height))
         if scaled:  # pictures were exported smaller than the sensor's
-            warnings.append(f"{name} is for {usual.width}×{usual.height} pictures; scaled to {size[0]}×{size[1]}")
+            warnings.append(f"{file.name} is for {usual.width}×{usual.height} pictures; scaled to {size[0]}×{size[1]}")
         cameras.append(camera)
     return cameras[0], cameras[1], warnings

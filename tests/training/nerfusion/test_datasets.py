@@ -108,6 +108,7 @@ def test_scanned_objects_look_at_the_origin(tmp_path: Path) -> None:
     scene = scanned_object_scene(folders[1], 32)
     assert scene.kind == "object" and not scene.ordered
     assert scene.depth_hint == pytest.approx(layouts.DEPTH, rel=0.05)
+    assert scene.pictures([0]).background == (1.0, 1.0, 1.0)  # opaque pictures, but white is nothing and no wall
     check_sample(scene)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from tests.training.nerfusion.tiny import SMALL, merged, tiny_settings
 from toolkit.errors import InputError
@@ -106,6 +106,19 @@ def test_resuming_repeats_every_bit(tmp_path: Path) -> None:
     assert once[-1] == twice[-1]
 
 
+def test_a_kill_between_two_files_of_a_save_costs_no_row_of_the_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = Trainer(tiny_settings(), tmp_path, Crew())
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr("toolkit.training.nerfusion.train.save_model", killed)  # the checkpoint is there then
+        first.run(until=1)
+    second = Trainer(tiny_settings(), tmp_path, Crew(), resume=True)
+    assert second.step == 1 and [row["step"] for row in second.curve.rows] == [1]
+
+
 def test_a_request_to_stop_keeps_what_there_is(tmp_path: Path) -> None:
     class StopAtTwo(Progress):
         done = 0.0
@@ -133,8 +146,15 @@ def test_only_the_newest_checkpoints_are_kept(tmp_path: Path) -> None:
 
 def test_a_broken_or_foreign_checkpoint_is_refused(tmp_path: Path) -> None:
     Trainer(tiny_settings(), tmp_path, Crew()).run(until=1)
-    with pytest.raises(InputError, match="not a checkpoint of these networks"):
+    with pytest.raises(InputError, match=r"not a checkpoint of these networks \(\S+ is [0-9×]+ there and [0-9×]+ here\); go on with"):
         Trainer(tiny_settings(model=merged(SMALL["model"], {"channels": 12})), tmp_path, Crew(), resume=True)
+    kept = load_file(checkpoints(tmp_path)[-1])
+    with safe_open(checkpoints(tmp_path)[-1], "pt") as file:
+        meta = file.metadata()
+    lost = next(name for name in kept if name.startswith("model."))
+    save_file({name: value for name, value in kept.items() if name != lost}, checkpoints(tmp_path)[-1], metadata=meta)
+    with pytest.raises(InputError, match=rf"networks \({lost.removeprefix('model.')} is not in it\)"):
+        Trainer(tiny_settings(), tmp_path, Crew(), resume=True)
     path = checkpoints(tmp_path)[-1]
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(InputError, match="cannot read"):

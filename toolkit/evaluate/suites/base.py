@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from toolkit.capture.detect import detect_kind
 from toolkit.capture.listing import natural_key
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
@@ -96,8 +97,8 @@ class Suite:
 
 
 def is_scene(path: Path) -> bool:
-    """A folder that a posed capture's reader would take."""
-    return any(next(path.glob(mark), None) is not None for mark in SCENE_MARKS)
+    """A folder that a posed capture's reader would take, or that has a file of one: a scene that is broken is told of, not left out."""
+    return any(next(path.glob(mark), None) is not None for mark in SCENE_MARKS) or detect_kind(path) not in (None, "photos")
 
 
 def split(capture: Capture, train: Sequence[int], test: Sequence[int]) -> Capture:

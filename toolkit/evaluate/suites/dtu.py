@@ -27,7 +27,8 @@ SUITE = Suite(
     ),
     protocol=f"training views {', '.join(map(str, TRAIN))}, the first three alone for direct inference;"
     f" test views {', '.join(map(str, TEST))}",
-    differs="whole pictures are scored, the paper's are cut to the object's depth mask; one field of three views serves all test views,"
+    differs="whole pictures are scored (of scans that bring masks, what these leave), the paper's are cut to the object's depth mask;"
+    " one field of three views serves all test views,"
     " where the paper takes the three nearest for each",
     long_side=640,
 )

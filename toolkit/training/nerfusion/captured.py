@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from toolkit.camera import Intrinsics, Similarity
-from toolkit.capture.prepare import prepare_views
+from toolkit.capture.prepare import WHITE, prepare_views
 from toolkit.capture.types import Capture
 from toolkit.config import CaptureSettings
 from toolkit.errors import InputError
@@ -28,15 +28,26 @@ class CapturedScene:
         long_side: pictures are brought to it, never enlarged.
         scale: one unit of the capture in the unit that samples shall have.
         depth_hint: typical depth in the sample's unit; None: from the depth pictures, or where the optical axes meet.
+        background: colour where rays meet nothing, of pictures that show it without alpha; None: white where the capture has alpha, else
+            every ray meets something.
 
     Raises:
         InputError: a frame without pose or intrinsics.
     """
 
-    def __init__(self, capture: Capture, kind: str, long_side: int, scale: float = 1.0, depth_hint: float | None = None) -> None:
+    def __init__(
+        self,
+        capture: Capture,
+        kind: str,
+        long_side: int,
+        scale: float = 1.0,
+        depth_hint: float | None = None,
+        background: tuple[float, float, float] | None = None,
+    ) -> None:
         if not capture.posed:
             raise InputError(f"{capture.root}: not every frame has a pose and intrinsics; training needs both")
         self.capture, self.kind, self.ordered, self.name = capture, kind, capture.ordered, capture.root.name
+        self._background = WHITE if background is None and capture.alpha else background
         self._scale = Similarity(scale, np.eye(3), np.zeros(3))
         self._settings = CaptureSettings(image_size=long_side, holdout=0)
         poses = np.array([frame.world_from_camera for frame in capture.frames], dtype=np.float64)
@@ -69,5 +80,5 @@ class CapturedScene:
             intrinsics=torch.tensor([[c.fx, c.fy, c.cx, c.cy] for _, c, _ in read], dtype=torch.float32),
             world_from_camera=torch.from_numpy(self.world_from_camera[list(indices)].astype(np.float32)),
             depths=torch.stack([blank if depth is None else depth.float() for _, _, depth in read]),
-            background=(1.0, 1.0, 1.0) if self.capture.alpha else None,
+            background=self._background,
         )

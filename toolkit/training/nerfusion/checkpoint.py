@@ -94,7 +94,10 @@ def load_checkpoint(path: Path, model: nn.Module, adam: torch.optim.Adam, averag
         if average is not None:
             average.load({name[len(AVERAGE) :]: value for name, value in tensors.items() if name.startswith(AVERAGE)})
     except (KeyError, ValueError, RuntimeError) as error:
-        raise InputError(f"{path} is not a checkpoint of these networks ({first_line(error)}); start anew in another folder") from error
+        raise InputError(
+            f"{path} is not a checkpoint of these networks ({first_line(error)}); go on with the settings it was made "
+            "with, or start anew in another folder"
+        ) from error
     return step
 
 
@@ -129,10 +132,20 @@ def checkpoint_settings(path: Path) -> dict[str, Any]:
 
 
 def _fill(model: nn.Module, values: dict[str, Tensor]) -> None:
+    own = model.state_dict()
+    # Said here: what torch says of such begins with a line that tells nothing.
+    if odd := sorted(own.keys() ^ values.keys()):
+        raise ValueError(f"{odd[0]} is {'not in it' if odd[0] in own else 'not one of theirs'}")
     for name, value in values.items():
+        if value.shape != own[name].shape:
+            raise ValueError(f"{name} is {_size(value)} there and {_size(own[name])} here")
         if not bool(torch.isfinite(value).all()):
             raise ValueError(f"{name} holds a value that is not finite")
     model.load_state_dict(values)
+
+
+def _size(value: Tensor) -> str:
+    return "×".join(map(str, value.shape)) or "one number"
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

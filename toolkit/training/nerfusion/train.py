@@ -228,11 +228,14 @@ class Trainer:
         self.curve.write()
 
     def save(self) -> None:
-        """Write a checkpoint, the weights so far and the curve.
+        """Write the curve, a checkpoint and the weights so far.
+
+        The curve goes first: whoever goes on from the checkpoint before cuts what it has too much, and what it lacks is lost.
 
         Raises:
             OutputError: the folder is not writable.
         """
+        self.curve.write()
         save_checkpoint(
             self.out,
             self.step,
@@ -245,4 +248,3 @@ class Trainer:
         )
         with self.average.applied(self.model):
             save_model(self.out / WEIGHTS, self.model, {"steps": self.step})
-        self.curve.write()

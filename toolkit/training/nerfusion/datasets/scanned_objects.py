@@ -1,7 +1,7 @@
 """Google Scanned Objects as rendered by IBRNet: `<object>/{rgb,pose,intrinsics}/NNN.{png,txt}`.
 
-Poses are world_from_camera in OpenCV axes, cameras are 4×4 matrices of 16 numbers, one text file a picture; white behind the object,
-whose largest side is about 1.
+Poses are world_from_camera in OpenCV axes, cameras are 4×4 matrices of 16 numbers, one text file a picture. Pictures are opaque, and white
+where they show nothing of the object, whose largest side is about 1.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from toolkit.camera import checked_pose
 from toolkit.capture.calibration import from_matrix
 from toolkit.capture.listing import assemble, files_in, picture_header, pictures_in, read_matrix, require_folder, same_count
+from toolkit.capture.prepare import WHITE
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 from toolkit.training.nerfusion.captured import CapturedScene
@@ -62,11 +63,11 @@ def read_scanned_object(folder: Path | str) -> Capture:
 
 
 def scanned_object_scene(folder: Path, long_side: int) -> CapturedScene:
-    """One object. The renderings look at the origin from around it, so its distance is the depth.
+    """One object before nothing, which is white. The renderings look at the origin from around it, so its distance is the depth.
 
     Raises:
         InputError: it cannot be read.
     """
     capture = read_scanned_object(folder)
     distance = [float(np.linalg.norm(frame.world_from_camera[:3, 3])) for frame in capture.frames if frame.world_from_camera is not None]
-    return CapturedScene(capture, "object", long_side, depth_hint=float(np.median(distance)))
+    return CapturedScene(capture, "object", long_side, depth_hint=float(np.median(distance)), background=WHITE)
