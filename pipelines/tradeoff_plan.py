@@ -19,15 +19,6 @@ SAMPLES = (2, 8)  # in a brick of four voxels along a ray, beside 4
 PRECISIONS = ("uint8", "float32")  # of the stored field, beside float16
 DECODER_TIMES = (10.0, 60.0)  # both decoders are measured at the times between these
 DEFAULT = {"voxel_size": 1.0, "views": 1.0, "samples": 4, "precision": "float16"}
-MEANING = {
-    "iterations": "--times",
-    "voxel_size": "of fields and surfaces",
-    "views": "training views",
-    "samples": "along a ray when rendering",
-    "decoder": "deferred and per sample",
-    "precision": "of the stored field",
-    "keyframes": "that the networks fuse",
-}
 
 
 @dataclass(frozen=True)

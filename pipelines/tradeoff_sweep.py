@@ -28,11 +28,10 @@ FOLDER = "tradeoff"
 
 @dataclass
 class Swept:
-    """What a sweep has so far: rows, the names of what was left out for lack of time, and how many were reused."""
+    """What a sweep has so far: rows, and the names of what was left out for lack of time."""
 
     rows: list[dict[str, Any]]
     left_out: list[str]
-    reused: int = 0
 
 
 def sweep(job: Job, wanted: Sequence[Wanted], stereo_seconds: float, budget: float | None, swept: Swept) -> None:
@@ -46,9 +45,7 @@ def sweep(job: Job, wanted: Sequence[Wanted], stereo_seconds: float, budget: flo
     for one in wanted:
         spec = job_spec(job, one, stereo_seconds, base_voxel)
         rows = known_rows(job, one, spec)
-        if rows is not None:
-            swept.reused += 1
-        else:
+        if rows is None:
             expected = float(one.wanted.get("iterations", 0.0)) + beside[one.is_surface]
             if budget is not None and time.monotonic() - began + expected > budget:
                 swept.left_out.append(one.name)

@@ -162,6 +162,7 @@ def test_tables_of_few_views_go_on_where_they_stopped(room: Path, tmp_path: Path
     settings = ["--set", "field.resolution=32", "--set", "network.voxels=12", "--image-size", 48]
     first = call(capsys, "bench", "few-views", room, "--out", out, "--views", "3", "--budgets", "0.5", "--starts", "classical", *settings)
     assert first.code == 0, first.err
+    assert read_json(out / "few_views.json")["settings"]["fit"]["budget"] == load_settings().fit.budget, "rows tell their own"
     kept = read_json(out / "few_views.json")["rows"]
     assert [row["start"] for row in kept] == ["nearest", "classical"]
     answer = call(capsys, "bench", "few-views", room, "--out", out, "--views", "3,all", "--budgets", "0.5", *settings)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import count
 from typing import Any
 
@@ -175,6 +176,15 @@ def test_going_on_from_a_broken_field_is_refused(monkeypatch: pytest.MonkeyPatch
     field.feature_rows[3, 2] = math.nan
     with pytest.raises(InputError, match="not finite; fit it anew"):
         fit_field(sphere_views(), scene(), settings, start=field)
+
+
+def test_going_on_from_a_field_of_no_voxel_is_refused() -> None:
+    """As the networks leave it, where nothing could be recognised: no block, or blocks without a voxel."""
+    views, settings = sphere_views(), wanted("engine=torch", "field.resolution=32")
+    made, _ = _first(views, views, scene(), settings, torch.device("cpu"), TorchHost(), torch.Generator().manual_seed(0))
+    for start in (empty := replace(made, occupied=torch.zeros_like(made.occupied)), empty.settled()):
+        with pytest.raises(InputError, match=r"holds no voxel, .* fit it anew with --init classical"):
+            fit_field(views, scene(), settings, start=start)
 
 
 def test_large_finite_gradients_are_no_bad_step() -> None:

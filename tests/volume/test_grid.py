@@ -305,6 +305,11 @@ def test_a_fits_rows_are_open3ds_memory_from_a_cache_line_on(channels: int) -> N
     host.close()
 
 
+def test_no_block_has_rows_as_well() -> None:
+    hosted = GridHost().allocate(torch.zeros((0, 3), dtype=torch.int32), 4, 0.1)
+    assert hosted.topology.blocks == 0 and hosted.density.tolist() == [0.0] and hosted.feature.tolist() == [[0.0] * 4]
+
+
 @pytest.mark.skipif(madvise is None, reason="this system takes no pages back early")
 def test_a_coarser_levels_rows_take_no_memory_while_the_finer_ones_are_made() -> None:
     keys = torch.cartesian_prod(*[torch.arange(8)] * 3).int()

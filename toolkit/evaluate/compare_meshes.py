@@ -97,18 +97,11 @@ def _gap_colours(mesh: Mesh, truth: Mesh, voxel_size: float) -> Array:
     return coloured(gap[None] / (ERROR_VOXELS * voxel_size), ERROR_COLOURS)[0]
 
 
-def _normals(mesh: Mesh) -> Array:
-    """(T, 3) unit normals, out of the surface; 0 for a triangle without area."""
-    a, b, c = (mesh.vertices[mesh.triangles[:, corner]] for corner in range(3))
-    normal = np.cross(b - a, c - a)
-    return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30))
-
-
 def _towards(mesh: Mesh, eye: Array) -> Array:
     """(T,) cosine between each triangle's normal and the direction to the eye."""
     away = eye - mesh.vertices[mesh.triangles].mean(axis=1)
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-30)
-    return np.asarray((_normals(mesh) * away).sum(axis=1))
+    return np.asarray((mesh.facing(np.arange(len(mesh.triangles))) * away).sum(axis=1))
 
 
 def _facing(mesh: Mesh, eye: Array) -> Array:
@@ -122,6 +115,6 @@ def _within(mesh: Mesh, box: tuple[Array, Array]) -> Array:
 
 def _headlight(mesh: Mesh, eye: Array) -> Array:
     """(T, 3) uint8 grey as lit from the eye and a little from above, either side alike."""
-    normal = _normals(mesh)
+    normal = mesh.facing(np.arange(len(mesh.triangles)))
     light = 0.25 + 0.6 * np.abs(_towards(mesh, eye)) + 0.15 * np.abs(normal[:, 2])
     return np.repeat(np.round(np.clip(light, 0, 1) * 235).astype(np.uint8)[:, None], 3, axis=1)

@@ -7,11 +7,13 @@ machine does not blur the comparison; the networks' seconds stand beside, they a
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from toolkit.capture.types import Views
 from toolkit.config import Settings
@@ -129,9 +131,9 @@ def few_views_rows(
             if start not in starts or (count, start, budget) in done:
                 continue
             progress.check()
-            settings.fit.budget = budget
-            first = network_start(made, views, scene, settings) if start == "network" and made is not None else None
-            fitted = fit_guided(views, scene, settings, progress, start=first, coarse=first is not None, ticks=time.process_time)
+            asked = replace(settings, fit=replace(settings.fit, budget=budget))
+            first = network_start(made, views, scene, asked) if start == "network" and made is not None else None
+            fitted = fit_guided(views, scene, asked, progress, start=first, coarse=first is not None, ticks=time.process_time)
             row = {"views": count, "start": start, "budget": budget, **measured(fitted.field, ground)}
             yield {**row, "steps": fitted.steps, "resolution": fitted.field.resolution}
 
@@ -143,30 +145,35 @@ def ablation_rows(ground: Ground, model: NerfusionModel, progress: Progress = SI
     options = NetworkOptions.of(ground.settings.network)
     for name in ABLATIONS:
         progress.check()
-        with _without(model, name):
+        with without(model, name):
             inference, facts = infer(model, ground, replace(options, **OF_OPTIONS.get(name, {})), progress)
             yield {"views": ground.training, "part": name, **measured_alone(inference, ground, facts, progress)}
 
 
-class _without:
-    """The model with one part switched off while the context is open."""
+@contextmanager
+def without(model: NerfusionModel, part: str) -> Iterator[None]:
+    """The model with one part switched off while the context is open: of `ABLATIONS`, those that are parts of the networks.
 
-    def __init__(self, model: NerfusionModel, name: str) -> None:
-        self.model, self.name = model, name
-        self.config, self.fusion = model.config, model.fusion
-
-    def __enter__(self) -> None:
-        if self.name == "no variance":
-            self.model.config = replace(self.config, variance=False)
-        elif self.name == "mean instead of GRU":
-            self.model.fusion = RunningMean()
-        elif self.name == "no direction code" and self.model.direction is not None:
-            self.hook = self.model.direction.register_forward_hook(lambda module, given, out: out * 0)
-
-    def __exit__(self, *_: object) -> None:
-        self.model.config, self.model.fusion = self.config, self.fusion
-        if self.name == "no direction code" and self.model.direction is not None:
-            self.hook.remove()
+    Of the direction code the last layer's numbers are set to zero, where they lie: on CUDA encoding is recorded (`networks.recorded`), and
+    a recording reads its parameters anew, but knows nothing of hooks.
+    """
+    config, fusion = model.config, model.fusion
+    last = [] if part != "no direction code" or model.direction is None else list(model.direction[-1].parameters())
+    kept = [value.detach().clone() for value in last]
+    if part == "no variance":
+        model.config = replace(config, variance=False)
+    elif part == "mean instead of GRU":
+        model.fusion = RunningMean()
+    try:
+        with torch.no_grad():
+            for value in last:
+                value.zero_()
+        yield
+    finally:
+        model.config, model.fusion = config, fusion
+        with torch.no_grad():
+            for value, old in zip(last, kept, strict=True):
+                value.copy_(old)
 
 
 def few_views_table(rows: list[dict[str, Any]]) -> str:

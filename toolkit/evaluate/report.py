@@ -138,7 +138,7 @@ def write_report(folder: Path | str, data: dict[str, Any], pictures: Pictures | 
             missing}; `scene` {metric, …}; `field` {voxel_size, blocks, voxels, bytes}; `evaluation` {field, tsdf} as `score_views` answers;
             `baseline` as `nearest_image_scores` answers (in the JSON it is `evaluation.nearest_image`); `timeline` [{seconds, psnr}];
             `stages` [{name, seconds, peak_memory_mb, cached}]; `exports` [{path, bytes, facts}] or paths; `settings` (nested plain data).
-        pictures: as `make_pictures` answers; None: none.
+        pictures: as `method_pictures` answers; None: none.
 
     Returns:
         the paths of the JSON and of the HTML file.

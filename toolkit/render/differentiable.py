@@ -48,8 +48,8 @@ def render_with_gradients(
     Args:
         jitter: (B,) in [0, 1): moves the samples of a ray along it.
         behind: (3,) or (B, 3) colour behind everything; None: the field's own.
-        threshold: samples of smaller weight have no colour. 0 is exact; 1e-3 is faster where most of a field is thin, and leaves these
-            samples only the gradient that they have as obstacles in front of others.
+        threshold: of the deferred decoder, samples of smaller weight have no colour. 0 is exact; 1e-3 is faster where most of a field is
+            thin, and leaves these samples only the gradient that they have as obstacles in front of others.
     """
     count = len(origins)
     samples = march(field.grid, origins.float(), directions.float(), field.near, field.fine, jitter)

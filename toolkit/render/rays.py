@@ -28,7 +28,7 @@ class RayValues:
 
 @torch.no_grad()
 def render_rays(field: Field, origins: Tensor, directions: Tensor, threshold: float = 1e-3) -> RayValues:
-    """Render (B, 3) rays. Samples whose weight stays below `threshold` are not decoded."""
+    """Render (B, 3) rays. The deferred decoder leaves out samples whose weight is at most `threshold`."""
     count = len(origins)
     samples = march(field.grid, origins, directions, field.near, field.fine)
     if isinstance(field.decoder, Deferred):

@@ -111,7 +111,8 @@ def fit_field(
         ticks: the clock, in seconds, that the budget is counted on; a benchmark beside other work takes `time.process_time`.
 
     Raises:
-        InputError: there is no training view or pixel, `start` is not finite, not one step was, or it does not fit into memory.
+        InputError: there is no training view or pixel, `start` is not finite or holds nothing, not one step was finite, or there is no
+            memory for it.
     """
     device = fit_device(settings)
     train = views.subset(np.flatnonzero(~views.test))

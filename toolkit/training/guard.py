@@ -59,11 +59,13 @@ class Guard:
 
 
 def refuse_broken(field: Field) -> None:
-    """A field to go on from must be finite.
+    """A field to go on from must be finite, and hold something that rays can come to.
 
     Raises:
-        InputError: it is not.
+        InputError: it is not, or does not.
     """
+    if field.voxels == 0:
+        raise InputError("the field to go on from holds no voxel, so no ray would change it; fit it anew with --init classical")
     values = (field.density_rows, field.feature_rows, *field.decoder.parameters())
     if not all(bool(torch.isfinite(value).all()) for value in values):
         raise InputError("the field to go on from holds values that are not finite; fit it anew")

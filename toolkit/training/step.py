@@ -31,7 +31,6 @@ class Rates:
     decoder: float
     distortion: float
     opacity: float = 0.0  # weight of the mean of (1 - opacity)², for captures in which every ray ends somewhere
-    random_background: bool = False  # what is behind everything is another colour for every ray, so that it cannot stand in for a surface
     colour_threshold: float = 3e-3  # samples of smaller weight are neither decoded nor given a gradient
     depth: float = 0.0  # weight of the mean of the depth term (see `depth`), for rays whose surface is known
     depth_noise: float = FINE.noise  # share of its distance by which such a surface may be off
@@ -116,9 +115,8 @@ class Optimiser:
         jitter = torch.rand(len(batch.origins), generator=generator).to(field.device)
         samples = march(field.grid, batch.origins, batch.directions, field.near, field.fine, jitter)
         deferred = isinstance(field.decoder, Deferred)
-        behind = torch.rand(len(batch.origins), 3, generator=generator).to(field.device) if rates.random_background else field.background
         try:
-            error = (self._deferred if deferred else self._per_sample)(batch, samples, rates, behind)
+            error = (self._deferred if deferred else self._per_sample)(batch, samples, rates)
         except NotFiniteError:
             self.decoder.forget()
             self.seen.nan_to_num_(0.0)
@@ -129,7 +127,7 @@ class Optimiser:
         self.decoder.forget()
         return error, len(samples)
 
-    def _deferred(self, batch: Batch, samples: Samples, rates: Rates, behind: Tensor) -> float:
+    def _deferred(self, batch: Batch, samples: Samples, rates: Rates) -> float:
         """Features are composited, then decoded once a ray; only the decoder goes through autograd."""
         field, count = self.field, len(batch.origins)
         assert isinstance(field.decoder, Deferred)
@@ -149,7 +147,7 @@ class Optimiser:
 
         mean.requires_grad_(True)
         colour = field.decoder(mean, batch.directions)
-        mixed = opacity[:, None] * colour + (1 - opacity)[:, None] * behind
+        mixed = opacity[:, None] * colour + (1 - opacity)[:, None] * field.background
         residual = (mixed - batch.colour).detach()
         # L = mean over rays and channels of the squared error; ∂L/∂mixed in closed form, the rest from the decoder's graph.
         shares = self._shares(batch)
@@ -158,7 +156,7 @@ class Optimiser:
         g_mean = mean.grad
         assert g_mean is not None
         colour = colour.detach()
-        g_opacity = (g_mixed * (colour - behind)).sum(1) - (1 - opacity) * (2 * rates.opacity * shares)
+        g_opacity = (g_mixed * (colour - field.background)).sum(1) - (1 - opacity) * (2 * rates.opacity * shares)
         # mean = Σ w f / A and A = Σ w: ∂mean/∂w_i = (f_i - mean) / A
         g_sum = g_mean / opacity.clamp_min(OPACITY_FLOOR)[:, None]
         per_ray = torch.cat([g_sum, (g_opacity - (g_sum * mean.detach()).sum(1))[:, None]], 1)[kept.ray]
@@ -173,7 +171,7 @@ class Optimiser:
         self._move(rows, corner_weights, g_raw, per_ray[:, :-1] * (weight * slow)[:, None], rates, residual)
         return self._mean_error(residual, shares)
 
-    def _per_sample(self, batch: Batch, samples: Samples, rates: Rates, behind: Tensor) -> float:
+    def _per_sample(self, batch: Batch, samples: Samples, rates: Rates) -> float:
         """The paper's decoder at every sample: autograd from looked-up features to loss, then our scatter and lazy Adam."""
         field, count = self.field, len(batch.origins)
         rows, corner_weights = corners(field.topology, samples.cell, samples.inside)
@@ -186,11 +184,11 @@ class Optimiser:
         weight, transmittance = weights(tau, samples.first)
         self._mark(samples, weight, transmittance >= STOP, count)
         opacity = ray_sum(weight, samples.ray, count)
-        mixed = ray_sum(weight[:, None] * colour.detach(), samples.ray, count) + (1 - opacity)[:, None] * behind
+        mixed = ray_sum(weight[:, None] * colour.detach(), samples.ray, count) + (1 - opacity)[:, None] * field.background
         residual = mixed - batch.colour
         shares = self._shares(batch)
         g_rays = residual * (2 / 3 * shares)[:, None]
-        g_opacity = -(g_rays * behind).sum(1) - (1 - opacity) * (2 * rates.opacity * shares)
+        g_opacity = -(g_rays * field.background).sum(1) - (1 - opacity) * (2 * rates.opacity * shares)
         g_mixed = g_rays[samples.ray]
         g_weight = (g_mixed * colour.detach()).sum(1) + g_opacity[samples.ray]
         if rates.distortion > 0:

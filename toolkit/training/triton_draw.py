@@ -8,7 +8,6 @@ import triton.language as tl
 from toolkit.networks.encoding import SH
 from toolkit.render.triton_march import C_BEHIND, C_COUNTS, C_JITTER, C_RED, C_TARGET
 from toolkit.training.importance import TILE, TOP
-from toolkit.training.triton_rates import R_RANDOM
 
 TRIES = 24  # evenly drawn pixels, of which the first that luck takes is looked at; one of 3·10⁴ rays takes its last one
 S0, S1, S2, S3, S4, S5, S6, S7, S8, S9 = (tl.constexpr(v) for v in SH)
@@ -53,7 +52,7 @@ def _seen_at(starts, places, camera, pick, views, SOME: tl.constexpr, mask):
 
 @triton.jit(do_not_specialize=["count", "stride", "columns", "channels", "views", "tiles_high", "tiles_wide", "seed"])
 def draw(
-    rays, tiles, inputs, state, rates,
+    rays, tiles, inputs, state,
     colour, places, starts, distance, camera, pose, densities, background, limit,
     count, stride, columns, channels, views, tiles_high, tiles_wide, seed,
     SOME: tl.constexpr, KNOWN: tl.constexpr, B: tl.constexpr,
@@ -94,12 +93,10 @@ def draw(
     tl.store(rays + 4 * stride + ray, y, mask=on)
     tl.store(rays + 5 * stride + ray, z, mask=on)
     _harmonics(inputs, ray * columns + channels, x, y, z, on)
-    wild = tl.load(rates + R_RANDOM) > 0
     for k in tl.static_range(3):
         level = tl.load(colour + pick.to(tl.int64) * 3 + k, mask=on, other=0).to(tl.float32) / 255
         tl.store(rays + (C_RED + k) * stride + ray, level, mask=on)
-        behind = tl.where(wild, tl.rand(key, number + 56 + k), tl.load(background + k))
-        tl.store(rays + (C_BEHIND + k) * stride + ray, behind, mask=on)
+        tl.store(rays + (C_BEHIND + k) * stride + ray, tl.load(background + k), mask=on)
     tl.store(rays + C_COUNTS * stride + ray, 1 / (density * count), mask=on)
     target = density * 0
     if KNOWN:

@@ -138,9 +138,8 @@ class TritonOptimiser:
         self.steps += 1
         return (self._look() if self.steps <= LOOK or self.steps % LOOK == 0 else math.nan), 0
 
-    def step_on(self, batch: Batch, rates: Rates, jitter: Tensor, behind: Tensor | None = None) -> float:
-        """One step on rays that are given, as `Optimiser.step`: jitter (B,), and (B, 3) what is behind each, where it is not the
-        field's background. Answers their mean squared error."""
+    def step_on(self, batch: Batch, rates: Rates, jitter: Tensor) -> float:
+        """One step on rays that are given, with jitter (B,), as `Optimiser.step`. Answers their mean squared error."""
         count = len(batch.origins)
         self._tell(rates)
         self._room_for(count)
@@ -149,7 +148,7 @@ class TritonOptimiser:
         rays[COUNTS] = (1.0 if batch.weight is None else batch.weight) / count
         rays[TARGET] = 0.0 if batch.distance is None else batch.distance
         rays[JITTER] = jitter
-        rays[BEHIND:] = (self.field.background.expand(count, 3) if behind is None else behind).T
+        rays[BEHIND:] = self.field.background[:, None]
         self.inputs[:, self.field.feature_rows.shape[1] :] = spherical_harmonics(batch.directions)
         self._learn(count, remember=False)
         return self._look()
@@ -188,7 +187,7 @@ class TritonOptimiser:
     def _draw(self, rays: int) -> None:
         pool = self.pool
         draw[(triton.cdiv(rays, 128),)](
-            *(self.buffers[0], self.tiles, self.inputs, self.state, self.rates),
+            *(self.buffers[0], self.tiles, self.inputs, self.state),
             *(pool.colour, pool.places, pool.starts, pool.distance, pool.camera, pool.pose, self.tile_density, self.field.background),
             *(self.limit, rays, rays, self.inputs.shape[1], self.field.feature_rows.shape[1], len(pool.pose)),
             *(self.high, self.wide, self.seed * 1_000_003 % 2**31),

@@ -6,12 +6,12 @@ import triton.language as tl
 
 from toolkit.training.step import Rates
 
-R_DENSITY, R_FEATURE, R_DECODER, R_DISTORTION, R_OPACITY, R_DEPTH, R_NOISE, R_SLOW, R_RANDOM = (tl.constexpr(v) for v in range(9))
-RATES = 9
+R_DENSITY, R_FEATURE, R_DECODER, R_DISTORTION, R_OPACITY, R_DEPTH, R_NOISE, R_SLOW = (tl.constexpr(v) for v in range(8))
+RATES = 8
 
 
 def told(rates: Rates) -> list[float]:
     """What kernels read of `rates`, each in its place."""
     steps = [rates.density, rates.feature, rates.decoder]
     losses = [rates.distortion, rates.opacity, rates.depth, rates.depth_noise, rates.slow_within]
-    return [*steps, *losses, float(rates.random_background)]
+    return [*steps, *losses]

@@ -35,7 +35,7 @@ class GridHost:
         # One spare block holds the zero row, so the table never grows and the views stay good. It gives `_aligned` room, too.
         self.grid = BlockGrid(voxel_size, {"feature": channels, "density": 1}, capacity=blocks + 1, device=self.device)
         slots = self.grid.activate(keys)
-        if int(slots.max()) != blocks - 1:  # a fresh table hands out its first slots; otherwise its order is not ours to use
+        if blocks and int(slots.max()) != blocks - 1:  # a fresh table hands out its first slots; otherwise its order is not ours to use
             topology = self.grid.topology()
             size = topology.zero_row + 1
             return Hosted(topology, zero_rows((size,), self.device), zero_rows((size, channels), self.device))

@@ -26,6 +26,7 @@ from toolkit.training.nerfusion.checkpoint import checkpoint_settings, checkpoin
 from toolkit.training.nerfusion.curve import Curve, draw_curve
 from toolkit.training.nerfusion.distributed import Crew, join_crew
 from toolkit.training.nerfusion.health import ALIVE
+from toolkit.training.nerfusion.step import local_of
 from toolkit.training.nerfusion.train import WEIGHTS, Trainer, learning_rate, make_model
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -184,6 +185,16 @@ def test_reduced_precision_stays_close(tmp_path: Path) -> None:
     reduced = Trainer(tiny_settings(optimiser={"reduced": True}), tmp_path / "reduced", Crew()).one_step()
     assert np.isfinite(reduced["gradient_norm"]) and reduced["gradient_norm"] > 0
     assert reduced["loss"] == pytest.approx(full["loss"], rel=0.1)
+
+
+def test_gates_of_what_is_validated_between_steps_count_in_no_row(tmp_path: Path) -> None:
+    trainer = Trainer(tiny_settings(stage={"steps": 0}), tmp_path, Crew())
+    assert "gate_update_saturated" in trainer.one_step()
+    sample = trainer.mixture.sample(0, 1)
+    local = local_of(trainer.model, sample, 0)
+    with torch.no_grad():
+        trainer.model.fuse(trainer.model.start(local.lattice), local)
+    assert trainer.gates.shares() == {}
 
 
 def poison(trainer: Trainer, monkeypatch: pytest.MonkeyPatch, steps: Iterable[int], loss: bool = False) -> None:

@@ -16,7 +16,6 @@ from toolkit.volume.topology import BLOCK, VOXELS, Topology
 GROUP = "lookup"
 VALUE = 1e-6
 ABSENT = 1e-4  # thousands of terms of both signs, and nobody uses the sum
-Cells = dict[tuple[int, int, int], int]
 
 
 def lattice(topology: Topology) -> Tensor:

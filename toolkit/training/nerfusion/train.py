@@ -172,6 +172,7 @@ class Trainer:
         self.stepper.watched = self.gates.on = (step + 1) % settings.record.log_every == 0
         with torch.autocast(self.crew.device.type, torch.bfloat16, enabled=settings.optimiser.reduced):
             outcome: Outcome = (self.stepper.stage_two if second else self.stepper.stage_one)(sample, step, generator)
+        self.gates.on = False  # what is validated in between counts in no row
         self.crew.average_gradients(self.model.parameters())
         norm = clipped(self.model, settings.optimiser.clip)
         rate = learning_rate(settings, step) * self.caution.slower
