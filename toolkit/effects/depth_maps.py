@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -32,7 +33,18 @@ class DepthMaps:
     start: Array  # (M,) where each begins
     size: Array  # (M, 2) its width and height
     step: Array  # (M,) pixels of its camera from one of its pixels to the next
-    cameras: tuple[Intrinsics, ...]  # (M,)
+    cameras: tuple[Intrinsics, ...]  # (M,) each frame may have its own
+
+    @cached_property
+    def _lens(self) -> Array:
+        """(M, 4) fx, fy, cx, cy."""
+        return np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in self.cameras])
+
+    @cached_property
+    def _bent(self) -> list[tuple[Intrinsics, Array]]:
+        """Cameras that are no pinholes, and (M,) bool whose they are."""
+        kinds = dict.fromkeys(camera for camera in self.cameras if camera.distorted)
+        return [(camera, np.array([other == camera for other in self.cameras])) for camera in kinds]
 
     def off(self, places: Array, which: Array, depth_from_picture: Array, scale: float = 1.0) -> Array:
         """(N,) r; NaN: the four pixels around are not all known, or not of one surface.
@@ -46,10 +58,10 @@ class DepthMaps:
         places = scale * places @ depth_from_picture[:3, :3].T + depth_from_picture[:3, 3]
         front = np.flatnonzero(places[:, 2] > 0)
         ideal, mine = places[front, :2] / places[front, 2:], which[front]
-        for camera in dict.fromkeys(camera for camera in self.cameras if camera.distorted):
-            one = np.array([other == camera for other in self.cameras])[mine]
+        for camera, maps in self._bent:
+            one = maps[mine]
             ideal[one] = distort(camera, ideal[one])
-        lens = np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in self.cameras])[mine]  # each frame may have its own
+        lens = self._lens[mine]
         pixels = (ideal * lens[:, :2] + lens[:, 2:] - 0.5) / self.step[mine, None]
         inside = (pixels >= 0).all(axis=1) & (pixels < self.size[mine] - 1).all(axis=1)
         front, pixels, mine = front[inside], pixels[inside], mine[inside]

@@ -139,6 +139,21 @@ def solved(found: Observations) -> Registration | None:
     return Registration(_pose(_fitted(known, usual, ALL), usual), values[0], values[1], len(known.point))
 
 
+def quickly(found: Observations) -> Array:
+    """(4, 4) the offset, judged by the observations that it is fitted to; none where it is not there, or too few have depth."""
+    known = found.some(np.flatnonzero(np.isfinite(found.off(np.eye(4), 1.0))))
+    if len(known.point) < FEWEST:
+        return np.eye(4)
+    usual = float(np.median(known.places[:, 2]))
+    scale, offset = (_fitted(known, usual, free) for free in (SCALE, ALL))
+    off = np.abs([_off(known, scale, usual), _off(known, offset, usual)])
+    off = np.minimum(off[:, np.isfinite(off).all(axis=0)], STAGES[-1][0])
+    if not off.size:
+        return np.eye(4)
+    judged = Registration(_pose(offset, usual), float(off[0].mean()), float(off[1].mean()), off.shape[1])
+    return judged.depth_from_picture if judged.there else np.eye(4)
+
+
 def _fitted(found: Observations, usual: float, free: Array) -> Array:
     """(7,) a turn, a move in usual depths, the logarithm of the scale; 0 but for those `free`."""
     some = found.some(np.linspace(0, len(found.point) - 1, min(MOST, len(found.point))).astype(int))

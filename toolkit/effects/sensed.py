@@ -20,11 +20,11 @@ from toolkit.capture.types import Capture
 from toolkit.effects.adjust import LENS, Belief, Problem, adjust, predict, residuals, scatter
 from toolkit.effects.correct import Corrections, correctable
 from toolkit.effects.depth_maps import DepthMaps, read
-from toolkit.effects.registration import FEWEST, Observations, deep_frames, solved, sure
+from toolkit.effects.registration import FEWEST, Observations, deep_frames, quickly, sure
 from toolkit.progress import SILENT, Progress
 
 MAPS = 300  # depth maps that take part
-ROUNDS = 3
+ROUNDS = 2
 STEPS = 60
 MARGIN = 0.01  # least relative fall of what depth maps are off each other
 WORSE = 0.03  # relative growth of what places are off that is nothing
@@ -110,9 +110,7 @@ class Sensor:
         use = sure(problem) & np.isin(problem.frame, self.frames)
         if use.sum() < FEWEST:
             return np.eye(4)
-        seen = Observations(predict(problem)[0][use], problem.point[use], np.searchsorted(self.frames, problem.frame[use]), self.maps)
-        found = solved(seen)
-        return found.depth_from_picture if found is not None and found.there else np.eye(4)
+        return quickly(Observations(predict(problem)[0][use], problem.point[use], np.searchsorted(self.frames, problem.frame[use]), self.maps))
 
     def both_off(self, one: Problem, first: Array, other: Problem, second: Array) -> tuple[float, float]:
         """What maps are off each other in the mean, shares of depth up to `CUT`, with the cameras of two problems, at the same pixels."""
