@@ -74,7 +74,8 @@ class RunFolder:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path.absolute()
+        # One name, without links and "..": what a run keeps of its own files is compared with it. (`Path.resolve` refuses circles.)
+        self.path = Path(os.path.realpath(path))
         self._lock: IO[str] | None = None
         self._made: list[Path] = []  # folders that were not there before, the innermost first
         self._held_run = False

@@ -238,7 +238,7 @@ def source_state(source: Path, without: Path) -> str:
 
 def _files(root: Path, without: Path) -> Iterable[Path]:
     found: list[Path] = []
-    for folder, folders, files in os.walk(root):
+    for folder, folders, files in os.walk(os.path.realpath(root)):  # as `without` is named
         folders[:] = sorted(name for name in folders if Path(folder, name) != without and not name.startswith("."))
         found += [Path(folder, name) for name in sorted(files) if not name.startswith(".")]
         if len(found) > MAX_LISTED:

@@ -47,7 +47,10 @@ def test_video_is_cut_into_frames(tmp_path: Path, capsys: Capsys) -> None:
     for pose in circle(30, 0.3):
         writer.write(cv2.cvtColor(shoot(pose, PHOTO)[0], cv2.COLOR_RGB2BGR))
     writer.release()
-    answer = call(capsys, "poses", path, "--out", tmp_path / "out", "--set", "capture.max_frames=12", "--threads", 1, "--quiet", "--json")
+    (tmp_path / "link").symlink_to(tmp_path)
+    place = tmp_path / "elsewhere" / ".." / "link" / "out"  # the same folder as below, by a way that people take
+    (tmp_path / "elsewhere").mkdir()
+    answer = call(capsys, "poses", path, "--out", place, "--set", "capture.max_frames=12", "--threads", 1, "--quiet", "--json")
     assert answer.code == 0, answer.err
     data = as_json(answer.out)
     assert data["capture"]["kind"] == "video" and 6 <= data["capture"]["frames"] <= 12
