@@ -99,7 +99,7 @@ def test_a_very_large_photo_is_read_without_a_remark(tmp_path: Path, recwarn: py
 
 
 def test_a_name_that_is_not_utf8_is_refused_in_a_sentence(tmp_path: Path) -> None:
-    """As archives of other systems leave names; OpenCV ended the process at a video of such a name, other libraries failed after the fit."""
+    """As archives of other systems leave names; OpenCV ended the process at a video of such a name, others failed after the fit."""
     strange = os.fsdecode(b"K\xfcche")
     for place in (tmp_path / strange, tmp_path / "photos"):
         for index in range(3):
