@@ -18,7 +18,7 @@ from typing import IO, Any
 from toolkit import __version__
 from toolkit.config import Settings, settings_dict
 from toolkit.errors import FieldfuseError, InputError, Interrupted, OutputError, first_line
-from toolkit.files import atomic_path, read_json, remove, write_json
+from toolkit.files import atomic_path, read_json, remove, require_utf8, write_json
 
 LOCK = ".lock"
 RUN = "run.json"
@@ -69,11 +69,13 @@ class RunFolder:
     """The folder of one run, locked for as long as the context is open.
 
     Raises:
+        InputError: its name is not UTF-8.
         OutputError: it cannot be made or written to, belongs to something else, or another command is working in it.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path.absolute()
+        # One name, without links and "..": what a run keeps of its own files is compared with it. (`Path.resolve` refuses circles.)
+        self.path = Path(os.path.realpath(path))
         self._lock: IO[str] | None = None
         self._made: list[Path] = []  # folders that were not there before, the innermost first
         self._held_run = False
@@ -83,6 +85,7 @@ class RunFolder:
         return self.path / name
 
     def __enter__(self) -> RunFolder:
+        require_utf8(self.path)
         try:
             self._made = [place for place in (self.path, *self.path.parents) if not place.exists()]
             self._take_lock()

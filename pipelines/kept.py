@@ -41,7 +41,7 @@ FEW_VIEWS = {
     "*": ANY
 }  # fmt: skip
 MEASURED_POINT = {"key": TEXT, "crashed": FLAG, "wall_seconds": NUMBER, "rows": [POINT]}
-EXPORT_FACTS = {"mesh": (None, MESH), "notes": [TEXT]}
+EXPORT_FACTS = {"mesh": (None, MESH), "?notes": [TEXT], "?note": (None, TEXT)}
 TIMELINE = [{"seconds": NUMBER, "psnr": (None, NUMBER), "*": (None, NUMBER, TEXT)}]
 NOTES = [TEXT]
 MATCHED = {"views": NUMBER, "pixels": NUMBER, "share": NUMBER, "?bare": NUMBER, "seconds": NUMBER}
@@ -67,6 +67,17 @@ def read_kept(path: Path, form: Any) -> Any:
         InputError: it cannot be read, or it has another form.
     """
     return fitting(read_json(path), form, path)
+
+
+def read_export_facts(path: Path) -> dict[str, Any]:
+    """`exports/facts.json`; earlier versions kept one note, or none.
+
+    Raises:
+        InputError: it cannot be read, or it has another form.
+    """
+    facts: dict[str, Any] = read_kept(path, EXPORT_FACTS)
+    note = facts.pop("note", None)
+    return {"notes": [] if note is None else [note], **facts}
 
 
 def fitting(value: Any, form: Any, path: Path) -> Any:

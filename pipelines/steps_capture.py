@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from toolkit.errors import InputError
 from toolkit.files import fingerprint, read_json, write_json
 
 if TYPE_CHECKING:
-    from toolkit.capture.types import Capture, Views
+    from toolkit.capture.types import Capture, Frame, Views
     from toolkit.effects.correct import Corrections
     from toolkit.keyframes import KeyFrames
     from toolkit.poses.result import PoseResult
@@ -75,11 +75,21 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
         "frames",
         make=make,
         save=save,
-        load=lambda: capture_from_dict(read_json(path)),
+        load=lambda: at_home(capture_from_dict(read_json(path)), folder),
         uses=job.settings.capture.max_frames if video else pixel_state(capture),
         after=["capture"],
         in_place=True,
     )
+
+
+def at_home(chosen: Capture, folder: Path) -> Capture:
+    """The capture with the pictures that were written to a run's `frames` where these are now: the run's folder may have been moved."""
+
+    def here(frame: Frame) -> Frame:
+        written = frame.image.parent.name == folder.name and (folder / frame.image.name).is_file()
+        return replace(frame, image=folder / frame.image.name) if written else frame
+
+    return chosen.with_frames([here(frame) for frame in chosen.frames])
 
 
 def last_of(job: Job, *names: str) -> list[str]:
@@ -238,7 +248,7 @@ def source_state(source: Path, without: Path) -> str:
 
 def _files(root: Path, without: Path) -> Iterable[Path]:
     found: list[Path] = []
-    for folder, folders, files in os.walk(root):
+    for folder, folders, files in os.walk(os.path.realpath(root)):  # as `without` is named
         folders[:] = sorted(name for name in folders if Path(folder, name) != without and not name.startswith("."))
         found += [Path(folder, name) for name in sorted(files) if not name.startswith(".")]
         if len(found) > MAX_LISTED:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.job import Job, set_seeds
-from pipelines.kept import EVALUATION, EXPORT_FACTS, MATCHED, NOTES, TIMELINE, read_kept
+from pipelines.kept import EVALUATION, MATCHED, NOTES, TIMELINE, read_export_facts, read_kept
 from pipelines.rendered import Pictures, depth_steps, load_pictures, save_pictures, to_picture, write_pngs
 from pipelines.room import require_pictures, require_scores
 from pipelines.steps_capture import last_of, pixel_state
@@ -230,7 +230,7 @@ def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, sc
 
         nonlocal whole
         fits = job.stages.usable("export")
-        before = read_kept(facts_path, EXPORT_FACTS) if fits else None
+        before = read_export_facts(facts_path) if fits else None
         exported = export_field(job, job.folder / "exports", field, poses, posed, scene, views)
         facts, whole = exported.facts, exported.whole
         if job.alone and not exported.made:
@@ -252,7 +252,7 @@ def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, sc
         "export",
         make=make,
         save=save,
-        load=lambda: read_kept(facts_path, EXPORT_FACTS),
+        load=lambda: read_export_facts(facts_path),
         uses=asdict(job.settings.export),
         adds=True,
         part=job.formats is not None,

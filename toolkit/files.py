@@ -103,6 +103,18 @@ def inside(root: Path, relative: str) -> Path:
     return resolved
 
 
+def require_utf8(path: Path) -> None:
+    """Refuse what libraries cannot open, some of them only when a fit is done, and others by ending the process.
+
+    Raises:
+        InputError: the path is not UTF-8, as where an archive was unpacked with names in another encoding.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"the name {path} is not UTF-8, and other programs cannot open it; rename it, with letters that show") from error
+
+
 def _circular(path: Path) -> bool:
     """Whether links are left after `resolve`, which says so by itself up to Python 3.12."""
     try:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from tests.capture.films import film, quarters
 from toolkit.capture import open_capture
 from toolkit.capture.photos import focal_from_exif, read_photos
 from toolkit.errors import InputError
@@ -94,3 +96,17 @@ def test_a_very_large_photo_is_read_without_a_remark(tmp_path: Path, recwarn: py
     Image.new("1", (12_000, 9_000)).save(tmp_path / "large.png")
     assert len(read_photos(tmp_path).frames) == 1
     assert not list(recwarn)
+
+
+def test_a_name_that_is_not_utf8_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    """As archives of other systems leave names; OpenCV ended the process at a video of such a name, others failed after the fit."""
+    strange = os.fsdecode(b"K\xfcche")
+    for place in (tmp_path / strange, tmp_path / "photos"):
+        for index in range(3):
+            photo(place / f"{index}.jpg")
+    photo(tmp_path / "photos" / f"{strange}.jpg")
+    (tmp_path / "film").mkdir()
+    (tmp_path / "link.mp4").symlink_to(film(tmp_path / "clip.mp4", quarters()).rename(tmp_path / "film" / f"{strange}.mp4"))
+    for source in (tmp_path / strange, tmp_path / "photos", tmp_path / "film", tmp_path / "link.mp4"):
+        with pytest.raises(InputError, match=r"K\?che.* is not UTF-8.*rename it"):
+            open_capture(source)

@@ -219,12 +219,30 @@ def test_a_still_video_is_refused(tmp_path: Path) -> None:
     video = film(tmp_path / "clip.avi", pan([5.0]) * 40)
     with pytest.raises(InputError, match="does not move"):
         select(video, tmp_path / "run", 20)
+    video = film(tmp_path / "nearly.avi", pan([5.0, 5.3] * 20))
+    with pytest.raises(InputError, match="does not move") as refused:
+        select(video, tmp_path / "run", 20)
+    assert "interlaced" not in str(refused.value)
 
 
 def test_a_black_video_is_refused(tmp_path: Path) -> None:
     video = film(tmp_path / "clip.avi", [np.zeros((*SIZE, 3), np.uint8)] * 20)
     with pytest.raises(InputError, match="shows nothing"):
         select(video, tmp_path / "run", 20)
+
+
+@pytest.mark.parametrize("size", [SIZE, (540, 960)])  # of large pictures the memory that nothing is written to is black
+def test_an_interlaced_video_is_refused_and_told_how_to_be_converted(tmp_path: Path, size: tuple[int, int]) -> None:
+    av = pytest.importorskip("av", reason="PyAV is not installed; make test brings it")
+    path = tmp_path / "clip.mts"
+    with av.open(str(path), "w", format="mpegts") as file:
+        stream = file.add_stream("mpeg2video", rate=25, options={"flags": "+ildct+ilme"})
+        stream.height, stream.width, stream.pix_fmt = *size, "yuv420p"
+        for picture in pan(list(np.linspace(0, 200, 12))):
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(cv2.resize(picture, size[::-1]), format="rgb24")))
+        file.mux(stream.encode())
+    with pytest.raises(InputError, match=r"interlaced.*ffmpeg -i clip\.mts -vf bwdif"):
+        select(path, tmp_path / "run", 5)
 
 
 def test_of_a_long_video_every_nth_frame_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import re
 import resource
 import shutil
@@ -374,3 +375,11 @@ def test_good_camera_file(tmp_path: Path) -> None:
     names, lenses, poses = read_cameras(tmp_path / "transforms.json")
     assert names[1] == "images/001.png" and lenses[0] == CAMERA
     np.testing.assert_allclose(poses, circle(3), atol=1e-12)
+
+
+def test_a_run_folder_whose_name_is_not_utf8_is_refused(tmp_path: Path) -> None:
+    """The field could not be written into it when all was done."""
+    path = tmp_path / os.fsdecode(b"K\xfcche")
+    with pytest.raises(InputError, match=r"K\?che is not UTF-8"), RunFolder(path):
+        pass
+    assert not path.exists()

@@ -46,6 +46,13 @@ def test_a_damaged_file_is_refused_in_a_sentence(text: str, tmp_path: Path) -> N
         read_kept(tmp_path / "effects.json", kept.EFFECTS)
 
 
+@pytest.mark.parametrize(("told", "notes"), [({}, []), ({"note": None}, []), ({"note": "a"}, ["a"]), ({"notes": ["a", "b"]}, ["a", "b"])])
+def test_facts_of_exports_of_earlier_versions_are_read(told: dict[str, Any], notes: list[str], tmp_path: Path) -> None:
+    """They had one note or none, and were called damaged."""
+    (tmp_path / "facts.json").write_text(json.dumps({"mesh": None, **told}))
+    assert kept.read_export_facts(tmp_path / "facts.json") == {"mesh": None, "notes": notes}
+
+
 def test_what_the_stages_write_has_the_forms(tmp_path: Path) -> None:
     """A finished small run, read back."""
     from tests.stability.runs import launch, make_source

@@ -15,7 +15,9 @@ import psutil
 import pytest
 from PIL import Image
 
+from pipelines.steps_capture import at_home
 from tests.pipelines.made import CAMERA, call, circle, command, environment, look_at, make_photos, shoot
+from toolkit.capture.types import Capture, Frame
 
 Capsys = pytest.CaptureFixture[str]
 PHOTO = CAMERA.scaled(288, 216)
@@ -47,7 +49,10 @@ def test_video_is_cut_into_frames(tmp_path: Path, capsys: Capsys) -> None:
     for pose in circle(30, 0.3):
         writer.write(cv2.cvtColor(shoot(pose, PHOTO)[0], cv2.COLOR_RGB2BGR))
     writer.release()
-    answer = call(capsys, "poses", path, "--out", tmp_path / "out", "--set", "capture.max_frames=12", "--threads", 1, "--quiet", "--json")
+    (tmp_path / "link").symlink_to(tmp_path)
+    place = tmp_path / "elsewhere" / ".." / "link" / "out"  # the same folder as below, by a way that people take
+    (tmp_path / "elsewhere").mkdir()
+    answer = call(capsys, "poses", path, "--out", place, "--set", "capture.max_frames=12", "--threads", 1, "--quiet", "--json")
     assert answer.code == 0, answer.err
     data = as_json(answer.out)
     assert data["capture"]["kind"] == "video" and 6 <= data["capture"]["frames"] <= 12
@@ -58,6 +63,17 @@ def test_video_is_cut_into_frames(tmp_path: Path, capsys: Capsys) -> None:
     again = as_json(call(capsys, "poses", path, "--out", tmp_path / "out", "--set", "capture.max_frames=12", "--quiet", "--json").out)
     assert {stage["name"]: stage["cached"] for stage in again["stages"]} == {"capture": True, "frames": False, "poses": False}
     assert frames[2].is_file()
+
+
+def test_the_frames_of_a_run_folder_that_was_moved_are_its_own(tmp_path: Path) -> None:
+    """They were looked for where they had been written, and not found, whatever command was given."""
+    before, now = tmp_path / "before" / "frames", tmp_path / "now" / "frames"
+    now.mkdir(parents=True)
+    (now / "a.jpg").touch()
+    kept = [tmp_path / "photos" / "a.jpg", tmp_path / "frames" / "b.jpg"]  # photos that needed no writing
+    frames = [Frame(str(index), path) for index, path in enumerate([before / "a.jpg", *kept])]
+    got = at_home(Capture("photos", tmp_path, tuple(frames)), now)
+    assert [frame.image for frame in got.frames] == [now / "a.jpg", *kept]
 
 
 def test_heic_photos_become_jpegs_that_the_cameras_name(tmp_path: Path, capsys: Capsys) -> None:

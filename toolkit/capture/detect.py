@@ -33,6 +33,7 @@ from toolkit.capture.tum import looks_like_tum, read_tum
 from toolkit.capture.types import Capture
 from toolkit.capture.video import VIDEO_SUFFIXES, read_video
 from toolkit.errors import InputError
+from toolkit.files import require_utf8
 
 CAMERA_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 
@@ -76,6 +77,8 @@ def read_source(path: Path) -> Capture:
         InputError: nothing there, nothing known, or the layout's own files are broken.
     """
     path = path.absolute()
+    if path.exists():
+        require_utf8(path)
     if path.is_file():
         if path.suffix.lower() == ".json":
             return read_blender(path.parent) if path.name.startswith("transforms_") else read_transforms(path)

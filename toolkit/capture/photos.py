@@ -17,6 +17,7 @@ from toolkit.capture.heif import SUFFIXES as HEIF_SUFFIXES
 from toolkit.capture.listing import assemble, counted, picture_header, pictures_in, require_folder, unique_names
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
+from toolkit.files import require_utf8
 
 FOLDERS = (".", "images", "input")
 FILM_DIAGONAL = math.hypot(36.0, 24.0)  # mm
@@ -45,6 +46,8 @@ def read_photos(path: Path | str) -> Capture:
     pictures = photo_files(root)
     if not pictures:
         raise InputError(f"no photo (jpg, heic, png, webp, bmp, tif) was found in {root}; give the folder that holds them")
+    for picture in pictures:
+        require_utf8(picture)
     pictures, remarks = _once_each(pictures)
     frames = [
         Frame(name=name, image=picture, focal_prior=focal_from_exif(picture))

@@ -36,6 +36,7 @@ BLANK = 0.05  # sharpness of frames that show one colour
 BLURRED = 0.6  # of the sharpness around it: a frame that may be left out
 MEASURED = 1200  # frames of a long video that are measured, evenly spread: converting one of 3840×2160 takes longer than decoding it …
 MEASURED_A_SECOND = 10  # … but never fewer, so that what is seen in one is still seen in the next
+INTERLACED = ", or, since all frames come out alike, convert it if it is interlaced, as camcorders' are, which cannot be read"
 JUMP = 0.30  # motion booked where tracking fails (a cut, a blank wall, strong blur)
 
 
@@ -75,11 +76,14 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
         raise InputError(
             f"only {readable} of {announced} frames of the video {video} can be decoded; the file is damaged, copy or convert it again"
         )
+    # Of interlaced frames FFmpeg inside OpenCV converts none, and says of all that they were: one piece of memory comes back each time.
+    alike = f"{INTERLACED} (ffmpeg -i {video.name} -vf bwdif new.mp4)" if len(set(measure.sharpness)) == 1 else ""
     if np.median(measure.sharpness) < BLANK:
-        raise InputError(f"the video {video} shows nothing (its frames are black or of one colour); check the camera and the file")
+        raise InputError(f"the video {video} shows nothing (its frames are black or of one colour); check the camera and the file{alike}")
     if measure.motion[-1] < STILL:
         raise InputError(
             f"the camera does not move in the video {video}; depth needs views from different places, film while walking around the scene"
+            f"{alike}"
         )
     best = choose(measure, settings.max_frames)
     chosen = [index * stride for index in best]

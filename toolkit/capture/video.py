@@ -19,6 +19,7 @@ import numpy as np
 from toolkit.camera import Array
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
+from toolkit.files import require_utf8
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".wmv")
 MOST_FRAMES = 2_000_000  # eighteen hours at 30 a second
@@ -103,6 +104,7 @@ def to_rgb(picture: Array) -> Array:
 
 
 def _open(path: Path, as_stored: bool = False) -> cv2.VideoCapture:
+    require_utf8(path)  # OpenCV would end the process
     # FFmpeg only: other backends would take a single picture, or a name with "%03d", for a video.
     with OPENING, _options(as_stored):
         level = cv2.utils.logging.getLogLevel()

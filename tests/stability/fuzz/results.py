@@ -105,7 +105,7 @@ def _report(root: Path) -> dict[str, Any]:
             "effects": {name: effects[name] for name in ("effects", "seconds", "looked_at")},
             "baseline": scores.get("nearest_image"),
             "timeline": kept.read_kept(root / "timeline.json", kept.TIMELINE),
-            "export_facts": kept.read_kept(root / "exports" / "facts.json", kept.EXPORT_FACTS),
+            "export_facts": kept.read_export_facts(root / "exports" / "facts.json"),
             "exports": [{"path": "mesh.ply", "bytes": 10}],
             "stages": [{"name": "field", "seconds": 1.0, "peak_memory_mb": 100.0, "cached": False}],
             "field": {"voxel_size": 0.1, "blocks": 4, "voxels": 100, "bytes": 1000},
