@@ -36,14 +36,16 @@ Init = Annotated[
 ]
 Finetune = Annotated[
     bool | None,
-    typer.Option("--finetune/--no-finetune", help="Whether the networks' field is fitted; without it is the result.", show_default=False),
+    typer.Option("--finetune/--no-finetune", help="Whether the networks' field is fitted (default), or the result.", show_default=False),
 ]
 PosesFrom = Annotated[str | None, typer.Option("--poses", help="auto (default), given, or sfm: ignore given poses.", show_default=False)]
 Baked = Annotated[
     bool, typer.Option("--baked", help="Take the baked field (about twice as fast on a CPU); it is made if need be.", show_default=False)
 ]
 Config = Annotated[Path | None, typer.Option(help="YAML file with settings.", show_default=False)]
-Pairs = Annotated[list[str] | None, typer.Option("--set", help="Any setting as key=value; may be repeated.", show_default=False)]
+Pairs = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting as key=value; may be repeated.", show_default=False)
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")]
 

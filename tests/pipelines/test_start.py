@@ -49,3 +49,8 @@ def test_doctor_as_json(capsys: Capsys) -> None:
     checks = json.loads(answer.out)
     assert {"python", "torch", "pycolmap"} <= {check["name"] for check in checks}
     assert answer.code == int(any(check["status"] == "fail" for check in checks))
+
+
+@pytest.mark.parametrize("group", [(), ("bench",)])
+def test_the_list_of_commands_cuts_no_text_off(capsys: Capsys, group: tuple[str, ...]) -> None:
+    assert "..." not in call(capsys, *group, "--help").out.partition("Commands:")[2]
