@@ -31,7 +31,8 @@ Decoder = Annotated[str | None, typer.Option(help="deferred (default) or per_sam
 Init = Annotated[
     str | None,
     typer.Option(
-        help="Start of the fit: network, classical, or auto (default): networks' if few pictures, no background.", show_default=False
+        help="Start of the fit: network, classical, or auto (default): the networks' with fewer than 24 training pictures.",
+        show_default=False,
     ),
 ]
 Finetune = Annotated[

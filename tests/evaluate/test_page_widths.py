@@ -8,8 +8,11 @@ from pathlib import Path
 from tests.evaluate.driven import Driven, driven, until
 from tests.evaluate.test_compare_page import made, pictures
 from tests.evaluate.test_report import sample
+from tests.evaluate.test_tradeoff import ladder
 from toolkit.evaluate.compare_page import write_comparison
 from toolkit.evaluate.report import write_report
+from toolkit.evaluate.tradeoff import points_of
+from toolkit.evaluate.tradeoff_page import render_tradeoff, tradeoff_data
 
 PHONE, SMALL = 390, 1100  # CSS pixels
 WIDE = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
@@ -26,7 +29,7 @@ EFFECT = {
 
 
 def put_pages(folder: Path) -> None:
-    """A report with effects and exports, and a comparison of five methods."""
+    """A report with effects and exports, a comparison of five methods, and a sweep of long names without its plots."""
     data, shown = sample()
     data["effects"] = {"effects": [EFFECT], "seconds": 1.0, "looked_at": {}}
     data["exports"] = [{"path": "exports/cameras/colmap/cameras.txt", "points": 12}, {"path": "exports/field.html"}]
@@ -35,6 +38,9 @@ def put_pages(folder: Path) -> None:
     for name in ("tsdf_stereo", "network"):
         compared["methods"].append({**deepcopy(compared["methods"][1]), "key": name, "title": "TSDF of matched pictures"})
     write_comparison(folder, compared, views, meshes, 0.075)
+    rows = [{**row, "method": row["method"].replace("tsdf", "tsdf_stereo")} for row in ladder()]
+    swept = tradeoff_data({"rows": rows, "unit": "units", "source": "room"})
+    (folder / "tradeoff.html").write_text(render_tradeoff(swept, points_of(rows), {}), encoding="utf-8")
 
 
 def show(page: Driven, address: str, width: int) -> None:
@@ -47,7 +53,7 @@ def show(page: Driven, address: str, width: int) -> None:
 
 def test_pages_fit_a_phone_and_a_small_screen(tmp_path: Path) -> None:
     put_pages(tmp_path)
-    report, compared = ((tmp_path / name).as_uri() for name in ("report.html", "compare.html"))
+    report, compared, swept = ((tmp_path / f"{name}.html").as_uri() for name in ("report", "compare", "tradeoff"))
     with driven(report, tmp_path, (PHONE, 900)) as page:
         show(page, report, PHONE)
         assert page.run(WIDE) == 0
@@ -55,5 +61,8 @@ def test_pages_fit_a_phone_and_a_small_screen(tmp_path: Path) -> None:
         assert page.run("document.querySelector('tr.why td div').getBoundingClientRect().right") <= PHONE
         show(page, compared, PHONE)
         assert page.run(WIDE) == 0
-        show(page, compared, SMALL)
-        assert page.run("[...document.querySelectorAll('.scroll')].every(part => part.scrollWidth <= part.clientWidth)")
+        show(page, swept, PHONE)
+        assert page.run(WIDE) == 0
+        for table in (compared, swept):
+            show(page, table, SMALL)
+            assert page.run("[...document.querySelectorAll('.scroll')].every(part => part.scrollWidth <= part.clientWidth)")
