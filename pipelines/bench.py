@@ -126,6 +126,8 @@ def show(data: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from toolkit.evaluate.words import counted
+
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("what", "size", "a unit, processor", "wall", "times faster", "than"):
         table.add_column(column, justify="right" if column in ("a unit, processor", "wall", "times faster") else "left", overflow="fold")
@@ -149,7 +151,8 @@ def show(data: dict[str, Any]) -> None:
             "time a unit grows with the size to the power: " + ", ".join(f"{name} {b:+.2f}" for name, b in data["growth"].items())
         )
     about = data["machine"]
-    console.print(f"{about['machine']}, {about['cores']} cores, {about['threads']} threads, load {about['load']} to {about['load_after']}")
+    threads = counted(about["threads"], "thread")
+    console.print(f"{about['machine']}, {about['cores']} cores, {threads}, load {about['load']} to {about['load_after']}")
 
 
 def _time(microseconds: float, unit: str) -> str:

@@ -28,7 +28,7 @@ def effects(
             "--drifting", help="Film ten with drift and vignetting; fit with what was found, with all off, and with what is true."
         ),
     ] = False,
-    every: Annotated[int, typer.Option(min=1, help="Of the captures, every so manieth is fitted.")] = 1,
+    every: Annotated[int, typer.Option(min=1, help="Of so many captures one is fitted; 1: all.")] = 1,
     seconds: Annotated[float, typer.Option(min=0.5, help="Processor seconds of each fit.")] = 3.0,
     quiet: Quiet = False,
 ) -> None:

@@ -33,6 +33,7 @@ def keyframes(
     bound_threads({"flags": {"threads": threads}})
 
     import os
+    import time
 
     import torch
 
@@ -48,7 +49,9 @@ def keyframes(
     progress, rows = make_progress(quiet), list[dict[str, Any]]()
     with progress.listening():
         progress.begin("room")
+        began = time.monotonic()
         way = walk(key_frames, width, voxel, levels, seed or 0, where)
+        progress.finish("room", time.monotonic() - began, False)
         progress.begin("key frames")
         for row in key_frame_rates(way, FusionOptions(levels, NEAR, FAR), where, repetitions, progress):
             rows.append(row)
@@ -65,6 +68,8 @@ def show(rows: list[dict[str, Any]], about: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from toolkit.evaluate.words import counted
+
     table = Table(box=None, pad_edge=False, header_style="bold")
     columns = [name for name in TITLES if name in rows[0]]
     for name in columns:
@@ -73,4 +78,4 @@ def show(rows: list[dict[str, Any]], about: dict[str, Any]) -> None:
         table.add_row(*(f"{row[name]:,}" for name in columns))
     console = Console(highlight=False)
     console.print(table)
-    console.print(f"{about['device']}; {about['machine']}, {about['cores']} cores, {about['threads']} threads")
+    console.print(f"{about['device']}; {about['machine']}, {about['cores']} cores, {counted(about['threads'], 'thread')}")

@@ -6,6 +6,7 @@ Exit codes: 0 done; 1 something unexpected, with a log file; 2 bad input, settin
 from __future__ import annotations
 
 import atexit
+import inspect
 import os
 import signal
 import sys
@@ -163,6 +164,9 @@ bench.app.command("few-views")(few_views.few_views)
 bench.app.command("ablations")(few_views.ablations)
 bench.app.command("engines")(bench_engines.engines)
 bench.app.command("keyframes")(bench_keyframes.keyframes)
+for _list in (app, bench.app):
+    for _entry in _list.registered_commands:  # in the list of commands their first sentences are wrapped like this, and cut off otherwise
+        _entry.short_help = " ".join((_entry.help or inspect.getdoc(_entry.callback) or "").partition("\n\n")[0].split())
 app.add_typer(bench.app, name="bench")
 
 

@@ -108,12 +108,13 @@ def compare_run(target: Path, out: Path | None, options: dict[str, Any], depth: 
 
 def show(data: dict[str, Any], folder: Path, quiet: bool, as_json: bool) -> None:
     """The result on stdout: JSON, or the table and where the page is."""
+    from pipelines.console import columns
     from toolkit.evaluate.compare_text import comparison_text
 
     if as_json:
         sys.stdout.write(writer.dumps(data, indent=1) + "\n")
     elif not quiet:
-        sys.stdout.write(comparison_text(data))
+        sys.stdout.write(comparison_text(data, columns(sys.stdout)))
         for warning in data["warnings"]:
             sys.stdout.write(f"note: {warning}\n")
         sys.stdout.write(f"{folder / 'compare.html'}\n")

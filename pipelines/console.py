@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import _thread
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -214,6 +215,12 @@ def make_progress(quiet: bool = False, stream: IO[str] | None = None) -> Console
 
 def show_table(data: dict[str, Any], stream: IO[str] | None = None) -> None:
     """The report's numbers as one table."""
-    from toolkit.evaluate.table import table  # rich and the metrics are needed only here
+    from toolkit.evaluate.table import WIDEST, table  # rich and the metrics are needed only here
 
-    (stream or sys.stdout).write(str(table(data)).rstrip() + "\n")
+    stream = stream or sys.stdout
+    stream.write(str(table(data, min(columns(stream) or WIDEST, WIDEST))).rstrip() + "\n")
+
+
+def columns(stream: IO[str]) -> int | None:
+    """How many characters a line of the terminal has; None where there is no terminal."""
+    return shutil.get_terminal_size().columns if stream.isatty() else None

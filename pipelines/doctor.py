@@ -162,7 +162,8 @@ def _pycolmap() -> Check:
 def _torch() -> Check:
     import torch
 
-    threads = f"{torch.get_num_threads()} threads"
+    count = torch.get_num_threads()
+    threads = f"{count} thread{'' if count == 1 else 's'}"
     if torch.cuda.is_available():
         from toolkit.gpu import runs_kernels
 

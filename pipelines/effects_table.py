@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+BESIDE = 140  # characters that a line must have for the evidence to stand in the table
+
 
 def effects_facts(target: Path, quiet: bool) -> dict[str, Any]:
     """What an earlier run found, or what its pictures and given poses show now.
@@ -50,23 +52,32 @@ def effects_facts(target: Path, quiet: bool) -> dict[str, Any]:
 
 
 def show(data: dict[str, Any]) -> None:
-    """The table on standard output, one effect a row."""
+    """The table on standard output, one effect a row; where lines are short what speaks for each stands below it."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in ("effect", "there", "number", "threshold", "held out", "s", "evidence"):
-        table.add_column(column, justify="right" if column in ("number", "threshold", "held out", "s") else "left", overflow="fold")
-    for entry in data["effects"]:
-        held = entry.get("held_out")
-        change = "" if held is None else f"{held['before']:.3f} → {held['after']:.3f} {held['unit']}"
-        there = "yes" if entry["there"] else "no"
-        paid = f"{entry['seconds']:.2f}" if "seconds" in entry else ""
-        table.add_row(entry["effect"], there, f"{entry['number']:.3f}", f"{entry['threshold']:g}", change, paid, entry["reason"])
+    from toolkit.evaluate.words import significant
+
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(highlight=False, width=180)
+    beside = console.width >= BESIDE
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("effect", "there", "number", "threshold", "held out", "s", *(["evidence"] if beside else [])):
+        table.add_column(column, justify="right" if column in ("number", "threshold", "held out", "s") else "left", overflow="fold")
+    for entry in data["effects"]:
+        held = entry.get("held_out")
+        change = "" if held is None else f"{significant(held['before'])} → {significant(held['after'])} {held['unit']}"
+        there = "yes" if entry["there"] else "no"
+        paid = f"{entry['seconds']:.2f}" if "seconds" in entry else ""
+        last = [Text(entry["reason"])] if beside else []
+        table.add_row(entry["effect"], there, f"{entry['number']:.3f}", f"{entry['threshold']:g}", change, paid, *last)
     console.print(table)
+    if not beside:
+        for entry in data["effects"]:
+            console.print(f"\n{entry['effect']}: {entry['reason']}", markup=False)
+        console.print()
     about = data["looked_at"]
     points = f", {about['points_seconds']:.1f} s of it for finding these points" if "points_seconds" in about else ""
     console.print(f"{about['frames']} pictures and {about['points']} shared points looked at in {data['seconds']:.1f} s{points}")

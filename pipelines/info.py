@@ -19,7 +19,7 @@ OUTDATED = (
     ({"render", "evaluate"}, "scores, pictures and the report are of an earlier field or surface; `fieldfuse evaluate {}` renews them"),
     ({"export"}, "the exports are of an earlier field; `fieldfuse export {}` renews them"),
 )
-TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS"}
+SHOWN = {"views": "views {}", "psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.3f}", "lpips": "LPIPS {:.3f}"}
 
 
 def info(
@@ -126,7 +126,7 @@ def scores_of(path: Path) -> dict[str, dict[str, float]]:
     except InputError:
         return {}
     return {
-        what: {name: score[name] for name in ("views", *TITLES) if score.get(name) is not None}
+        what: {name: score[name] for name in SHOWN if score.get(name) is not None}
         for what, score in scores.items()
         if score is not None and score.get("psnr") is not None
     }
@@ -143,7 +143,7 @@ def for_people(data: dict[str, Any]) -> dict[str, Any]:
         shown["stages"] = ", ".join(told)
     if "scores" in shown:
         shown["scores"] = [
-            f"{what.replace('_', ' ')}: " + ", ".join(f"{TITLES.get(name, name)} {number(value)}" for name, value in of.items())
+            f"{what.replace('_', ' ')}: " + ", ".join(SHOWN[name].format(value) for name, value in of.items())
             for what, of in shown["scores"].items()
         ]
     return shown

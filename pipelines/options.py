@@ -31,19 +31,22 @@ Decoder = Annotated[str | None, typer.Option(help="deferred (default) or per_sam
 Init = Annotated[
     str | None,
     typer.Option(
-        help="Start of the fit: network, classical, or auto (default): networks' if few pictures, no background.", show_default=False
+        help="Start of the fit: network, classical, or auto (default): the networks' with fewer than 24 training pictures.",
+        show_default=False,
     ),
 ]
 Finetune = Annotated[
     bool | None,
-    typer.Option("--finetune/--no-finetune", help="Whether the networks' field is fitted; without it is the result.", show_default=False),
+    typer.Option("--finetune/--no-finetune", help="Whether the networks' field is fitted (default), or the result.", show_default=False),
 ]
 PosesFrom = Annotated[str | None, typer.Option("--poses", help="auto (default), given, or sfm: ignore given poses.", show_default=False)]
 Baked = Annotated[
     bool, typer.Option("--baked", help="Take the baked field (about twice as fast on a CPU); it is made if need be.", show_default=False)
 ]
 Config = Annotated[Path | None, typer.Option(help="YAML file with settings.", show_default=False)]
-Pairs = Annotated[list[str] | None, typer.Option("--set", help="Any setting as key=value; may be repeated.", show_default=False)]
+Pairs = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting as key=value; may be repeated.", show_default=False)
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")]
 

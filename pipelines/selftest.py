@@ -14,7 +14,9 @@ if TYPE_CHECKING:
 
 
 def selftest(
-    stability: Annotated[bool, typer.Option("--stability", help="Hard cases for every kernel, against float64 references.")] = True,
+    stability: Annotated[
+        bool, typer.Option("--stability", help="Hard cases for every kernel, against float64 references; always.", show_default=False)
+    ] = True,
     fast: Annotated[bool, typer.Option("--fast", help="Leave out the cases that take longer or much memory.")] = False,
     only: Annotated[str | None, typer.Option(help="Only cases whose title holds this text.", show_default=False)] = None,
     every: Annotated[bool, typer.Option("--all", help="Show every number, not only the one nearest to its bound.")] = False,

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from tests.effects.seen import CAMERA, FRAMES, made
 from toolkit.effects import background, geometry, light, motion_blur, view_dependence
-from toolkit.effects.adjust import POSES, ROWS, adjust, predict, residuals, rotation, scatter, vectors
+from toolkit.effects.adjust import LENS, POSES, ROWS, adjust, predict, residuals, rotation, scatter, vectors
 from toolkit.effects.paid import Paid
 from toolkit.effects.refine import believed, refined_poses
-from toolkit.effects.survey import ORDER, _rows, look
+from toolkit.effects.survey import ORDER, _lens, _poses, _rows, look
 
 
 def drift(seed: int) -> np.ndarray:
@@ -219,6 +219,14 @@ def test_no_shutter_takes_longer_than_from_picture_to_picture(share: float, ther
     finding = _rows(found, SimpleNamespace(times=np.arange(6.0)))  # type: ignore[arg-type]
     assert finding.there is there and f"{share:.2f} of the time between two pictures" in finding.reason
     assert ("more slowly" in finding.reason) is there
+
+
+@pytest.mark.parametrize(("after", "words"), [(0.66, ("lowers", "lower", "34% less")), (1.34, ("raises", "raise", "34% more"))])
+def test_what_makes_held_out_points_worse_is_said_to_do_so(after: float, words: tuple[str, str, str]) -> None:
+    found = SimpleNamespace(choices=dict.fromkeys((LENS, ROWS, POSES), geometry.Choice(1.0, after, False)), profile=[0.0])
+    told = [_lens(found).reason, _rows(found, SimpleNamespace()).reason, _poses(found).reason]  # type: ignore[arg-type]
+    for reason, word in zip(told, words, strict=True):
+        assert f" {word}" in reason and "34%" in reason and "-34" not in reason
 
 
 def test_seconds_of_several_effects_are_split_evenly_and_add_up(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -92,6 +92,14 @@ def test_the_terminal_shows_the_same() -> None:
     assert "TSDF of exact depth" in text and "<b>" not in text
 
 
+@pytest.mark.parametrize(("width", "tables"), [(60, 3), (80, 2), (100, 1), (None, 1)])
+def test_the_terminals_lines_are_no_longer_than_it(width: int | None, tables: int) -> None:
+    text = comparison_text(made(), width)
+    assert width is None or max(map(len, text.splitlines())) <= width
+    assert len(re.findall("PSNR", text)) == tables * len(re.findall("PSNR", comparison_text(made())))
+    assert {"25.00", "20.00", "30.00"} <= set(text.split()) and "…" not in text
+
+
 def pictures() -> tuple[Pictures, list[MeshPictures]]:
     rng = np.random.default_rng(0)
 

@@ -317,6 +317,16 @@ def test_table_for_the_terminal() -> None:
     assert table(report_data(data)) == text
 
 
+def test_no_number_is_cut_off_in_the_terminal() -> None:
+    data, _ = sample()
+    data["scene"]["metric"] = False
+    data["evaluation"]["network"] = {**data["evaluation"]["field"], "key_frames": 12, "seconds": 191.0}
+    for width in (60, 80, 100):
+        text = table(data, width)
+        assert "…" not in text and max(map(len, text.splitlines())) <= width
+        assert text.count(f"{data['evaluation']['field']['psnr']:.2f}") >= 2 and "12 key" in text
+
+
 def test_table_without_scores_is_the_facts() -> None:
     assert table({}) == ""
     data = {"capture": {"frames": 50}, "poses": {"registered": 48, "total": 50}, "exports": "run/exports/cameras"}

@@ -175,6 +175,23 @@ def test_a_browser_draws_it_as_bright_as_the_pictures_were(exposure: float, tmp_
         assert not browser.errors
 
 
+KEYS = "document.getElementById('keys')"
+
+
+def test_the_keys_are_explained_on_a_phone_too(tmp_path: Path) -> None:
+    """Held either way: the panel stays within the screen, and its words are no column of single ones."""
+    write_page(tmp_path / "field.html", bake(coloured_field()), tour(), "sphere")
+    with driven((tmp_path / "field.html").as_uri(), tmp_path, (390, 700)) as browser:
+        loaded(browser)
+        browser.run("document.getElementById('help').click()")
+        for width, height in ((390, 700), (700, 320)):
+            browser.ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=True)
+            until(lambda size=width: browser.run("innerWidth") == size)
+            box = browser.run(f"(box => [box.left, box.top, box.right, box.bottom])({KEYS}.getBoundingClientRect())")
+            assert box[0] >= 0 and box[1] >= 0 and box[2] <= width and box[3] <= height, box
+            assert browser.run(f"{KEYS}.querySelector('dd').clientWidth") > 120
+
+
 def test_a_visitor_walks(tmp_path: Path) -> None:
     write_page(tmp_path / "field.html", bake(coloured_field()), tour(), "sphere")
     with driven((tmp_path / "field.html").as_uri(), tmp_path, (520, 400)) as browser:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import signal
 import sys
 import time
@@ -11,6 +12,8 @@ import time
 import pytest
 
 from pipelines.console import ConsoleProgress, PlainProgress, RichProgress, clock, make_progress
+from pipelines.effects_table import show as show_effects
+from pipelines.info import for_people
 
 
 class Terminal(io.StringIO):
@@ -125,3 +128,22 @@ def test_other_errors_in_del_are_told_as_ever() -> None:
     finally:
         sys.unraisablehook = hook
     assert told == [ValueError]
+
+
+def test_evidence_of_effects_stands_below_the_table_where_lines_are_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    reason = "points that pictures share are 0.64% of their depth off the sensor's, 0.62% with a depth camera that stands beside"
+    held = {"before": 0.0064, "after": 0.0062, "unit": "of depth"}
+    entry = {"effect": "depth_offset", "there": False, "number": 0.02, "threshold": 0.12, "held_out": held, "reason": reason}
+    for columns, lines in ((80, 6), (200, 3)):
+        monkeypatch.setattr("sys.stdout", terminal := Terminal())
+        monkeypatch.setenv("COLUMNS", str(columns))
+        monkeypatch.setenv("NO_COLOR", "1")
+        show_effects({"effects": [entry], "looked_at": {"frames": 3, "points": 9}, "seconds": 1.0})
+        shown = re.sub(r"\x1b\[[0-9;]*m", "", terminal.getvalue()).strip()
+        assert reason in " ".join(shown.split()) and "0.0064 → 0.0062 of depth" in shown
+        assert len([line for line in shown.splitlines() if line.strip()]) <= lines
+
+
+def test_scores_have_as_many_digits_as_in_the_report() -> None:
+    score = {"views": 3, "psnr": 22.841526, "ssim": 0.8804669, "lpips": 0.0859564}
+    assert for_people({"scores": {"nearest_image": score}})["scores"] == ["nearest image: views 3, PSNR 22.84 dB, SSIM 0.880, LPIPS 0.086"]

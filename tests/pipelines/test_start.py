@@ -49,3 +49,14 @@ def test_doctor_as_json(capsys: Capsys) -> None:
     checks = json.loads(answer.out)
     assert {"python", "torch", "pycolmap"} <= {check["name"] for check in checks}
     assert answer.code == int(any(check["status"] == "fail" for check in checks))
+
+
+def test_help_tells_when_a_fit_starts_from_the_networks(capsys: Capsys) -> None:
+    from toolkit.training.start import FEW_VIEWS
+
+    assert f"fewer than {FEW_VIEWS} training pictures" in " ".join(call(capsys, "run", "--help").out.split())
+
+
+@pytest.mark.parametrize("group", [(), ("bench",)])
+def test_the_list_of_commands_cuts_no_text_off(capsys: Capsys, group: tuple[str, ...]) -> None:
+    assert "..." not in call(capsys, *group, "--help").out.partition("Commands:")[2]

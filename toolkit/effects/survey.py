@@ -173,16 +173,18 @@ def _gain(choice: geometry.Choice) -> float:
     return 1 - choice.after / choice.before if choice.before > 0 else 0.0
 
 
-def _percent(choice: geometry.Choice) -> str:
-    """The gain in words; adding zero turns a rounded -0 into 0."""
-    return f"{round(100 * _gain(choice), 0) + 0:.0f}"
+def _changed(choice: geometry.Choice, less: str = "lowers", more: str = "raises") -> tuple[str, str]:
+    """Whether what held-out points are off by falls or grows, and by how many percent."""
+    percent = round(100 * _gain(choice))
+    return (more if percent < 0 else less), f"{abs(percent)}%"
 
 
 def _lens(found: geometry.Explained) -> Finding:
     choice = found.choices[LENS]
     rings = ", ".join(f"{round(float(value), 2) + 0:+.2f}" for value in found.profile)
+    does, percent = _changed(choice)
     reason = (
-        f"a lens with k1 and k2 beyond the given one lowers what held-out points are off by {_percent(choice)}%; from the middle "
+        f"a lens with k1 and k2 beyond the given one {does} what held-out points are off by {percent}; from the middle "
         f"to the corners points lie {rings} working pixels too far out"
     )
     return Finding(LENS, max(_gain(choice), 0.0), geometry.MARGIN[LENS], reason, choice.kept, choice.before, choice.after, PIXELS)
@@ -190,7 +192,8 @@ def _lens(found: geometry.Explained) -> Finding:
 
 def _rows(found: geometry.Explained, seen: Sightings) -> Finding:
     choice = found.choices[ROWS]
-    reason = f"rows read one after the other lower what held-out points are off by {_percent(choice)}%"
+    do, percent = _changed(choice, "lower", "raise")
+    reason = f"rows read one after the other {do} what held-out points are off by {percent}"
     there = choice.kept
     if choice.kept:
         share, alike = geometry.readout(found.problem.motion, geometry.steps_of(found.problem.poses, seen.times))
@@ -203,9 +206,10 @@ def _rows(found: geometry.Explained, seen: Sightings) -> Finding:
 
 def _poses(found: geometry.Explained) -> Finding:
     choice = found.choices[POSES]
+    way, percent = _changed(choice, "less", "more")
     reason = (
         f"held-out points are {choice.before:.2f} working pixels off with the given poses, {choice.after:.2f} with refined ones: "
-        f"{_percent(choice)}% less"
+        f"{percent} {way}"
     )
     return Finding(POSES, max(_gain(choice), 0.0), geometry.MARGIN[POSES], reason, choice.kept, choice.before, choice.after, PIXELS)
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 import io
 import re
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -29,6 +31,7 @@ CSS = {
 }
 SANS = "system-ui, -apple-system, 'Segoe UI', 'Helvetica Neue', Arial, sans-serif"
 LONGEST_NAME = 24  # letters
+LABEL_LONG, LABEL_TALL = 0.35, 0.1  # shares of the axes that the name of a level takes, with what keeps it clear of its line
 METADATA: dict[str, Any] = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
 
@@ -92,16 +95,42 @@ def psnr_over_time(timeline: list[dict[str, Any]], levels: dict[str, float | Non
         fontsize=10,
         weight="bold",
     )
-    for name, level in (levels or {}).items():
-        if level is not None:
-            axes.axhline(level, color=SECOND, linewidth=1.2, dashes=(4, 3))
-            end: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "xytext": (0, 4)}
-            axes.annotate(f"{name} {level:.1f}", (1, level), ha="right", color=SECOND, fontsize=9.5, **end)
+    known = [(name, level) for name, level in (levels or {}).items() if level is not None]
+    for _, level in known:
+        axes.axhline(level, color=SECOND, linewidth=1.2, dashes=(4, 3))
     axes.margins(x=0.02, y=0.14)
     axes.set_xlim(left=0)
+    for (name, level), (right, above) in zip(known, label_places(seconds, values, [level for _, level in known], axes), strict=True):
+        end: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "xytext": (0, 4 if above else -4)}
+        side: dict[str, Any] = {"ha": "right" if right else "left", "va": "bottom" if above else "top"}
+        axes.annotate(f"{name} {level:.1f}", (right, level), color=SECOND, fontsize=9.5, **end, **side)
     axes.set_xlabel("seconds of fitting", color=QUIET, fontsize=9.5)
     axes.set_ylabel("PSNR on test views (dB)", color=QUIET, fontsize=9.5)
     return _svg(figure, "PSNR on test views over seconds of fitting", "time")
+
+
+def label_places(seconds: Sequence[float], values: Sequence[float], levels: list[float], axes: Axes) -> list[tuple[bool, bool]]:
+    """For the name of each level (at the right end, above its line): the first place that no curve, line or other text crosses."""
+    (_, width), (low, high) = axes.get_xlim(), axes.get_ylim()
+    tall = LABEL_TALL * (high - low)
+    taken = [(True, values[-1] + tall / 3)]  # the curve's last value
+    side = np.linspace(0, LABEL_LONG * width, 32)
+    along = {True: width - side[::-1], False: side}
+    out = []
+    for level in levels:
+        for right, above in ((True, True), (False, True), (True, False), (False, False)):
+            bottom = level if above else level - tall
+            curve = np.interp(along[right], seconds, values, left=np.nan, right=np.nan)
+            lines = [other for other in levels if other != level and bottom < other < bottom + tall]
+            names = [end for end, other in taken if end == right and abs(other - bottom) < tall]
+            inside = low <= bottom and bottom + tall <= high
+            if inside and not lines and not names and not ((curve > bottom) & (curve < bottom + tall)).any():
+                break
+        else:
+            right, above, bottom = True, True, level
+        taken.append((right, bottom))
+        out.append((right, above))
+    return out
 
 
 def shown_name(stage: dict[str, Any]) -> str:

@@ -13,6 +13,7 @@ from rich.text import Text
 from toolkit.evaluate import words
 from toolkit.evaluate.report import report_data
 
+WIDEST = 100  # characters
 METHODS = (("field", "field"), ("network", "networks alone"), ("tsdf", "TSDF"))
 
 
@@ -23,8 +24,8 @@ def headline_table(data: dict[str, Any]) -> Table:
     evaluation = data["evaluation"]
     table = Table(box=box.SIMPLE_HEAD, title_justify="left", caption_justify="left", caption_style="")
     depth = any((evaluation.get(key) or {}).get("depth_abs_err") is not None for key, _ in METHODS)
-    for name in ("", "PSNR", "SSIM", "LPIPS", *([f"depth error ({unit})"] if depth else []), "render a view"):
-        table.add_column(name, justify="left" if name == "" else "right", no_wrap=True)
+    for name in ("", "PSNR", "SSIM", "LPIPS", *([f"depth error\n({unit})"] if depth else []), "render\na view"):
+        table.add_column(name, justify="left" if name == "" else "right", no_wrap=name != "")  # the names give way, never a number
     for key, title in METHODS:
         score = evaluation.get(key)
         if score is not None:
@@ -65,7 +66,7 @@ def facts(data: dict[str, Any]) -> list[str]:
     return lines
 
 
-def table(data: dict[str, Any], width: int = 100) -> str:
+def table(data: dict[str, Any], width: int = WIDEST) -> str:
     """`headline_table` as plain text lines of at most `width` characters; the facts alone when nothing was scored."""
     whole = headline_table(data)
     if whole.row_count == 0:

@@ -8,7 +8,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined, Template
 
 from toolkit.evaluate import words
 
-FILTERS = (words.decimal, words.significant, words.whole, words.size, words.memory, words.duration, words.share)
+FILTERS = (words.decimal, words.significant, words.whole, words.size, words.memory, words.duration, words.share, words.held)
 
 
 def template(name: str) -> Template:

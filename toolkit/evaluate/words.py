@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 NONE = "–"
@@ -65,6 +66,11 @@ def _two(total: int, large: str, small: str) -> str:
 def counted(count: float | None, thing: str) -> str:
     """1 key frame, 1,234 key frames."""
     return f"{whole(count)} {thing}{'' if count == 1 else 's'}"
+
+
+def held(text: str) -> str:
+    """No line ends between a number and its unit: `7 min 34 s` breaks before 34 alone."""
+    return re.sub(r"(?<=\d) (?=[^\W\d])", "\N{NO-BREAK SPACE}", text)
 
 
 def share(value: float | None) -> str:

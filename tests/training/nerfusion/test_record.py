@@ -78,6 +78,13 @@ def test_a_curve_of_nothing_can_be_drawn_and_a_damaged_one_is_refused(tmp_path: 
         Curve(tmp_path).load(5)
 
 
+def test_a_curve_of_one_row_is_seen(tmp_path: Path) -> None:
+    draw_curve([{"step": 2, "psnr_local": 15.0}], tmp_path / "curve.png")
+    picture = cv2.imread(str(tmp_path / "curve.png")).astype(int)
+    panel = picture[20:-30, 100:300]  # without the legend
+    assert (abs(panel - (180, 119, 31)).max(-1) < 40).sum() > 4  # blue, in OpenCV's order
+
+
 def test_smoothing_is_a_trailing_mean() -> None:
     assert smoothed([1, 2, 3, 4, 5], window=2) == pytest.approx([1, 1.5, 2.5, 3.5, 4.5])
     assert smoothed([]) == []

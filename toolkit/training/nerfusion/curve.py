@@ -9,6 +9,7 @@ from pathlib import Path
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from toolkit.errors import InputError, first_line
 from toolkit.files import atomic_path
@@ -103,12 +104,15 @@ def draw_curve(rows: Sequence[dict[str, float]], path: Path, stage_two: float | 
             steps, values = zip(*points, strict=True)
             checked = column.startswith("val_")
             drawn = values if checked else smoothed(values)
-            axes.plot(steps, drawn, label=column.replace("_", " "), linewidth=1.3, marker="o" if checked else None, markersize=3)
+            dots = "o" if checked or len(points) == 1 else None  # a line through one point is not seen
+            axes.plot(steps, drawn, label=column.replace("_", " "), linewidth=1.3, marker=dots, markersize=3)
         if logarithmic:
             axes.set_yscale("log")
         if stage_two is not None and stage_two > 0:
             axes.axvline(stage_two, color="0.7", linewidth=0.8, linestyle="--")
         axes.set_title(title, fontsize=9)
+        axes.set_xlabel("step", fontsize=8)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         axes.tick_params(labelsize=8)
         axes.grid(color="0.9", linewidth=0.6)
         if axes.get_legend_handles_labels()[0]:
