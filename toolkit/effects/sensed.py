@@ -24,9 +24,10 @@ from toolkit.effects.registration import FEWEST, Observations, deep_frames, quic
 from toolkit.progress import SILENT, Progress
 
 MAPS = 300  # depth maps that take part
-ROUNDS = 2
+ROUNDS = 3  # of which the best that passes is taken
 STEPS = 60
 MARGIN = 0.01  # least relative fall of what depth maps are off each other
+SAME = 0.02  # share of depth that they may be off each other; beyond, they are not of one scene, or noise
 WORSE = 0.03  # relative growth of what places are off that is nothing
 PARTNERS = 6  # maps that each is held against, of those with the most points in common
 COMMON = 12  # points without which they are none
@@ -76,15 +77,22 @@ def agreeing(
     start = sensor.standing(problem)
     known = sensor.depth(problem, start)
     ratio = known / predict(problem)[0][:, 2]
-    if np.isfinite(ratio).sum() < FEWEST or abs(scale := float(np.nanmedian(ratio)) - 1) > UNITS:
+    if np.isfinite(ratio).sum() < FEWEST or abs(float(np.nanmedian(ratio)) - 1) > UNITS:
         return None
-    grown, held_to = scaled(problem, belief, 1 + scale)
-    moved, standing = _in_turns(grown, sensor, unknown, held_to, start)
-    before, after = sensor.both_off(problem, start, moved, standing)
-    places = [adjust(one).scatter for one in (problem, moved)]
-    if not after < (1 - MARGIN) * before or places[1] > (1 + WORSE) * places[0]:
-        return None
-    return Agreed(moved, held_to, before, after)
+    grown, held_to = scaled(problem, belief, float(np.nanmedian(ratio)))
+    most, best, moved, standing = (1 + WORSE) * adjust(problem).scatter, None, grown, start
+    for _ in range(ROUNDS):
+        progress.check()
+        told = sensor.told(moved, standing)
+        if told is None:
+            break
+        moved = replace(adjust(told, unknown, STEPS, held_to).problem, depth=None)
+        standing = sensor.standing(moved)
+        before, after = sensor.both_off(problem, start, moved, standing)
+        least = min(SAME, (1 - MARGIN) * before if best is None else best.after / best.before * before)
+        if after < least and adjust(moved).scatter < most:
+            best = Agreed(moved, held_to, before, after)
+    return best
 
 
 class Sensor:
@@ -105,12 +113,27 @@ class Sensor:
         out[mine] = self.maps.along(places[mine], np.searchsorted(self.frames, problem.frame[mine]), standing)
         return out
 
+    def told(self, problem: Problem, standing: Array) -> Problem | None:
+        """The problem with the depth that the sensor tells, weighed by what both leave; None: it tells none.
+
+        Args:
+            standing: as for `depth`.
+        """
+        depth = self.depth(problem, standing)
+        off = np.abs(predict(problem)[0][:, 2] / depth - 1)
+        right = off < WRONG
+        if not right.any():
+            return None
+        noise = max(float(np.median(off[right])) / 0.6745, SHARP)
+        return replace(problem, depth=np.where(right, depth, np.nan), depth_weight=scatter(residuals(problem)) / noise)
+
     def standing(self, problem: Problem) -> Array:
         """(4, 4) where its camera stands, if that is to be told, else where the picture's does."""
         use = sure(problem) & np.isin(problem.frame, self.frames)
         if use.sum() < FEWEST:
             return np.eye(4)
-        return quickly(Observations(predict(problem)[0][use], problem.point[use], np.searchsorted(self.frames, problem.frame[use]), self.maps))
+        which = np.searchsorted(self.frames, problem.frame[use])
+        return quickly(Observations(predict(problem)[0][use], problem.point[use], which, self.maps))
 
     def both_off(self, one: Problem, first: Array, other: Problem, second: Array) -> tuple[float, float]:
         """What maps are off each other in the mean, shares of depth up to `CUT`, with the cameras of two problems, at the same pixels."""
@@ -153,19 +176,3 @@ def scaled(problem: Problem, belief: Belief, scale: float) -> tuple[Problem, Bel
     points = middle + scale * (problem.points - middle)
     motion = problem.motion * np.array([1, 1, 1, scale, scale, scale])
     return replace(problem, poses=grown(problem.poses), points=points, motion=motion), replace(belief, poses=grown(belief.poses))
-
-
-def _in_turns(problem: Problem, sensor: Sensor, unknown: frozenset[str], belief: Belief, standing: Array) -> tuple[Problem, Array]:
-    """Poses by depth, and the sensor's camera by poses."""
-    for _ in range(ROUNDS):
-        depth = sensor.depth(problem, standing)
-        off = np.abs(predict(problem)[0][:, 2] / depth - 1)
-        right = off < WRONG
-        if not right.any():
-            break
-        noise = max(float(np.median(off[right])) / 0.6745, SHARP)
-        weight = scatter(residuals(problem)) / noise
-        told = replace(problem, depth=np.where(right, depth, np.nan), depth_weight=weight)
-        problem = replace(adjust(told, unknown, STEPS, belief).problem, depth=None)
-        standing = sensor.standing(problem)
-    return problem, standing
