@@ -99,7 +99,7 @@ def effects_part(job: Job, background: bool | None) -> dict[str, Any] | None:
 
 
 def moved_cameras(job: Job, capture: Capture) -> list[str]:
-    """How far cameras that came with the capture were moved by what pictures show: what is exported lies with the moved ones."""
+    """How far cameras that came with the capture were moved by what pictures and depth show: what is exported lies with the moved ones."""
     import numpy as np
 
     given = {frame.name: frame.world_from_camera for frame in capture.frames if frame.world_from_camera is not None}
@@ -114,7 +114,7 @@ def moved_cameras(job: Job, capture: Capture) -> list[str]:
     unregistered = capture.has_depth and job.corrections.depth is None
     depth = "; a sensor's depth that is not registered with the colours fits those better" if unregistered else ""
     return [
-        f"the poses that came with the capture were refined by its pictures: cameras moved by {length} and turned by {np.median(turn):.2f}°"
+        f"the poses that came with the capture were refined: cameras moved by {length} and turned by {np.median(turn):.2f}°"
         f" in the median, and surfaces lie with them; --set effects.off=[poses] keeps the poses as they came{depth}"
     ]
 
