@@ -111,10 +111,12 @@ def moved_cameras(job: Job, capture: Capture) -> list[str]:
     cosine = (np.einsum("nij,nij->n", before[:, :3, :3], after[:, :3, :3]) - 1) / 2
     turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     length = f"{100 * np.median(way):.1f} cm" if capture.metric else f"{np.median(way):.3g} of the capture's units"
-    unregistered = capture.has_depth and job.corrections.depth is None
+    held = job.corrections.by_depth
+    unregistered = capture.has_depth and job.corrections.depth is None and not held
     depth = "; a sensor's depth that is not registered with the colours fits those better" if unregistered else ""
     return [
-        f"the poses that came with the capture were refined: cameras moved by {length} and turned by {np.median(turn):.2f}°"
+        f"the poses that came with the capture were refined by its pictures{' and depth' if held else ''}: cameras moved by {length} and "
+        f"turned by {np.median(turn):.2f}°"
         f" in the median, and surfaces lie with them; --set effects.off=[poses] keeps the poses as they came{depth}"
     ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -137,6 +138,10 @@ def test_how_far_given_cameras_were_moved_is_told() -> None:
     job = SimpleNamespace(corrections=Corrections(poses=dict(zip(names, moved, strict=False))))
     (text,) = moved_cameras(job, capture)  # type: ignore[arg-type]
     assert "moved by 2.0 cm and turned by 1.00°" in text and "effects.off=[poses]" in text and "sensor" in text
+    held = SimpleNamespace(corrections=replace(job.corrections, by_depth=True))
+    (text,) = moved_cameras(held, capture)  # type: ignore[arg-type]
+    assert "by its pictures and depth:" in text and "sensor" not in text
+    assert Corrections.from_dict(held.corrections.to_dict()).by_depth and not Corrections.from_dict(job.corrections.to_dict()).by_depth
     (text,) = moved_cameras(job, SimpleNamespace(frames=frames, metric=False, has_depth=False))  # type: ignore[arg-type]
     assert "0.02 of the capture's units" in text and "sensor" not in text
     for corrections in (None, Corrections()):

@@ -29,6 +29,7 @@ class Corrections:
     poses: dict[str, Array] = field(default_factory=dict)  # (4, 4) world_from_camera
     weight: dict[str, float] = field(default_factory=dict)  # of frames that count for less in the fit: share of their pixels, 0 to 1
     depth: Array | None = None  # (4, 4) the picture's camera from the depth camera, where depth was not brought to the pictures
+    by_depth: bool = False  # whether a sensor's depth took part in the poses
 
     @property
     def geometric(self) -> bool:
@@ -95,6 +96,7 @@ class Corrections:
             "dimmed": self.dimmed,
             "lens": None if self.lens is None else list(self.lens),
             "poses": {name: pose.tolist() for name, pose in self.poses.items()},
+            "by_depth": self.by_depth,
             "depth": None if self.depth is None else self.depth.tolist(),
             "weight": dict(self.weight),
         }
@@ -124,7 +126,8 @@ class Corrections:
             if any(not np.isfinite(numbers).all() for numbers in told):
                 raise ValueError("a pose or the lens is not finite")
             exact = {name: (values[0], values[1], values[2]) for name, values in gain.items()}
-            return cls(exact, corner=corner, dimmed=dimmed, lens=lens, poses=poses, depth=depth, weight=weight)
+            by_depth = data.get("by_depth") is True
+            return cls(exact, corner=corner, dimmed=dimmed, lens=lens, poses=poses, by_depth=by_depth, depth=depth, weight=weight)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
             raise InputError(f"effects.json is not what the effects stage writes ({first_line(error)}); remove it and run again") from error
 

@@ -196,7 +196,11 @@ def _corrections(
             poses = dict(zip(every.names, refined.poses, strict=True))
             lens, agreed = refined.lens if LENS in on else None, refined.agreed
     dimmed = room_for_light(seen, corner, gain)
-    return Corrections(gain, corner=corner, dimmed=dimmed, lens=lens, poses=poses, weight=weight), every or seen, agreed
+    return (
+        Corrections(gain, corner=corner, dimmed=dimmed, lens=lens, poses=poses, by_depth=agreed is not None, weight=weight),
+        every or seen,
+        agreed,
+    )
 
 
 def room_for_light(seen: Sightings | None, corner: float | None, gain: dict[str, Gain]) -> float:
