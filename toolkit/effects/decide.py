@@ -105,8 +105,7 @@ def decide(capture: Capture, test: Array, settings: EffectsSettings, progress: P
     on = frozenset(decision.finding.effect for decision in decisions if decision.on)
     corrections, seen, agreed = _corrections(capture, test, found, on, progress, known)
     if agreed is not None:
-        held = {POSES: agreed.note}
-        decisions = [replace(one, note=held.get(one.finding.effect, one.note)) for one in decisions]
+        decisions = [replace(one, note=agreed.note) if one.finding.effect == POSES else one for one in decisions]
     if capture.has_depth:
         with found.paid.by(DEPTH_OFFSET):
             finding, pose = look_for_offset(corrections.on_capture(capture), train, seen, progress, known)

@@ -80,7 +80,9 @@ def agreeing(
     if np.isfinite(ratio).sum() < FEWEST or abs(float(np.nanmedian(ratio)) - 1) > UNITS:
         return None
     grown, held_to = scaled(problem, belief, float(np.nanmedian(ratio)))
-    most, best, moved, standing = (1 + WORSE) * adjust(problem).scatter, None, grown, start
+    pairs = sensor.pairs(problem)
+    was, most = sensor.apart(pairs, problem, start), (1 + WORSE) * adjust(problem).scatter
+    best, moved, standing = None, grown, start
     for _ in range(ROUNDS):
         progress.check()
         told = sensor.told(moved, standing)
@@ -88,7 +90,11 @@ def agreeing(
             break
         moved = replace(adjust(told, unknown, STEPS, held_to).problem, depth=None)
         standing = sensor.standing(moved)
-        before, after = sensor.both_off(problem, start, moved, standing)
+        now = sensor.apart(pairs, moved, standing)
+        both = np.isfinite(was) & np.isfinite(now)
+        if not both.any():
+            break
+        before, after = (float(np.minimum(np.abs(off[both]), CUT).mean()) for off in (was, now))
         least = min(SAME, (1 - MARGIN) * before if best is None else best.after / best.before * before)
         if after < least and adjust(moved).scatter < most:
             best = Agreed(moved, held_to, before, after)
@@ -135,16 +141,7 @@ class Sensor:
         which = np.searchsorted(self.frames, problem.frame[use])
         return quickly(Observations(predict(problem)[0][use], problem.point[use], which, self.maps))
 
-    def both_off(self, one: Problem, first: Array, other: Problem, second: Array) -> tuple[float, float]:
-        """What maps are off each other in the mean, shares of depth up to `CUT`, with the cameras of two problems, at the same pixels."""
-        pairs = self._pairs(one)
-        off = [self._apart(pairs, problem.poses @ invert(standing)) for problem, standing in ((one, first), (other, second))]
-        same = np.isfinite(off[0]) & np.isfinite(off[1])
-        if not same.any():
-            return 0.0, 0.0
-        return float(np.minimum(np.abs(off[0][same]), CUT).mean()), float(np.minimum(np.abs(off[1][same]), CUT).mean())
-
-    def _pairs(self, problem: Problem) -> list[tuple[int, int]]:
+    def pairs(self, problem: Problem) -> list[tuple[int, int]]:
         """Maps (numbers of `frames`) that see the same, by the points that their frames share."""
         seen = np.zeros((len(self.frames), len(problem.points)), dtype=np.float32)
         mine = np.isin(problem.frame, self.frames)
@@ -154,12 +151,14 @@ class Sensor:
         best = np.argsort(-shared, axis=1, kind="stable")[:, :PARTNERS]
         return [(one, int(other)) for one, row in enumerate(best) for other in row if shared[one, other] >= COMMON]
 
-    def _apart(self, pairs: Sequence[tuple[int, int]], poses: Array) -> Array:
-        """(N,) what the first of each pair sees is off the second's depth; poses: (F, 4, 4) of the sensor's camera in all frames."""
+    def apart(self, pairs: Sequence[tuple[int, int]], problem: Problem, standing: Array) -> Array:
+        """(N,) what the first of each pair sees is off the second's depth, shares of depth, always of the same pixels; NaN: not told."""
+        poses = problem.poses @ invert(standing)
+        seen = {one: self.maps.surface(one, ACROSS) for one, _ in pairs}
         off = [np.zeros(0)]
         for one, other in pairs:
             to_other = invert(poses[self.frames[other]]) @ poses[self.frames[one]]
-            places = self.maps.surface(one, ACROSS) @ to_other[:3, :3].T + to_other[:3, 3]
+            places = seen[one] @ to_other[:3, :3].T + to_other[:3, 3]
             off.append(self.maps.off(places, np.full(len(places), other), np.eye(4)))
         return np.concatenate(off)
 
