@@ -35,8 +35,18 @@ RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03, depth=0.05, slow_within=3.0, depth_nois
 RAYS = 32  # one program's
 
 
-def field_of(shell: float, keep: float = 0.5, seed: int = 0) -> Field:
-    return random_field(shell, 16, keep=keep, raw=-1.5, seed=seed)
+@pytest.fixture(autouse=True)
+def unchecked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Triton's interpreter looks at each sum and product of integers for overflow, which is half of its time; where they are drawn at random
+    it may."""
+    if triton.knobs.runtime.interpret and request.function is not test_pixels_are_drawn_by_their_tiles_errors:
+        from triton.runtime.interpreter import interpreter_builder
+
+        monkeypatch.setattr(interpreter_builder, "options", replace(interpreter_builder.options, sanitize_overflow=False))
+
+
+def field_of(shell: float, keep: float = 0.5, seed: int = 0, raw: float = -1.0) -> Field:
+    return random_field(shell, 16, keep=keep, raw=raw, seed=seed)
 
 
 def engine_of(field: Field, views: object = None, **options: object) -> TritonOptimiser:
@@ -47,10 +57,10 @@ def picks(pool: PixelPool, seed: int = 0) -> torch.Tensor:
     return torch.randperm(len(pool), generator=torch.Generator().manual_seed(seed))[:RAYS]
 
 
-@pytest.mark.parametrize(("shell", "keep"), [(0.0, 1.0), (0.0, 0.03), (1.0, 0.3)])
-def test_pictures_agree(shell: float, keep: float) -> None:
-    field = field_of(shell, keep)
-    origins, directions = random_rays(RAYS + 9)
+@pytest.mark.parametrize(("shell", "keep", "rays"), [(0.0, 1.0, RAYS), (0.0, 0.03, RAYS + 9), (1.0, 0.3, RAYS - 9)])
+def test_pictures_agree(shell: float, keep: float, rays: int) -> None:
+    field = field_of(shell, keep, raw=0.0)
+    origins, directions = random_rays(rays)
     if shell:
         origins = origins * torch.linspace(0.02, 3, len(origins))[:, None]
     expected = render_rays(field, origins, directions)
@@ -81,7 +91,7 @@ def test_gradients_agree(shell: float, seed: int) -> None:
 
 def test_steps_agree() -> None:
     """Two steps: rows, decoder, what was seen and how often, as the reference has them."""
-    field, rates = field_of(1.0), replace(RATES, density=0.02, feature=0.03, decoder=0.004)
+    field, rates = field_of(1.0, raw=0.0), replace(RATES, density=0.02, feature=0.03, decoder=0.004)
     engine, start = engine_of(field), field.feature_rows.clone()
     reference, pool = Optimiser(field), PixelPool(made_views(), depth=True)
     for seed in range(2):
@@ -109,7 +119,7 @@ def test_pixels_are_drawn_by_their_tiles_errors() -> None:
     engine.tile_density.copy_(torch.linspace(0.2, TOP, len(engine.tile_density)))
     every = pool.take(torch.arange(len(pool), device=DEVICE))
     tiles = Errors(pool).tiles(torch.arange(len(pool), device=DEVICE))
-    rays = 512
+    rays = 256
     engine.limit.fill_(pool.limit)
     engine._tell(RATES)
     engine._room_for(rays)
@@ -138,7 +148,7 @@ def test_pixels_are_drawn_by_their_tiles_errors() -> None:
 
 
 def test_what_is_not_finite_moves_nothing() -> None:
-    engine = engine_of(field_of(0.0, keep=0.1))
+    engine = engine_of(field_of(0.0, raw=1.0))
     rates = replace(RATES, density=0.02, feature=0.03, decoder=0.004)
     good = engine.pool.take(picks(engine.pool).to(DEVICE))
     jitter = torch.zeros(RAYS, device=DEVICE)
@@ -159,7 +169,7 @@ def test_what_is_not_finite_moves_nothing() -> None:
 
 def test_a_fit_that_cannot_begin_is_told_at_its_first_step() -> None:
     """Later ones are looked at now and then; whether there was a good one at all decides what is said."""
-    engine = engine_of(field_of(0.0, keep=0.05))
+    engine = engine_of(field_of(0.0, raw=1.0))
     engine.field.feature_rows[:-1] = float("nan")
     with pytest.raises(NotFiniteError):
         engine.step(RAYS, RATES)
@@ -185,8 +195,10 @@ def test_tables_follow_pruning() -> None:
     assert torch.equal(tables.occupied.bool(), kept) and torch.equal(tables.skip, bricks_to_skip(less.grid.bricks))
 
 
-def test_every_kernel_is_warmed_up() -> None:
+def test_every_kernel_is_warmed_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Everything that a fit calls runs once, pruning and a finer lattice between, and leaves torch's random numbers alone."""
+    if DEVICE.type == "cpu":
+        monkeypatch.setattr(triton_warm, "EAGER", -1)  # nothing is recorded here: one step instead of four
     state = torch.get_rng_state()
     updates: list[str] = []
 

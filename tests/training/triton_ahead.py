@@ -18,7 +18,7 @@ from toolkit.training import triton_engine, triton_warm
 
 TYPES = {torch.float32: "*fp32", torch.int32: "*i32", torch.int64: "*i64", torch.uint8: "*u8"}
 CAPABILITY = 80
-PARTS = ("HAS_SHELL", "SOME", "KNOWN")  # where one of these is not wanted, a kernel is a part of what it is with it
+PARTS = ("HAS_SHELL", "TRAIN", "SOME", "KNOWN")  # where one of these is not wanted, a kernel is a part of what it is with it
 done: set[tuple[Any, ...]] = set()
 
 
@@ -26,7 +26,8 @@ def compiled(self: Any, *args: Any, grid: Any, warmup: bool, num_warps: int = 4,
     """In place of a launch."""
     names = [name for name in self.arg_names if name not in constants]
     kinds = [TYPES[a.dtype] if isinstance(a, torch.Tensor) else "fp32" if isinstance(a, float) else "i32" for a in args]
-    key = (self.fn.__name__, tuple(kinds), tuple(constants.items()))
+    shaping = {name: value for name, value in constants.items() if name != "SLOTS"}  # a number among others in what is compiled
+    key = (self.fn.__name__, tuple(kinds), tuple(shaping.items()))
     if key not in done and all(constants.get(name, True) for name in PARTS):
         done.add(key)
         signature = dict(zip(names, kinds, strict=True)) | dict.fromkeys(constants, "constexpr")
