@@ -29,7 +29,8 @@ SCENE = Scene(Similarity.identity(), np.array([0.0, 0.0, 0.0]), np.full(3, 1.5),
 
 
 def wanted(*pairs: str) -> Settings:
-    return load_settings(pairs=["budget=4", "field.resolution=64", "device=cpu", "engine=numba", "threads=1", *pairs])
+    small = ["field.resolution=64", "field.channels=8", "field.hidden=16"]
+    return load_settings(pairs=["budget=4", *small, "device=cpu", "engine=numba", "threads=1", *pairs])
 
 
 def steady(step: float = 0.005) -> Callable[[], float]:
@@ -230,12 +231,12 @@ def test_a_guess_leaves_the_coarsest_lattice_sooner_where_validation_views_tell_
     rough = fit_guided(views(), SCENE, wanted("budget=1", "field.resolution=32"), ticks=steady()).field
     few = views()
     many = few.subset(np.tile(np.arange(len(few)), -(-LEAST_VIEWS // np.count_nonzero(~few.test))))
-    for shown, factor in ((many, 0.7), (few, 1.0)):
+    for shown, factor, tick in ((many, 0.7, 0.002), (few, 1.0, 0.005)):
         shares = []
         for begin in ({}, {"start": rough, "coarse": True}):
             told = Levels()
             settings = wanted("fit.depth_from=sensor", "fit.moving=off")
-            fit_guided(shown, SCENE, settings, told, ticks=steady(0.002), **begin)  # type: ignore[arg-type]
+            fit_guided(shown, SCENE, settings, told, ticks=steady(tick), **begin)  # type: ignore[arg-type]
             assert set(told.seen) == {"32³", "64³"}
             shares.append(told.seen.count("32³") / len(told.seen))
         assert shares[1] <= factor * shares[0]
