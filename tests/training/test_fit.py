@@ -83,10 +83,16 @@ def test_a_sphere_is_learnt(decoder: str, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_budget_is_kept() -> None:
-    start = time.perf_counter()
-    result = fit_field(sphere_views(), scene(), wanted("budget=3"))
-    assert result.seconds <= 3 * 1.05 + 2
-    assert time.perf_counter() - start < 20
+    """By the real clock: what it goes over is one step, or one climb to a finer level, however long the machine takes for that."""
+    looks: list[float] = []
+
+    def ticks() -> float:
+        looks.append(time.perf_counter())
+        return looks[-1]
+
+    result = fit_field(sphere_views(), scene(), wanted("budget=1"), ticks=ticks)
+    assert result.steps > 0 and result.seconds <= 1 * 1.05 + 2 * float(np.diff(looks).max())
+    assert result.seconds <= looks[-1] - looks[0] + 1e-6
 
 
 def test_a_fit_of_few_views_ends_with_its_passes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,11 +100,11 @@ def test_a_fit_of_few_views_ends_with_its_passes(monkeypatch: pytest.MonkeyPatch
     ticking(monkeypatch, 1e-3)
     views = sphere_views(8)  # too few for a validation split
     pixels = 7 * SIZE * SIZE
-    result = fit_field(views, scene(), wanted("budget=60", "fit.passes=20"))
-    assert 20 * pixels <= result.rays < 20 * pixels + 2048 and result.seconds < 30
+    result = fit_field(views, scene(), wanted("budget=60", "fit.passes=12"))
+    assert 12 * pixels <= result.rays < 12 * pixels + 2048 and result.seconds < 30
     assert result.timeline[-1]["psnr"] > 14
-    longer = fit_field(views, scene(), wanted("budget=2", "fit.passes=null"))
-    assert longer.rays > 25 * pixels
+    longer = fit_field(views, scene(), wanted("budget=1", "fit.passes=null"))
+    assert longer.rays > 15 * pixels
 
 
 def test_held_out_views_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,7 +187,7 @@ def test_when_memory_is_short_surfaces_keep_the_neighbours_that_no_ray_came_to()
 
 
 def test_coarse_levels_end_soon_where_no_validation_views_tell_that_they_gain_nothing_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    ticking(monkeypatch, 0.01)
+    ticking(monkeypatch, 0.02)
     climbed: list[int] = []
 
     def note(done: float, total: float, text: str = "") -> None:

@@ -40,7 +40,7 @@ def test_a_fit_does_not_learn_what_it_may_not_see(engine: str, kind: str) -> Non
     looks = count()  # a clock that stands still but for being looked at: as many steps on any machine
     for view in ("none", "low", "full"):
         settings = wanted("budget=1", f"engine={engine}", f"field.decoder={kind}", f"field.view={view}", "field.resolution=32")
-        fitted = fit_field(views, scene(), settings, ticks=lambda: 0.02 * next(looks))
+        fitted = fit_field(views, scene(), settings, ticks=lambda: 0.05 * next(looks))
         decoder = fitted.field.decoder
         assert fitted.steps > 5
         assert int(blind(decoder).sum()) == 16 - HARMONICS[view]
