@@ -37,8 +37,7 @@ RAYS = 32  # one program's
 
 @pytest.fixture(autouse=True)
 def unchecked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Triton's interpreter looks at each sum and product of integers for overflow, which is half of its time; where they are drawn at random
-    it may."""
+    """Triton's interpreter looks for overflow at each sum and product of integers, half of its time: here where pixels are drawn alone."""
     if triton.knobs.runtime.interpret and request.function is not test_pixels_are_drawn_by_their_tiles_errors:
         from triton.runtime.interpreter import interpreter_builder
 
