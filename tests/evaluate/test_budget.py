@@ -147,7 +147,8 @@ def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path, monkeypatch:
     assert model.remembered("it") is None
 
 
-def test_the_self_test_measures_every_kind() -> None:
+def test_the_self_test_measures_every_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("toolkit.evaluate.budget_probe.SECONDS", 0.05)
     speed = self_test(load_settings("balanced", flags={"device": "cpu"}))
     assert set(speed.units) == set(model.KINDS)
     assert 1e-8 < speed.units["ray"] < 1e-3 and 1e-8 < speed.units["fit"] < 1e-2 and speed.units["features"] > 1e-3

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pipelines.bench_effects import fits_table, table
+from tests.evaluate.samples import even_clock
 from toolkit.capture import open_capture
 from toolkit.evaluate import effects_fits, effects_plan
 from toolkit.evaluate.effects_bench import Looked, confusion
@@ -78,7 +79,8 @@ def test_captures_do_not_tell_their_lens_or_true_poses(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("small")
-def test_fits_in_every_mode(tmp_path: Path) -> None:
+def test_fits_in_every_mode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    even_clock(monkeypatch, 0.005)
     planned = [Planned("plain", "room", 7, ())]
     data = effects_fits.compared(planned, tmp_path, 0.5, ("all_off", "all_on"))
     only = data["each"][0]

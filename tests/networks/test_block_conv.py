@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 import torch.nn.functional as F
@@ -172,18 +168,6 @@ def test_cuda_agrees_with_the_cpu() -> None:
     expected = layer(rows, topology)
     found = layer.cuda()(rows.cuda(), topology.to("cuda"))
     torch.testing.assert_close(found.cpu(), expected, atol=1e-9, rtol=1e-9)
-
-
-def test_imports_without_open3d() -> None:
-    code = """
-import sys
-for name in ("open3d", "pycolmap", "trimesh"):
-    sys.modules[name] = None
-import toolkit.networks.block_conv, toolkit.volume.topology, toolkit.volume.edit, toolkit.volume.store
-"""
-    root = Path(__file__).resolve().parents[2]
-    done = subprocess.run([sys.executable, "-c", code], check=False, cwd=root, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("kind", [torch.float64, torch.float32, torch.float16, torch.bfloat16])

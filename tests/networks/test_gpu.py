@@ -83,7 +83,7 @@ def test_matching(shape: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_sweep_and_its_witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
     views = 3
-    monkeypatch.setattr("toolkit.networks.sweep.SPACING", 9)  # the interpreter is slow
+    monkeypatch.setattr("toolkit.networks.sweep.SPACING", 14)  # the interpreter is slow
     monkeypatch.setattr("toolkit.networks.sweep.PLANES", (8, 16))
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
     slow = everything(views, 1000)
@@ -140,10 +140,9 @@ def test_what_a_sensor_measured(within: bool, monkeypatch: pytest.MonkeyPatch) -
     torch.testing.assert_close(made(), slow, atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
-def test_what_witnesses_say_together(order: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_witnesses_say_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of their own pictures alone and not, from elsewhere, with other planes, and on a grid with an odd number of rows."""
-    monkeypatch.setattr("toolkit.networks.sweep.SPACING", 8)
+    monkeypatch.setattr("toolkit.networks.sweep.SPACING", 14)
     monkeypatch.setattr("toolkit.networks.sweep.PLANES", (8, 16))
     monkeypatch.setattr("toolkit.networks.witness.SURE", 0.4)
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
@@ -156,7 +155,7 @@ def test_what_witnesses_say_together(order: tuple[int, int, int], monkeypatch: p
         mine, surface = alone(compared)
         other = witness(decide(compare([described[1], described[0]], seen_by[[1, 0]], NEAR, 2 * FAR)))
         theirs = [mine, other, replace(mine, camera=seen_by[2])]
-        believed, weighed = (evidence(compared, [theirs[k] for k in order], at) for at in (None, surface))
+        believed, weighed = (evidence(compared, [theirs[k] for k in (2, 0, 1)], at) for at in (None, surface))
         assert believed is not None and weighed is not None
         sure = surface[surface.isfinite().all(1)]
         return [mine.says, sure, believed, weighed, decide(compared, said=weighed).table]
@@ -171,7 +170,7 @@ def test_what_witnesses_say_together(order: tuple[int, int, int], monkeypatch: p
 @pytest.mark.parametrize(("inside", "outside"), [(4, 8), (32, 16)])
 def test_convolution_and_its_gradients(inside: int, outside: int, monkeypatch: pytest.MonkeyPatch) -> None:
     generator = torch.Generator().manual_seed(0)
-    topology = Topology(torch.tensor([[0, 0, 0], [1, 0, 0], [1, 1, 0]]))
+    topology = Topology(torch.tensor([[0, 0, 0], [1, 0, 0]]))
     rows = torch.randn(topology.zero_row + 1, inside, generator=generator)
     occupied = torch.rand(topology.zero_row, generator=generator) < 0.6
     rows[:-1] *= occupied[:, None]
@@ -300,18 +299,18 @@ def test_a_local_volume(shell: float, variance: bool, count: int, monkeypatch: p
 
 
 def test_key_frames_are_fused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two of them on two lattices, and what is left of them when blocks are forgotten."""
+    """Two of them, of two views each, on two lattices, and what is left of them when blocks are forgotten."""
     model = small_model(config=replace(SIZES, hidden=16))
-    seen_by, space = cameras(4), Lattice(Space((0.0, 0.0, 0.0), 0.8, 0.0, (0.7, 0.7, 1.0)), 16)  # two coarse blocks
+    seen_by, space = cameras(4), Lattice(Space((0.0, 0.0, 0.0), 0.8, 0.0, (0.7, 0.7, 0.7)), 16)  # one coarse block, of up to eight
     with torch.no_grad():
         for parameter in (*model.local.parameters(), *model.fusion.parameters()):
             parameter.add_(0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(parameter.numel())))
         views = model.encode(pictures(4), seen_by)
-        swept = [model.sweep([views[k] for k in group], seen_by[group], 0.8, 4.0) for group in ([0, 1, 2], [3, 2, 1])]
+        swept = [model.sweep([views[k] for k in group], seen_by[group], 0.8, 4.0) for group in ([0, 1], [3, 2])]
 
     def fused() -> Fusion:
         fusion = Fusion(model, space, FusionOptions(2, 0.1, 4.0))
-        for group, sweep in zip(([0, 1, 2], [3, 2, 1]), swept, strict=True):
+        for group, sweep in zip(([0, 1], [3, 2]), swept, strict=True):
             fusion.add([views[k] for k in group], seen_by[group], None, sweep)
         return fusion
 
@@ -345,7 +344,8 @@ def test_a_finer_lattice(believed: bool, monkeypatch: pytest.MonkeyPatch) -> Non
     generator = torch.Generator().manual_seed(0)
     keys = torch.tensor([[1, 0, 2]])
     topology = Topology(keys)
-    occupied = torch.rand(topology.zero_row, generator=generator) < 0.01
+    occupied = torch.rand(topology.zero_row, generator=generator) < 0.03
+    occupied[256:] = False  # the interpreter takes long for each block of the finer lattice
     rows = torch.cat([torch.rand(topology.zero_row, 5, generator=generator), torch.zeros(1, 5)])
     slow, inside, (values,) = split(topology, occupied, [rows])
     nodes = corner_nodes(slow, inside)
