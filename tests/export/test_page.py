@@ -229,7 +229,7 @@ def test_a_visitor_walks(browser: Driven, tmp_path: Path) -> None:
     assert turned[:3] == dragged[:3] and turned[9:] != dragged[9:]  # on the spot
     browser.drag((340, 160), (300, 160), shift=True)
     assert pose() == pytest.approx(dragged, abs=1e-6)  # and back
-    browser.ask("Input.dispatchMouseEvent", type="mouseWheel", x=300, y=160, deltaX=0, deltaY=-300)
+    browser.ask("Input.dispatchMouseEvent", type="mouseWheel", x=300, y=160, deltaX=0, deltaY=-150)  # of dots, and a dot is two pixels
     until(lambda: pose()[:3] != dragged[:3])
     near = np.linalg.norm(np.array(pose()[:3]) - np.array(dragged[:3]))
     assert 0.5 < near < 1.5

@@ -89,7 +89,9 @@ def test_same_seed_same_picture(filmed: tuple[Filmed, list[Array]]) -> None:
     assert np.array_equal(hand_held(5, 2), film.world_from_camera)
 
 
-def test_stopping_leaves_no_file(tmp_path: Path) -> None:
+def test_stopping_leaves_no_file(filmed: tuple[Filmed, list[Array]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demo, "demo_scene", lambda seed: filmed[0].scene)  # made once
+
     class Stopped(Progress):
         def stopping(self) -> bool:
             return True
