@@ -167,6 +167,7 @@ def test_progress_has_totals(tmp_path: Path) -> None:
 
 
 def test_many_large_photos_take_seconds(tmp_path: Path) -> None:
+    """Half of what it would take to read them in full is more than enough (a quarter where it was measured), on whatever machine."""
     base = cv2.resize(texture(600, 800, blur=1), (4000, 3000), interpolation=cv2.INTER_CUBIC)
     sources = [
         save(tmp_path / f"source{index}.jpg", np.roll(base, 300 * index, axis=1), cv2.IMWRITE_JPEG_QUALITY, 90) for index in range(2)
@@ -178,7 +179,10 @@ def test_many_large_photos_take_seconds(tmp_path: Path) -> None:
         frames.append(Frame(path.stem, path))
     started = time.process_time()
     check_capture(capture_of(tmp_path, frames, kind="photos"))
-    assert time.process_time() - started < 6  # 200 of them: under 10 s on one core; headroom for slow machines
+    between = time.process_time()
+    for source in 2 * sources:
+        cv2.imread(str(source))
+    assert between - started < 0.5 * len(frames) * (time.process_time() - between) / 4
 
 
 # ---------------------------------------------------------------------------------------------------- depth

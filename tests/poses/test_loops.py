@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,43 +16,39 @@ from scipy.spatial.transform import Rotation
 
 from tests.poses.textured import aligned_error, orbit, post, render, write_capture
 from toolkit.config import PosesSettings
-from toolkit.poses import loops
+from toolkit.poses import loops, sfm
 from toolkit.poses.health import fold
 from toolkit.poses.job import Job
-from toolkit.poses.mapping import Model, map_pictures, plain
+from toolkit.poses.mapping import Model, Report, plain
 from toolkit.poses.result import PoseResult
 from toolkit.poses.sfm import find_poses
+from toolkit.poses.worker import Mouth, work
 
 FRAMES, TURNS = 40, 1.2
 POSES = orbit(FRAMES, TURNS)
+SMALL = PosesSettings(max_features=450)
 
 
 def silent(done: float, total: float, note: str) -> None:
     pass
 
 
-@pytest.fixture(scope="module")
-def walked(tmp_path_factory) -> tuple[PoseResult, Path]:
-    """A post that looks the same from the front and the back, and from the left and the right."""
-    out = tmp_path_factory.mktemp("post")
-    planes = post((3, 4, 3, 4))
-    pictures = [render(pose, planes=planes)[0] for pose in POSES]
-    capture = write_capture(out / "photos", pictures, ordered=True)
-    return find_poses(capture, out, PosesSettings(max_features=800), seed=3, threads=1), out
+class Voice(Mouth):
+    """Of the child's work when no other process does it."""
 
+    def __init__(self, hear: Callable[[dict[str, Any]], None]) -> None:
+        self.hear = hear
 
-def test_a_post_with_two_sides_alike_is_walked_around(walked):
-    result, out = walked
-    assert result.registered == FRAMES and result.models[0] == FRAMES
-    assert aligned_error(result.world_from_camera[:, :3, 3], POSES[:, :3, 3]) < 0.005
-    assert any("looks alike from several sides" in warning for warning in result.warnings)
-    assert not (out / "sparse" / "again").exists()
+    def say(self, **message: Any) -> None:
+        self.hear(message)
 
 
 @dataclass
-class Again:
-    """The steps of the child process once more, on what it left: the mapper's model, what pairs tell before and after, and the answer."""
+class Walked:
+    """An answer, and the steps to it: the mapper's model, what pairs tell before and after, and the better model."""
 
+    result: PoseResult
+    out: Path
     job: Job
     folded: Model
     before: loops.Turns
@@ -60,53 +58,75 @@ class Again:
 
 
 @pytest.fixture(scope="module")
-def again(walked) -> Again:
-    job = Job.load(walked[1] / "sparse" / "job.json")
-    model, attempts = map_pictures(job, silent)
-    assert model is not None
-    before = loops.turns(job, model.reconstruction.cameras)
-    better, _, facts = loops.without_folds(job, model, attempts, silent)
-    return Again(job, model, before, loops.turns(job, model.reconstruction.cameras), better, facts)
+def walked(tmp_path_factory) -> Walked:
+    """A post that looks the same from the front and the back, and from the left and the right; its way is mapped in this process."""
+    out = tmp_path_factory.mktemp("post")
+    planes = post((3, 4, 3, 4))
+    pictures = [render(pose, planes=planes)[0] for pose in POSES]
+    capture = write_capture(out / "photos", pictures, ordered=True)
+    steps: list[tuple[Any, ...]] = []
+    real = loops.without_folds
+
+    def looked_at(job: Job, model: Model, attempts: list[dict[str, Any]], report: Report) -> loops.Mapped:
+        before = loops.turns(job, model.reconstruction.cameras)
+        better, tried, facts = real(job, model, attempts, report)
+        steps.append((job, model, before, loops.turns(job, model.reconstruction.cameras), better, facts))
+        return better, tried, facts
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sfm, "run_child", lambda module, arguments, log, hear, *_: work(Path(arguments[0]), Voice(hear)))
+        patch.setattr(loops, "without_folds", looked_at)
+        result = find_poses(capture, out, SMALL, seed=3, threads=1)
+    assert len(steps) == 1
+    return Walked(result, out, *steps[0])
+
+
+def test_a_post_with_two_sides_alike_is_walked_around(walked):
+    result = walked.result
+    assert result.registered == FRAMES and result.models[0] == FRAMES
+    assert aligned_error(result.world_from_camera[:, :3, 3], POSES[:, :3, 3]) < 0.005
+    assert any("looks alike from several sides" in warning for warning in result.warnings)
+    assert not (walked.out / "sparse" / "again").exists()
 
 
 def centres(model: Model) -> np.ndarray:
     return np.array(plain(model)["world_from_camera"])[:, :3, 3]
 
 
-def test_without_it_the_way_is_folded_and_all_frames_seem_well(again):
+def test_without_it_the_way_is_folded_and_all_frames_seem_well(walked):
     """What the mapper makes of the same matches: the reason for `without_folds`."""
-    assert len(again.folded.registered) == FRAMES and again.folded.reconstruction.compute_mean_reprojection_error() < 1
-    assert aligned_error(centres(again.folded), POSES[:, :3, 3]) > 0.05
-    assert loops.contradictions(again.before, loops.axes(again.folded)) >= loops.LEAST
-    assert again.facts is not None and again.facts["dropped"] > 10 and again.facts["left"] == 0
-    assert aligned_error(centres(again.better), POSES[:, :3, 3]) < 0.005
+    assert len(walked.folded.registered) == FRAMES and walked.folded.reconstruction.compute_mean_reprojection_error() < 1
+    assert aligned_error(centres(walked.folded), POSES[:, :3, 3]) > 0.05
+    assert loops.contradictions(walked.before, loops.axes(walked.folded)) >= loops.LEAST
+    assert walked.facts is not None and walked.facts["dropped"] > 10 and walked.facts["left"] == 0
+    assert aligned_error(centres(walked.better), POSES[:, :3, 3]) < 0.005
 
 
-def test_true_cameras_agree_with_their_neighbours_and_not_with_matches_across_the_post(again):
+def test_true_cameras_agree_with_their_neighbours_and_not_with_matches_across_the_post(walked):
     true = {i: pose[:3, :3].T for i, pose in enumerate(POSES)}
-    assert loops.contradictions(again.before, true) == 0
-    assert np.count_nonzero(loops.disagreement(again.before, true)[again.before.apart > 10] > loops.AGREES) > 10
+    assert loops.contradictions(walked.before, true) == 0
+    assert np.count_nonzero(loops.disagreement(walked.before, true)[walked.before.apart > 10] > loops.AGREES) > 10
 
 
-def test_a_fold_that_pairs_tell_of_is_never_mapped(again):
-    """The same without the pairs of the second turn that are right: nearly all that is matched far apart contradicts the way."""
-    true = {i: pose[:3, :3].T for i, pose in enumerate(POSES)}
-    right = (again.before.apart > loops.NEAR[0]) & (loops.disagreement(again.before, true) < loops.AGREES)
-    with loops.copied(again.job) as job:
-        loops._drop(job, again.before, right)
-        found = loops.never_folded(job, silent)
-    assert found is not None
-    model, attempts, facts = found
-    assert len(attempts) == 1 and facts is not None and facts["dropped"] > 10 and facts["left"] == 0
-    assert "were taken back" in fold({"folded": facts}, True)[0]
-    assert len(model.registered) == FRAMES and aligned_error(centres(model), POSES[:, :3, 3]) < 0.005
+def test_a_fold_that_pairs_tell_of_is_never_mapped(tmp_path):
+    """With hardly a second turn, whose pairs are right, nearly all that is matched far apart contradicts the way."""
+    poses = orbit(36, 1.08)
+    planes = post((3, 4, 3, 4))
+    capture = write_capture(tmp_path / "photos", [render(pose, planes=planes)[0] for pose in poses], ordered=True)
+    result = find_poses(capture, tmp_path, SMALL, seed=3, threads=1)
+    assert result.registered == len(poses) and aligned_error(result.world_from_camera[:, :3, 3], poses[:, :3, 3]) < 0.005
+    assert any("were taken back" in warning for warning in result.warnings)
+    told = json.loads((tmp_path / "sparse" / "result.json").read_text())
+    # Mapped first by its neighbours alone, not folded: there is one attempt, and what contradicts is all that is far apart.
+    assert len(told["attempts"]) == 1 and told["folded"]["dropped"] > 10 and told["folded"]["left"] == 0
+    assert told["folded"]["contradicting"] > 30 and not (tmp_path / "sparse" / "again").exists()
 
 
 def test_a_circle_without_a_fold_is_mapped_as_ever(tmp_path):
     """All sides differ, and the second turn meets the first."""
     planes = post((3, 4, 13, 14))
     capture = write_capture(tmp_path / "photos", [render(pose, planes=planes)[0] for pose in POSES], ordered=True)
-    result = find_poses(capture, tmp_path, PosesSettings(max_features=800), seed=3, threads=1)
+    result = find_poses(capture, tmp_path, SMALL, seed=3, threads=1)
     assert result.registered == FRAMES and aligned_error(result.world_from_camera[:, :3, 3], POSES[:, :3, 3]) < 0.005
     job = Job.load(tmp_path / "sparse" / "job.json")
     seen = loops.turns(job)
@@ -117,14 +137,14 @@ def test_a_circle_without_a_fold_is_mapped_as_ever(tmp_path):
     assert json.loads((tmp_path / "sparse" / "result.json").read_text())["folded"] is None
 
 
-def test_what_was_matched_is_as_it_was(again):
+def test_what_was_matched_is_as_it_was(walked):
     """Only copies of the database lose pairs, so that a second run begins with the same."""
-    np.testing.assert_array_equal(again.before.images, again.after.images)
-    np.testing.assert_array_equal(again.before.turn, again.after.turn)
+    np.testing.assert_array_equal(walked.before.images, walked.after.images)
+    np.testing.assert_array_equal(walked.before.turn, walked.after.turn)
 
 
-def test_cameras_that_meet_on_the_second_turn_are_found(again):
-    pairs = loops.meetings(again.better)
+def test_cameras_that_meet_on_the_second_turn_are_found(walked):
+    pairs = loops.meetings(walked.better)
     around = FRAMES / TURNS
     assert len(pairs) >= FRAMES - around
     assert all(abs((j - i) - around) < 4 for i, j in pairs)
@@ -185,8 +205,7 @@ def test_frames_that_are_not_in_the_model_say_nothing():
 
 
 def test_each_outcome_has_its_sentence(walked):
-    _, out = walked
-    facts = json.loads((out / "sparse" / "result.json").read_text())
+    facts = json.loads((walked.out / "sparse" / "result.json").read_text())
     assert facts["folded"]["dropped"] > 0 and "were taken back" in fold(facts, True)[0]
     unresolved = {"folded": {"contradicting": 7, "left": 7, "far": 40, "dropped": 0}}
     assert "7 pairs of neighbouring frames contradict" in fold(unresolved, True)[0]
@@ -199,6 +218,6 @@ def test_photos_in_any_order_are_left_alone(tmp_path):
     poses = orbit(20, 0.8)[np.random.default_rng(1).permutation(20)]
     planes = post((3, 4, 13, 14))
     capture = write_capture(tmp_path / "photos", [render(pose, planes=planes)[0] for pose in poses])
-    result = find_poses(replace(capture, ordered=False), tmp_path, PosesSettings(max_features=800), seed=3, threads=1)
+    result = find_poses(replace(capture, ordered=False), tmp_path, SMALL, seed=3, threads=1)
     assert result.registered >= 18 and not result.warnings[1 if result.registered < 20 else 0 :]
     assert json.loads((tmp_path / "sparse" / "result.json").read_text())["folded"] is None

@@ -27,10 +27,10 @@ def aligned(source: Array, target: Array) -> tuple[float, Array, Array]:
 
 @pytest.mark.slow
 def test_every_chosen_frame_is_registered_where_it_was_filmed(tmp_path: Path) -> None:
-    film = write_demo_video(tmp_path / "demo.mp4", frames=20, size=(384, 288))
+    film = write_demo_video(tmp_path / "demo.mp4", frames=16, size=(384, 288))
     chosen = select_frames(read_video(tmp_path / "demo.mp4"), tmp_path, CaptureSettings())
-    found = find_poses(chosen, tmp_path, PosesSettings(max_features=2048), seed=0, threads=1)
-    assert len(chosen.frames) >= 16
+    found = find_poses(chosen, tmp_path, PosesSettings(max_features=1024), seed=0, threads=1)
+    assert len(chosen.frames) >= 13
     assert found.registered == found.total == len(chosen.frames)
     truth = np.stack([film.world_from_camera[int(name.rpartition("_")[2])] for name in found.names])  # frame_000012
     centres = found.world_from_camera[:, :3, 3]

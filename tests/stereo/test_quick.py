@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.simulate.test_procedural import plain_operations
 from tests.stereo.made import FAR, MEDIAN, NEAR, corner
 from toolkit.capture.types import Views
 from toolkit.stereo import quick
@@ -72,13 +73,19 @@ def test_some_pictures_are_left_out_of_many(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_small_picture_takes_about_what_is_reckoned_with() -> None:
-    """Within a factor of eight, on whatever machine: the share of a fit's seconds must not be off by an order."""
+    """Within a factor of eight, on whatever machine: the share of a fit's seconds must not be off by an order.
+
+    A slower one than the nominal, where a hundred rounds of arithmetic on 320×240 rays take 0.09 s, is given as much longer.
+    """
     views = with_held_out()
     quick.guided(views, NEAR, FAR, MEDIAN, 1.0)
     start = time.process_time()
     _, matched = quick.guided(views, NEAR, FAR, MEDIAN, 1.0)
-    each = (time.process_time() - start) / 6
-    assert matched is not None and matched.pixels == quick.LEAST_SIDE and each < 8 * quick.view_seconds(quick.LEAST_SIDE, 0.75)
+    between = time.process_time()
+    plain_operations(320 * 240)
+    slower = max(1.0, (time.process_time() - between) / 0.09)
+    each = (between - start) / 6
+    assert matched is not None and matched.pixels == quick.LEAST_SIDE and each < 8 * slower * quick.view_seconds(quick.LEAST_SIDE, 0.75)
 
 
 def test_warming_up_finds_something_to_match() -> None:

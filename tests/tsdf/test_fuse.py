@@ -227,7 +227,7 @@ def test_the_threshold_rises_with_sightings() -> None:
 def test_carving_removes_what_one_view_put_into_empty_space(frames: list[DepthFrame]) -> None:
     depth = frames[0].depth.copy()
     depth[2:22, 2:22] = 1.0  # a floater in front of everything, seen by one view only
-    floating = [replace(frames[0], depth=depth), *frames[1:]]
+    floating = [replace(frames[0], depth=depth), *frames[2::2]]
     # All others see that the space is free: there is a wall behind it.
     walled = [
         replace(frame, depth=np.where(frame.depth > 0, frame.depth, np.float32(2.9)))  # a far shell at constant z
@@ -243,10 +243,11 @@ def test_carving_removes_what_one_view_put_into_empty_space(frames: list[DepthFr
     spot = np.zeros(depth.shape, bool)
     spot[4:20, 4:20] = True
     assert (np.abs(depth_of(plain, view)[spot] - 1.0) < VOXEL).mean() > 0.8
-    assert (np.abs(depth_of(carved, view)[spot] - 1.0) < VOXEL).mean() < 0.05
+    left = depth_of(carved, view)
+    assert (np.abs(left[spot] - 1.0) < VOXEL).mean() < 0.05
     ball = view.depth > 0
     ball[2:22, 2:22] = False
-    assert np.median(np.abs(depth_of(carved, view) - view.depth)[ball]) < 0.2 * VOXEL
+    assert np.median(np.abs(left - view.depth)[ball]) < 0.2 * VOXEL
 
 
 def depth_of(volume: TsdfVolume, frame: DepthFrame) -> np.ndarray:

@@ -327,7 +327,7 @@ def test_full_disk_is_said_and_leaves_nothing_behind(tmp_path: Path) -> None:
             print("refused:", error)
     """
     done = subprocess.run(
-        [sys.executable, "-B", "-c", textwrap.dedent(code)], check=False, cwd=tmp_path, capture_output=True, text=True, timeout=120
+        [sys.executable, "-B", "-c", textwrap.dedent(code)], check=False, cwd=tmp_path, capture_output=True, text=True, timeout=600
     )
     assert done.stdout.startswith("refused: cannot write f"), done
     assert list(tmp_path.iterdir()) == []
