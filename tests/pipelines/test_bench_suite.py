@@ -53,8 +53,6 @@ def test_a_scene_whose_poses_do_not_fit_is_a_row_too(tmp_path: Path, capsys: Cap
     assert [row["scene"] for row in json.loads(answer.out)["rows"] if "check the poses" in row["error"]] == ["a", "b"]
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_the_networks_alone(tmp_path: Path, capsys: Capsys) -> None:
     make_room(tmp_path / "room", 10)
     answer = call(
@@ -68,6 +66,10 @@ def test_the_networks_alone(tmp_path: Path, capsys: Capsys) -> None:
         "direct",
         "--threads",
         "1",
+        "--set",
+        "network.voxels=12",
+        "--set",
+        "keyframes.most=5",
         "--json",
         "--quiet",
     )

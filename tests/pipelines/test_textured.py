@@ -23,7 +23,7 @@ from toolkit.files import read_json
 from toolkit.tone import Tone
 
 Capsys = pytest.CaptureFixture[str]
-FEW = ["--image-size", "48", "--budget", "2", *ALONE, "--set", "field.resolution=32", "--set", "export.mesh_views=6", "--quiet"]
+FEW = ["--image-size", "48", "--budget", "1", *ALONE, "--set", "field.resolution=32", "--set", "export.mesh_views=6", "--quiet"]
 TAKEN = CAMERA.scaled(192, 144)
 
 
