@@ -20,7 +20,7 @@ def test_posed_captures_are_measured_and_their_table_written(tmp_path: Path, cap
     (tmp_path / "data" / "broken" / "transforms.json").write_text("{}")
     out = tmp_path / "out"
     command = ["bench", "posed", tmp_path / "data", "--out", out, "--threads", "1", "--budget", "1", "--variants", "fitted"]
-    command += ["--set", "field.resolution=32"]
+    command += ["--set", "field.resolution=32", "--set", "init=classical"]
     answer = call(capsys, *command, "--quiet", "--json")
     assert answer.code == 0, answer.err
     rows = {row["scene"]: row for row in json.loads(answer.out)["rows"]}

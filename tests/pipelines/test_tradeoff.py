@@ -16,7 +16,7 @@ from tests.pipelines.test_matched import make_corner
 from tests.training.test_network_start import scene, wall_views
 from toolkit.config import Settings
 from toolkit.errors import InputError
-from toolkit.evaluate.tradeoff import checked_row, points_of, series
+from toolkit.evaluate.tradeoff import MEASURES, checked_row, points_of, series
 from toolkit.files import read_json, write_json
 from toolkit.progress import SILENT
 
@@ -116,6 +116,7 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, capsys: Capsys, monkey
 
     monkeypatch.setattr("pipelines.tradeoff_sweep.run_child", here)
     monkeypatch.setattr("toolkit.poses.worker.die_with_parent", lambda: None)
+    monkeypatch.setattr("toolkit.evaluate.tradeoff_page.MEASURES", {"psnr": MEASURES["psnr"]})  # the other plots are as before
     # The rest of a crash is made again, what is finished is reused.
     path = out / "tradeoff" / "points" / "tsdf-seed0.json"
     write_json(path, {**read_json(path), "crashed": True, "rows": []})
