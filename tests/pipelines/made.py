@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import subprocess
@@ -9,6 +11,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -122,17 +125,25 @@ class Answer:
 
 def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> Answer:
     """`fieldfuse …` in this process."""
+    code = _main(arguments)
+    shown = capsys.readouterr()
+    return Answer(code, shown.out, shown.err)
+
+
+def said(*arguments: object) -> Answer:
+    """`fieldfuse …` in this process, for fixtures of a module or a session, which have no `capsys`."""
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
+        code = _main(arguments)
+    return Answer(code, out.getvalue(), err.getvalue())
+
+
+def _main(arguments: tuple[object, ...]) -> int:
+    """The exit code."""
     from pipelines import cli
 
-    before = sys.argv
-    sys.argv = ["fieldfuse", *map(str, arguments)]
-    try:
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-    finally:
-        sys.argv = before
-    shown = capsys.readouterr()
-    return Answer(int(end.value.code or 0), shown.out, shown.err)
+    with mock.patch.object(sys, "argv", ["fieldfuse", *map(str, arguments)]), pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
 
 
 def command(*arguments: object) -> list[str]:

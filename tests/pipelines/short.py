@@ -1,18 +1,51 @@
-"""Settings of short runs on the made-up room, and what their reports hold."""
+"""Settings of short runs on the made-up room, a clock on which their fits make the same steps anywhere, and what their reports hold."""
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from tests.pipelines.made import command, environment
 from toolkit.files import read_json
+from toolkit.training.fit import Clock
 
 ALONE = ["--threads", "1", "--init", "classical"]
 SMALL = ["--budget", "3", *ALONE, "--set", "field.resolution=32", "--set", "export.mesh_views=6", "--set", "export.video_frames=4"]
 FAST = ["--budget", "1", *ALONE, "--set", "field.resolution=16", "--set", "export.formats=[points]", "--set", "export.mesh_views=3"]
+
+TICK = 0.01  # seconds that the clock of a fit goes on by at each look: a second is some hundred steps
+
+
+PLAIN = Clock.__init__
+
+
+@contextmanager
+def clocked(clock: Callable[[], Callable[[], float]]) -> Iterator[None]:
+    """Each fit is on a clock of its own, made by `clock`."""
+
+    def begin(self: Clock, _: Callable[[], float]) -> None:
+        PLAIN(self, clock())
+
+    with mock.patch.object(Clock, "__init__", begin):
+        yield
+
+
+@contextmanager
+def steady(tick: float = TICK) -> Iterator[None]:
+    """The clock of each fit goes on by `tick` seconds at each look: a fit makes the same steps on any machine, however busy."""
+
+    def clock() -> Callable[[], float]:
+        looks = itertools.count()
+        return lambda: next(looks) * tick
+
+    with clocked(clock):
+        yield
 
 
 def report(folder: Path) -> dict[str, Any]:
@@ -29,7 +62,7 @@ def start(*arguments: object) -> subprocess.Popen[str]:
     return subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment())
 
 
-def wait_for(path: Path, process: subprocess.Popen[str], seconds: float = 60) -> None:
+def wait_for(path: Path, process: subprocess.Popen[str], seconds: float = 150) -> None:
     end = time.monotonic() + seconds
     while not path.exists():
         assert process.poll() is None, process.communicate()[1]

@@ -20,7 +20,7 @@ def test_posed_captures_are_measured_and_their_table_written(tmp_path: Path, cap
     (tmp_path / "data" / "broken" / "transforms.json").write_text("{}")
     out = tmp_path / "out"
     command = ["bench", "posed", tmp_path / "data", "--out", out, "--threads", "1", "--budget", "1", "--variants", "fitted"]
-    command += ["--set", "field.resolution=32"]
+    command += ["--set", "field.resolution=32", "--set", "init=classical"]
     answer = call(capsys, *command, "--quiet", "--json")
     assert answer.code == 0, answer.err
     rows = {row["scene"]: row for row in json.loads(answer.out)["rows"]}
@@ -53,8 +53,6 @@ def test_a_scene_whose_poses_do_not_fit_is_a_row_too(tmp_path: Path, capsys: Cap
     assert [row["scene"] for row in json.loads(answer.out)["rows"] if "check the poses" in row["error"]] == ["a", "b"]
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_the_networks_alone(tmp_path: Path, capsys: Capsys) -> None:
     make_room(tmp_path / "room", 10)
     answer = call(
@@ -68,6 +66,10 @@ def test_the_networks_alone(tmp_path: Path, capsys: Capsys) -> None:
         "direct",
         "--threads",
         "1",
+        "--set",
+        "network.voxels=12",
+        "--set",
+        "keyframes.most=5",
         "--json",
         "--quiet",
     )

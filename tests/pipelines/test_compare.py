@@ -14,6 +14,7 @@ from safetensors.numpy import save_file
 from pipelines.steps_compare import choose_surfaces
 from tests.evaluate.browser import embedded_pictures, open_page
 from tests.pipelines.made import call
+from tests.pipelines.short import steady
 from tests.pipelines.test_matched import CAMERA, make_corner
 from tests.poses.textured import PLANES, arc, render
 from toolkit.capture.types import Capture, Frame
@@ -24,7 +25,7 @@ from toolkit.files import read_json, write_json
 from toolkit.tsdf.mesh import Mesh
 
 Capsys = pytest.CaptureFixture[str]
-PAIRS = ["init=classical", "fit.budget=3", "field.resolution=32", "export.mesh_views=8"]
+PAIRS = ["init=classical", "fit.budget=1", "field.resolution=32", "export.mesh_views=8"]
 SMALL = ["--holdout", "4", "--threads", "1", *(word for pair in PAIRS for word in ("--set", pair))]
 
 
@@ -64,8 +65,9 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from pipelines.console import make_progress
     from pipelines.options import gather
 
-    options = gather("fast", None, [*PAIRS[1:], "export.formats=[ply]"], holdout=4, threads=1)
-    compare_run(folder / "corner", folder / "out", options, "auto", make_progress(quiet=True))
+    options = gather("fast", None, [*PAIRS[1:], "export.formats=[ply]", "network.voxels=16"], holdout=4, threads=1)
+    with steady():
+        compare_run(folder / "corner", folder / "out", options, "auto", make_progress(quiet=True))
     return folder / "out"
 
 

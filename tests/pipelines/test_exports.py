@@ -16,8 +16,8 @@ from pipelines.reconstruct import BEFORE, stand
 from pipelines.steps_capture import choose_frames, find_capture
 from pipelines.steps_results import fit_radiance_field
 from tests.capture.films import film
-from tests.pipelines.made import call, circle, make_room, shoot
-from tests.pipelines.short import ALONE, stages
+from tests.pipelines.made import call, circle, make_room, said, shoot
+from tests.pipelines.short import ALONE, stages, steady
 from toolkit.files import read_json
 
 Capsys = pytest.CaptureFixture[str]
@@ -26,13 +26,24 @@ WISH = ["--set", "export.formats=[points,cameras]"]
 AGAIN = ["--threads", "1", "--quiet", "--json"]
 
 
-@pytest.fixture
-def out(tmp_path: Path, capsys: Capsys) -> Path:
-    """A run on pictures half as wide as the photos are, so that meshes need the photos."""
-    make_room(tmp_path / "room", 10)
-    answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", *FEW, *WISH)
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on pictures half as wide as the photos are, so that meshes need the photos: a folder with it and its capture."""
+    folder = tmp_path_factory.mktemp("exports")
+    make_room(folder / "now" / "room", 10)
+    with steady():
+        answer = said("run", folder / "now" / "room", "--out", folder / "now" / "out", *FEW, *WISH)
     assert answer.code == 0, answer.err
-    return tmp_path / "out"
+    shutil.copytree(folder / "now", folder / "made")
+    return folder
+
+
+@pytest.fixture
+def out(made: Path) -> Path:
+    """The run with its capture at the place where they were made, as they were."""
+    shutil.rmtree(made / "now")
+    shutil.copytree(made / "made", made / "now")
+    return made / "now" / "out"
 
 
 def files(out: Path) -> set[str]:

@@ -10,6 +10,7 @@ import pytest
 
 from pipelines import kept
 from pipelines.kept import FLAG, NUMBER, TEXT, misfit, read_kept
+from tests.pipelines.made import call
 from toolkit.errors import InputError
 
 
@@ -53,13 +54,13 @@ def test_facts_of_exports_of_earlier_versions_are_read(told: dict[str, Any], not
     assert kept.read_export_facts(tmp_path / "facts.json") == {"mesh": None, "notes": notes}
 
 
-def test_what_the_stages_write_has_the_forms(tmp_path: Path) -> None:
+def test_what_the_stages_write_has_the_forms(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A finished small run, read back."""
-    from tests.stability.runs import launch, make_source
+    from tests.stability.runs import OPTIONS, make_source
 
     out = tmp_path / "out"
-    done = launch({}, make_source(tmp_path / "room"), out)
-    assert done.returncode == 0, done.stderr
+    answer = call(capsys, "run", make_source(tmp_path / "room"), "--out", out, *OPTIONS)
+    assert answer.code == 0, answer.err
     for name, form in (
         ("effects.json", kept.EFFECTS),
         ("evaluation.json", kept.EVALUATION),

@@ -17,7 +17,8 @@ import torch
 
 from pipelines.few_views import numbers, part_of, wanted
 from pipelines.steps_network import uses_network
-from tests.pipelines.made import call, command, environment, make_room
+from tests.pipelines.made import CAMERA, call, command, environment, make_room
+from tests.pipelines.short import clocked
 from toolkit.config import load_settings
 from toolkit.errors import InputError
 from toolkit.files import read_json
@@ -27,7 +28,7 @@ FAST = [
     "--init",
     "network",
     "--budget",
-    1.5,
+    1,
     "--threads",
     1,
     "--set",
@@ -58,7 +59,7 @@ def run(capsys: Capsys, room: Path, out: Path, *more: object) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("network") / "room"
-    make_room(folder, 12, depth=True)
+    make_room(folder, 12, True, CAMERA.scaled(48, 36))
     return folder
 
 
@@ -71,15 +72,15 @@ def test_few_pictures_start_from_the_networks_and_the_report_says_what_they_gave
     assert 0 < network["encode_seconds"] < network["fusion_seconds"] < network["seconds"] and network["first_preview_seconds"] > 0
     assert field["psnr"] > network["psnr"] > data["evaluation"]["nearest_image"]["psnr"]
     picture = cv2.imread(str(out / "preview.png"))
-    assert picture.shape == (72, 3 * 96, 3) and np.ptp(picture[:, 96:192]) > 20
+    assert picture.shape == (36, 3 * 48, 3) and np.ptp(picture[:, 48:96]) > 20
     assert "preview.png shows what 3 key frames" in data["said"]
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "Networks alone" in page and "nothing fitted" in page
     # The same again reuses all; other settings of the fit leave the networks' field as it is; other key frames do not.
     assert all(stages(run(capsys, room, out)).values())
-    cached = stages(run(capsys, room, out, "--budget", 1))
+    cached = stages(run(capsys, room, out, "--budget", 0.5))
     assert cached["network"] and cached["direct"] and not cached["field"]
-    cached = stages(run(capsys, room, out, "--budget", 1, "--set", "keyframes.method=uniform", "--set", "keyframes.every=2"))
+    cached = stages(run(capsys, room, out, "--budget", 0.5, "--set", "keyframes.method=uniform", "--set", "keyframes.every=2"))
     assert cached["views"] and not (cached["keyframes"] or cached["network"] or cached["direct"] or cached["field"])
     chosen = read_json(out / "keyframes.json")
     assert chosen["keyframes"] == ["001", "003", "005", "007", "010"]
@@ -92,7 +93,7 @@ def test_without_fine_tuning_the_networks_field_is_the_result_until_it_is_fitted
     assert any("nothing was fitted" in text for text in data["warnings"])
     direct = data["evaluation"]["field"]["psnr"]
     assert direct > data["evaluation"]["nearest_image"]["psnr"]
-    answer = call(capsys, "finetune", out, "--budget", 1.5, "--json", "--quiet")
+    answer = call(capsys, "finetune", out, "--budget", 6, "--json", "--quiet")
     assert answer.code == 0, answer.err
     data = json.loads(answer.out)
     assert stages(data)["network"] and not stages(data)["field"]
@@ -108,7 +109,7 @@ def test_with_many_pictures_too_the_networks_field_is_fitted_further(
     out = tmp_path / "out"
     assert stages(run(capsys, room, out, "--no-finetune", "--init", "auto"))["network"] is False
     timelines = []
-    for verb in (["finetune", out, "--budget", 1.5], ["finetune", out, "--budget", 1.5], ["export", out]):
+    for verb in (["finetune", out, "--budget", 0.5], ["finetune", out, "--budget", 0.5], ["export", out]):
         answer = call(capsys, *verb, "--json", "--quiet")
         assert answer.code == 0, answer.err
         data = json.loads(answer.out)
@@ -159,7 +160,7 @@ def test_a_run_killed_among_the_key_frames_goes_on(room: Path, tmp_path: Path, c
 
 def test_tables_of_few_views_go_on_where_they_stopped(room: Path, tmp_path: Path, capsys: Capsys) -> None:
     out = tmp_path / "table"
-    settings = ["--set", "field.resolution=32", "--set", "network.voxels=12", "--image-size", 48]
+    settings = ["--set", "field.resolution=32", "--set", "network.voxels=12"]
     first = call(capsys, "bench", "few-views", room, "--out", out, "--views", "3", "--budgets", "0.5", "--starts", "classical", *settings)
     assert first.code == 0, first.err
     assert read_json(out / "few_views.json")["settings"]["fit"]["budget"] == load_settings().fit.budget, "rows tell their own"
@@ -187,7 +188,7 @@ def test_rows_of_other_settings_do_not_go_into_one_table(room: Path, tmp_path: P
 
 
 def test_parts_of_the_networks_can_be_switched_off(room: Path, tmp_path: Path, capsys: Capsys) -> None:
-    settings = ["--set", "network.voxels=12", "--image-size", 48, "--views", "4"]
+    settings = ["--set", "network.voxels=12", "--views", "4"]
     answer = call(capsys, "bench", "ablations", room, "--out", tmp_path / "table", *settings, "--quiet")
     assert answer.code == 0, answer.err
     rows = {row["part"]: row for row in read_json(tmp_path / "table" / "ablations.json")["rows"]}
@@ -220,12 +221,15 @@ def test_lists_of_numbers() -> None:
         part_of("magic")
 
 
-def test_engines_are_measured_side_by_side(room: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_engines_are_measured_side_by_side(room: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each engine fits within the same seconds, and pictures of its field are timed."""
-    answer = call(
-        *(capsys, "bench", "engines", room, "--out", tmp_path / "engines", "--budgets", "1", "--engines", "auto,torch"),
-        *("--threads", 1, "--set", "field.resolution=32", "--set", "effects=off", "--quiet"),
-    )
+    monkeypatch.setattr("toolkit.evaluate.engines.PICTURE", (96, 72))
+    monkeypatch.setattr("toolkit.evaluate.engines.STEPS", 2)
+    with clocked(lambda: time.process_time):  # what else the machine does is not counted
+        answer = call(
+            *(capsys, "bench", "engines", room, "--out", tmp_path / "engines", "--budgets", "1", "--engines", "auto,torch"),
+            *("--threads", 1, "--set", "field.resolution=32", "--set", "effects=off", "--quiet"),
+        )
     assert answer.code == 0, answer.err
     kept = read_json(tmp_path / "engines" / "engines.json")
     assert [row["engine"] for row in kept["rows"]] == ["numba", "torch"]

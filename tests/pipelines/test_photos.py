@@ -21,7 +21,7 @@ from toolkit.capture.types import Capture, Frame
 
 Capsys = pytest.CaptureFixture[str]
 PHOTO = CAMERA.scaled(288, 216)
-SHORT = ["--budget", "2", "--threads", "1", "--image-size", "96", "--init", "classical", "--set", "export.formats=[cameras]", "--quiet"]
+SHORT = ["--budget", "0.5", "--threads", "1", "--image-size", "96", "--init", "classical", "--set", "export.formats=[cameras]", "--quiet"]
 
 
 def as_json(text: str) -> dict[str, Any]:
@@ -31,12 +31,12 @@ def as_json(text: str) -> dict[str, Any]:
 
 
 def test_photos_get_poses_and_the_report_says_what_the_poses_have_seen(tmp_path: Path, capsys: Capsys) -> None:
-    source = make_photos(tmp_path / "photos", circle(14, 0.3), PHOTO)
+    source = make_photos(tmp_path / "photos", circle(9, 0.2), PHOTO)
     answer = call(capsys, "run", source, "--out", tmp_path / "out", *SHORT, "--json")
     assert answer.code == 0, answer.err
     data = as_json(answer.out)
     assert data["capture"]["kind"] == "photos" and data["poses"]["source"] == "sfm"
-    assert data["poses"]["registered"] >= 12 and data["poses"]["total"] == 14
+    assert data["poses"]["registered"] >= 7 and data["poses"]["total"] == 9
     assert any("held-out ones included" in warning for warning in data["warnings"])
     assert (tmp_path / "out" / "exports" / "cameras" / "colmap").is_dir()
     again = as_json(call(capsys, "poses", tmp_path / "out", "--quiet", "--json").out)
@@ -46,21 +46,22 @@ def test_photos_get_poses_and_the_report_says_what_the_poses_have_seen(tmp_path:
 def test_video_is_cut_into_frames(tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "film.mp4"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10, (PHOTO.width, PHOTO.height))
-    for pose in circle(30, 0.3):
+    for pose in circle(24, 0.2):
         writer.write(cv2.cvtColor(shoot(pose, PHOTO)[0], cv2.COLOR_RGB2BGR))
     writer.release()
     (tmp_path / "link").symlink_to(tmp_path)
     place = tmp_path / "elsewhere" / ".." / "link" / "out"  # the same folder as below, by a way that people take
     (tmp_path / "elsewhere").mkdir()
-    answer = call(capsys, "poses", path, "--out", place, "--set", "capture.max_frames=12", "--threads", 1, "--quiet", "--json")
+    options = ["--set", "capture.max_frames=8", "--threads", 1, "--quiet", "--json"]
+    answer = call(capsys, "poses", path, "--out", place, *options)
     assert answer.code == 0, answer.err
     data = as_json(answer.out)
-    assert data["capture"]["kind"] == "video" and 6 <= data["capture"]["frames"] <= 12
+    assert data["capture"]["kind"] == "video" and 5 <= data["capture"]["frames"] <= 8
     assert (data["capture"]["width"], data["capture"]["height"]) == (288, 216)
     frames = sorted((tmp_path / "out" / "frames").glob("*.jpg"))
     assert len(frames) == data["capture"]["frames"]
     frames[2].unlink()
-    again = as_json(call(capsys, "poses", path, "--out", tmp_path / "out", "--set", "capture.max_frames=12", "--quiet", "--json").out)
+    again = as_json(call(capsys, "poses", path, "--out", tmp_path / "out", *options).out)
     assert {stage["name"]: stage["cached"] for stage in again["stages"]} == {"capture": True, "frames": False, "poses": False}
     assert frames[2].is_file()
 
@@ -79,20 +80,19 @@ def test_the_frames_of_a_run_folder_that_was_moved_are_its_own(tmp_path: Path) -
 def test_heic_photos_become_jpegs_that_the_cameras_name(tmp_path: Path, capsys: Capsys) -> None:
     pillow_heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not installed; make test brings it")
     pillow_heif.register_heif_opener()
-    source = make_photos(tmp_path / "photos", circle(12, 0.3), PHOTO)
-    pictures = sorted(source.glob("*.*"))
-    for path in pictures:
+    source = make_photos(tmp_path / "photos", circle(9, 0.2), PHOTO)
+    for path in sorted(source.glob("*.*"))[:2]:
         Image.open(path).save(path.with_suffix(".HEIC"), format="HEIF", quality=90)
         path.unlink()
     out = tmp_path / "out"
-    answer = call(capsys, "poses", source, "--out", out, "--threads", 2, "--quiet", "--json")
+    answer = call(capsys, "poses", source, "--out", out, "--threads", 1, "--quiet", "--json")
     assert answer.code == 0, answer.err
     data = as_json(answer.out)
-    assert data["capture"]["kind"] == "photos" and data["capture"]["extra"]["converted"] == 12 and data["poses"]["registered"] >= 10
+    assert data["capture"]["kind"] == "photos" and data["capture"]["extra"]["converted"] == 2 and data["poses"]["registered"] >= 7
     named = json.loads((out / "exports" / "cameras" / "transforms.json").read_text())["frames"][0]["file_path"]
     assert named.endswith(".jpg") and (out / named).is_file()
     (out / named).unlink()
-    again = as_json(call(capsys, "poses", source, "--out", out, "--threads", 2, "--quiet", "--json").out)
+    again = as_json(call(capsys, "poses", source, "--out", out, "--threads", 1, "--quiet", "--json").out)
     assert {stage["name"]: stage["cached"] for stage in again["stages"]} == {"capture": True, "frames": False, "poses": False}
     assert (out / named).is_file()
 
@@ -116,17 +116,17 @@ def test_turning_on_the_spot_is_named(tmp_path: Path, capsys: Capsys) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_the_child_that_finds_poses_does_not_outlive_us(number: int, tmp_path: Path) -> None:
-    source = make_photos(tmp_path / "photos", circle(20, 0.4), PHOTO)
+    source = make_photos(tmp_path / "photos", circle(12, 0.3), PHOTO)
     process = subprocess.Popen(command("poses", source, "--out", tmp_path / "out"), stderr=subprocess.PIPE, text=True, env=environment())
-    end = time.monotonic() + 60
+    end = time.monotonic() + 150
     children: list[psutil.Process] = []
     while not children and time.monotonic() < end and process.poll() is None:
         children = psutil.Process(process.pid).children(recursive=True)
         time.sleep(0.02)
     assert children, process.communicate()[1]
     process.send_signal(number)
-    _, err = process.communicate(timeout=30)
+    _, err = process.communicate(timeout=120)
     assert process.returncode == (-signal.SIGKILL if number == signal.SIGKILL else 130), err
-    _, alive = psutil.wait_procs(children, timeout=10)
+    _, alive = psutil.wait_procs(children, timeout=60)
     assert not alive
     assert not (tmp_path / "out" / "stages" / "poses.json").exists()

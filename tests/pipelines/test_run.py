@@ -86,7 +86,7 @@ def test_the_same_command_again_reuses_everything(done: Path, capsys: Capsys) ->
     data = json.loads(answer.out)
     assert all(stages(data).values()), stages(data)
     assert data["evaluation"] == before["evaluation"]
-    assert data["seconds_total"] == pytest.approx(before["seconds_total"], abs=8)
+    assert data["seconds_total"] == pytest.approx(before["seconds_total"], rel=0.5, abs=8)
 
 
 def test_info_on_source_and_run(done: Path, capsys: Capsys) -> None:

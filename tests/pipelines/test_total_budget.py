@@ -21,34 +21,43 @@ from toolkit.files import read_json, write_json
 Capsys = pytest.CaptureFixture[str]
 
 
+@pytest.fixture(autouse=True)
+def _steps_for_seconds() -> None:
+    """Seconds are what this is about: fits keep the machine's clock."""
+
+
 def test_a_run_that_takes_what_was_asked_for(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(model, "EFFECTS_SHARE", 0.0)  # no time for them
     make_room(tmp_path / "room", 10)
     out = tmp_path / "out"
-    command = ["run", tmp_path / "room", "--out", out, "--total-budget", "14", "--holdout", "5", "--threads", "1", "--quiet", "--json"]
+    command = ["run", tmp_path / "room", "--out", out, "--total-budget", "10", "--holdout", "5", "--threads", "1", "--quiet", "--json"]
     age, start = time.time() - psutil.Process().create_time(), time.monotonic()
     answer = call(capsys, *command, "--set", "export.formats=[ply,video,cameras]")
     whole = time.monotonic() - start + (age if age < LONGEST_START else 0.0)
     assert answer.code == 0, answer.err
     data = json.loads(answer.out)
     told = data["budget"]
-    assert told["asked_seconds"] == 14 and told["predicted_seconds"] > 0 and not told["reused"]
+    assert told["asked_seconds"] == 10 and told["predicted_seconds"] > 0 and not told["reused"]
     assert told["real_seconds"] + told["self_test_seconds"] >= data["seconds_total"] - 1
     choice, stages = told["choice"], told["stages"]
     assert choice["image_size"] == 160 and data["views"]["width"] == 96  # never enlarged
-    assert stages["fit"]["real"] == pytest.approx(choice["fit_seconds"], abs=2) and choice["resolution"] >= 64
+    # Not sooner than was chosen; how much later tells how busy the machine is.
+    assert choice["fit_seconds"] - 0.1 < stages["fit"]["real"] < 3 * choice["fit_seconds"] + 20 and choice["resolution"] >= 64
     assert {"capture", "scene", "views", "render", "export", "evaluate", "report"} <= set(stages)
     assert data["settings"]["fit"]["budget"] == choice["fit_seconds"]
     assert (out / "exports" / "orbit.mp4").exists() == bool(choice["video_frames"])
     assert told["self_test_seconds"] > 1 and told["real_seconds"] + told["self_test_seconds"] < whole + 0.5  # it comes on top
-    assert any("Of the 14 s asked for" in note and "this machine was measured" in note for note in data["notes"])
-    assert "Of the 14 s asked for" in (out / "report.html").read_text(encoding="utf-8")
+    assert any("Of the 10 s asked for" in note and "this machine was measured" in note for note in data["notes"])
+    assert "Of the 10 s asked for" in (out / "report.html").read_text(encoding="utf-8")
     assert (tmp_path / "cache" / "fieldfuse" / "speed.json").is_file() and read_json(out / "report.json")["budget"] == told
 
     again = json.loads(call(capsys, *command, "--set", "export.formats=[ply,video,cameras]").out)
-    assert again["budget"]["reused"] and again["budget"]["choice"] == choice and again["budget"]["self_test_seconds"] == 0
-    assert not any("this machine was measured" in note for note in again["notes"])
+    assert again["budget"]["reused"] and again["budget"]["choice"] == choice
+    # Measured again only where the machine turned out to be far slower, or faster, than it was when it was measured.
+    far = abs(told["real_seconds"] - 10) > 2 * model.AGREES * 10
+    assert (again["budget"]["self_test_seconds"] > 0) == far
+    assert any("this machine was measured" in note for note in again["notes"]) == far
     assert all(stage["cached"] for stage in again["stages"])
 
     # What was decided for want of time (no effects, no networks) holds for work on the folder, too: the field stays.

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from pipelines import tradeoff_child
 from pipelines.direct_field import direct_field
 from pipelines.tradeoff import unbounded
 from pipelines.tradeoff_plan import base_time, chosen_axes, chosen_times, plan
@@ -15,7 +16,7 @@ from tests.pipelines.test_matched import make_corner
 from tests.training.test_network_start import scene, wall_views
 from toolkit.config import Settings
 from toolkit.errors import InputError
-from toolkit.evaluate.tradeoff import checked_row, points_of, series
+from toolkit.evaluate.tradeoff import MEASURES, checked_row, points_of, series
 from toolkit.files import read_json, write_json
 from toolkit.progress import SILENT
 
@@ -89,7 +90,12 @@ def test_the_command_of_a_whole_sweep_makes_it_in_one_call(typed: str, whole: st
     assert unbounded(typed) == whole
 
 
-def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, capsys: Capsys) -> None:
+def here(_: object, ask: Path, *__: object) -> int:
+    """What a point's process does, in this one."""
+    return tradeoff_child.main(str(ask))
+
+
+def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     make_corner(tmp_path / "corner", depth=True)
     out = tmp_path / "out"
     command = ["tradeoff", tmp_path / "corner", "--out", out, *SMALL, "--times", "1", "--axes", "iterations,precision"]
@@ -108,6 +114,9 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, capsys: Capsys) -> Non
     assert abs(found["field-1s"]["psnr"] - found["field-1s-precisionuint8"]["psnr"]) < 1
     assert data["unit"] == "units" and (out / "tradeoff.csv").read_text().count("\n") == 5
 
+    monkeypatch.setattr("pipelines.tradeoff_sweep.run_child", here)
+    monkeypatch.setattr("toolkit.poses.worker.die_with_parent", lambda: None)
+    monkeypatch.setattr("toolkit.evaluate.tradeoff_page.MEASURES", {"psnr": MEASURES["psnr"]})  # the other plots are as before
     # The rest of a crash is made again, what is finished is reused.
     path = out / "tradeoff" / "points" / "tsdf-seed0.json"
     write_json(path, {**read_json(path), "crashed": True, "rows": []})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import sys
 import time
@@ -16,8 +17,8 @@ import pytest
 
 from pipelines.visitor import lens_of, pose_of
 from tests.evaluate.driven import driven, until
-from tests.pipelines.made import CAMERA, call, make_room
-from tests.pipelines.short import FAST, start
+from tests.pipelines.made import CAMERA, call, make_room, said
+from tests.pipelines.short import FAST, start, steady
 from toolkit.camera import Array
 
 Capsys = pytest.CaptureFixture[str]
@@ -43,7 +44,7 @@ class Browser:
     def say(self, kind: str, **facts: Any) -> None:
         self.socket.send(msgspec.msgpack.encode({"type": kind, **facts}))
 
-    def until(self, done: Callable[[dict[str, Any]], bool], seconds: float = 60) -> dict[str, Any]:
+    def until(self, done: Callable[[dict[str, Any]], bool], seconds: float = 120) -> dict[str, Any]:
         """The first message for which it is so; all go to `seen`."""
         end = time.monotonic() + seconds
         while True:
@@ -72,11 +73,21 @@ def _decoded(message: dict[str, Any]) -> Array:
     return picture
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small run."""
+    folder = tmp_path_factory.mktemp("view")
+    make_room(folder / "room", 9)
+    with steady():
+        answer = said("run", folder / "room", "--out", folder / "out", *FAST, "--quiet")
+    assert answer.code == 0, answer.err
+    return folder / "out"
+
+
 @pytest.fixture
-def served(tmp_path: Path, capsys: Capsys) -> Iterator[tuple[Any, int, Path]]:
-    """A small run, its viewer at work, and its port."""
-    make_room(tmp_path / "room", 9)
-    assert call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", *FAST, "--quiet").code == 0
+def served(made: Path, tmp_path: Path) -> Iterator[tuple[Any, int, Path]]:
+    """The viewer of a copy of the run at work, its port, and the copy."""
+    shutil.copytree(made, tmp_path / "out")
     size = max(CAMERA.width, CAMERA.height)
     process = start("view", tmp_path / "out", "--port", 0, "--image-size", size, "--threads", 1, "--quiet")
     try:
@@ -92,7 +103,7 @@ def served(tmp_path: Path, capsys: Capsys) -> Iterator[tuple[Any, int, Path]]:
 @pytest.mark.slow
 def test_a_visitor_sees_what_the_cameras_saw(served: tuple[Any, int, Path], capsys: Capsys) -> None:
     process, port, out = served
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=20) as page:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=120) as page:
         assert page.status == 200 and b"<html" in page.read().lower()
     browser = Browser(port)
     fov = float(2 * np.arctan(CAMERA.height / 2 / CAMERA.fy))
@@ -124,7 +135,7 @@ def test_a_visitor_sees_what_the_cameras_saw(served: tuple[Any, int, Path], caps
     time.sleep(0.5)
     assert process.poll() is None  # a visitor who leaves ends nothing
     process.send_signal(signal.SIGINT)
-    said, errors = process.communicate(timeout=30)
+    said, errors = process.communicate(timeout=120)
     assert process.returncode == 0 and said == errors == ""
 
 
