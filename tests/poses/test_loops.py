@@ -218,6 +218,6 @@ def test_photos_in_any_order_are_left_alone(tmp_path):
     poses = orbit(20, 0.8)[np.random.default_rng(1).permutation(20)]
     planes = post((3, 4, 13, 14))
     capture = write_capture(tmp_path / "photos", [render(pose, planes=planes)[0] for pose in poses])
-    result = find_poses(replace(capture, ordered=False), tmp_path, SMALL, seed=3, threads=1)
+    result = find_poses(replace(capture, ordered=False), tmp_path, PosesSettings(max_features=800), seed=3, threads=1)
     assert result.registered >= 18 and not result.warnings[1 if result.registered < 20 else 0 :]
     assert json.loads((tmp_path / "sparse" / "result.json").read_text())["folded"] is None
