@@ -217,7 +217,7 @@ def test_kernels_compile_without_a_gpu(tmp_path: Path) -> None:
     environment = {**os.environ, "TRITON_CACHE_DIR": str(tmp_path)}
     environment.pop("TRITON_INTERPRET", None)
     command = [sys.executable, "-m", "tests.training.triton_ahead"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=Path(__file__).parents[2], timeout=170)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=Path(__file__).parents[2], timeout=500)
     assert done.returncode == 0, done.stderr[-2000:]
     names = "composite count_step draw inspect judge learn move spread walk"
     assert done.stdout.splitlines()[0] == names
