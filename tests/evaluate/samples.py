@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import pytest
 
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture.types import Views
@@ -19,16 +17,6 @@ class Drawn:
     rgb: Array
     depth: Array
     mask: Array | None = None
-
-
-def even_clock(monkeypatch: pytest.MonkeyPatch, tick: float) -> None:
-    """Each fit's clock goes on by `tick` seconds at each look: a fit of so many seconds makes the same steps on any machine."""
-
-    def seconds(clock: Any) -> float:
-        clock.looks = getattr(clock, "looks", 0) + 1
-        return float(clock.looks * tick)
-
-    monkeypatch.setattr("toolkit.training.fit.Clock.seconds", seconds)
 
 
 def picture(height: int = 72, width: int = 96, phase: float = 0.0) -> Array:

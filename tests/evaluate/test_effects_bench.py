@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipelines.bench_effects import fits_table, table
-from tests.evaluate.samples import even_clock
+from tests.pipelines.short import steady
 from toolkit.capture import open_capture
 from toolkit.evaluate import effects_fits, effects_plan
 from toolkit.evaluate.effects_bench import Looked, confusion
@@ -79,10 +79,10 @@ def test_captures_do_not_tell_their_lens_or_true_poses(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("small")
-def test_fits_in_every_mode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    even_clock(monkeypatch, 0.005)
+def test_fits_in_every_mode(tmp_path: Path) -> None:
     planned = [Planned("plain", "room", 7, ())]
-    data = effects_fits.compared(planned, tmp_path, 0.5, ("all_off", "all_on"))
+    with steady(0.005):
+        data = effects_fits.compared(planned, tmp_path, 0.5, ("all_off", "all_on"))
     only = data["each"][0]
     assert only["found"] == only["auto"]["on"] and only["all_off"]["on"] == [] and only["all_off"]["effects_seconds"] == 0
     assert only["all_on"]["effects_seconds"] > 0 and only["all_on"]["psnr"] > 8

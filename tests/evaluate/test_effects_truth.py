@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipelines.bench_effects import switched_table
-from tests.evaluate.samples import even_clock
+from tests.pipelines.short import steady
 from toolkit.capture import open_capture
 from toolkit.capture.prepare import held_out
 from toolkit.errors import InputError, Interrupted
@@ -91,9 +91,9 @@ def test_blur_and_noise_are_not_in_the_canonical_picture(tmp_path: Path) -> None
 
 @pytest.mark.usefixtures("small")
 def test_fits_are_scored_against_canonical_pictures_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    even_clock(monkeypatch, 0.005)
     planned = [Planned("drift", "room", 6, (("exposure", "strong"), ("vignetting", "strong")))]
-    data = effects_fits.compared(planned, tmp_path, 0.7, ("all_off", "known"))
+    with steady(0.005):
+        data = effects_fits.compared(planned, tmp_path, 0.7, ("all_off", "known"))
     mean = data["mean"]
     assert mean["known"]["canonical"] > mean["all_off"]["canonical"] + 2
     assert mean["known"]["effects_seconds"] < 0.2 * mean["auto"]["effects_seconds"]  # nothing is looked for

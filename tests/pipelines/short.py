@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from tests.pipelines.made import command, environment
+from tests.pipelines.made import command, environment, make_room, said
 from toolkit.files import read_json
 from toolkit.training.fit import Clock
 
@@ -46,6 +46,14 @@ def steady(tick: float = TICK) -> Iterator[None]:
 
     with clocked(clock):
         yield
+
+
+def finished(out: Path, count: int, *options: object) -> None:
+    """A finished run in `out`, of a room of `count` pictures in `room` beside it, for tests of what a run leaves."""
+    make_room(out.parent / "room", count)
+    with steady():
+        answer = said("run", out.parent / "room", "--out", out, *options)
+    assert answer.code == 0, answer.err
 
 
 def report(folder: Path) -> dict[str, Any]:

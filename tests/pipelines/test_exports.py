@@ -16,8 +16,8 @@ from pipelines.reconstruct import BEFORE, stand
 from pipelines.steps_capture import choose_frames, find_capture
 from pipelines.steps_results import fit_radiance_field
 from tests.capture.films import film
-from tests.pipelines.made import call, circle, make_room, said, shoot
-from tests.pipelines.short import ALONE, stages, steady
+from tests.pipelines.made import call, circle, make_room, shoot
+from tests.pipelines.short import ALONE, finished, stages
 from toolkit.files import read_json
 
 Capsys = pytest.CaptureFixture[str]
@@ -30,10 +30,7 @@ AGAIN = ["--threads", "1", "--quiet", "--json"]
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on pictures half as wide as the photos are, so that meshes need the photos: a folder with it and its capture."""
     folder = tmp_path_factory.mktemp("exports")
-    make_room(folder / "now" / "room", 10)
-    with steady():
-        answer = said("run", folder / "now" / "room", "--out", folder / "now" / "out", *FEW, *WISH)
-    assert answer.code == 0, answer.err
+    finished(folder / "now" / "out", 10, *FEW, *WISH)
     shutil.copytree(folder / "now", folder / "made")
     return folder
 

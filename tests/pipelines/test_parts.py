@@ -12,8 +12,8 @@ import pytest
 
 from pipelines.folder import FILES, SUBFOLDERS
 from pipelines.job import THREAD_VARIABLES, bound_threads
-from tests.pipelines.made import call, make_room, said
-from tests.pipelines.short import FAST, report, stages, steady
+from tests.pipelines.made import call, make_room
+from tests.pipelines.short import FAST, finished, report, stages
 from toolkit.errors import InputError
 from toolkit.files import read_json
 
@@ -24,10 +24,7 @@ Capsys = pytest.CaptureFixture[str]
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run beside its capture, made once."""
     folder = tmp_path_factory.mktemp("parts")
-    make_room(folder / "room", 10)
-    with steady():
-        answer = said("run", folder / "room", "--out", folder / "made", *FAST, "--quiet")
-    assert answer.code == 0, answer.err
+    finished(folder / "made", 10, *FAST, "--quiet")
     return folder
 
 

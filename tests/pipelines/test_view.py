@@ -17,8 +17,8 @@ import pytest
 
 from pipelines.visitor import lens_of, pose_of
 from tests.evaluate.driven import driven, until
-from tests.pipelines.made import CAMERA, call, make_room, said
-from tests.pipelines.short import FAST, start, steady
+from tests.pipelines.made import CAMERA, call, make_room
+from tests.pipelines.short import FAST, finished, start
 from toolkit.camera import Array
 
 Capsys = pytest.CaptureFixture[str]
@@ -76,12 +76,9 @@ def _decoded(message: dict[str, Any]) -> Array:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small run."""
-    folder = tmp_path_factory.mktemp("view")
-    make_room(folder / "room", 9)
-    with steady():
-        answer = said("run", folder / "room", "--out", folder / "out", *FAST, "--quiet")
-    assert answer.code == 0, answer.err
-    return folder / "out"
+    out = tmp_path_factory.mktemp("view") / "out"
+    finished(out, 9, *FAST, "--quiet")
+    return out
 
 
 @pytest.fixture
