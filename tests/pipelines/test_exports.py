@@ -16,7 +16,7 @@ from pipelines.reconstruct import BEFORE, stand
 from pipelines.steps_capture import choose_frames, find_capture
 from pipelines.steps_results import fit_radiance_field
 from tests.capture.films import film
-from tests.pipelines.made import call, circle, make_room, shoot
+from tests.pipelines.made import call, circle, shoot
 from tests.pipelines.short import ALONE, finished, stages
 from toolkit.files import read_json
 
