@@ -69,7 +69,8 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
 
     def save(chosen: Capture) -> list[Path]:
         write_json(path, capture_to_dict(chosen))
-        return [*(frame.image for frame in chosen.frames if frame.image.parent == folder.resolve()), path]
+        written = (file for frame in chosen.frames for file in (frame.image, frame.depth) if file is not None)
+        return [*(file for file in written if file.is_relative_to(folder.resolve())), path]
 
     return job.stages.run(
         "frames",
@@ -83,11 +84,17 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
 
 
 def at_home(chosen: Capture, folder: Path) -> Capture:
-    """The capture with the pictures that were written to a run's `frames` where these are now: the run's folder may have been moved."""
+    """The capture with the pictures (and depth) that were written to a run's `frames` where these are now: the run's folder may have been
+    moved."""
+    from toolkit.capture.extract import DEPTH
 
     def here(frame: Frame) -> Frame:
-        written = frame.image.parent.name == folder.name and (folder / frame.image.name).is_file()
-        return replace(frame, image=folder / frame.image.name) if written else frame
+        if not (frame.image.parent.name == folder.name and (folder / frame.image.name).is_file()):
+            return frame
+        depth = frame.depth
+        if depth is not None and depth.parent == frame.image.parent / DEPTH:
+            depth = folder / DEPTH / depth.name
+        return replace(frame, image=folder / frame.image.name, depth=depth)
 
     return chosen.with_frames([here(frame) for frame in chosen.frames])
 

@@ -22,6 +22,7 @@ FILES = {
     "7scenes": ("frame-000002.pose.txt",),
     "tum": ("rgb.txt", "depth.txt", "groundtruth.txt"),
     "scannet": ("pose/10.txt", "intrinsic/intrinsic_color.txt"),
+    "sens": ("scene0000_00.sens",),
     "llff": ("poses_bounds.npy",),
     "dtu": ("cameras.npz",),
     "redwood": ("trajectory.log", "camera_intrinsics.json"),

@@ -92,6 +92,7 @@ FILES = {
     "7scenes": ("frame-000002.pose.txt", "frame-000002.depth.png"),
     "tum": ("rgb.txt", "depth.txt", "groundtruth.txt"),
     "scannet": ("pose/10.txt", "intrinsic/intrinsic_color.txt", "color/5.jpg"),
+    "sens": ("scene0000_00.sens",),
     "llff": ("poses_bounds.npy",),
     "dtu": ("cameras.npz",),
     "redwood": ("trajectory.log", "camera_intrinsics.json"),
