@@ -247,10 +247,14 @@ def make_views(job: Job, posed: Capture, scene: Scene, corrections: Corrections 
 
 def source_state(source: Path, without: Path) -> str:
     """Hash of names, sizes and times of all files of the source, wherever it lies; `without` (the run's own folder) does not count."""
+    from toolkit.capture.replica import camera_file, looks_like_replica
+
     if source.is_file() and source.suffix.lower() != ".json":
         return fingerprint(_state(source, source.parent))
     root = source.parent if source.is_file() else source
-    return fingerprint(source.name if source.is_file() else "", [_state(path, root) for path in _files(root, without)])
+    beside = camera_file(root) if looks_like_replica(root) else None  # one for all scenes, in the folder above
+    outside = [] if beside is None or beside.parent == root else [_state(beside, beside.parent)]
+    return fingerprint(source.name if source.is_file() else "", [_state(path, root) for path in _files(root, without)], *outside)
 
 
 def _files(root: Path, without: Path) -> Iterable[Path]:

@@ -231,6 +231,20 @@ def write_redwood(root: Path) -> Pinhole:
     return c
 
 
+def write_replica(root: Path) -> Pinhole:
+    lines = []
+    for index, eye in enumerate(eyes()):
+        picture, depth = render(eye, OFF_CENTRE)
+        save_picture(root / f"results/frame{index:06d}.jpg", picture)
+        save_depth(root / f"results/depth{index:06d}.png", np.where(depth < 9.99, depth, 0), 6553.5)  # 16 bits reach 10 m
+        lines.append(" ".join(f"{value:.18e}" for value in eye.pose().ravel()))
+    (root / "traj.txt").write_text("\n".join(lines) + "\n")
+    c = OFF_CENTRE
+    told = {"w": c.width, "h": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx - 0.5, "cy": c.cy - 0.5, "scale": 6553.5}
+    (root / "cam_params.json").write_text(json.dumps({"camera": told}))
+    return c
+
+
 def write_polycam(root: Path) -> Pinhole:
     """As the app exports it: depth and confidence at a quarter of the pictures' size, and cameras before and after loops were closed."""
     quarter, place = quarter_size(PHONE), root / "keyframes"
@@ -295,6 +309,7 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], Pinhole]]] = {
     "llff": ("llff", write_llff),
     "dtu": ("dtu", write_dtu),
     "redwood": ("redwood", write_redwood),
+    "replica": ("replica", write_replica),
     "polycam": ("polycam", write_polycam),
     "stray": ("stray", write_stray),
 }

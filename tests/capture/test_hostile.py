@@ -26,6 +26,7 @@ FILES = {
     "llff": ("poses_bounds.npy",),
     "dtu": ("cameras.npz",),
     "redwood": ("trajectory.log", "camera_intrinsics.json"),
+    "replica": ("traj.txt", "cam_params.json"),
     "polycam": ("keyframes/corrected_cameras/100333.json",),
     "stray": ("odometry.csv", "camera_matrix.csv"),
 }

@@ -25,6 +25,7 @@ from toolkit.capture.llff import looks_like_llff, read_llff
 from toolkit.capture.photos import looks_like_photos, photo_files, read_photos
 from toolkit.capture.polycam import looks_like_polycam, read_polycam
 from toolkit.capture.redwood import looks_like_redwood, read_redwood
+from toolkit.capture.replica import looks_like_replica, read_replica
 from toolkit.capture.scannet import looks_like_scannet, read_scannet, read_sens
 from toolkit.capture.sens import is_sens
 from toolkit.capture.seven_scenes import looks_like_seven_scenes, read_seven_scenes
@@ -55,6 +56,7 @@ READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ..
     ("blender", looks_like_blender, read_blender),
     ("tum", looks_like_tum, read_tum),
     ("redwood", looks_like_redwood, read_redwood),
+    ("replica", looks_like_replica, read_replica),
     ("scannet", looks_like_scannet, read_scannet),
     ("7scenes", looks_like_seven_scenes, read_seven_scenes),
     ("stray", looks_like_stray, read_stray),

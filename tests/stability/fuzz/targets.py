@@ -96,6 +96,7 @@ FILES = {
     "llff": ("poses_bounds.npy",),
     "dtu": ("cameras.npz",),
     "redwood": ("trajectory.log", "camera_intrinsics.json"),
+    "replica": ("traj.txt", "cam_params.json", "results/depth000001.png"),
     "polycam": ("keyframes/corrected_cameras/100333.json", "keyframes/depth/100333.png", "keyframes/confidence/100333.png"),
     "stray": ("odometry.csv", "camera_matrix.csv", "depth/000001.png"),
 }
