@@ -9,7 +9,8 @@ from typing import Any
 import cv2
 
 from toolkit.camera import Array
-from toolkit.capture.sens import JPEG, is_sens, scan, sens_bytes, sens_depth
+from toolkit.capture.sens import JPEG, is_sens, scan
+from toolkit.capture.sens_frames import sens_bytes, sens_depth
 from toolkit.capture.video import iterate_video
 from toolkit.errors import InputError, OutputError
 from toolkit.files import atomic_path, fingerprint, read_json, write_json

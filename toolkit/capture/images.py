@@ -11,7 +11,8 @@ from toolkit.camera import Array
 from toolkit.capture import heif
 from toolkit.capture.colours import to_srgb
 from toolkit.capture.headers import MAX_PIXELS, Header, read_bytes, read_header
-from toolkit.capture.sens import is_sens, sens_depth
+from toolkit.capture.sens import is_sens
+from toolkit.capture.sens_frames import sens_depth
 from toolkit.capture.types import Capture, Frame
 from toolkit.capture.video import iterate_video
 from toolkit.errors import InputError

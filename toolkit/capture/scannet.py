@@ -16,7 +16,8 @@ import numpy as np
 from toolkit.camera import Intrinsics, checked_pose
 from toolkit.capture.calibration import from_matrix, read_matrix_for, sensor
 from toolkit.capture.listing import assemble, counted, files_in, fitted, picture_header, pictures_in, require_folder, same_count
-from toolkit.capture.sens import SUFFIX, Sens, scan, sens_size
+from toolkit.capture.sens import SUFFIX, Sens, scan
+from toolkit.capture.sens_frames import sens_size
 from toolkit.capture.seven_scenes import FrameFiles, first_sizes, frame_files, frame_folders, frame_names, lost_frames, posed_frames
 from toolkit.capture.seven_scenes_cameras import INFO
 from toolkit.capture.types import Capture, Frame

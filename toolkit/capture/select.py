@@ -49,7 +49,8 @@ class Measure:
 def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progress: Progress = SILENT) -> Capture:
     """At most `settings.max_frames` sharp, well-spread frames of a video, written as pictures under `out/frames`.
 
-    Two passes: the first measures frames small (all, or about `MEASURED` of a long video), the second writes the chosen ones as JPEG.
+    Two passes: the first measures frames small (all, or about `MEASURED` of a long video), the second writes the chosen ones as JPEG,
+    with their depth where the file holds that too.
     What was measured stays in `out/selection.json` and pictures that are there are not written again, so a killed run goes on where
     it stopped and a second run does nothing.
 

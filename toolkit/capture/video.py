@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 
 from toolkit.camera import Array
-from toolkit.capture.sens import is_sens, iterate_sens
+from toolkit.capture.sens import is_sens
+from toolkit.capture.sens_frames import iterate_sens
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 from toolkit.files import require_utf8
