@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.capture.layouts import OFF_CENTRE, rows, write_redwood
+from tests.capture.layouts import OFF_CENTRE, rows, write_redwood, write_scannet
 from tests.capture.made import Pinhole, eyes, pixel_error, render, save_depth, save_picture
 from tests.conftest import shared_data
 from toolkit.capture import open_capture
@@ -104,6 +104,14 @@ def test_one_trajectory_is_meant_and_one_depth(tmp_path: Path) -> None:
         open_capture(tmp_path)
 
 
+def test_what_open3d_left_beside_a_scan_does_not_replace_its_poses(tmp_path: Path) -> None:
+    write_redwood(tmp_path / "redwood")
+    write_scannet(tmp_path / "scan")
+    (tmp_path / "scan" / "scene").mkdir()
+    (tmp_path / "redwood" / "trajectory.log").rename(tmp_path / "scan" / "scene" / "trajectory.log")
+    assert detect_kind(tmp_path / "scan") == "scannet"
+
+
 def test_other_logs_make_no_trajectory(tmp_path: Path) -> None:
     write_redwood(tmp_path)
     (tmp_path / "trajectory.log").rename(tmp_path / "odometry.log")
@@ -113,7 +121,7 @@ def test_other_logs_make_no_trajectory(tmp_path: Path) -> None:
     assert detect_kind(tmp_path) != "redwood"
 
 
-@pytest.mark.parametrize("folder", ["image", "rgb", "images"])
+@pytest.mark.parametrize("folder", ["image", "rgb", "images", "colors"])
 def test_folders_of_pictures(tmp_path: Path, folder: str) -> None:
     write_redwood(tmp_path)
     (tmp_path / "color").rename(tmp_path / folder)

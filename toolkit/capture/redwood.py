@@ -44,6 +44,8 @@ HEAD = 2000  # characters that hold one
 def looks_like_redwood(path: Path) -> bool:
     if (path / LOG).is_file():
         return True
+    if (path / "pose").is_dir():  # a pose a frame, of ScanNet: what Open3D found of the same pictures does not replace them
+        return False
     # Folders of Redwood's site are called `livingroom1-color`.
     pictures = any((path / folder).is_dir() for folder in FOLDERS) or next(path.glob("*-color/"), None) is not None
     return pictures and bool(_logs(path))
