@@ -69,7 +69,8 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
 
     def save(chosen: Capture) -> list[Path]:
         write_json(path, capture_to_dict(chosen))
-        return [*(frame.image for frame in chosen.frames if frame.image.parent == folder.resolve()), path]
+        written = (file for frame in chosen.frames for file in (frame.image, frame.depth) if file is not None)
+        return [*(file for file in written if file.is_relative_to(folder.resolve())), path]
 
     return job.stages.run(
         "frames",
@@ -83,11 +84,17 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
 
 
 def at_home(chosen: Capture, folder: Path) -> Capture:
-    """The capture with the pictures that were written to a run's `frames` where these are now: the run's folder may have been moved."""
+    """The capture with the pictures (and depth) that were written to a run's `frames` where these are now: the run's folder may have been
+    moved."""
+    from toolkit.capture.extract import DEPTH
 
     def here(frame: Frame) -> Frame:
-        written = frame.image.parent.name == folder.name and (folder / frame.image.name).is_file()
-        return replace(frame, image=folder / frame.image.name) if written else frame
+        if not (frame.image.parent.name == folder.name and (folder / frame.image.name).is_file()):
+            return frame
+        depth = frame.depth
+        if depth is not None and depth.parent == frame.image.parent / DEPTH:
+            depth = folder / DEPTH / depth.name
+        return replace(frame, image=folder / frame.image.name, depth=depth)
 
     return chosen.with_frames([here(frame) for frame in chosen.frames])
 
@@ -240,10 +247,14 @@ def make_views(job: Job, posed: Capture, scene: Scene, corrections: Corrections 
 
 def source_state(source: Path, without: Path) -> str:
     """Hash of names, sizes and times of all files of the source, wherever it lies; `without` (the run's own folder) does not count."""
+    from toolkit.capture.replica import camera_file, looks_like_replica
+
     if source.is_file() and source.suffix.lower() != ".json":
         return fingerprint(_state(source, source.parent))
     root = source.parent if source.is_file() else source
-    return fingerprint(source.name if source.is_file() else "", [_state(path, root) for path in _files(root, without)])
+    beside = camera_file(root) if looks_like_replica(root) else None  # one for all scenes, in the folder above
+    outside = [] if beside is None or beside.parent == root else [_state(beside, beside.parent)]
+    return fingerprint(source.name if source.is_file() else "", [_state(path, root) for path in _files(root, without)], *outside)
 
 
 def _files(root: Path, without: Path) -> Iterable[Path]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -162,6 +163,38 @@ def write_scannet(root: Path) -> Pinhole:
     return SCANNET_COLOUR
 
 
+def write_sens(root: Path) -> Pinhole:
+    """The file that ScanNet publishes beside meshes and a text; its tracking was lost in frame 2."""
+    pictures = [cv2.imencode(".jpg", render(eye, SCANNET_COLOUR)[0][..., ::-1])[1].tobytes() for eye in eyes()]
+    depths = [zlib.compress((1000 * render(eye, OFF_CENTRE)[1]).round().astype("<u2").tobytes()) for eye in eyes()]
+    poses = [eye.pose() for eye in eyes()]
+    root.mkdir(parents=True, exist_ok=True)
+    lost = (pictures[0], depths[0], np.full((4, 4), -np.inf))
+    frames = [*zip(pictures, depths, poses, strict=True)]
+    (root / "scene0000_00.sens").write_bytes(sens_of([*frames[:2], lost, *frames[2:]]))
+    (root / "scene0000_00.txt").write_text("sceneType = Kitchen\n")
+    return SCANNET_COLOUR
+
+
+def sens_of(frames: list[tuple[bytes, bytes, Array]], codings: tuple[int, int] = (2, 1), count: int | None = None) -> bytes:
+    """The file of frames (picture and depth as they are packed, pose), 30 a second, with the readings of one other sensor behind them."""
+
+    def k(camera: Pinhole) -> Array:
+        matrix = np.eye(4, dtype="<f4")
+        matrix[:3, :3] = whole_centres(camera)
+        return matrix
+
+    name, still = b"StructureSensor", np.eye(4, dtype="<f4")
+    out = struct.pack("<IQ", 4, len(name)) + name
+    out += b"".join(matrix.tobytes() for matrix in (k(SCANNET_COLOUR), still, k(OFF_CENTRE), still))
+    c, d = SCANNET_COLOUR, OFF_CENTRE
+    out += struct.pack("<2i4IfQ", *codings, c.width, c.height, d.width, d.height, 1000.0, len(frames) if count is None else count)
+    for index, (picture, depth, pose) in enumerate(frames):
+        time = 1000 + 33333 * index
+        out += np.asarray(pose, "<f4").tobytes() + struct.pack("<4Q", time, time, len(picture), len(depth)) + picture + depth
+    return out + struct.pack("<Q15dQ", 1, *[0.0] * 15, 1000)
+
+
 def write_llff(root: Path) -> Pinhole:
     table = []
     for index, eye in enumerate(eyes()):
@@ -195,6 +228,20 @@ def write_redwood(root: Path) -> Pinhole:
     c = OFF_CENTRE
     by_column = [c.fx, 0, 0, 0, c.fy, 0, c.cx - 0.5, c.cy - 0.5, 1]
     (root / "camera_intrinsics.json").write_text(json.dumps({"width": c.width, "height": c.height, "intrinsic_matrix": by_column}))
+    return c
+
+
+def write_replica(root: Path) -> Pinhole:
+    lines = []
+    for index, eye in enumerate(eyes()):
+        picture, depth = render(eye, OFF_CENTRE)
+        save_picture(root / f"results/frame{index:06d}.jpg", picture)
+        save_depth(root / f"results/depth{index:06d}.png", np.where(depth < 9.99, depth, 0), 6553.5)  # 16 bits reach 10 m
+        lines.append(" ".join(f"{value:.18e}" for value in eye.pose().ravel()))
+    (root / "traj.txt").write_text("\n".join(lines) + "\n")
+    c = OFF_CENTRE
+    told = {"w": c.width, "h": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx - 0.5, "cy": c.cy - 0.5, "scale": 6553.5}
+    (root / "cam_params.json").write_text(json.dumps({"camera": told}))
     return c
 
 
@@ -258,9 +305,11 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], Pinhole]]] = {
     "7scenes": ("7scenes", write_seven_scenes),
     "tum": ("tum", write_tum),
     "scannet": ("scannet", write_scannet),
+    "sens": ("scannet", write_sens),
     "llff": ("llff", write_llff),
     "dtu": ("dtu", write_dtu),
     "redwood": ("redwood", write_redwood),
+    "replica": ("replica", write_replica),
     "polycam": ("polycam", write_polycam),
     "stray": ("stray", write_stray),
 }

@@ -80,7 +80,7 @@ def test_what_is_written_on_purpose_goes_before_what_is_left_behind(tmp_path: Pa
 
 def test_each_kind_has_one_reader() -> None:
     kinds = [kind for kind, _, _ in READERS]
-    assert len(set(kinds)) == len(kinds) == 12
+    assert len(set(kinds)) == len(kinds) == 13
 
 
 def test_a_json_file_names_its_capture(tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_a_file_that_is_no_picture_is_named(tmp_path: Path, layout: str) -> None
         open_capture(tmp_path)
 
 
-@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name not in ("blender", "stray")])  # these tell no size
+@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name not in ("blender", "stray", "sens")])  # these tell no size, or hold it
 def test_a_cropped_picture_does_not_pass_as_a_resized_one(tmp_path: Path, layout: str) -> None:
     LAYOUTS[layout][1](tmp_path)
     victim = open_capture(tmp_path).frames[0].image
@@ -158,7 +158,7 @@ def test_what_macos_leaves_beside_files_is_not_read(tmp_path: Path, layout: str)
     assert (capture.kind, len(capture.frames)) == (LAYOUTS[layout][0], len(eyes()))
 
 
-@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name not in ("colmap bin", "llff", "dtu")])  # these have no text
+@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name not in ("colmap bin", "llff", "dtu", "sens")])  # these have no text
 def test_text_with_the_mark_that_windows_writes_first(tmp_path: Path, layout: str) -> None:
     camera = LAYOUTS[layout][1](tmp_path)
     for path in [path for path in tmp_path.rglob("*") if path.suffix in (".json", ".txt", ".csv", ".log")]:

@@ -22,9 +22,11 @@ FILES = {
     "7scenes": ("frame-000002.pose.txt",),
     "tum": ("rgb.txt", "depth.txt", "groundtruth.txt"),
     "scannet": ("pose/10.txt", "intrinsic/intrinsic_color.txt"),
+    "sens": ("scene0000_00.sens",),
     "llff": ("poses_bounds.npy",),
     "dtu": ("cameras.npz",),
     "redwood": ("trajectory.log", "camera_intrinsics.json"),
+    "replica": ("traj.txt", "cam_params.json"),
     "polycam": ("keyframes/corrected_cameras/100333.json",),
     "stray": ("odometry.csv", "camera_matrix.csv"),
 }

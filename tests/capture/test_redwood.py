@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.capture.layouts import OFF_CENTRE, rows, write_redwood
+from tests.capture.layouts import OFF_CENTRE, rows, write_redwood, write_scannet
 from tests.capture.made import Pinhole, eyes, pixel_error, render, save_depth, save_picture
 from tests.conftest import shared_data
 from toolkit.capture import open_capture
+from toolkit.capture.detect import detect_kind
 from toolkit.errors import InputError
 
 
@@ -54,7 +55,73 @@ def test_the_index_of_the_log_counts_not_its_order(tmp_path: Path) -> None:
     assert pixel_error(open_capture(tmp_path), eyes(), OFF_CENTRE) < 1e-3
 
 
-@pytest.mark.parametrize("folder", ["image", "rgb", "images"])
+PUBLISHED = {  # the log, the pictures' folder, the depth's, the camera's file
+    "Open3D's sample": ("trajectory.log", "color", "depth", "camera_primesense.json"),
+    "Open3D's living room": ("livingroom1-traj.txt", "color", "depth", None),
+    "Redwood's site": ("office2-traj.txt", "office2-color", "office2-depth-clean", None),
+    "Redwood's site, noisy": ("office2-traj.txt", "office2-color", "office2-depth-simulated", None),
+    "lounge": ("lounge_trajectory.log", "color", "depth", None),
+    "bedroom": ("bedroom.log", "image", "depth", None),
+    "Open3D's reconstruction system": ("scene/trajectory.log", "color", "depth", "intrinsic.json"),
+    "fountain": ("scene/key.log", "image", "depth", None),
+}
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_what_is_published_is_read_as_it_is_unpacked(tmp_path: Path, name: str) -> None:
+    log, pictures, depth, camera = PUBLISHED[name]
+    write_redwood(tmp_path)
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "trajectory.log").rename(tmp_path / log)
+    (tmp_path / "color").rename(tmp_path / pictures)
+    (tmp_path / "depth").rename(tmp_path / depth)
+    (tmp_path / "camera_intrinsics.json").rename(tmp_path / (camera or "elsewhere.txt"))
+    step = f"0 1 5\n{rows(np.eye(4))}"
+    (tmp_path / "odometry.log").write_text(step * 4)
+    (tmp_path / "rgbd.match").write_text("5 0 1\n")
+    (tmp_path / "dist-model.txt").write_text("1 2 3\n")
+    (tmp_path / "run.log").write_text("10:02 started\n")
+    (tmp_path / "pairs.log").write_text(step * 4)
+    capture = open_capture(tmp_path)
+    assert (capture.kind, capture.has_depth, bool(capture.warnings)) == ("redwood", True, camera is None)
+    if camera:
+        assert pixel_error(capture, eyes(), OFF_CENTRE) < 1e-3
+    for frame, eye in zip(capture.frames, eyes(), strict=True):
+        np.testing.assert_allclose(frame.world_from_camera, eye.pose(), atol=1e-9)
+        assert frame.depth.parent.name == depth and frame.depth.stem == frame.image.stem
+
+
+def test_one_trajectory_is_meant_and_one_depth(tmp_path: Path) -> None:
+    write_redwood(tmp_path)
+    (tmp_path / "trajectory.log").rename(tmp_path / "livingroom1-traj.txt")
+    (tmp_path / "depth_noisy").mkdir()
+    for path in (tmp_path / "depth").iterdir():
+        (tmp_path / "depth_noisy" / path.name).write_bytes(path.read_bytes())
+    assert open_capture(tmp_path).warnings == ("the depth in depth/ is used, that in depth_noisy/ is left out",)
+    text = (tmp_path / "livingroom1-traj.txt").read_text()
+    (tmp_path / "livingroom2-traj.txt").write_text(text)
+    with pytest.raises(InputError, match=r"holds livingroom1-traj\.txt, livingroom2-traj\.txt; call the one .* trajectory\.log"):
+        open_capture(tmp_path)
+
+
+def test_what_open3d_left_beside_a_scan_does_not_replace_its_poses(tmp_path: Path) -> None:
+    write_redwood(tmp_path / "redwood")
+    write_scannet(tmp_path / "scan")
+    (tmp_path / "scan" / "scene").mkdir()
+    (tmp_path / "redwood" / "trajectory.log").rename(tmp_path / "scan" / "scene" / "trajectory.log")
+    assert detect_kind(tmp_path / "scan") == "scannet"
+
+
+def test_other_logs_make_no_trajectory(tmp_path: Path) -> None:
+    write_redwood(tmp_path)
+    (tmp_path / "trajectory.log").rename(tmp_path / "odometry.log")
+    (tmp_path / "pairs.log").write_text(f"0 1 5\n{rows(np.eye(4))}")
+    (tmp_path / "wrong.log").write_bytes(b"\xff\xfe0 0 1\n")
+    (tmp_path / "digits.log").write_text("0 0 1\n" + "1" * 100_000)
+    assert detect_kind(tmp_path) != "redwood"
+
+
+@pytest.mark.parametrize("folder", ["image", "rgb", "images", "colors"])
 def test_folders_of_pictures(tmp_path: Path, folder: str) -> None:
     write_redwood(tmp_path)
     (tmp_path / "color").rename(tmp_path / folder)

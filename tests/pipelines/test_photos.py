@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,8 +74,10 @@ def test_the_frames_of_a_run_folder_that_was_moved_are_its_own(tmp_path: Path) -
     (now / "a.jpg").touch()
     kept = [tmp_path / "photos" / "a.jpg", tmp_path / "frames" / "b.jpg"]  # photos that needed no writing
     frames = [Frame(str(index), path) for index, path in enumerate([before / "a.jpg", *kept])]
-    got = at_home(Capture("photos", tmp_path, tuple(frames)), now)
-    assert [frame.image for frame in got.frames] == [now / "a.jpg", *kept]
+    deep = [replace(frames[0], depth=before / "depth" / "a.png"), replace(frames[0], depth=tmp_path / "depth" / "a.png")]
+    got = at_home(Capture("photos", tmp_path, (*frames, *deep)), now)
+    assert [frame.image for frame in got.frames] == [now / "a.jpg", *kept, now / "a.jpg", now / "a.jpg"]
+    assert [frame.depth for frame in got.frames[3:]] == [now / "depth" / "a.png", deep[1].depth]
 
 
 def test_heic_photos_become_jpegs_that_the_cameras_name(tmp_path: Path, capsys: Capsys) -> None:

@@ -22,7 +22,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from tests.capture.layouts import LAYOUTS
+from tests.capture.layouts import LAYOUTS, sens_of
 from tests.stability.fuzz.watch import SECONDS, bound_memory
 from toolkit.capture import open_capture
 from toolkit.capture.checks import check_capture
@@ -127,6 +127,9 @@ def bombs(place: Path) -> dict[str, Callable[[], Any]]:
     (place / "side.png").write_bytes(png(2**31 - 1, 1, 8, 0, b""))
     (place / "sparse.json").open("wb").truncate(2**36)
     (place / "deep.json").write_text("[" * 10_000_000)
+    for name, count in (("many.sens", 2**60), ("empty.sens", 50_000)):
+        (place / name).write_bytes(sens_of([], count=count)[:-136])  # without what stands behind the frames
+        (place / name).open("ab").truncate(2**36)
     lines = "\n".join([f"a{i}: &a{i} [{', '.join(f'*a{i - 1}' for _ in range(9))}]" if i else "a0: &a0 [x]" for i in range(12)])
     zipped, promising, folder = archive(place / "zip"), promising_archive(place / "promise"), picture_folder(place / "pictures")
     (place / "loop").mkdir()
@@ -152,6 +155,8 @@ def bombs(place: Path) -> dict[str, Callable[[], Any]]:
         "an array in a zip that promises 80 GB": lambda: open_capture(promising),
         "a depth map that promises 80 GB": lambda: load_depth(depth_of(place / "a.npy", npy("(100000, 100000)")), plain(place)),
         "a depth map of objects": lambda: load_depth(depth_of(place / "b.npy", npy("(2, 2)").replace(b"<f8", b"|O ")), plain(place)),
+        "a .sens file of 2⁶⁰ frames": lambda: open_capture(place / "many.sens"),
+        "a .sens file of 50,000 frames in a sparse file": lambda: open_capture(place / "empty.sens"),
         "a folder that links to itself": lambda: open_capture(place / "loop"),
         "a picture that is a link out of the capture": lambda: open_capture(place / "links"),
     }

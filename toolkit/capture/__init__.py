@@ -10,7 +10,7 @@ __all__ = ["Capture", "Frame", "Views", "open_capture"]
 
 
 def open_capture(source: Path | str) -> Capture:
-    """The capture at `source`: a video, a folder of a known layout, or one of a layout's JSON files. Found by looking.
+    """The capture at `source`: a video, a folder of a known layout, a `.sens` file, or one of a layout's JSON files. Found by looking.
 
     Only listings, metadata and picture headers are read; pixels are decoded of a video's first frame, and of a few pictures with alpha.
 

@@ -14,7 +14,14 @@ from toolkit.capture.listing import fitted, read_matrix, read_object
 from toolkit.capture.nerf_json import MAX_SIDE, number
 from toolkit.errors import InputError
 
-JSON_NAMES = ("camera_intrinsics.json", "camera_intrinsic.json", "camera.json", "intrinsics.json", "intrinsic.json")
+JSON_NAMES = (
+    "camera_intrinsics.json",
+    "camera_intrinsic.json",
+    "camera.json",
+    "intrinsics.json",
+    "intrinsic.json",
+    "camera_primesense.json",  # of Open3D's samples
+)
 
 
 def sensor(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Intrinsics:

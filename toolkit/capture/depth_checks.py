@@ -24,6 +24,7 @@ FACTORS = (1000.0, 100.0, 10.0, 5.0, 0.2, 0.1, 0.01, 0.001)  # units that get co
 WHAT_TO_SET = {
     "transforms": "set `depth_unit_scale_factor` (units of length for each stored value) in transforms.json",
     "redwood": "set `depth_scale` (stored values for each unit of the trajectory) in the camera's json",
+    "replica": "set `scale` (stored values for each metre) in cam_params.json",
     "tum": "store depth as 16-bit PNG with 5000 for each metre",
 }
 OTHERWISE = "store depth as 16-bit PNG in millimetres and poses in metres"

@@ -25,7 +25,9 @@ from toolkit.capture.llff import looks_like_llff, read_llff
 from toolkit.capture.photos import looks_like_photos, photo_files, read_photos
 from toolkit.capture.polycam import looks_like_polycam, read_polycam
 from toolkit.capture.redwood import looks_like_redwood, read_redwood
-from toolkit.capture.scannet import looks_like_scannet, read_scannet
+from toolkit.capture.replica import looks_like_replica, read_replica
+from toolkit.capture.scannet import looks_like_scannet, read_scannet, read_sens
+from toolkit.capture.sens import is_sens
 from toolkit.capture.seven_scenes import looks_like_seven_scenes, read_seven_scenes
 from toolkit.capture.stray import looks_like_stray, read_stray
 from toolkit.capture.transforms import looks_like_transforms, read_transforms
@@ -54,6 +56,7 @@ READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ..
     ("blender", looks_like_blender, read_blender),
     ("tum", looks_like_tum, read_tum),
     ("redwood", looks_like_redwood, read_redwood),
+    ("replica", looks_like_replica, read_replica),
     ("scannet", looks_like_scannet, read_scannet),
     ("7scenes", looks_like_seven_scenes, read_seven_scenes),
     ("stray", looks_like_stray, read_stray),
@@ -71,7 +74,7 @@ def detect_kind(folder: Path) -> str | None:
 
 
 def read_source(path: Path) -> Capture:
-    """The capture at `path`: a folder of any known layout, a video, or a `transforms*.json`.
+    """The capture at `path`: a folder of any known layout, a video, a `.sens` file, or a `transforms*.json`.
 
     Raises:
         InputError: nothing there, nothing known, or the layout's own files are broken.
@@ -84,7 +87,7 @@ def read_source(path: Path) -> Capture:
             return read_blender(path.parent) if path.name.startswith("transforms_") else read_transforms(path)
         if path.suffix.lower() in (*PICTURES, *CAMERA_RAW):
             raise InputError(f"{path} is one picture, and one cannot show depth; give the folder that holds all of them")
-        return read_video(path)
+        return read_sens(path) if is_sens(path) else read_video(path)
     folder = require_folder(path)
     try:
         for _, looks_like, read in READERS:

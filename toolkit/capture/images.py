@@ -11,6 +11,8 @@ from toolkit.camera import Array
 from toolkit.capture import heif
 from toolkit.capture.colours import to_srgb
 from toolkit.capture.headers import MAX_PIXELS, Header, read_bytes, read_header
+from toolkit.capture.sens import is_sens
+from toolkit.capture.sens_frames import sens_depth
 from toolkit.capture.types import Capture, Frame
 from toolkit.capture.video import iterate_video
 from toolkit.errors import InputError
@@ -66,7 +68,8 @@ def load_depth(frame: Frame, capture: Capture) -> Array:
 
     Stored values are divided by `capture.depth_scale`. 0, negative, NaN and infinite values are missing, so is 65535 in 16-bit pictures,
     and so is where the frame's confidence is 0. Where the depth camera stands beside the picture's, the map is carried to where that
-    stands (`carried`). Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, and .npy arrays.
+    stands (`carried`). Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, .npy arrays, and what `.sens`
+    files hold.
 
     Raises:
         InputError: naming the file, when it is missing, damaged, or not one value a pixel.
@@ -74,7 +77,10 @@ def load_depth(frame: Frame, capture: Capture) -> Array:
     if frame.depth is None:
         raise InputError(f"the frame {frame.name} has no depth map")
     path = frame.depth
-    raw = _load_npy(path) if path.suffix.lower() == ".npy" else _decode(path)[0]
+    if frame.video_index is not None and is_sens(path):
+        raw = sens_depth(path, frame.video_index)
+    else:
+        raw = _load_npy(path) if path.suffix.lower() == ".npy" else _decode(path)[0]
     if raw.ndim == 3 and raw.shape[2] == 1:
         raw = raw[:, :, 0]
     if raw.ndim != 2 or raw.size == 0:

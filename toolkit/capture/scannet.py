@@ -1,28 +1,46 @@
-"""ScanNet: the exported layout (`color/`, `depth/`, `pose/`, `intrinsic/`) and loose `frame-*.color.jpg` samples of it.
+"""ScanNet: `.sens` files as the site publishes them, the layout that its reader exports (`color/`, `depth/`, `pose/`, `intrinsic/`), and
+loose `frame-*.color.jpg` samples of that.
 
 Poses are world_from_camera in OpenCV axes, metres, z up; frames whose tracking was lost have a pose of -inf and are dropped.
 Depth is in millimetres, through a camera of its own. ScanNet's subset of 25,000 frames has `intrinsics_color.txt` and
-`intrinsics_depth.txt` beside the folders. Samples come without cameras: the sensor's usual ones then stand in.
+`intrinsics_depth.txt` beside the folders. Samples come without cameras: the sensor's usual ones then stand in. Where a folder holds
+frames as files, these go before its `.sens`: somebody exported them, perhaps on purpose not all.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from toolkit.camera import Intrinsics
-from toolkit.capture.calibration import read_matrix_for, sensor
-from toolkit.capture.listing import assemble, files_in, picture_header, pictures_in, require_folder, same_count
-from toolkit.capture.seven_scenes import FrameFiles, first_sizes, frame_files, frame_folders, frame_names, posed_frames
+import numpy as np
+
+from toolkit.camera import Intrinsics, checked_pose
+from toolkit.capture.calibration import from_matrix, read_matrix_for, sensor
+from toolkit.capture.listing import assemble, counted, files_in, fitted, picture_header, pictures_in, require_folder, same_count
+from toolkit.capture.sens import SUFFIX, Sens, scan
+from toolkit.capture.sens_frames import sens_size
+from toolkit.capture.seven_scenes import FrameFiles, first_sizes, frame_files, frame_folders, frame_names, lost_frames, posed_frames
 from toolkit.capture.seven_scenes_cameras import INFO
-from toolkit.capture.types import Capture
+from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 
 COLOUR_CAMERA = sensor(1296, 968, 1165.72, 1165.74, 647.5, 483.5)  # nominal centre
 DEPTH_CAMERA = sensor(640, 480, 577.87, 577.87, 319.5, 239.5)
+UP = (0.0, 0.0, 1.0)
+RATES = (1.0, 240.0)  # frames a second that a file's times can mean
+
+
+def looks_exported(path: Path) -> bool:
+    """Whether a folder holds what ScanNet's reader exports."""
+    return (path / "pose").is_dir() and (path / "color").is_dir()
+
+
+def packed(path: Path) -> list[Path]:
+    """The `.sens` files directly in a folder that holds no frames as files."""
+    return [] if looks_exported(path) or frame_folders(path) else pictures_in(path, (SUFFIX,))
 
 
 def looks_like_scannet(path: Path) -> bool:
-    if (path / "pose").is_dir() and (path / "color").is_dir():
+    if looks_exported(path) or packed(path):
         return True
     if (path / INFO).is_file():  # BundleFusion's, which brings its cameras
         return False
@@ -42,6 +60,11 @@ def read_scannet(path: Path | str) -> Capture:
         InputError: no frames, pictures and poses differ in number, a pose is NaN or not rigid, or a camera file is not usable.
     """
     root = require_folder(path)
+    inside = packed(root)
+    if len(inside) > 1:
+        raise InputError(f"{root} holds {len(inside)} .sens files; give one of them, for instance {inside[0]}")
+    if inside:
+        return read_sens(inside[0])
     found = _exported(root) if (root / "pose").is_dir() else frame_files(root)
     names = frame_names(found) if not (root / "pose").is_dir() else [entry.stem for entry in found]
     colour_camera, depth_camera, warnings = _cameras(root, found)
@@ -54,9 +77,69 @@ def read_scannet(path: Path | str) -> Capture:
         ordered=True,
         metric=True,
         depth_scale=1000.0,
-        up=(0.0, 0.0, 1.0),
+        up=UP,
         extra={"listed": len(found), "lost": len(found) - len(frames)},
     )
+
+
+def read_sens(path: Path) -> Capture:
+    """The frames of a `.sens` file that have a pose, still inside it (`Capture.filmed`); named by their number, as they are exported.
+
+    Raises:
+        InputError: the file is not usable, all frames are lost, a pose or a camera in it is none, or its pictures have another shape.
+    """
+    found = scan(path)
+    colour, depth = (
+        from_matrix(found.matrices[which], *size, f"{path}: the {what} camera").centred(f"{path}: the {what} camera")
+        for which, size, what in ((0, found.size, "colour"), (2, found.depth_size, "depth"))
+    )
+    seen = np.flatnonzero(found.places[:, 1])
+    if not len(seen):
+        raise InputError(f"{path} holds no picture; copy it again from where it was published")
+    tracked = [int(index) for index in seen if not np.isinf(found.poses[index]).any()]
+    remarks = [*lost_frames(len(seen), len(tracked), path), *_unused(found)]
+    colour = fitted(colour, sens_size(found, tracked[0]), f"{path}, frame {tracked[0]}")
+    frames = [
+        Frame(
+            name=str(index),
+            image=path,
+            intrinsics=colour,
+            world_from_camera=checked_pose(found.poses[index], f"{path}, frame {index}"),
+            depth=path if found.places[index, 2] else None,
+            depth_intrinsics=depth if found.places[index, 2] else None,
+            video_index=index,
+        )
+        for index in tracked
+    ]
+    return assemble(
+        "scannet",
+        path.parent,
+        frames,
+        remarks,
+        ordered=True,
+        metric=True,
+        depth_scale=found.depth_scale,
+        up=UP,
+        extra={"listed": len(found), "lost": len(seen) - len(tracked), "fps": _rate(found)},
+    )
+
+
+def _unused(found: Sens) -> list[str]:
+    """What the file tells and nobody uses."""
+    remarks = []
+    blind = int((found.places[:, 1] == 0).sum())
+    if blind:
+        remarks.append(f"{counted(blind, 'frame')} of {found.path.name} left out because no picture belongs to it")
+    if np.abs(found.matrices[[1, 3]] - np.eye(4)).max() > 1e-6:
+        remarks.append(f"{found.path.name} tells how far picture and depth camera stand apart, which is not used: both are taken as one")
+    return remarks
+
+
+def _rate(found: Sens) -> float:
+    """Frames a second by their times, 0 where these tell none."""
+    seconds = (float(found.times[-1]) - float(found.times[0])) / 1e6 if len(found) > 1 else 0.0
+    rate = (len(found) - 1) / seconds if seconds > 0 else 0.0
+    return rate if RATES[0] <= rate <= RATES[1] else 0.0
 
 
 def _exported(root: Path) -> list[FrameFiles]:

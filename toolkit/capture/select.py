@@ -4,28 +4,26 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from toolkit.camera import Array
 from toolkit.capture.checks import check_capture
+from toolkit.capture.extract import depth_at, origin, picture_at, write_frames
 from toolkit.capture.types import Capture, Frame
 from toolkit.capture.video import iterate_video
 from toolkit.config import CaptureSettings
-from toolkit.errors import InputError, OutputError
-from toolkit.files import atomic_path, fingerprint, read_json, write_json
+from toolkit.errors import InputError
+from toolkit.files import fingerprint, read_json, write_json
 from toolkit.progress import SILENT, Progress
 
 log = logging.getLogger(__name__)
 
 SELECTED = "selected_from"  # in `Capture.extra`: readable frames of the video that pictures were taken from
-VERSION = 1  # of the measurement kept beside the frames
-QUALITY = 97
 TRACK_SIDE = 320  # long side of the pictures that motion is measured on
 SHARP_SIDE = 640  # and sharpness
 MIN_STEP = 0.008  # motion between chosen frames, share of the long side: less adds no parallax
@@ -51,7 +49,8 @@ class Measure:
 def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progress: Progress = SILENT) -> Capture:
     """At most `settings.max_frames` sharp, well-spread frames of a video, written as pictures under `out/frames`.
 
-    Two passes: the first measures frames small (all, or about `MEASURED` of a long video), the second writes the chosen ones as JPEG.
+    Two passes: the first measures frames small (all, or about `MEASURED` of a long video), the second writes the chosen ones as JPEG,
+    with their depth where the file holds that too.
     What was measured stays in `out/selection.json` and pictures that are there are not written again, so a killed run goes on where
     it stopped and a second run does nothing.
 
@@ -67,10 +66,12 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
         raise InputError(f"{capture.root} is not a video, there are no frames to choose")
     video, announced = capture.frames[0].image, len(capture.frames)
     stride = stride_of(announced, float(capture.extra.get("fps") or 0))
-    # What is posed has as many frames as poses, and not what the video may have beyond them.
-    wanted = range(0, announced, stride) if stride > 1 or capture.posed else None
+    # What is posed has as many frames as poses, and not what the video may have beyond them, or between them.
+    numbers, last = [int(frame.video_index or 0) for frame in capture.frames][::stride], int(capture.frames[-1].video_index or 0)
+    every = range(0, announced, stride)
+    wanted = (every if numbers == list(every) else numbers) if stride > 1 or capture.posed else None
     as_stored = capture.frames[0].as_stored
-    measure = _measured(video, as_stored, announced, wanted, Path(out) / "selection.json", progress)
+    measure = _measured(video, as_stored, last + 1, wanted, Path(out) / "selection.json", progress)
     readable = min(len(measure.sharpness) * stride, announced)
     if readable < 2:
         raise InputError(
@@ -86,18 +87,26 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
             f"{alike}"
         )
     best = choose(measure, settings.max_frames)
-    chosen = [index * stride for index in best]
+    chosen = best if wanted is None else [wanted[index] for index in best]
     folder = Path(out) / "frames"
-    names = [f"frame_{index:06d}" for index in chosen]
-    _write(video, as_stored, chosen, folder, announced, progress)
     known = {frame.video_index: frame for frame in capture.frames}
+    frames = [known.get(index, Frame("", video)) for index in chosen]
+    deep = {index for index, frame in zip(chosen, frames, strict=True) if frame.depth == video}  # both in one file
+    write_frames(video, as_stored, chosen, deep, folder, last + 1, progress)
     frames = [
-        replace(known.get(index, Frame("", video)), name=name, image=(folder / f"{name}.jpg").resolve(), video_index=None, as_stored=False)
-        for index, name in zip(chosen, names, strict=True)
+        replace(
+            frame,
+            name=picture_at(folder, index).stem,
+            image=picture_at(folder, index).resolve(),
+            depth=depth_at(folder, index).resolve() if index in deep else frame.depth,
+            video_index=None,
+            as_stored=False,
+        )
+        for index, frame in zip(chosen, frames, strict=True)
     ]
     extra = {**capture.extra, SELECTED: readable, "video": str(video)}
     remarks = _remarks(measure, best, readable, announced)
-    if as_stored and len(measure.sharpness) < len(range(0, announced, stride)):
+    if as_stored and len(measure.sharpness) < len(every):
         remarks.append(
             f"about {readable} of the {announced} frames of {video} that have a pose can be decoded; if those that are missing do not lie "
             "at its end, pictures and poses do not belong together, and --poses sfm finds others"
@@ -181,9 +190,9 @@ def displacement(before: Array, after: Array) -> float:
     return float(min(np.mean(np.clip(length, 0, np.quantile(length, 0.9))) / long_side, JUMP))
 
 
-def _measured(video: Path, as_stored: bool, announced: int, wanted: range | None, path: Path, progress: Progress) -> Measure:
+def _measured(video: Path, as_stored: bool, announced: int, wanted: Sequence[int] | None, path: Path, progress: Progress) -> Measure:
     """The measurement kept at `path` when it is of this very file, else a new one, kept there."""
-    key = fingerprint(*_origin(video, as_stored), *([] if wanted is None else [wanted.stop, wanted.step]))
+    key = fingerprint(*origin(video, as_stored), *([wanted.stop, wanted.step] if isinstance(wanted, range) else [wanted] if wanted else []))
     if path.is_file():
         try:
             kept = read_json(path)
@@ -199,39 +208,6 @@ def _measured(video: Path, as_stored: bool, announced: int, wanted: range | None
     measure = measure_frames(iterate_video(video, wanted, as_stored=as_stored), announced, progress)
     write_json(path, {"key": key, **{name: [round(value, 6) for value in values] for name, values in asdict(measure).items()}})
     return measure
-
-
-def _origin(video: Path, as_stored: bool) -> list[Any]:
-    """What tells this video's frames from others."""
-    return [VERSION, video, *(["as stored"] if as_stored else [])]
-
-
-def _write(video: Path, as_stored: bool, chosen: list[int], folder: Path, announced: int, progress: Progress) -> None:
-    """Write the chosen frames that are not there yet, and remove frames of an earlier choice."""
-    wanted = {index: folder / f"frame_{index:06d}.jpg" for index in chosen}
-    marker = folder / "source.json"
-    origin: dict[str, Any] = {"video": fingerprint(*_origin(video, as_stored)), "quality": QUALITY}
-    try:
-        same = marker.is_file() and read_json(marker) == origin
-    except InputError:
-        same = False
-    for stale in folder.glob("frame_*.jpg"):
-        if not same or stale not in wanted.values():
-            stale.unlink(missing_ok=True)
-    if not same:
-        write_json(marker, origin)
-    missing = {index for index, path in wanted.items() if not path.is_file()}
-    for index, picture in iterate_video(video, missing, as_stored=as_stored):
-        progress.check()
-        progress.update(announced + index, 2 * announced, f"writing frame {index}")
-        with atomic_path(wanted[index]) as temporary:
-            coded, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-            if not coded:
-                raise OutputError(f"frame {index} of {video} cannot be encoded as JPEG")
-            temporary.write_bytes(data.tobytes())
-    for index, path in wanted.items():
-        if not path.is_file():
-            raise InputError(f"frame {index} of the video {video} could be decoded once and not again; the file or the disk is damaged")
 
 
 def _relative_sharpness(sharpness: Array) -> Array:

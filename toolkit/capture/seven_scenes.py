@@ -97,10 +97,19 @@ def posed_frames(
                 depth_intrinsics=None if entry.depth is None else fitted(depth, picture_header(entry.depth).size, str(entry.depth)),
             )
         )
-    lost = len(found) - len(frames)
-    if not frames:
-        raise InputError(f"all {counted(lost, 'pose')} in {root} are -inf (tracking lost); no frame is left to use")
-    return frames, [f"{counted(lost, 'frame')} left out because tracking was lost there (pose -inf)"] if lost else []
+    return frames, lost_frames(len(found), len(frames), root)
+
+
+def lost_frames(listed: int, tracked: int, where: Path) -> list[str]:
+    """A remark on frames whose tracking was lost, none where none was.
+
+    Raises:
+        InputError: all of them are.
+    """
+    lost = listed - tracked
+    if not tracked:
+        raise InputError(f"all {counted(lost, 'pose')} in {where} are -inf (tracking lost); no frame is left to use")
+    return [f"{counted(lost, 'frame')} left out because tracking was lost there (pose -inf)"] if lost else []
 
 
 def first_sizes(found: list[FrameFiles]) -> tuple[tuple[int, int], tuple[int, int] | None]:

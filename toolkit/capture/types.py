@@ -19,10 +19,10 @@ class Frame:
     """One picture of a capture. Paths are absolute; nothing is decoded yet."""
 
     name: str  # unique within the capture; frames are sorted by it (natural order: 2 before 10)
-    image: Path  # the picture, or the video that holds it
+    image: Path  # the picture, or the video (or `.sens` file) that holds it
     intrinsics: Intrinsics | None = None  # None: unknown, poses are to find it
     world_from_camera: Array | None = None  # (4, 4) float64, OpenCV axes, the input's own frame; None: unknown
-    depth: Path | None = None  # picture of z-depth
+    depth: Path | None = None  # picture of z-depth, or the `.sens` file that holds it, as it holds the frame
     depth_intrinsics: Intrinsics | None = None  # None: the same camera as the picture
     mask: Path | None = None  # picture; 0 = do not use this pixel
     split: str | None = None  # "train" or "test" when the source says so
@@ -38,7 +38,7 @@ class Capture:
     """A source as found on disk, in its own frame of reference."""
 
     kind: str  # "video", "photos", "transforms", "blender", "colmap", "7scenes", "tum", "scannet", "llff", "dtu", "redwood",
-    # "polycam", "stray"
+    # "replica", "polycam", "stray"
     root: Path
     frames: tuple[Frame, ...]
     ordered: bool = False  # neighbours in the list are neighbours in time
@@ -56,7 +56,7 @@ class Capture:
 
     @property
     def filmed(self) -> bool:
-        """Whether the frames are still inside a video."""
+        """Whether the frames are still inside a video, or a `.sens` file, which is used as one."""
         return bool(self.frames) and self.frames[0].video_index is not None
 
     @property

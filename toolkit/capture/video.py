@@ -17,6 +17,8 @@ import cv2
 import numpy as np
 
 from toolkit.camera import Array
+from toolkit.capture.sens import is_sens
+from toolkit.capture.sens_frames import iterate_sens
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 from toolkit.files import require_utf8
@@ -75,11 +77,14 @@ def iterate_video(path: Path, indices: Collection[int] | None = None, *, as_stor
     """Decode a video from its start and yield (index, picture), picture (H, W, 3) uint8 RGB, upright (or `as_stored`, see `read_video`).
 
     Frames are counted in decoding order rather than sought by time, so an index always means the same picture. With `indices`
-    only those are converted and yielded, and decoding ends after the last of them.
+    only those are converted and yielded, and decoding ends after the last of them. A `.sens` file is a video too.
 
     Raises:
         InputError: the video cannot be opened.
     """
+    if is_sens(Path(path)):
+        yield from iterate_sens(Path(path), indices)
+        return
     wanted = None if indices is None else set(indices)
     last = -1 if wanted is None else max(wanted, default=-1)
     stream = _open(Path(path), as_stored)

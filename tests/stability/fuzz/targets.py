@@ -92,9 +92,11 @@ FILES = {
     "7scenes": ("frame-000002.pose.txt", "frame-000002.depth.png"),
     "tum": ("rgb.txt", "depth.txt", "groundtruth.txt"),
     "scannet": ("pose/10.txt", "intrinsic/intrinsic_color.txt", "color/5.jpg"),
+    "sens": ("scene0000_00.sens",),
     "llff": ("poses_bounds.npy",),
     "dtu": ("cameras.npz",),
     "redwood": ("trajectory.log", "camera_intrinsics.json"),
+    "replica": ("traj.txt", "cam_params.json", "results/depth000001.png"),
     "polycam": ("keyframes/corrected_cameras/100333.json", "keyframes/depth/100333.png", "keyframes/confidence/100333.png"),
     "stray": ("odometry.csv", "camera_matrix.csv", "depth/000001.png"),
 }

@@ -1,7 +1,7 @@
 """ScanNet as in NerfingMVS: eight rooms by name, a local region of about 40 pictures of each.
 
 What is published of a room has a `train.txt` and a `test.txt` beside `images/`, a picture's name a line; they are the protocol's split.
-Rooms without them (cut from ScanNet's own export) have every eighth picture held out.
+Rooms without them (ScanNet's own `.sens`, or cut from its export) have every eighth picture held out.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ def pick(capture: Capture) -> Capture:
     lists = [capture.root / name for name in LISTS]
     if not all(path.is_file() for path in lists):
         return every(8)(capture)
-    numbers = {frame.image.stem: index for index, frame in enumerate(capture.frames)}
+    # Pictures inside a .sens file have no file names, and are called as they would be exported.
+    names = [frame.image.stem if frame.video_index is None else frame.name for frame in capture.frames]
+    numbers = {name: index for index, name in enumerate(names)}
     return split(capture, *(_listed(path, numbers) for path in lists))
 
 

@@ -1,4 +1,5 @@
-"""ScanNet: `scans/scene0000_00/{color,depth,pose,intrinsic}` as the site's exporter writes them; video of rooms with depth, metres.
+"""ScanNet: `scans/scene0000_00/scene0000_00.sens` as the site publishes it, or `{color,depth,pose,intrinsic}` as its exporter writes them;
+video of rooms with depth, metres.
 
 A `scannetv2_train.txt` beside the scans names the training scenes; without it every scene is used.
 """
@@ -7,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from toolkit.capture.scannet import read_scannet
+from toolkit.capture.scannet import looks_exported, packed, read_scannet
 from toolkit.errors import InputError
 from toolkit.training.nerfusion.captured import CapturedScene
 from toolkit.training.nerfusion.datasets.folders import listed, scene_folders
@@ -16,7 +17,7 @@ LISTS = ("scannetv2_train.txt", "train.txt")
 
 
 def _is_scene(path: Path) -> bool:
-    return (path / "color").is_dir() and (path / "pose").is_dir()
+    return looks_exported(path) or bool(packed(path))
 
 
 def scannet_folders(root: Path | str) -> list[Path]:
@@ -37,6 +38,6 @@ def scannet_scene(folder: Path, long_side: int) -> CapturedScene:
     """One scan.
 
     Raises:
-        InputError: it cannot be read as ScanNet's exported layout.
+        InputError: it cannot be read as ScanNet's file or exported layout.
     """
     return CapturedScene(read_scannet(folder), "room", long_side)
