@@ -32,8 +32,6 @@ def test_find_and_neighbours(keys: list[Key], extra: list[Key]) -> None:
         assert topology.find(query).tolist() == [slot_of.get(tuple(key), -1) for key in query.tolist()]
         assert topology.around.tolist() == around
         assert topology.neighbours.tolist() == [row[:13] + row[14:] for row in around]
-        faces = [(-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)]
-        assert topology.face_neighbours.tolist() == [[row[steps.index(face)] for face in faces] for row in around]
 
 
 @settings(max_examples=15, deadline=None)
@@ -67,23 +65,6 @@ def test_dilated_keys(keys: list[Key], steps: int) -> None:
         assert result[len(keys) :] == sorted(grown - set(keys), key=lambda key: key[::-1])
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.lists(st.tuples(*[st.integers(-4, 4)] * 3), max_size=12, unique=True), st.randoms(use_true_random=False), st.integers(1, 12))
-def test_occupied_distance(keys: list[Key], random, most: int) -> None:
-    topology = make(keys)
-    occupied = [random.random() < 0.4 for _ in keys]
-    distance = topology.occupied_distance(torch.tensor(occupied, dtype=torch.bool), most)
-    assert topology.table is not None and distance.shape == topology.table.shape and distance.dtype == torch.uint8
-    sx, sy, sz = topology.table_size
-    ox, oy, oz = topology.table_origin
-    full = [key for key, is_occupied in zip(keys, occupied, strict=True) if is_occupied]
-    for z in range(sz):
-        for y in range(sy):
-            for x in range(sx):
-                near = (max(abs(x + ox - k[0]), abs(y + oy - k[1]), abs(z + oz - k[2])) for k in full)
-                assert int(distance[z, y, x]) == min([most, *near])
-
-
 def test_the_table_is_as_documented() -> None:
     topology = make([(5, -7, 2), (6, -9, 2)])
     (ox, oy, oz), (sx, sy, sz) = topology.table_origin, topology.table_size
@@ -96,8 +77,6 @@ def test_the_table_is_as_documented() -> None:
     assert topology.to("cpu") is topology and make([(0, 0, 0), (2**20, 0, 0)]).table is not None
     far = make([(0, 0, 0), (2**20, 2**20, 2**20)])
     assert far.table is None
-    with pytest.raises(ValueError, match="too far apart"):
-        far.occupied_distance(torch.ones(2, dtype=torch.bool))
 
 
 @pytest.mark.parametrize("cells", WAYS)

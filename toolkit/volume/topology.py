@@ -1,4 +1,4 @@
-"""Which blocks there are and which rows lie beside which: find, halos, neighbours, distances. Torch only, CPU and CUDA.
+"""Which blocks there are and which rows lie beside which: find, halos, neighbours. Torch only, CPU and CUDA.
 
 A block is 8×8×8 voxels. Block `keys[s]` = (bx, by, bz) owns rows s·512 … s·512 + 511 of every value array; inside a block rows are
 z-major, row = ((s·8 + z)·8 + y)·8 + x, and the voxel sits at the lattice corner (key·8 + (x, y, z)) · voxel_size of the caller's frame.
@@ -212,11 +212,6 @@ class Topology:
         """(M, 26) int64 slots of the blocks that share a face, edge or corner, −1 absent; columns of `around` without the block itself."""
         return torch.cat([self.around[:, :SELF], self.around[:, SELF + 1 :]], dim=1)
 
-    @property
-    def face_neighbours(self) -> Tensor:
-        """(M, 6) int64 slots of the blocks at −x, +x, −y, +y, −z, +z, −1 absent."""
-        return self.around[:, [12, 14, 10, 16, 4, 22]]
-
     def _rows(self, start: int, stop: int, first: int, size: int) -> Tensor:
         """(stop − start, size³) int32 rows of the lattice corners first … first + size − 1 along each axis of blocks start … stop."""
         which, inner = _pattern(first, size, self.device)
@@ -268,33 +263,6 @@ class Topology:
             new = new[self.find(new) < 0]
         new = new[((new >= KEY_LOW) & (new <= KEY_HIGH)).all(1)]
         return torch.cat([self.keys, new.to(torch.int32)])
-
-    def occupied_distance(self, occupied: Tensor, most: int = 15) -> Tensor:
-        """Chebyshev distance in blocks from every table cell to the nearest occupied block, for skipping empty space.
-
-        Args:
-            occupied: (M,) bool, blocks that hold something.
-            most: distances are capped here (1 … 255).
-
-        Returns:
-            (Sz, Sy, Sx) uint8 like `table`: 0 in occupied blocks, `most` where none is nearer.
-
-        Raises:
-            ValueError: there is no dense table (the keys are too far apart).
-        """
-        if self.table is None:
-            raise ValueError("distances need the dense block table, and these keys are too far apart for one")
-        reached = torch.zeros_like(self.table, dtype=torch.bool)
-        reached.view(-1)[self._cells(self.keys[occupied.to(torch.bool)].to(torch.int64))] = True
-        distance = torch.where(reached, 0, most).to(torch.uint8)
-        for step in range(1, most):
-            grown = _spread(reached)
-            fresh = grown & ~reached
-            if not bool(fresh.any()):
-                break
-            distance.masked_fill_(fresh, step)
-            reached = grown
-        return distance
 
 
 @lru_cache(maxsize=256)

@@ -35,11 +35,6 @@ class Traced:
     distance: Tensor
     ray: Tensor
 
-    def mean_distance(self) -> Tensor:
-        """(R,) expected distance where the ray ends; 0 where it is empty."""
-        total = ray_sum(self.weight * self.distance, self.ray, len(self.opacity))
-        return total / self.opacity.clamp_min(1e-6) * (self.opacity > 1e-3)
-
     def median_distance(self) -> Tensor:
         """(R,) distance at which half of a ray's own opacity is reached; 0 where it is empty. No gradient."""
         with torch.no_grad():
