@@ -50,7 +50,7 @@ def find_capture(job: Job) -> Capture:
 
 
 def choose_frames(job: Job, capture: Capture) -> Capture:
-    """Pictures of a video, and JPEGs of HEIF and mirrored pictures; other captures pass as they are."""
+    """Pictures of a video or a film, and JPEGs of HEIF and mirrored pictures; other captures pass as they are."""
     from toolkit.capture.convert import convert_pictures, to_convert
     from toolkit.capture.select import select_frames
     from toolkit.capture.storage import capture_from_dict, capture_to_dict
@@ -69,7 +69,8 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
 
     def save(chosen: Capture) -> list[Path]:
         write_json(path, capture_to_dict(chosen))
-        return [*(frame.image for frame in chosen.frames if frame.image.parent == folder.resolve()), path]
+        written = [file for frame in chosen.frames for file in (frame.image, frame.depth) if file is not None]
+        return [*(file for file in written if file.parent == folder.resolve()), path]
 
     return job.stages.run(
         "frames",
@@ -83,11 +84,13 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
 
 
 def at_home(chosen: Capture, folder: Path) -> Capture:
-    """The capture with the pictures that were written to a run's `frames` where these are now: the run's folder may have been moved."""
+    """The capture with what was written to a run's `frames` where that is now: the run's folder may have been moved."""
+
+    def moved(file: Path) -> Path:
+        return folder / file.name if file.parent.name == folder.name and (folder / file.name).is_file() else file
 
     def here(frame: Frame) -> Frame:
-        written = frame.image.parent.name == folder.name and (folder / frame.image.name).is_file()
-        return replace(frame, image=folder / frame.image.name) if written else frame
+        return replace(frame, image=moved(frame.image), depth=None if frame.depth is None else moved(frame.depth))
 
     return chosen.with_frames([here(frame) for frame in chosen.frames])
 

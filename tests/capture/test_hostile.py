@@ -27,6 +27,7 @@ FILES = {
     "redwood": ("trajectory.log", "camera_intrinsics.json"),
     "polycam": ("keyframes/corrected_cameras/100333.json",),
     "stray": ("odometry.csv", "camera_matrix.csv"),
+    "record3d": ("metadata",),
 }
 CASES = [(layout, name) for layout, names in FILES.items() for name in names]
 
