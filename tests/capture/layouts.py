@@ -273,6 +273,27 @@ def write_record3d(root: Path, camera: Pinhole = PHONE) -> Pinhole:
     return camera
 
 
+def write_scanner3d(root: Path) -> Pinhole:
+    """As the app exports all it has: a JSON, depth and confidence for every frame, a picture for every other."""
+    quarter, c = quarter_size(PHONE), PHONE
+    for index, eye in enumerate(eye for eye in eyes() for _ in range(2)):
+        if index % 2 == 0:
+            save_picture(root / f"frame_{index:05d}.jpg", render(eye, PHONE)[0])
+        depth = render(eye, quarter)[1]
+        save_depth(root / f"depth_{index:05d}.png", depth)
+        believed = np.where(np.arange(quarter.width) < 2, 0, 2 - 0 * depth).astype(np.uint8)
+        assert cv2.imwrite(str(root / f"conf_{index:05d}.png"), believed)
+        told = {
+            "cameraPoseARFrame": eye.opengl().ravel().tolist(),
+            "intrinsics": [c.fx, 0, c.cx, 0, c.fy, c.cy, 0, 0, 1],
+            "frame_index": index, "time": 7.5 + index / 60, "motionQuality": 1,
+        }  # fmt: skip
+        (root / f"frame_{index:05d}.json").write_text(json.dumps(told))
+    (root / "info.json").write_text(json.dumps({"device": "phone"}))
+    (root / "thumb_00.jpg").write_bytes((root / "frame_00000.jpg").read_bytes())
+    return PHONE
+
+
 def zipped(root: Path, path: Path, folder: str = "") -> Path:
     """The folder as a zip file at `path`, its files below `folder` in it."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
@@ -296,6 +317,7 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], Pinhole]]] = {
     "polycam": ("polycam", write_polycam),
     "stray": ("stray", write_stray),
     "record3d": ("record3d", write_record3d),
+    "scanner3d": ("scanner3d", write_scanner3d),
 }
 
 

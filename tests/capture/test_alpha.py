@@ -17,7 +17,7 @@ from toolkit.capture.prepare import prepare_views
 from toolkit.capture.types import Frame
 from toolkit.config import CaptureSettings
 
-OTHERS = ("blender", "polycam", "record3d", "redwood", "scannet", "stray")  # counts as cut out; JPEG and video hold no alpha
+OTHERS = ("blender", "polycam", "record3d", "redwood", "scannet", "scanner3d", "stray")  # counts as cut out; JPEG and video hold no alpha
 HIDDEN = (255, 0, 255)  # RGB of what alpha takes away
 
 

@@ -28,6 +28,7 @@ from toolkit.capture.polycam import looks_like_polycam, read_polycam
 from toolkit.capture.record3d import SUFFIX as RECORD3D
 from toolkit.capture.record3d import holds_record3d, looks_like_record3d, read_record3d
 from toolkit.capture.redwood import looks_like_redwood, read_redwood
+from toolkit.capture.scanner3d import looks_like_scanner3d, read_scanner3d
 from toolkit.capture.scannet import looks_like_scannet, read_scannet
 from toolkit.capture.seven_scenes import looks_like_seven_scenes, read_seven_scenes
 from toolkit.capture.stray import looks_like_stray, read_stray
@@ -63,6 +64,7 @@ READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ..
     ("stray", looks_like_stray, read_stray),
     ("polycam", looks_like_polycam, read_polycam),
     ("record3d", looks_like_record3d, read_record3d),
+    ("scanner3d", looks_like_scanner3d, read_scanner3d),
     ("dtu", looks_like_dtu, read_dtu),
     ("colmap", _colmap_without_llff, read_colmap),
     ("llff", looks_like_llff, read_llff),
@@ -116,7 +118,7 @@ def read_source(path: Path) -> Capture:
     held = ", ".join(sorted(child.name for child in folder.iterdir())[:4])
     raise InputError(
         f"{folder} holds no capture of a known kind (it holds {held}); "
-        "give a video, a folder of photos, or a posed capture as the README lists"
+        "give a video, a folder of photos, a phone's recording (.r3d, …), or a posed capture as the README lists"
     )
 
 

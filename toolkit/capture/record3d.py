@@ -195,6 +195,7 @@ def _root(names: Sequence[str]) -> str | None:
     known = set(names)
     for name in names:
         member = MEMBER.fullmatch(name)
-        if member is not None and member["kind"] == "jpg" and f"{member['folder']}{METADATA}" in known and ".." not in member["folder"].split("/"):
-            return str(member["folder"])
+        folder = None if member is None or member["kind"] != "jpg" else str(member["folder"])
+        if folder is not None and f"{folder}{METADATA}" in known and ".." not in folder.split("/"):
+            return folder
     return None

@@ -99,6 +99,7 @@ FILES = {
     "polycam": ("keyframes/corrected_cameras/100333.json", "keyframes/depth/100333.png", "keyframes/confidence/100333.png"),
     "stray": ("odometry.csv", "camera_matrix.csv", "depth/000001.png"),
     "record3d": ("metadata", "metadata", "rgbd/1.depth", "rgbd/0.depth", "rgbd/2.conf", "rgbd/0.jpg"),
+    "scanner3d": ("frame_00002.json", "frame_00004.json", "depth_00002.png", "conf_00000.png"),
 }
 
 
