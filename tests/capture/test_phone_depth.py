@@ -1,4 +1,4 @@
-"""Phones with a depth sensor: folders of Polycam, Stray Scanner and 3D Scanner App, what is believed of their depth, and what may be missing."""
+"""Phones with a depth sensor: Polycam's, Stray Scanner's, 3D Scanner App's folders, what is believed of depth, and what may be missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""3D Scanner App's "All Data", of phones with a depth sensor: `frame_00000.json`, `.jpg`, `depth_00000.png`, `conf_00000.png` in one folder.
+"""3D Scanner App's "All Data", of phones with a depth sensor: `frame_00000.json`, `.jpg`, `depth_00000.png`, `conf_00000.png` together.
 
 Every frame has a JSON: `cameraPoseARFrame` (16 numbers, row by row: world_from_camera in OpenGL axes, metres, y up) and `intrinsics`
 (nine numbers, row by row, for the sensor's own, lying picture). Key frames alone, about every sixth, have a picture, and they are used.
