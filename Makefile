@@ -82,14 +82,14 @@ $(VENV)/.python: | system
 
 $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt $(VENV)/.python
 	@echo "Installing Fieldfuse and what it needs into $(VENV)"
-	@$(PIP_INSTALL) --editable '.[h264,heic,view]'
+	@$(PIP_INSTALL) --editable '.[h264,heic,record3d,view]'
 	@$(COMPILE) || true
 	@touch $@
 
 # All at once: what `make demo` needs is a part of it.
 $(VENV)/.installed-test: setup.cfg pyproject.toml constraints.txt $(VENV)/.python
 	@echo "Installing Fieldfuse, what it needs and the test tools into $(VENV)"
-	@$(PIP_INSTALL) --editable '.[h264,heic,test,view]'
+	@$(PIP_INSTALL) --editable '.[h264,heic,record3d,test,view]'
 	@$(COMPILE) || true
 	@touch $(VENV)/.installed
 	@$(MAKE) --no-print-directory $(VENV)/.installed-lpips

@@ -68,7 +68,8 @@ class Check:
 def collect() -> list[Check]:
     """Look at everything (a few seconds). Never raises: what goes wrong in a check is its finding."""
     checks = [_python(), *_packages()]
-    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _video, _lpips, _viewer, _heic, _h264, _cores, _memory, _disk)
+    extras: tuple[Callable[[], Check], ...] = (_lpips, _viewer, _heic, _record3d, _h264)
+    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _video, *extras, _cores, _memory, _disk)
     for look in looks:
         try:
             checks.append(look())
@@ -201,6 +202,10 @@ def _viewer() -> Check:
 
 def _heic() -> Check:
     return _package("heic", "pillow-heif", "photos of phones in HEIC (.heic) are not read", "pip install 'pillow-heif>=1'")
+
+
+def _record3d() -> Check:
+    return _package("record3d", "imagecodecs", "recordings of Record3D with depth are not read", "pip install 'imagecodecs>=2024.1'")
 
 
 def _h264() -> Check:

@@ -50,7 +50,7 @@ def find_capture(job: Job) -> Capture:
 
 
 def choose_frames(job: Job, capture: Capture) -> Capture:
-    """Pictures of a video, and JPEGs of HEIF and mirrored pictures; other captures pass as they are."""
+    """Pictures of a video or a film, and JPEGs of HEIF and mirrored pictures; other captures pass as they are."""
     from toolkit.capture.convert import convert_pictures, to_convert
     from toolkit.capture.select import select_frames
     from toolkit.capture.storage import capture_from_dict, capture_to_dict
@@ -84,9 +84,8 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
 
 
 def at_home(chosen: Capture, folder: Path) -> Capture:
-    """The capture with the pictures (and depth) that were written to a run's `frames` where these are now: the run's folder may have been
-    moved."""
-    from toolkit.capture.extract import DEPTH
+    """The capture with what was written to a run's `frames` where that is now: the run's folder may have been moved."""
+    from toolkit.capture.film import DEPTH
 
     def here(frame: Frame) -> Frame:
         if not (frame.image.parent.name == folder.name and (folder / frame.image.name).is_file()):

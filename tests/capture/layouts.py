@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
@@ -297,6 +298,58 @@ def write_stray(root: Path, header: bool = True) -> Pinhole:
     return PHONE
 
 
+def write_record3d(root: Path, camera: Pinhole = PHONE) -> Pinhole:
+    """As a recording comes out of its zip file: depth at a quarter of the pictures' size, the matrix column by column."""
+    from imagecodecs import lzfse_encode
+
+    quarter, c, poses = quarter_size(camera), camera, []
+    for index, eye in enumerate(eyes()):
+        save_picture(root / f"rgbd/{index}.jpg", render(eye, camera)[0])
+        depth = render(eye, quarter)[1].astype(np.float32)
+        believed = np.where(np.arange(quarter.width) < 2, 0, 2 - 0 * depth).astype(np.uint8)
+        (root / f"rgbd/{index}.depth").write_bytes(lzfse_encode(np.where(depth > 0, depth, np.nan).astype("<f4").tobytes()))
+        (root / f"rgbd/{index}.conf").write_bytes(lzfse_encode(believed.tobytes()))
+        w, x, y, z = quaternion(eye.opengl()[:3, :3])
+        poses.append([x, y, z, w, *eye.centre])
+    told = {
+        "w": c.width, "h": c.height, "dw": quarter.width, "dh": quarter.height, "fps": 60, "cameraType": 1, "deviceType": 3,
+        "K": [c.fx, 0, 0, 0, c.fy, 0, c.cx, c.cy, 1], "perFrameIntrinsicCoeffs": [[c.fx, c.fy, c.cx, c.cy]] * len(poses),
+        "frameTimestamps": [7.5 + index / 60 for index in range(len(poses))], "initPose": [0, 0, 0, 1, 0, 0, 0],
+    }  # fmt: skip
+    (root / "metadata").write_text(json.dumps({**told, "poses": np.array(poses).tolist()}))
+    return camera
+
+
+def write_scanner3d(root: Path) -> Pinhole:
+    """As the app exports all it has: a JSON, depth and confidence for every frame, a picture for every other."""
+    quarter, c = quarter_size(PHONE), PHONE
+    for index, eye in enumerate(eye for eye in eyes() for _ in range(2)):
+        if index % 2 == 0:
+            save_picture(root / f"frame_{index:05d}.jpg", render(eye, PHONE)[0])
+        depth = render(eye, quarter)[1]
+        save_depth(root / f"depth_{index:05d}.png", depth)
+        believed = np.where(np.arange(quarter.width) < 2, 0, 2 - 0 * depth).astype(np.uint8)
+        assert cv2.imwrite(str(root / f"conf_{index:05d}.png"), believed)
+        told = {
+            "cameraPoseARFrame": eye.opengl().ravel().tolist(),
+            "intrinsics": [c.fx, 0, c.cx, 0, c.fy, c.cy, 0, 0, 1],
+            "frame_index": index, "time": 7.5 + index / 60, "motionQuality": 1,
+        }  # fmt: skip
+        (root / f"frame_{index:05d}.json").write_text(json.dumps(told))
+    (root / "info.json").write_text(json.dumps({"device": "phone"}))
+    (root / "thumb_00.jpg").write_bytes((root / "frame_00000.jpg").read_bytes())
+    return PHONE
+
+
+def zipped(root: Path, path: Path, folder: str = "") -> Path:
+    """The folder as a zip file at `path`, its files below `folder` in it."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for source in sorted(root.rglob("*")):
+            if source.is_file():
+                file.write(source, folder + source.relative_to(root).as_posix())
+    return path
+
+
 LAYOUTS: dict[str, tuple[str, Callable[[Path], Pinhole]]] = {
     "transforms": ("transforms", write_transforms),
     "blender": ("blender", write_blender),
@@ -312,6 +365,8 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], Pinhole]]] = {
     "replica": ("replica", write_replica),
     "polycam": ("polycam", write_polycam),
     "stray": ("stray", write_stray),
+    "record3d": ("record3d", write_record3d),
+    "scanner3d": ("scanner3d", write_scanner3d),
 }
 
 

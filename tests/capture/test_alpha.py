@@ -17,7 +17,8 @@ from toolkit.capture.prepare import prepare_views
 from toolkit.capture.types import Frame
 from toolkit.config import CaptureSettings
 
-OTHERS = ("blender", "polycam", "redwood", "replica", "scannet", "sens", "stray")  # counts as cut out; JPEG and video hold no alpha
+# Counts as cut out; JPEG and video hold no alpha.
+OTHERS = ("blender", "polycam", "record3d", "redwood", "replica", "scannet", "scanner3d", "sens", "stray")
 HIDDEN = (255, 0, 255)  # RGB of what alpha takes away
 
 

@@ -29,6 +29,8 @@ FILES = {
     "replica": ("traj.txt", "cam_params.json"),
     "polycam": ("keyframes/corrected_cameras/100333.json",),
     "stray": ("odometry.csv", "camera_matrix.csv"),
+    "record3d": ("metadata",),
+    "scanner3d": ("frame_00002.json",),
 }
 CASES = [(layout, name) for layout, names in FILES.items() for name in names]
 

@@ -1,4 +1,4 @@
-"""Phones with a depth sensor: Polycam's and Stray Scanner's folders, what is believed of their depth, and what may be missing."""
+"""Phones with a depth sensor: Polycam's, Stray Scanner's, 3D Scanner App's folders, what is believed of depth, and what may be missing."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.capture.layouts import PHONE, quarter_size, write_polycam, write_stray
+from tests.capture.layouts import PHONE, quarter_size, write_polycam, write_scanner3d, write_stray
 from tests.capture.made import eyes, pixel_error, render
 from toolkit.capture import open_capture
 from toolkit.capture.images import load_depth, load_image
@@ -16,7 +16,7 @@ from toolkit.capture.select import select_frames
 from toolkit.config import CaptureSettings
 from toolkit.errors import InputError
 
-WRITERS = {"polycam": write_polycam, "stray": write_stray}
+WRITERS = {"polycam": write_polycam, "stray": write_stray, "scanner3d": write_scanner3d}
 
 
 @pytest.mark.parametrize("layout", WRITERS)
@@ -132,3 +132,57 @@ def test_confidence_of_another_size(tmp_path: Path) -> None:
     image.write_bytes((tmp_path / "keyframes" / "corrected_images" / "100000.jpg").read_bytes())
     with pytest.raises(InputError, match=r"confidence .*100000\.png has the shape"):
         load_depth(capture.frames[0], capture)
+
+
+# ------------------------------------------------------------------------------------------------ 3D Scanner App
+
+
+def retold(path: Path, **changes: object) -> None:
+    path.write_text(json.dumps({key: value for key, value in (json.loads(path.read_text()) | changes).items() if value is not None}))
+
+
+def test_key_frames_alone_have_pictures_and_some_no_depth(tmp_path: Path) -> None:
+    write_scanner3d(tmp_path)
+    (tmp_path / "frame_00002.json").unlink()
+    (tmp_path / "depth_00004.png").unlink()
+    (tmp_path / "conf_00006.png").unlink()
+    capture = open_capture(tmp_path)
+    assert [frame.name for frame in capture.frames] == ["frame_00000", "frame_00004", "frame_00006", "frame_00008"]
+    assert [frame.depth is None for frame in capture.frames] == [False, True, False, False]
+    assert [frame.confidence is None for frame in capture.frames] == [False, True, True, False]
+    assert capture.warnings == ("1 of the 5 pictures have no .json beside them and are left out",)
+
+
+def test_a_pose_that_is_written_column_by_column(tmp_path: Path) -> None:
+    write_scanner3d(tmp_path)
+    for path in tmp_path.glob("frame_*.json"):
+        retold(path, cameraPoseARFrame=np.reshape(json.loads(path.read_text())["cameraPoseARFrame"], (4, 4)).T.ravel().tolist())
+    assert pixel_error(open_capture(tmp_path), eyes(), PHONE) < 1e-3
+
+
+def test_pictures_smaller_than_what_the_intrinsics_are_for(tmp_path: Path) -> None:
+    write_scanner3d(tmp_path)
+    for path in tmp_path.glob("frame_*.json"):  # of 1920 × 1440
+        retold(path, intrinsics=[12 * PHONE.fx, 0, 12 * PHONE.cx, 0, 12 * PHONE.fy, 12 * PHONE.cy, 0, 0, 1])
+    assert pixel_error(open_capture(tmp_path), eyes(), PHONE) < 1e-3
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"cameraPoseARFrame": None},
+        {"cameraPoseARFrame": [1, 2, 3]},
+        {"cameraPoseARFrame": [float("nan")] * 16},
+        {"cameraPoseARFrame": [0] * 16},
+        {"cameraPoseARFrame": {"a": 1}},
+        {"intrinsics": None},
+        {"intrinsics": "wide"},
+        {"intrinsics": [0] * 9},
+        {"intrinsics": [128, 0, 59, 0, 128, 81, 0, 0, 1]},  # of a picture that was turned
+    ],
+)
+def test_frames_of_3d_scanner_app_that_cannot_be(tmp_path: Path, changes: dict) -> None:
+    write_scanner3d(tmp_path)
+    retold(tmp_path / "frame_00002.json", **changes)
+    with pytest.raises(InputError, match=r"frame_00002\.json"):
+        open_capture(tmp_path)

@@ -19,10 +19,11 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from imagecodecs import lzfse_encode
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from tests.capture.layouts import LAYOUTS, sens_of
+from tests.capture.layouts import LAYOUTS, sens_of, write_record3d, zipped
 from tests.stability.fuzz.watch import SECONDS, bound_memory
 from toolkit.capture import open_capture
 from toolkit.capture.checks import check_capture
@@ -96,6 +97,18 @@ def promising_archive(root: Path) -> Path:
     return root
 
 
+def recording(root: Path, name: str, content: bytes) -> Path:
+    """A recording in one file whose member `name` is `content`."""
+    write_record3d(root)
+    (root / name).write_bytes(content)
+    return zipped(root, root.with_suffix(".r3d"))
+
+
+def depth_in(path: Path) -> object:
+    capture = open_capture(path)
+    return load_depth(capture.frames[0], capture)
+
+
 def text(path: Path, content: str) -> Path:
     path.write_text(content)
     return path
@@ -131,7 +144,14 @@ def bombs(place: Path) -> dict[str, Callable[[], Any]]:
         (place / name).write_bytes(sens_of([], count=count)[:-136])  # without what stands behind the frames
         (place / name).open("ab").truncate(2**36)
     lines = "\n".join([f"a{i}: &a{i} [{', '.join(f'*a{i - 1}' for _ in range(9))}]" if i else "a0: &a0 [x]" for i in range(12)])
-    zipped, promising, folder = archive(place / "zip"), promising_archive(place / "promise"), picture_folder(place / "pictures")
+    packed, promising, folder = archive(place / "zip"), promising_archive(place / "promise"), picture_folder(place / "pictures")
+    zeros = lzfse_encode(bytes(2**20))
+    zeros = zeros[:-4] * 1024 + zeros[-4:]  # a stream is blocks, and a mark of four bytes
+    deep, wide = recording(place / "inflates", "rgbd/0.depth", zeros), recording(place / "wide", "rgbd/0.depth", zeros)
+    (place / "wide" / "metadata").write_text((place / "wide" / "metadata").read_text().replace('"dw"', '"a"'))
+    zipped(place / "wide", wide)
+    heavy = recording(place / "heavy", "rgbd/2.jpg", bytes(2**28))
+    long = recording(place / "long", "metadata", b" " * 2**27)
     (place / "loop").mkdir()
     (place / "loop" / "loop").symlink_to(place / "loop")
     LAYOUTS["transforms"][1](place / "links")
@@ -151,12 +171,16 @@ def bombs(place: Path) -> dict[str, Callable[[], Any]]:
         "ten million brackets": lambda: read_json(place / "deep.json"),
         "YAML whose aliases multiply to 9¹¹": lambda: load_settings(file=text(place / "laugh.yaml", lines)),
         "YAML nested 100,000 deep": lambda: load_settings(file=text(place / "deep.yaml", "{a: " * 100_000)),
-        "a zip of 300 MB of zeros": lambda: open_capture(zipped),
+        "a zip of 300 MB of zeros": lambda: open_capture(packed),
         "an array in a zip that promises 80 GB": lambda: open_capture(promising),
         "a depth map that promises 80 GB": lambda: load_depth(depth_of(place / "a.npy", npy("(100000, 100000)")), plain(place)),
         "a depth map of objects": lambda: load_depth(depth_of(place / "b.npy", npy("(2, 2)").replace(b"<f8", b"|O ")), plain(place)),
         "a .sens file of 2⁶⁰ frames": lambda: open_capture(place / "many.sens"),
         "a .sens file of 50,000 frames in a sparse file": lambda: open_capture(place / "empty.sens"),
+        "a recording's depth of 1 GB in less than one MB": lambda: depth_in(deep),
+        "the same without a word of its size": lambda: depth_in(wide),
+        "a recording with a picture of 256 MB in a kilobyte": lambda: load_image(open_capture(heavy).frames[2]),
+        "a recording whose metadata are 128 MB of blanks": lambda: open_capture(long),
         "a folder that links to itself": lambda: open_capture(place / "loop"),
         "a picture that is a link out of the capture": lambda: open_capture(place / "links"),
     }

@@ -45,7 +45,7 @@ class Look:
 def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
     """Look at all pictures and some depth maps; return the capture with warnings and `extra["sizes"]` added.
 
-    A video that has not been split into pictures passes as it is: `select_frames` checks what it writes.
+    A video that has not been split into pictures, or a film of pictures, passes as it is: `select_frames` checks what it writes.
 
     Raises:
         InputError: fewer than two pictures, a file that is missing, cut short, no picture or of another shape than its camera,
@@ -54,7 +54,7 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
     frames = capture.frames
     if not frames:
         raise InputError(f"{capture.root} holds no pictures; give a video, a folder of photos or a capture")
-    if frames[0].video_index is not None:
+    if capture.filmed:
         if len(frames) < 2:
             raise InputError(f"the video {frames[0].image} has only one frame; film for some seconds while moving around the scene")
         return capture

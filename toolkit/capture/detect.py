@@ -8,7 +8,7 @@ The order is deliberate: what somebody wrote for this very purpose goes before w
 4. DTU's `cameras*.npz`;
 5. a COLMAP model before LLFF's `poses_bounds.npy`: sets that have both keep lens and points only in the model, but only
    when its pictures are there (sets at 1/8 size often come without them);
-6. photos; 7. one video in a folder, alone or with one picture (its cover).
+6. photos; 7. one video (or recording in one file) in a folder, alone or with one picture (its cover).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from toolkit.capture.archive import SUFFIXES as ARCHIVES
 from toolkit.capture.blender import looks_like_blender, read_blender
 from toolkit.capture.colmap import image_folders, looks_like_colmap, read_colmap
 from toolkit.capture.dtu import looks_like_dtu, read_dtu
@@ -24,8 +25,11 @@ from toolkit.capture.listing import PICTURES, counted, pictures_in, require_fold
 from toolkit.capture.llff import looks_like_llff, read_llff
 from toolkit.capture.photos import looks_like_photos, photo_files, read_photos
 from toolkit.capture.polycam import looks_like_polycam, read_polycam
+from toolkit.capture.record3d import SUFFIX as RECORD3D
+from toolkit.capture.record3d import holds_record3d, looks_like_record3d, read_record3d
 from toolkit.capture.redwood import looks_like_redwood, read_redwood
 from toolkit.capture.replica import looks_like_replica, read_replica
+from toolkit.capture.scanner3d import looks_like_scanner3d, read_scanner3d
 from toolkit.capture.scannet import looks_like_scannet, read_scannet, read_sens
 from toolkit.capture.sens import is_sens
 from toolkit.capture.seven_scenes import looks_like_seven_scenes, read_seven_scenes
@@ -37,6 +41,7 @@ from toolkit.capture.video import VIDEO_SUFFIXES, read_video
 from toolkit.errors import InputError
 from toolkit.files import require_utf8
 
+FILMS = (*VIDEO_SUFFIXES, RECORD3D)
 CAMERA_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 
 
@@ -48,7 +53,7 @@ def _colmap_without_llff(path: Path) -> bool:
 
 def _photos_without_film(path: Path) -> bool:
     """One picture beside a film is its cover, not a capture."""
-    return looks_like_photos(path) and (len(photo_files(path)) > 1 or not pictures_in(path, VIDEO_SUFFIXES))
+    return looks_like_photos(path) and (len(photo_files(path)) > 1 or not pictures_in(path, FILMS))
 
 
 READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ...] = (
@@ -61,6 +66,8 @@ READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ..
     ("7scenes", looks_like_seven_scenes, read_seven_scenes),
     ("stray", looks_like_stray, read_stray),
     ("polycam", looks_like_polycam, read_polycam),
+    ("record3d", looks_like_record3d, read_record3d),
+    ("scanner3d", looks_like_scanner3d, read_scanner3d),
     ("dtu", looks_like_dtu, read_dtu),
     ("colmap", _colmap_without_llff, read_colmap),
     ("llff", looks_like_llff, read_llff),
@@ -74,7 +81,7 @@ def detect_kind(folder: Path) -> str | None:
 
 
 def read_source(path: Path) -> Capture:
-    """The capture at `path`: a folder of any known layout, a video, a `.sens` file, or a `transforms*.json`.
+    """The capture at `path`: a folder of any known layout, a video, a recording or scan in one file, or a `transforms*.json`.
 
     Raises:
         InputError: nothing there, nothing known, or the layout's own files are broken.
@@ -87,17 +94,19 @@ def read_source(path: Path) -> Capture:
             return read_blender(path.parent) if path.name.startswith("transforms_") else read_transforms(path)
         if path.suffix.lower() in (*PICTURES, *CAMERA_RAW):
             raise InputError(f"{path} is one picture, and one cannot show depth; give the folder that holds all of them")
+        if path.suffix.lower() in ARCHIVES:
+            return _unzipped(path)
         return read_sens(path) if is_sens(path) else read_video(path)
     folder = require_folder(path)
     try:
         for _, looks_like, read in READERS:
             if looks_like(folder):
                 return read(folder)
-        videos = pictures_in(folder, VIDEO_SUFFIXES)
+        videos = pictures_in(folder, FILMS)
     except OSError as error:
         raise InputError(f"cannot read {error.filename or folder}: {error.strerror or error}") from error
     if len(videos) == 1:
-        video = read_video(videos[0])
+        video = read_source(videos[0])
         beside = photo_files(folder)
         remarks = [f"the video {videos[0].name} is used; the one picture beside it, {beside[0].name}, is left out"] if beside else []
         return replace(video, warnings=(*video.warnings, *remarks))
@@ -112,5 +121,12 @@ def read_source(path: Path) -> Capture:
     held = ", ".join(sorted(child.name for child in folder.iterdir())[:4])
     raise InputError(
         f"{folder} holds no capture of a known kind (it holds {held}); "
-        "give a video, a folder of photos, or a posed capture as the README lists"
+        "give a video, a folder of photos, a phone's recording (.r3d, …), or a posed capture as the README lists"
     )
+
+
+def _unzipped(path: Path) -> Capture:
+    """The recording in a zip file. Only Record3D's is read from one, since the app itself writes it so."""
+    if path.suffix.lower() != RECORD3D and not holds_record3d(path):
+        raise InputError(f"{path} is a zip file; unpack it, and give the folder that comes of it")
+    return read_record3d(path)

@@ -11,6 +11,7 @@ from pathlib import Path
 from PIL import Image, UnidentifiedImageError
 
 from toolkit.capture import heif
+from toolkit.capture.archive import read_member
 from toolkit.capture.primaries import heif_colours, png_colours
 from toolkit.errors import InputError
 
@@ -32,13 +33,15 @@ class Header:
 
 
 def read_bytes(path: Path) -> bytes:
-    """The whole file.
+    """The whole file, which may be a zip file's member (see `archive`).
 
     Raises:
         InputError: missing, unreadable or empty.
     """
     try:
         data = Path(path).read_bytes()
+    except NotADirectoryError:
+        data = read_member(Path(path))
     except OSError as error:
         raise InputError(f"cannot read the picture {path}: {error.strerror or error}") from error
     if not data:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from toolkit.camera import Array
-from toolkit.capture import heif
+from toolkit.capture import heif, lzfse
 from toolkit.capture.colours import to_srgb
 from toolkit.capture.headers import MAX_PIXELS, Header, read_bytes, read_header
 from toolkit.capture.sens import is_sens
@@ -68,8 +68,8 @@ def load_depth(frame: Frame, capture: Capture) -> Array:
 
     Stored values are divided by `capture.depth_scale`. 0, negative, NaN and infinite values are missing, so is 65535 in 16-bit pictures,
     and so is where the frame's confidence is 0. Where the depth camera stands beside the picture's, the map is carried to where that
-    stands (`carried`). Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, .npy arrays, and what `.sens`
-    files hold.
+    stands (`carried`). Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, .npy arrays, LZFSE (`lzfse`), and what
+    `.sens` files hold.
 
     Raises:
         InputError: naming the file, when it is missing, damaged, or not one value a pixel.
@@ -80,7 +80,7 @@ def load_depth(frame: Frame, capture: Capture) -> Array:
     if frame.video_index is not None and is_sens(path):
         raw = sens_depth(path, frame.video_index)
     else:
-        raw = _load_npy(path) if path.suffix.lower() == ".npy" else _decode(path)[0]
+        raw = _load_npy(path) if path.suffix.lower() == ".npy" else _values(path, frame)
     if raw.ndim == 3 and raw.shape[2] == 1:
         raw = raw[:, :, 0]
     if raw.ndim != 2 or raw.size == 0:
@@ -92,7 +92,7 @@ def load_depth(frame: Frame, capture: Capture) -> Array:
     if raw.dtype == np.uint16:
         missing |= raw == 65535
     if frame.confidence is not None:
-        confidence = _decode(frame.confidence)[0]
+        confidence = _values(frame.confidence, frame)
         if confidence.shape != depth.shape:
             raise InputError(
                 f"the confidence {frame.confidence} has the shape {confidence.shape}, its depth map {depth.shape}; export both again"
@@ -145,6 +145,14 @@ def upright(picture: Array, orientation: int) -> Array:
     if orientation in (2, 3, 6, 7):
         picture = picture[:, ::-1]
     return np.ascontiguousarray(picture)
+
+
+def _values(path: Path, frame: Frame) -> Array:
+    """What the file of a depth map, or of its confidence, holds."""
+    camera = frame.depth_intrinsics
+    if path.suffix.lower() in lzfse.TYPES and camera is not None:
+        return lzfse.load_map(path, camera.width, camera.height)
+    return _decode(path)[0]
 
 
 def _decode(path: Path) -> tuple[Array, Header]:

@@ -1,4 +1,4 @@
-"""Which frames of a video are worth keeping: sharp ones, spread evenly over the camera's motion rather than over time."""
+"""Which frames of a video (or another film) are worth keeping: sharp ones, spread evenly over the camera's motion rather than over time."""
 
 from __future__ import annotations
 
@@ -7,23 +7,25 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from toolkit.camera import Array
 from toolkit.capture.checks import check_capture
-from toolkit.capture.extract import depth_at, origin, picture_at, write_frames
-from toolkit.capture.types import Capture, Frame
-from toolkit.capture.video import iterate_video
+from toolkit.capture.film import DEPTH, QUALITY, Film
+from toolkit.capture.listing import counted
+from toolkit.capture.types import Capture
 from toolkit.config import CaptureSettings
 from toolkit.errors import InputError
-from toolkit.files import fingerprint, read_json, write_json
+from toolkit.files import atomic_path, fingerprint, read_json, write_json
 from toolkit.progress import SILENT, Progress
 
 log = logging.getLogger(__name__)
 
 SELECTED = "selected_from"  # in `Capture.extra`: readable frames of the video that pictures were taken from
+VERSION = 1  # of the measurement kept beside the frames
 TRACK_SIDE = 320  # long side of the pictures that motion is measured on
 SHARP_SIDE = 640  # and sharpness
 MIN_STEP = 0.008  # motion between chosen frames, share of the long side: less adds no parallax
@@ -64,21 +66,21 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
     """
     if not capture.filmed:
         raise InputError(f"{capture.root} is not a video, there are no frames to choose")
-    video, announced = capture.frames[0].image, len(capture.frames)
+    film, announced = Film.of(capture), len(capture.frames)
+    video, as_stored = film.path, film.as_stored
     stride = stride_of(announced, float(capture.extra.get("fps") or 0))
     # What is posed has as many frames as poses, and not what the video may have beyond them, or between them.
-    numbers, last = [int(frame.video_index or 0) for frame in capture.frames][::stride], int(capture.frames[-1].video_index or 0)
+    numbers, last = film.numbers[::stride], film.numbers[-1]
     every = range(0, announced, stride)
     wanted = (every if numbers == list(every) else numbers) if stride > 1 or capture.posed else None
-    as_stored = capture.frames[0].as_stored
-    measure = _measured(video, as_stored, last + 1, wanted, Path(out) / "selection.json", progress)
+    measure = _measured(film, last + 1, wanted, Path(out) / "selection.json", progress)
     readable = min(len(measure.sharpness) * stride, announced)
     if readable < 2:
         raise InputError(
             f"only {readable} of {announced} frames of the video {video} can be decoded; the file is damaged, copy or convert it again"
         )
     # Of interlaced frames FFmpeg inside OpenCV converts none, and says of all that they were: one piece of memory comes back each time.
-    alike = f"{INTERLACED} (ffmpeg -i {video.name} -vf bwdif new.mp4)" if len(set(measure.sharpness)) == 1 else ""
+    alike = f"{INTERLACED} (ffmpeg -i {video.name} -vf bwdif new.mp4)" if len(set(measure.sharpness)) == 1 and not capture.film else ""
     if np.median(measure.sharpness) < BLANK:
         raise InputError(f"the video {video} shows nothing (its frames are black or of one colour); check the camera and the file{alike}")
     if measure.motion[-1] < STILL:
@@ -89,21 +91,9 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
     best = choose(measure, settings.max_frames)
     chosen = best if wanted is None else [wanted[index] for index in best]
     folder = Path(out) / "frames"
-    known = {frame.video_index: frame for frame in capture.frames}
-    frames = [known.get(index, Frame("", video)) for index in chosen]
-    deep = {index for index, frame in zip(chosen, frames, strict=True) if frame.depth == video}  # both in one file
-    write_frames(video, as_stored, chosen, deep, folder, last + 1, progress)
-    frames = [
-        replace(
-            frame,
-            name=picture_at(folder, index).stem,
-            image=picture_at(folder, index).resolve(),
-            depth=depth_at(folder, index).resolve() if index in deep else frame.depth,
-            video_index=None,
-            as_stored=False,
-        )
-        for index, frame in zip(chosen, frames, strict=True)
-    ]
+    names = [f"frame_{number:06d}.jpg" for number in chosen]
+    _write(film, chosen, folder, last + 1, progress)
+    frames = [film.written(number, folder / name) for number, name in zip(chosen, names, strict=True)]
     extra = {**capture.extra, SELECTED: readable, "video": str(video)}
     remarks = _remarks(measure, best, readable, announced)
     if as_stored and len(measure.sharpness) < len(every):
@@ -111,7 +101,11 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
             f"about {readable} of the {announced} frames of {video} that have a pose can be decoded; if those that are missing do not lie "
             "at its end, pictures and poses do not belong together, and --poses sfm finds others"
         )
-    picked = replace(capture, frames=tuple(frames), ordered=True, extra=extra, warnings=(*capture.warnings, *remarks))
+    told = (film.known[number].depth is not None for number in chosen if number in film.known)
+    lost = sum(told) - sum(frame.depth is not None for frame in frames)
+    if lost:
+        remarks.append(f"the depth of {counted(lost, 'chosen frame')} is damaged and left out")
+    picked = replace(capture, frames=tuple(frames), ordered=True, film=False, extra=extra, warnings=(*capture.warnings, *remarks))
     return check_capture(picked, progress)
 
 
@@ -154,8 +148,8 @@ def _without_blurred(chosen: list[int], clear: Array, way: Array) -> list[int]:
     return kept
 
 
-def measure_frames(frames: Iterator[tuple[int, Array]], announced: int, progress: Progress = SILENT) -> Measure:
-    """Sharpness and motion of pictures (H, W, 3) uint8 RGB in time order."""
+def measure_frames(frames: Iterator[tuple[int, Array | None]], announced: int, progress: Progress = SILENT) -> Measure:
+    """Sharpness and motion of pictures (H, W, 3) uint8 RGB in time order. Damaged ones (None) are as blurred as can be, and do not move."""
     sharpness: list[float] = []
     motion: list[float] = []
     anchor: Array | None = None  # grey picture that motion is counted from; a new one only after real motion, so jitter adds nothing
@@ -164,6 +158,10 @@ def measure_frames(frames: Iterator[tuple[int, Array]], announced: int, progress
         progress.check()
         if len(sharpness) % 10 == 0:
             progress.update(index, 2 * announced, f"frame {index} of {announced}")
+        if picture is None:
+            sharpness.append(0.0)
+            motion.append(motion[-1] if motion else 0.0)
+            continue
         grey = cv2.cvtColor(_shrunk(picture, SHARP_SIDE), cv2.COLOR_RGB2GRAY)
         # A light blur first: otherwise sensor noise and blocks of the codec count as detail.
         sharpness.append(float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 0.8), cv2.CV_32F).var()))
@@ -190,9 +188,9 @@ def displacement(before: Array, after: Array) -> float:
     return float(min(np.mean(np.clip(length, 0, np.quantile(length, 0.9))) / long_side, JUMP))
 
 
-def _measured(video: Path, as_stored: bool, announced: int, wanted: Sequence[int] | None, path: Path, progress: Progress) -> Measure:
+def _measured(film: Film, announced: int, wanted: Sequence[int] | None, path: Path, progress: Progress) -> Measure:
     """The measurement kept at `path` when it is of this very file, else a new one, kept there."""
-    key = fingerprint(*origin(video, as_stored), *([wanted.stop, wanted.step] if isinstance(wanted, range) else [wanted] if wanted else []))
+    key = fingerprint(VERSION, *film.state(), *([wanted.stop, wanted.step] if isinstance(wanted, range) else [wanted] if wanted else []))
     if path.is_file():
         try:
             kept = read_json(path)
@@ -205,9 +203,39 @@ def _measured(video: Path, as_stored: bool, announced: int, wanted: Sequence[int
                 return measure
         except (InputError, KeyError, TypeError, ValueError):
             log.info("%s is not readable, frames are measured again", path)
-    measure = measure_frames(iterate_video(video, wanted, as_stored=as_stored), announced, progress)
+    measure = measure_frames(film.pictures(wanted), announced, progress)
     write_json(path, {"key": key, **{name: [round(value, 6) for value in values] for name, values in asdict(measure).items()}})
     return measure
+
+
+def _write(film: Film, chosen: list[int], folder: Path, announced: int, progress: Progress) -> None:
+    """Write the chosen frames, and the depth that lies with them, that are not there yet, and remove frames of an earlier choice."""
+    wanted = {number: folder / f"frame_{number:06d}.jpg" for number in chosen}
+    depths = {number: depth for number, path in wanted.items() if (depth := film.depth_at(number, path)) is not None}
+    marker = folder / "source.json"
+    origin: dict[str, Any] = {"video": fingerprint(VERSION, *film.state()), "quality": QUALITY}
+    try:
+        same = marker.is_file() and read_json(marker) == origin
+    except InputError:
+        same = False
+    kept = {*wanted.values(), *depths.values()}
+    for stale in (*folder.glob("frame_*.jpg"), *(folder / DEPTH).glob("frame_*")):
+        if not same or stale not in kept:
+            stale.unlink(missing_ok=True)
+    if not same:
+        write_json(marker, origin)
+    for number, data in film.jpegs({number for number, path in wanted.items() if not path.is_file()}):
+        progress.check()
+        progress.update(announced + number, 2 * announced, f"writing frame {number}")
+        with atomic_path(wanted[number]) as temporary:
+            temporary.write_bytes(data)
+    for number, path in depths.items():
+        if not path.is_file():
+            progress.check()
+            film.write_depth(number, path)
+    for number, path in wanted.items():
+        if not path.is_file():
+            raise InputError(f"frame {number} of {film.path} could be decoded once and not again; the file or the disk is damaged")
 
 
 def _relative_sharpness(sharpness: Array) -> Array:

@@ -27,6 +27,7 @@ def capture_to_dict(capture: Capture) -> dict[str, Any]:
         "up": None if capture.up is None else [float(value) for value in capture.up],
         "warnings": list(capture.warnings),
         "extra": capture.extra,
+        "film": capture.film,
         "points": None if capture.points is None else np.asarray(capture.points, dtype=np.float64).tolist(),
         "frames": [_frame_to_dict(frame) for frame in capture.frames],
     }
@@ -55,6 +56,7 @@ def capture_from_dict(data: dict[str, Any]) -> Capture:
             points=None if data["points"] is None else np.array(data["points"], dtype=np.float64).reshape(-1, 3),
             warnings=tuple(str(warning) for warning in data["warnings"]),
             extra=dict(data["extra"]),
+            film=bool(data.get("film", False)),
         )
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise InputError(

@@ -38,7 +38,7 @@ class Capture:
     """A source as found on disk, in its own frame of reference."""
 
     kind: str  # "video", "photos", "transforms", "blender", "colmap", "7scenes", "tum", "scannet", "llff", "dtu", "redwood",
-    # "replica", "polycam", "stray"
+    # "replica", "polycam", "stray", "record3d", "scanner3d"
     root: Path
     frames: tuple[Frame, ...]
     ordered: bool = False  # neighbours in the list are neighbours in time
@@ -49,6 +49,7 @@ class Capture:
     points: Array | None = None  # (N, 3) sparse points in the input's frame, when the source has them
     warnings: tuple[str, ...] = ()
     extra: dict[str, Any] = field(default_factory=dict)  # facts for reports, e.g. {"listed": 67, "missing": 17, "fps": 30.0}
+    film: bool = False  # the frames are pictures, but as many as a video's, and some are still to be chosen
 
     @property
     def posed(self) -> bool:
@@ -56,8 +57,8 @@ class Capture:
 
     @property
     def filmed(self) -> bool:
-        """Whether the frames are still inside a video, or a `.sens` file, which is used as one."""
-        return bool(self.frames) and self.frames[0].video_index is not None
+        """Whether some of the frames are still to be chosen: they are inside a video or a `.sens` file, or are a film's."""
+        return bool(self.frames) and (self.film or self.frames[0].video_index is not None)
 
     @property
     def has_depth(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ import cv2
 import numpy as np
 import torch
 
-from tests.capture.layouts import LAYOUTS
+from tests.capture.layouts import LAYOUTS, write_record3d, zipped
 from tests.capture.made import eyes, render, save_picture
 from tests.stability.fuzz.given import (
     DATASETS,
@@ -99,7 +100,20 @@ FILES = {
     "replica": ("traj.txt", "cam_params.json", "results/depth000001.png"),
     "polycam": ("keyframes/corrected_cameras/100333.json", "keyframes/depth/100333.png", "keyframes/confidence/100333.png"),
     "stray": ("odometry.csv", "camera_matrix.csv", "depth/000001.png"),
+    "record3d": ("metadata", "metadata", "rgbd/1.depth", "rgbd/0.depth", "rgbd/2.conf", "rgbd/0.jpg"),
+    "scanner3d": ("frame_00002.json", "frame_00004.json", "depth_00002.png", "conf_00000.png"),
 }
+
+
+def make_recording(root: Path) -> None:
+    """Record3D's own file, without depth's size in it."""
+    source = root.with_name(f"{root.name}-unpacked")
+    write_record3d(source)
+    told = json.loads((source / "metadata").read_text())
+    (source / "metadata").write_text(json.dumps({key: value for key, value in told.items() if key not in ("dw", "dh")}))
+    root.mkdir(parents=True, exist_ok=True)
+    zipped(source, root / "a.r3d")
+    shutil.rmtree(source)
 
 
 def make_extras(root: Path) -> None:
@@ -270,6 +284,7 @@ TRAINING_FILES = (
 )  # fmt: skip
 TARGETS: tuple[Target, ...] = (
     *(Target(layout, files, LAYOUTS[layout][1], read_capture, 1.0) for layout, files in FILES.items()),
+    Target("recording", ("a.r3d",), make_recording, read_capture, 1.0),
     Target("extras", ("transforms.json", "mask1.png", "depth2.npy", "points.ply"), make_extras, read_capture, 2.0),
     Target("photos", PHOTOS, make_photos, read_photo_folder, 3.0),
     Target("videos", ("a.avi", "b.mp4", "c.webm"), make_videos, read_one_video, 1.5),

@@ -1,0 +1,69 @@
+"""Captures that come as one zip file and are read without unpacking: `walk.r3d/rgbd/0.jpg` is the member `rgbd/0.jpg` of `walk.r3d`.
+
+Members are looked up and never written by their names, so what a zip says its members are called cannot lead anywhere.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from functools import lru_cache
+from pathlib import Path
+
+from toolkit.errors import InputError, first_line
+
+SUFFIXES = (".r3d", ".zip")
+MOST_BYTES = 64 * 2**20  # of one member: a picture of a phone has five
+
+
+def archive_of(path: Path) -> Path | None:
+    """The zip file that `path` names a member of, None where it names none."""
+    return next((folder for folder in path.parents if folder.suffix.lower() in SUFFIXES and folder.is_file()), None)
+
+
+def members(archive: Path) -> list[str]:
+    """Names of everything in a zip file, as it says.
+
+    Raises:
+        InputError: no such file, no zip file, or one that is cut short.
+    """
+    return _opened(archive).namelist()
+
+
+def read_member(path: Path, most: int = MOST_BYTES) -> bytes:
+    """All bytes of a member; `path` is that of the archive with the member's name behind it.
+
+    Raises:
+        InputError: no such member, damaged, encrypted, or larger than `most` bytes when it is inflated.
+    """
+    archive = archive_of(path)
+    if archive is None:
+        raise InputError(f"cannot read {path}: it does not lie in a zip file; check the name")
+    opened, name = _opened(archive), path.relative_to(archive).as_posix()
+    try:
+        # What a member says its size is bounds what is inflated of it.
+        size = opened.getinfo(name).file_size
+        if size > most:
+            raise InputError(f"{path} has {size / 2**20:.0f} MB when it is unpacked, more than the {most / 2**20:.0f} MB that are read")
+        return opened.read(name)
+    except KeyError as error:
+        raise InputError(f"{archive} holds no {name}; export it again") from error
+    except InputError:
+        raise
+    except Exception as error:  # zipfile, zlib and the system raise many families on damaged files
+        raise InputError(f"{path} cannot be read ({first_line(error)}); copy or export {archive.name} again") from error
+
+
+def _opened(archive: Path) -> zipfile.ZipFile:
+    try:
+        stat = archive.stat()
+        return _kept(archive, stat.st_size, stat.st_mtime_ns)
+    except OSError as error:
+        raise InputError(f"cannot read {archive}: {error.strerror or error}") from error
+    except Exception as error:  # the directory of a damaged zip raises many families
+        raise InputError(f"{archive} is no zip file, or one that is cut short; copy it again from where it was recorded") from error
+
+
+@lru_cache(maxsize=2)
+def _kept(archive: Path, size: int, modified: int) -> zipfile.ZipFile:
+    """An open zip file: reading its directory takes tens of milliseconds where it has thousands of members."""
+    return zipfile.ZipFile(archive)
