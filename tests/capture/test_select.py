@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.capture.board import texture
-from tests.capture.films import film, turn
+from tests.capture.films import film, film_at, turn
 from tests.conftest import shared_data
 from toolkit.camera import Array
 from toolkit.capture.images import load_image
@@ -146,6 +146,15 @@ def test_frames_are_written_sharp_and_spread(tmp_path: Path) -> None:
     for frame, index in zip(chosen.frames, indices(chosen), strict=True):
         assert frame.video_index is None and frame.image.is_file() and frame.image.parent == (tmp_path / "run" / "frames").resolve()
         assert np.abs(load_image(frame).astype(int) - everything[index]).mean() < 6
+
+
+def test_a_rate_that_varies_is_no_damage(tmp_path: Path) -> None:
+    pytest.importorskip("av", reason="PyAV is not installed; make test brings it")
+    times = [67 * at for at in range(24)]  # every other frame of thirty a second
+    chosen = select(film_at(tmp_path / "screen.mkv", pan([4.0 * at for at in range(24)]), times), tmp_path / "run", 10)
+    assert chosen.extra["selected_from"] == 24 and 5 <= len(chosen.frames) <= 10
+    (said,) = chosen.warnings
+    assert "24 frames that can be decoded, not the" in said and "its rate varies" in said
 
 
 def test_upright_frames_are_written_for_a_turned_video(tmp_path: Path) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.capture.films import film, names, quarters, turn
+from tests.capture.films import film, film_at, names, quarters, turn
 from tests.conftest import shared_data
 from toolkit.capture.images import load_image
 from toolkit.capture.video import iterate_video, read_video
@@ -29,6 +30,16 @@ def test_containers(tmp_path: Path, suffix: str) -> None:
     for index, picture in pictures.items():
         assert picture.shape == (48, 64, 3) and picture.dtype == np.uint8 and names(picture) == "rgbk"  # RGB, not BGR
         assert abs(float(picture[30:42, 38:58].mean()) - 8 * index) < 6
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_pixels_that_are_not_square_are_told(tmp_path: Path, suffix: str) -> None:
+    pytest.importorskip("av", reason="PyAV is not installed; make test brings it")
+    times = [33 * at for at in range(8)]
+    (said,) = read_video(film_at(tmp_path / f"a.{suffix}", quarters(8), times, Fraction(4, 3))).warnings
+    assert "not square (4:3)" in said and f"ffmpeg -i a.{suffix} -vf scale=iw*sar:ih,setsar=1" in said
+    for pixel in (None, Fraction(1)):
+        assert read_video(film_at(tmp_path / f"b.{suffix}", quarters(8), times, pixel)).warnings == ()
 
 
 @pytest.mark.parametrize(

@@ -46,4 +46,4 @@ def test_depth_of_a_run_that_was_moved_is_found(recording: Path, tmp_path: Path)
     (tmp_path / "run").rename(tmp_path / "moved")
     capture = at_home(chosen, tmp_path / "moved" / "frames")
     for frame in capture.frames:
-        assert load_depth(frame, capture).any() and frame.image.parent == frame.depth.parent == tmp_path / "moved" / "frames"
+        assert load_depth(frame, capture).any() and frame.image.parent == frame.depth.parent.parent == tmp_path / "moved" / "frames"

@@ -17,6 +17,7 @@ from toolkit.capture.checks import check_capture
 from toolkit.capture.film import DEPTH, QUALITY, Film
 from toolkit.capture.listing import counted
 from toolkit.capture.types import Capture
+from toolkit.capture.video import UNCOUNTED
 from toolkit.config import CaptureSettings
 from toolkit.errors import InputError
 from toolkit.files import atomic_path, fingerprint, read_json, write_json
@@ -95,7 +96,7 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
     _write(film, chosen, folder, last + 1, progress)
     frames = [film.written(number, folder / name) for number, name in zip(chosen, names, strict=True)]
     extra = {**capture.extra, SELECTED: readable, "video": str(video)}
-    remarks = _remarks(measure, best, readable, announced)
+    remarks = _remarks(measure, best, readable, announced, exact=video.suffix.lower() not in UNCOUNTED)
     if as_stored and len(measure.sharpness) < len(every):
         remarks.append(
             f"about {readable} of the {announced} frames of {video} that have a pose can be decoded; if those that are missing do not lie "
@@ -245,9 +246,15 @@ def _relative_sharpness(sharpness: Array) -> Array:
     return np.clip(sharpness / np.maximum(median, 1e-6), 0.05, 20.0)
 
 
-def _remarks(measure: Measure, chosen: list[int], readable: int, announced: int) -> list[str]:
+def _remarks(measure: Measure, chosen: list[int], readable: int, announced: int, exact: bool) -> list[str]:
+    """What is worth saying; `exact`: the announced number is one of frames that were there."""
     remarks = []
-    if readable < 0.95 * announced:
+    if readable < 0.95 * announced and not exact:
+        remarks.append(
+            f"the video has {readable} frames that can be decoded, not the {announced} of its length and rate: its rate varies, as that "
+            "of screen recordings, or it is damaged"
+        )
+    elif readable < 0.95 * announced:
         remarks.append(f"the video announces {announced} frames, {readable} could be decoded")
     steps = np.diff(np.asarray(measure.motion)[chosen])
     wide = int((steps > MAX_STEP).sum())

@@ -24,6 +24,8 @@ from toolkit.errors import InputError
 from toolkit.files import require_utf8
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".wmv")
+UNCOUNTED = (".mkv", ".webm")  # they do not say how many frames they have: what is announced is their length times their rate
+SQUARE = 0.01  # difference of a pixel's sides that is nothing
 MOST_FRAMES = 2_000_000  # eighteen hours at 30 a second
 SMALLEST_FRAME = 8  # bytes
 OPENING = threading.Lock()  # one video is opened at a time: what OpenCV reads of the environment then is the whole process's
@@ -56,6 +58,7 @@ def read_video(path: Path, *, as_stored: bool = False) -> Capture:
         announced = stream.get(cv2.CAP_PROP_FRAME_COUNT)
         fps = stream.get(cv2.CAP_PROP_FPS)
         rotation = stream.get(cv2.CAP_PROP_ORIENTATION_META)
+        pixel = stream.get(cv2.CAP_PROP_SAR_NUM), stream.get(cv2.CAP_PROP_SAR_DEN)
         # A header may announce anything; what a file of this size cannot hold, or nobody would film, is counted instead.
         believable = min(path.stat().st_size // SMALLEST_FRAME, MOST_FRAMES)
         count = int(announced) if math.isfinite(announced) and 0 < announced <= believable else _count(stream) + 1
@@ -70,7 +73,17 @@ def read_video(path: Path, *, as_stored: bool = False) -> Capture:
         "height": int(first.shape[0]),
         "seconds": count / fps if fps else None,
     }
-    return Capture(kind="video", root=path.parent, frames=frames, ordered=True, extra=extra)
+    return Capture(kind="video", root=path.parent, frames=frames, ordered=True, extra=extra, warnings=_stretched(path, *pixel))
+
+
+def _stretched(path: Path, across: float, down: float) -> tuple[str, ...]:
+    """What to say of pixels that are `across` to `down` wide to high (0: not told)."""
+    if not (across > 0 and down > 0 and abs(across / down - 1) > SQUARE):
+        return ()
+    return (
+        f"the pixels of the video {path.name} are not square ({across:g}:{down:g}) and are taken as if they were, so that all comes out "
+        f"stretched; make them square first: ffmpeg -i {path.name} -vf scale=iw*sar:ih,setsar=1 new.mp4",
+    )
 
 
 def iterate_video(path: Path, indices: Collection[int] | None = None, *, as_stored: bool = False) -> Iterator[tuple[int, Array]]:
