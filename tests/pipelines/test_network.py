@@ -92,7 +92,7 @@ def test_without_fine_tuning_the_networks_field_is_the_result_until_it_is_fitted
     assert any("nothing was fitted" in text for text in data["warnings"])
     direct = data["evaluation"]["field"]["psnr"]
     assert direct > data["evaluation"]["nearest_image"]["psnr"]
-    answer = call(capsys, "finetune", out, "--budget", 3, "--json", "--quiet")
+    answer = call(capsys, "finetune", out, "--budget", 6, "--json", "--quiet")
     assert answer.code == 0, answer.err
     data = json.loads(answer.out)
     assert stages(data)["network"] and not stages(data)["field"]

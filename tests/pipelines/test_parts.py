@@ -150,7 +150,7 @@ def test_a_field_without_surface_is_exported_as_far_as_it_goes(out: Path, capsys
 
 
 def test_without_held_out_pictures_there_are_no_scores(tmp_path: Path, capsys: Capsys) -> None:
-    make_room(tmp_path / "room", 6)
+    make_room(tmp_path / "room", 10)
     options = [*FAST, "--budget", 0.3, "--holdout", 0, "--set", "export.formats=[cameras]"]
     answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", *options, "--quiet", "--json")
     assert answer.code == 0, answer.err

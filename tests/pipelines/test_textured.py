@@ -110,6 +110,7 @@ def test_a_mesh_stays_when_its_texture_cannot_be_made(
 
     monkeypatch.setattr("toolkit.export.texture.textured", too_many)
     out = shutil.copytree(run / "out", tmp_path / "out")
+    (out / "exports" / "textured.glb").unlink()
     answer = call(capsys, "run", run / "room", "--out", out, *FEW, "--set", "export.formats=[ply,texture]")
     assert answer.code == 0, answer.err
     assert (out / "exports" / "mesh.ply").is_file() and not (out / "exports" / "textured.glb").exists()

@@ -33,8 +33,8 @@ PHOTO = CAMERA.scaled(288, 216)
 
 
 def make_pictures(folder: Path) -> Path:
-    """Eight pictures of the made-up room with poses and without depth, 96×72."""
-    make_room(folder, 8)
+    """Ten pictures of the made-up room with poses and without depth, 96×72."""
+    make_room(folder, 10)
     return folder
 
 
