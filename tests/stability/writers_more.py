@@ -86,7 +86,7 @@ def more_writers(place: Path) -> dict[str, Write]:
         curve.write()
 
     def filmed(folder: Path) -> None:
-        with mock.patch.object(procedural, "texture_bank", partial(texture_bank, size=32)):  # nobody looks at what the pictures show
+        with mock.patch.object(procedural, "texture_bank", partial(texture_bank, size=128)):  # nobody looks at what the pictures show
             simulate(scene, folder / f"film{next(numbers)}", workers=1)
 
     def run_folder(folder: Path) -> None:
