@@ -102,7 +102,7 @@ camera, poses, room = Intrinsics(48, 36, 40.8, 40.8, 24.0, 18.0), hand_held(12),
 pictures = [room.picture(camera, pose) for pose in poses]
 views = Views([str(i) for i in range(12)], pictures, [camera] * 12, poses, np.arange(12) % 6 == 0)
 scene = Scene(Similarity.identity(), np.array([0.2, 0.2, 0.6]), np.array([1.6, 1.6, 1.0]), 2.0, 0.5, 6.0, 0.1, True, True)
-settings = load_settings("fast", pairs=["budget=5", "threads=1", "field.resolution=32"])
+settings = load_settings("fast", pairs=["budget=2", "threads=1", "field.resolution=32"])
 result = fit_field(views, scene, settings)
 rendered = render_view(result.field, camera, poses[6])
 assert rendered.rgb.shape == (36, 48, 3) and np.isfinite(rendered.rgb).all() and rendered.opacity.max() > 0.1

@@ -63,8 +63,8 @@ def open_page(page: Path, scratch: Path) -> Seen:
     copy = scratch / f"watched-{page.name}"
     copy.write_text(text.replace("<head>", "<head>" + BEFORE, 1).replace("</body>", AFTER + "</body>", 1), encoding="utf-8")
     command = [program, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"]
-    command += [f"--user-data-dir={scratch / 'browser'}", "--timeout=60000", "--virtual-time-budget=20000", "--window-size=1300,900"]
-    done = subprocess.run([*command, "--dump-dom", copy.as_uri()], capture_output=True, text=True, timeout=150, check=False)
+    command += [f"--user-data-dir={scratch / 'browser'}", "--timeout=300000", "--virtual-time-budget=20000", "--window-size=1300,900"]
+    done = subprocess.run([*command, "--dump-dom", copy.as_uri()], capture_output=True, text=True, timeout=400, check=False)
     told = re.search(r'<pre id="told">(.*?)</pre>', done.stdout, re.DOTALL)
     assert told is not None, f"Chromium did not finish the page: {done.stderr[-1500:]}"
     return Seen(**json.loads(escapes.unescape(told[1])))

@@ -20,7 +20,7 @@ from toolkit.camera import Array
 
 FLAGS = ("--headless", "--no-sandbox", "--disable-dev-shm-usage", "--no-first-run", "--disable-background-networking", "--disable-sync")
 NO_GPU = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # WebGL by the processor
-START_SECONDS = 60.0
+START_SECONDS = 240.0  # after which a page counts as hung, on the busiest machine
 
 
 class Driven:
@@ -88,7 +88,7 @@ def driven(url: str, scratch: Path, size: tuple[int, int]) -> Iterator[Driven]:
         port = until(lambda: told.read_text().split()[0] if told.exists() and told.stat().st_size else None)
 
         def page() -> Any:
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=20) as answer:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=START_SECONDS) as answer:
                 return next((one["webSocketDebuggerUrl"] for one in json.load(answer) if one["type"] == "page"), None)
 
         found = Driven(until(page))

@@ -49,10 +49,11 @@ def circle(count: int, part: float = 1.0) -> list[Array]:
 
 def colour_at(points: Array) -> Array:
     """(N, 3) points → (N, 3) RGB in [0, 1]: tiles of many colours with soft waves over them."""
-    cells = np.floor(points / TILE + 0.37).astype(np.int64) % 32
+    cells = np.floor(points / TILE + 0.37).astype(np.int64) & 31
+    tiles = COLOURS.reshape(-1, 3)[(cells[:, 0] * 32 + cells[:, 1]) * 32 + cells[:, 2]]
     x, y, z = points.T
     waves = np.stack([np.sin(3.1 * x + 1.7 * y - 2.3 * z), np.sin(4.3 * y - 5.1 * x + 1.0), np.sin(3.1 * z + 4.3 * y + 2.0)], axis=1)
-    return 0.1 + 0.6 * COLOURS[cells[:, 0], cells[:, 1], cells[:, 2]] + 0.1 * (1 + waves)
+    return 0.1 + 0.6 * tiles + 0.1 * (1 + waves)
 
 
 def shoot(pose: Array, camera: Intrinsics = CAMERA) -> tuple[Array, Array]:
@@ -69,7 +70,8 @@ def trace(pose: Array, camera: Intrinsics) -> tuple[Array, Array]:
     rays = np.stack([(u + 0.5 - camera.cx) / camera.fx, (v + 0.5 - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1).reshape(-1, 3)
     directions, eye = rays @ pose[:3, :3].T, pose[:3, 3]
     with np.errstate(divide="ignore"):
-        distance = np.max(np.stack([(HALF - eye) / directions, (-HALF - eye) / directions]), axis=0).min(axis=1)
+        x, y, z = np.maximum((HALF - eye) / directions, (-HALF - eye) / directions).T
+    distance = np.minimum(np.minimum(x, y), z)
     return colour_at(eye + directions * distance[:, None]).reshape(*u.shape, 3), distance.reshape(u.shape)
 
 

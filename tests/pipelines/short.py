@@ -19,6 +19,7 @@ ALONE = ["--threads", "1", "--init", "classical"]
 SMALL = ["--budget", "3", *ALONE, "--set", "field.resolution=32", "--set", "export.mesh_views=6", "--set", "export.video_frames=4"]
 FAST = ["--budget", "1", *ALONE, "--set", "field.resolution=16", "--set", "export.formats=[points]", "--set", "export.mesh_views=3"]
 
+HUNG = 500.0  # seconds after which a process counts as hung, on the busiest machine
 TICK = 0.01  # seconds that the clock of a fit goes on by at each look: a second is some hundred steps
 
 
@@ -70,7 +71,7 @@ def start(*arguments: object) -> subprocess.Popen[str]:
     return subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment())
 
 
-def wait_for(path: Path, process: subprocess.Popen[str], seconds: float = 150) -> None:
+def wait_for(path: Path, process: subprocess.Popen[str], seconds: float = HUNG) -> None:
     end = time.monotonic() + seconds
     while not path.exists():
         assert process.poll() is None, process.communicate()[1]

@@ -25,7 +25,7 @@ from toolkit.files import read_json, write_json
 from toolkit.tsdf.mesh import Mesh
 
 Capsys = pytest.CaptureFixture[str]
-PAIRS = ["init=classical", "fit.budget=1", "field.resolution=32", "export.mesh_views=8"]
+PAIRS = ["init=classical", "fit.budget=1", "field.resolution=32", "export.mesh_views=4"]
 SMALL = ["--holdout", "4", "--threads", "1", *(word for pair in PAIRS for word in ("--set", pair))]
 
 

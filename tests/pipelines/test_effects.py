@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from toolkit.capture import open_capture
 from toolkit.capture.prepare import held_out
 from toolkit.config import load_settings
 from toolkit.effects.correct import Corrections
-from toolkit.effects.decide import asleep, decide, wish
+from toolkit.effects.decide import Decided, asleep, decide, wish
 from toolkit.errors import InputError
 from toolkit.evaluate.effects_truth import known_light
 from toolkit.simulate.settings import scene_file
@@ -29,17 +30,25 @@ SCENE = {
     "seed": 3,
     "side": 1,
     "camera": {"width": 176, "height": 132},
-    "path": {"kind": "walk", "frames": 9, "fps": 5, "speed": 0.5, "shake": 4},
+    "path": {"kind": "walk", "fps": 5, "speed": 0.5, "shake": 4},
 }
 
 
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("effects")
-    listed = {"clean": [], "drift": ["exposure:strong", "vignetting:strong"]}
-    for name, effects in listed.items():
-        simulate(scene_file(SCENE, "test"), root / name, effects=effects, workers=1)
+    listed = {"clean": (12, []), "drift": (9, ["exposure:strong", "vignetting:strong"])}
+    for name, (count, effects) in listed.items():
+        scene = {**SCENE, "path": {**SCENE["path"], "frames": count}}
+        simulate(scene_file(scene, "test"), root / name, effects=effects, workers=1)
     return {name: root / name for name in listed}
+
+
+@pytest.fixture(scope="module")
+def found(captures: dict[str, Path]) -> Decided:
+    """What is decided by itself for the capture whose light drifts."""
+    capture = open_capture(captures["drift"])
+    return decide(capture, held_out(capture, 8), load_settings().effects)
 
 
 def test_a_clean_capture_gets_no_correction(captures: dict[str, Path]) -> None:
@@ -50,10 +59,9 @@ def test_a_clean_capture_gets_no_correction(captures: dict[str, Path]) -> None:
     assert got.corrections.on_capture(capture) is capture
 
 
-def test_drift_and_vignetting_are_corrected_and_off_is_off(captures: dict[str, Path]) -> None:
+def test_drift_and_vignetting_are_corrected_and_off_is_off(captures: dict[str, Path], found: Decided) -> None:
     capture = open_capture(captures["drift"])
-    test = held_out(capture, 8)
-    got = decide(capture, test, load_settings().effects)
+    test, got = held_out(capture, 8), found
     on = {decision.finding.effect for decision in got.decisions if decision.on}
     assert on == {"exposure", "vignetting"}
     gains = np.array([got.corrections.gain[frame.name] for frame in capture.frames])
@@ -63,12 +71,11 @@ def test_drift_and_vignetting_are_corrected_and_off_is_off(captures: dict[str, P
     assert without.corrections.corner is None and without.corrections.gain
 
 
-def test_what_is_found_is_what_was_simulated(captures: dict[str, Path]) -> None:
+def test_what_is_found_is_what_was_simulated(captures: dict[str, Path], found: Decided) -> None:
     capture = open_capture(captures["drift"])
-    test = held_out(capture, 8)
-    found, known = decide(capture, test, load_settings().effects).corrections, known_light(captures["drift"], capture, test)
-    off = np.log2([np.divide(found.gain[frame.name], known.gain[frame.name]) for frame in capture.frames])
-    assert np.sqrt(np.mean(off**2)) < 0.02 and found.corner == pytest.approx(known.corner, abs=0.02)
+    got, known = found.corrections, known_light(captures["drift"], capture, held_out(capture, 8))
+    off = np.log2([np.divide(got.gain[frame.name], known.gain[frame.name]) for frame in capture.frames])
+    assert np.sqrt(np.mean(off**2)) < 0.02 and got.corner == pytest.approx(known.corner, abs=0.02)
 
 
 def test_seconds_stand_beside_each_effect(captures: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,9 +89,8 @@ def test_seconds_stand_beside_each_effect(captures: dict[str, Path], monkeypatch
     fitting(data, EFFECTS, Path("effects.json"))
 
 
-def test_blurred_pictures_weigh_less(tmp_path: Path) -> None:
-    place = tmp_path / "jerk"
-    simulate(scene_file({**SCENE, "path": {**SCENE["path"], "frames": 12}}, "test"), place, effects=[], workers=1)
+def test_blurred_pictures_weigh_less(captures: dict[str, Path], tmp_path: Path) -> None:
+    place = Path(shutil.copytree(captures["clean"], tmp_path / "jerk"))
     for name in ("000003.png", "000006.png"):
         path = place / "images" / name
         cv2.imwrite(str(path), cv2.GaussianBlur(cv2.imread(str(path)), (0, 0), 2.5))

@@ -12,7 +12,7 @@ import pytest
 
 from pipelines.console import STOPPING
 from tests.pipelines.made import CAMERA, Answer, call, environment, make_room
-from tests.pipelines.short import FAST, report, stages, start, wait_for
+from tests.pipelines.short import FAST, HUNG, report, stages, start, wait_for
 from toolkit.render.field import Field
 
 Capsys = pytest.CaptureFixture[str]
@@ -54,7 +54,7 @@ def test_ctrl_c_while_fitting_keeps_the_field_and_reports(tmp_path: Path, capsys
     process = fitting(tmp_path / "fitting", *arguments, *LONG)
     wait_for(tmp_path / "fitting", process)
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=120)  # a whole fit would take longer
+    _, err = process.communicate(timeout=HUNG)  # a whole fit would take longer
     assert process.returncode == 0, err
     data = report(tmp_path / "out")
     assert any("stopped early" in warning for warning in data["warnings"])
@@ -72,7 +72,7 @@ def test_ctrl_c_before_the_field_says_how_to_go_on(tmp_path: Path) -> None:
     process = start("run", tmp_path / "room", "--out", tmp_path / "out", *FAST)
     wait_for(tmp_path / "out" / "run.json", process)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=HUNG)
     assert process.returncode == 130, err
     assert "same command again" in Answer(130, out, err).sentence()
 
@@ -86,7 +86,7 @@ def test_ctrl_c_twice_ends_at_once(tmp_path: Path) -> None:
     while process.stderr.readline().strip() not in (STOPPING, ""):  # the first has been heard
         pass
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=120)
+    _, err = process.communicate(timeout=HUNG)
     assert process.returncode == 130  # after one alone there would be a report, and code 0
     assert "Traceback" not in err
     # A fit ends within a step of the first, so its stage may be whole by the time of the second; nothing after it is.
@@ -107,7 +107,7 @@ def test_ctrl_c_while_code_is_made_from_text(tmp_path: Path) -> None:
         "pipelines.cli.program()\n"
     )
     there = environment(PYTHONPATH=os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])]))
-    answer = subprocess.run([sys.executable, "-m", "interrupted"], env=there, capture_output=True, text=True, timeout=150)
+    answer = subprocess.run([sys.executable, "-m", "interrupted"], env=there, capture_output=True, text=True, timeout=HUNG)
     assert answer.returncode == 130 and answer.stderr == "fieldfuse: stopped\n" and answer.stdout == "tidied\n"
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,8 +16,8 @@ import torch
 
 from pipelines.few_views import numbers, part_of, wanted
 from pipelines.steps_network import uses_network
-from tests.pipelines.made import CAMERA, call, command, environment, make_room
-from tests.pipelines.short import clocked
+from tests.pipelines.made import CAMERA, call, make_room
+from tests.pipelines.short import clocked, start, wait_for
 from toolkit.config import load_settings
 from toolkit.errors import InputError
 from toolkit.files import read_json
@@ -119,11 +118,6 @@ def test_with_many_pictures_too_the_networks_field_is_fitted_further(
     assert "network" not in stages(run(capsys, room, tmp_path / "other", "--init", "auto"))
 
 
-def test_the_classical_start_asks_no_network(room: Path, tmp_path: Path, capsys: Capsys) -> None:
-    data = run(capsys, room, tmp_path / "out", "--init", "classical")
-    assert "network" not in stages(data) and "network" not in data["evaluation"] and not (tmp_path / "out" / "preview.png").exists()
-
-
 def test_contradictions_and_missing_networks_are_said(room: Path, tmp_path: Path, capsys: Capsys) -> None:
     answer = call(capsys, "run", room, "--out", tmp_path / "a", *FAST, "--init", "classical", "--no-finetune", "--quiet")
     assert answer.code == 2 and "fine-tuning" in answer.sentence()
@@ -133,8 +127,11 @@ def test_contradictions_and_missing_networks_are_said(room: Path, tmp_path: Path
         assert call(capsys, "run", room, "--out", tmp_path / "c", "--set", pair, "--quiet").code == 2, pair
 
 
-def test_a_limit_leaves_the_held_out_views_alone(room: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_the_classical_start_asks_no_network_and_a_limit_leaves_the_held_out_views_alone(
+    room: Path, tmp_path: Path, capsys: Capsys
+) -> None:
     data = run(capsys, room, tmp_path / "out", "--set", "views.limit=3", "--init", "classical")
+    assert "network" not in stages(data) and "network" not in data["evaluation"] and not (tmp_path / "out" / "preview.png").exists()
     assert data["views"]["total"] == 5 and data["views"]["test"] == 2
     assert [view["name"] for view in data["evaluation"]["field"]["per_view"]] == ["000", "008"]
     cached = stages(run(capsys, room, tmp_path / "out", "--set", "views.limit=4", "--init", "classical"))
@@ -144,13 +141,8 @@ def test_a_limit_leaves_the_held_out_views_alone(room: Path, tmp_path: Path, cap
 def test_a_run_killed_among_the_key_frames_goes_on(room: Path, tmp_path: Path, capsys: Capsys) -> None:
     out = tmp_path / "out"
     arguments = [*FAST, "--set", "keyframes.method=uniform", "--set", "keyframes.every=1"]
-    process = subprocess.Popen(
-        command("run", room, "--out", out, *arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()
-    )
-    end = time.monotonic() + 90
-    while not (out / "preview.png").exists():
-        assert process.poll() is None and time.monotonic() < end, process.communicate()[1]
-        time.sleep(0.01)
+    process = start("run", room, "--out", out, *arguments)
+    wait_for(out / "preview.png", process)
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert cv2.imread(str(out / "preview.png")) is not None, "a preview is whole at any moment"

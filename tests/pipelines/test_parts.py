@@ -136,22 +136,23 @@ def test_a_folder_keeps_its_capture(tmp_path: Path, capsys: Capsys) -> None:
     assert call(capsys, "poses", tmp_path / "link", "--out", tmp_path / "out", "--quiet").code == 0
 
 
-def test_a_field_without_surface_is_exported_as_far_as_it_goes(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_field_without_surface_is_exported_as_far_as_it_goes(out: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     def nothing_opaque(*_: object, **__: object) -> None:
         raise InputError("no rendered view shows a surface")
 
     monkeypatch.setattr("toolkit.export.surface.field_volume", nothing_opaque)
-    make_room(tmp_path / "room", 10)
-    out = tmp_path / "out"
-    answer = call(capsys, "run", tmp_path / "room", "--out", out, *FAST, "--set", "export.formats=[ply,cameras]", "--quiet", "--json")
+    wish = ["--set", "export.formats=[ply,cameras]"]
+    answer = call(capsys, "run", out.parent / "room", "--out", out, *FAST, *wish, "--quiet", "--json")
     assert answer.code == 0, answer.err
-    assert any("meshes were left out" in warning for warning in json.loads(answer.out)["warnings"])
+    data = json.loads(answer.out)
+    assert stages(data)["field"] and any("meshes were left out" in warning for warning in data["warnings"])
     assert (out / "exports" / "cameras" / "transforms.json").is_file() and not (out / "exports" / "mesh.ply").exists()
 
 
 def test_without_held_out_pictures_there_are_no_scores(tmp_path: Path, capsys: Capsys) -> None:
     make_room(tmp_path / "room", 10)
-    answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", *FAST, "--holdout", 0, "--quiet", "--json")
+    options = [*FAST, "--budget", 0.3, "--holdout", 0, "--set", "export.formats=[cameras]"]
+    answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", *options, "--quiet", "--json")
     assert answer.code == 0, answer.err
     data = json.loads(answer.out)
     assert data["evaluation"]["field"]["psnr"] is None and data["timeline"] == []
@@ -162,10 +163,11 @@ def test_without_held_out_pictures_there_are_no_scores(tmp_path: Path, capsys: C
 def test_a_tampered_field_is_refused(out: Path, capsys: Capsys) -> None:
     path = out / "field.safetensors"
     whole = path.read_bytes()
-    for spoilt in (whole[:8] + b"{" * 40 + whole[48:], (2**62).to_bytes(8, "little") + whole[8:], bytes(len(whole))):
+    damages = whole[:8] + b"{" * 40 + whole[48:], (2**62).to_bytes(8, "little") + whole[8:], bytes(len(whole))
+    for spoilt, commands in zip(damages, (("render", "evaluate", "export"), ("export",), ("render",)), strict=True):
         path.write_bytes(spoilt)
-        for arguments in (["render", out], ["evaluate", out], ["export", out]):
-            answer = call(capsys, *arguments, "--quiet")
+        for command in commands:
+            answer = call(capsys, command, out, "--quiet")
             assert answer.code == 2, answer
             assert "field.safetensors" in answer.sentence()
 

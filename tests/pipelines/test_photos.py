@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import time
@@ -18,11 +19,18 @@ from PIL import Image
 
 from pipelines.steps_capture import at_home
 from tests.pipelines.made import CAMERA, call, circle, command, environment, look_at, make_photos, shoot
+from tests.pipelines.short import HUNG
 from toolkit.capture.types import Capture, Frame
 
 Capsys = pytest.CaptureFixture[str]
 PHOTO = CAMERA.scaled(288, 216)
 SHORT = ["--budget", "0.5", "--threads", "1", "--image-size", "96", "--init", "classical", "--set", "export.formats=[cameras]", "--quiet"]
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Nine bare photos that poses are found for, only read."""
+    return make_photos(tmp_path_factory.mktemp("bare") / "photos", circle(9, 0.2), PHOTO)
 
 
 def as_json(text: str) -> dict[str, Any]:
@@ -31,9 +39,8 @@ def as_json(text: str) -> dict[str, Any]:
     return data
 
 
-def test_photos_get_poses_and_the_report_says_what_the_poses_have_seen(tmp_path: Path, capsys: Capsys) -> None:
-    source = make_photos(tmp_path / "photos", circle(9, 0.2), PHOTO)
-    answer = call(capsys, "run", source, "--out", tmp_path / "out", *SHORT, "--json")
+def test_photos_get_poses_and_the_report_says_what_the_poses_have_seen(photos: Path, tmp_path: Path, capsys: Capsys) -> None:
+    answer = call(capsys, "run", photos, "--out", tmp_path / "out", *SHORT, "--json")
     assert answer.code == 0, answer.err
     data = as_json(answer.out)
     assert data["capture"]["kind"] == "photos" and data["poses"]["source"] == "sfm"
@@ -47,7 +54,7 @@ def test_photos_get_poses_and_the_report_says_what_the_poses_have_seen(tmp_path:
 def test_video_is_cut_into_frames(tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "film.mp4"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10, (PHOTO.width, PHOTO.height))
-    for pose in circle(24, 0.2):
+    for pose in circle(16, 0.2):
         writer.write(cv2.cvtColor(shoot(pose, PHOTO)[0], cv2.COLOR_RGB2BGR))
     writer.release()
     (tmp_path / "link").symlink_to(tmp_path)
@@ -80,10 +87,10 @@ def test_the_frames_of_a_run_folder_that_was_moved_are_its_own(tmp_path: Path) -
     assert [frame.depth for frame in got.frames[3:]] == [now / "depth" / "a.png", deep[1].depth]
 
 
-def test_heic_photos_become_jpegs_that_the_cameras_name(tmp_path: Path, capsys: Capsys) -> None:
+def test_heic_photos_become_jpegs_that_the_cameras_name(photos: Path, tmp_path: Path, capsys: Capsys) -> None:
     pillow_heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not installed; make test brings it")
     pillow_heif.register_heif_opener()
-    source = make_photos(tmp_path / "photos", circle(9, 0.2), PHOTO)
+    source = Path(shutil.copytree(photos, tmp_path / "photos"))
     for path in sorted(source.glob("*.*"))[:2]:
         Image.open(path).save(path.with_suffix(".HEIC"), format="HEIF", quality=90)
         path.unlink()
@@ -118,17 +125,16 @@ def test_turning_on_the_spot_is_named(tmp_path: Path, capsys: Capsys) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_the_child_that_finds_poses_does_not_outlive_us(number: int, tmp_path: Path) -> None:
-    source = make_photos(tmp_path / "photos", circle(12, 0.3), PHOTO)
-    process = subprocess.Popen(command("poses", source, "--out", tmp_path / "out"), stderr=subprocess.PIPE, text=True, env=environment())
-    end = time.monotonic() + 150
+def test_the_child_that_finds_poses_does_not_outlive_us(number: int, photos: Path, tmp_path: Path) -> None:
+    process = subprocess.Popen(command("poses", photos, "--out", tmp_path / "out"), stderr=subprocess.PIPE, text=True, env=environment())
+    end = time.monotonic() + HUNG
     children: list[psutil.Process] = []
     while not children and time.monotonic() < end and process.poll() is None:
         children = psutil.Process(process.pid).children(recursive=True)
         time.sleep(0.02)
     assert children, process.communicate()[1]
     process.send_signal(number)
-    _, err = process.communicate(timeout=120)
+    _, err = process.communicate(timeout=HUNG)
     assert process.returncode == (-signal.SIGKILL if number == signal.SIGKILL else 130), err
     _, alive = psutil.wait_procs(children, timeout=60)
     assert not alive

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -15,8 +16,8 @@ from pipelines.options import gather
 from pipelines.reconstruct import stand
 from pipelines.surface import finer_views
 from pipelines.taken import as_taken
-from tests.pipelines.made import CAMERA, call, make_room
-from tests.pipelines.short import ALONE
+from tests.pipelines.made import CAMERA, call, make_room, said
+from tests.pipelines.short import ALONE, steady
 from toolkit.effects.correct import Corrections
 from toolkit.errors import InputError
 from toolkit.files import read_json
@@ -32,13 +33,15 @@ TAKEN = CAMERA.scaled(192, 144)
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on pictures a quarter as wide as the photos are."""
     folder = tmp_path_factory.mktemp("textured")
-    make_room(folder / "room", 12, depth=True, camera=TAKEN)
+    make_room(folder / "room", 9, depth=True, camera=TAKEN)
+    with steady():
+        answer = said("run", folder / "room", "--out", folder / "out", *FEW, "--set", "export.formats=[texture]")
+    assert answer.code == 0, answer.err
     return folder
 
 
-def test_a_texture_has_texels_of_the_photos(run: Path, capsys: Capsys) -> None:
-    out = run / "out"
-    assert call(capsys, "run", run / "room", "--out", out, *FEW, "--set", "export.formats=[texture]").code == 0
+def test_a_texture_has_texels_of_the_photos(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+    out = shutil.copytree(run / "out", tmp_path / "out")
     large = trimesh.load(out / "exports" / "textured.glb").to_geometry().visual.material.baseColorTexture.size
     assert call(capsys, "export", out, "--set", "export.texture_size=48", "--formats", "texture", "--quiet").code == 0
     small = trimesh.load(out / "exports" / "textured.glb").to_geometry().visual.material.baseColorTexture.size
@@ -99,12 +102,15 @@ def test_a_size_of_nothing_is_refused(tmp_path: Path, capsys: Capsys, name: str)
     assert answer.code == 2 and f"export.{name} is 0; it must be a positive number" in answer.sentence()
 
 
-def test_a_mesh_stays_when_its_texture_cannot_be_made(run: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mesh_stays_when_its_texture_cannot_be_made(
+    run: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def too_many(*_: object, **__: object) -> None:
         raise InputError("80000 triangles do not fit into a texture")
 
     monkeypatch.setattr("toolkit.export.texture.textured", too_many)
-    out = run / "untextured"
+    out = shutil.copytree(run / "out", tmp_path / "out")
+    (out / "exports" / "textured.glb").unlink()
     answer = call(capsys, "run", run / "room", "--out", out, *FEW, "--set", "export.formats=[ply,texture]")
     assert answer.code == 0, answer.err
     assert (out / "exports" / "mesh.ply").is_file() and not (out / "exports" / "textured.glb").exists()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
 import sys
 import time
@@ -18,8 +17,9 @@ import pytest
 from pipelines.visitor import lens_of, pose_of
 from tests.evaluate.driven import driven, until
 from tests.pipelines.made import CAMERA, call, make_room
-from tests.pipelines.short import FAST, finished, start
+from tests.pipelines.short import FAST, HUNG, finished, start
 from toolkit.camera import Array
+from toolkit.files import read_json
 
 Capsys = pytest.CaptureFixture[str]
 msgspec, zstandard, viser = (pytest.importorskip(name) for name in ("msgspec", "zstandard", "viser"))
@@ -44,7 +44,7 @@ class Browser:
     def say(self, kind: str, **facts: Any) -> None:
         self.socket.send(msgspec.msgpack.encode({"type": kind, **facts}))
 
-    def until(self, done: Callable[[dict[str, Any]], bool], seconds: float = 120) -> dict[str, Any]:
+    def until(self, done: Callable[[dict[str, Any]], bool], seconds: float = HUNG) -> dict[str, Any]:
         """The first message for which it is so; all go to `seen`."""
         end = time.monotonic() + seconds
         while True:
@@ -73,25 +73,27 @@ def _decoded(message: dict[str, Any]) -> Array:
     return picture
 
 
+def kept(out: Path) -> int:
+    """How many cameras are kept."""
+    path = out / "cameras_kept.json"
+    return len(read_json(path)["frames"]) if path.exists() else 0
+
+
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small run."""
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, int, Path]]:
+    """The viewer of a small run at work, its port, and the run. In the end Ctrl-C ends it without a word."""
     out = tmp_path_factory.mktemp("view") / "out"
     finished(out, 9, *FAST, "--quiet")
-    return out
-
-
-@pytest.fixture
-def served(made: Path, tmp_path: Path) -> Iterator[tuple[Any, int, Path]]:
-    """The viewer of a copy of the run at work, its port, and the copy."""
-    shutil.copytree(made, tmp_path / "out")
-    size = max(CAMERA.width, CAMERA.height)
-    process = start("view", tmp_path / "out", "--port", 0, "--image-size", size, "--threads", 1, "--quiet")
+    process = start("view", out, "--port", 0, "--image-size", max(CAMERA.width, CAMERA.height), "--threads", 1, "--quiet")
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
         assert "http://localhost:" in line, process.communicate()[1]
-        yield process, int(line.split("http://localhost:")[1].split()[0]), tmp_path / "out"
+        yield process, int(line.split("http://localhost:")[1].split()[0]), out
+        assert process.poll() is None  # visitors who leave end nothing
+        process.send_signal(signal.SIGINT)
+        said, errors = process.communicate(timeout=HUNG)
+        assert process.returncode == 0 and said == errors == ""
     finally:
         process.kill()
         process.communicate()
@@ -100,7 +102,7 @@ def served(made: Path, tmp_path: Path) -> Iterator[tuple[Any, int, Path]]:
 @pytest.mark.slow
 def test_a_visitor_sees_what_the_cameras_saw(served: tuple[Any, int, Path], capsys: Capsys) -> None:
     process, port, out = served
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=120) as page:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=HUNG) as page:
         assert page.status == 200 and b"<html" in page.read().lower()
     browser = Browser(port)
     fov = float(2 * np.arctan(CAMERA.height / 2 / CAMERA.fy))
@@ -112,28 +114,28 @@ def test_a_visitor_sees_what_the_cameras_saw(served: tuple[Any, int, Path], caps
 
     browser.look(placed("SetOrientationMessage")["wxyz"], placed("SetPositionMessage")["position"], fov, (CAMERA.width, CAMERA.height))
     shown = browser.picture(CAMERA.width)
-    kept = cv2.imread(str(next((out / "renders").glob("field_000_*[!h].png"))))  # the first camera is held out, so its picture is there
-    assert kept is not None and kept.shape == shown.shape
-    assert 10 * np.log10(255**2 / np.mean((kept[..., ::-1].astype(float) - shown) ** 2)) > 28  # a JPEG of the same
+    scored = cv2.imread(str(next((out / "renders").glob("field_000_*[!h].png"))))  # the first camera is held out, so its picture is there
+    assert scored is not None and scored.shape == shown.shape
+    assert 10 * np.log10(255**2 / np.mean((scored[..., ::-1].astype(float) - shown) ** 2)) > 28  # a JPEG of the same
 
+    before = kept(out)
     keep = next(message for message in browser.seen if message["type"] == "GuiButtonMessage")
     browser.say("GuiUpdateMessage", uuid=keep["uuid"], updates={"value": True})
-    browser.until(lambda message: message["type"] == "GuiUpdateMessage" and "1 in" in str(message["updates"]))
+    browser.until(lambda message: message["type"] == "GuiUpdateMessage" and f"{before + 1} in" in str(message["updates"]))
     answer = call(capsys, "render", out, "--cameras", out / "cameras_kept.json", "--to", out / "again", "--threads", 1, "--quiet")
     assert answer.code == 0, answer.err
-    again = cv2.imread(str(next((out / "again").glob("*.png"))))
-    assert again is not None and abs(again.astype(int) - kept).max() <= 2  # the same camera, by way of the input's frame
+    again = cv2.imread(str(max((out / "again").glob("*.png"))))
+    assert again is not None and abs(again.astype(int) - scored).max() <= 2  # the same camera, by way of the input's frame
 
     choice = next(message for message in browser.seen if message["type"] == "GuiDropdownMessage")
     browser.say("GuiUpdateMessage", uuid=choice["uuid"], updates={"value": "opacity"})
     grey = browser.picture(CAMERA.width).astype(int)
     assert np.ptp(grey, axis=2).max() < 8 and abs(shown.astype(int) - grey).mean() > 20
+    browser.say("GuiUpdateMessage", uuid=choice["uuid"], updates={"value": choice["value"]})  # controls are every visitor's
+    browser.picture(CAMERA.width)
     browser.socket.close()
     time.sleep(0.5)
     assert process.poll() is None  # a visitor who leaves ends nothing
-    process.send_signal(signal.SIGINT)
-    said, errors = process.communicate(timeout=120)
-    assert process.returncode == 0 and said == errors == ""
 
 
 @pytest.mark.slow
@@ -148,17 +150,16 @@ def test_the_page_shows_the_field_in_a_browser(served: tuple[Any, int, Path], ca
             second = page.picture()
             return second if second[240:].std() > 10 and abs(first.astype(int) - second).max() < 8 else None
 
-        before = until(at_rest)
+        before, count = until(at_rest), kept(out)
         page.drag((260, 340), (380, 320))
         shown = until(at_rest)
         assert abs(shown.astype(int) - before).mean() > 3  # another view of the room
         page.run("[...document.querySelectorAll('button')].find(one => one.textContent.includes('Keep')).click()")
-        kept = out / "cameras_kept.json"
-        until(kept.exists)
+        until(lambda: kept(out) > count)
         assert not page.errors
-    answer = call(capsys, "render", out, "--cameras", kept, "--to", out / "kept", "--threads", 1, "--quiet")
+    answer = call(capsys, "render", out, "--cameras", out / "cameras_kept.json", "--to", out / "kept", "--threads", 1, "--quiet")
     assert answer.code == 0, answer.err
-    picture = cv2.imread(str(next((out / "kept").glob("*.png"))))
+    picture = cv2.imread(str(max((out / "kept").glob("*.png"))))
     assert picture is not None
     again = cv2.resize(picture, shown.shape[1::-1], interpolation=cv2.INTER_LINEAR)
     below = slice(shown.shape[0] // 2, None)  # the upper half is beside, or behind, the page's controls

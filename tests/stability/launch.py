@@ -2,7 +2,7 @@
 
 JSON: `event` n and `signal` s: send s to this process at its n-th change of a file (open for writing, rename, remove, make a folder).
 `stage` and `memory`: from when that stage begins the process may take so many bytes more. `ticks`: the clock of the fit advances by so
-many seconds a look, so that a fit of a given budget makes the same steps on every machine. `jumps`: the wall clock jumps to and fro.
+many seconds a look, so that a fit of a given budget makes the same steps on every machine.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import random
 import resource
 import signal
 import sys
@@ -65,20 +64,11 @@ def steady_clock(tick: float) -> None:
     time.perf_counter = lambda: next(looks) * tick
 
 
-def jumping_clock() -> None:
-    """The wall clock jumps by up to a year either way at each look."""
-    plain = time.time
-    draw = random.Random(0)
-    time.time = lambda: plain() + draw.uniform(-3e7, 3e7)
-
-
 def main() -> None:
     plan = json.loads(sys.argv[1])
     sys.argv = ["fieldfuse", *sys.argv[2:]]
     if "ticks" in plan:
         steady_clock(plan["ticks"])
-    if plan.get("jumps"):
-        jumping_clock()
     if "stage" in plan:
         at_stage(plan["stage"], lambda: little_memory(plan["memory"]))
     if "event" in plan:

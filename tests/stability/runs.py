@@ -18,12 +18,12 @@ from toolkit.files import read_json
 from toolkit.render.field import Field
 
 ROOT = Path(__file__).resolve().parents[2]
-OPTIONS = ("--budget", "1", "--threads", "1", "--holdout", "4", "--set", "field.resolution=16", "--set", "export.mesh_views=3",
+OPTIONS = ("--budget", "0.5", "--threads", "1", "--holdout", "4", "--set", "field.resolution=16", "--set", "export.mesh_views=3",
            "--set", "export.formats=[points,ply,cameras]", "--set", "field.init=classical", "--engine", "torch",
            "--quiet")  # fmt: skip
 NETWORK = ("--set", "field.init=network")  # behind the options above: a run that starts from the networks
 PATIENCE = 600.0  # seconds after which a run counts as hung, on the busiest machine
-TICK = 0.008  # seconds that the fit's clock advances at each look: some hundred looks a run, on any machine
+TICK = 0.008  # seconds that the fit's clock advances at each look: some sixty looks a run, on any machine
 STAGES = ("capture", "poses", "effects", "scene", "views", "keyframes", "tsdf", "field", "render", "export", "evaluate")
 VARYING = ("key", "made", "after", "outputs", "cached", "started", "created", "command")
 

@@ -33,8 +33,8 @@ PHOTO = CAMERA.scaled(288, 216)
 
 
 def make_pictures(folder: Path) -> Path:
-    """Twelve pictures of the made-up room with poses and without depth, 96×72."""
-    make_room(folder, 12)
+    """Ten pictures of the made-up room with poses and without depth, 96×72."""
+    make_room(folder, 10)
     return folder
 
 
@@ -57,7 +57,7 @@ class Kind:
     stages: tuple[str, ...]
 
 
-_MORE = ("--budget", "0.5", "--set", "field.init=network", "--set", "network.voxels=24", "--set", "tsdf.enabled=on")
+_MORE = ("--budget", "0.3", "--set", "field.init=network", "--set", "network.voxels=24", "--set", "tsdf.enabled=on")
 KINDS = {
     "RGB-D": Kind(make_source, (), STAGES),
     "pictures, from the networks": Kind(

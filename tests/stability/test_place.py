@@ -34,7 +34,7 @@ PLACES: dict[str, tuple[float, Array, Array]] = {  # scale, shift, turn
     "turned, a thousandfold and 6,000 km away": (1e3, FAR, rotation(7)),
     "turned": (1.0, NOWHERE, rotation(4)),
 }
-TURNS = 8
+TURNS = 4
 
 
 def moved(source: Path, target: Path, scale: float, shift: Array, turn: Array) -> Path:
