@@ -46,11 +46,12 @@ demo: $(VENV)/.installed
 WORKERS ?= $(if $(filter-out 0 1,$(shell nproc 2>/dev/null)),2,0)
 
 # Types take one core most of a minute, so they are checked beside the tests; their errors count all the same.
+# Bytecode is kept, also where the environment says otherwise: tests start many processes, and each would compile what it imports.
 test: $(VENV)/.installed-test
 	$(RUFF) $(SOURCES)
 	$(BIN)/lint-imports
 	$(BIN)/mypy & types=$$!; tests=0; \
-	$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile || tests=$$?; wait $$types; exit $$tests
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile || tests=$$?; wait $$types; exit $$tests
 
 stability: $(VENV)/.installed-test
 	$(BIN)/python -m tests.stability.page docs/stability.md
