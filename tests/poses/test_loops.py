@@ -24,7 +24,7 @@ from toolkit.poses.result import PoseResult
 from toolkit.poses.sfm import find_poses
 from toolkit.poses.worker import Mouth, work
 
-FRAMES, TURNS = 40, 1.2
+FRAMES, TURNS = 30, 1.2
 POSES = orbit(FRAMES, TURNS)
 SMALL = PosesSettings(max_features=450)
 

@@ -231,7 +231,7 @@ def test_a_guess_leaves_the_coarsest_lattice_sooner_where_validation_views_tell_
     rough = fit_guided(views(), SCENE, wanted("budget=1", "field.resolution=32"), ticks=steady()).field
     few = views()
     many = few.subset(np.tile(np.arange(len(few)), -(-LEAST_VIEWS // np.count_nonzero(~few.test))))
-    for shown, factor, tick in ((many, 0.7, 0.002), (few, 1.0, 0.005)):
+    for shown, factor, tick in ((many, 0.7, 0.004), (few, 1.0, 0.01)):
         shares = []
         for begin in ({}, {"start": rough, "coarse": True}):
             told = Levels()

@@ -68,7 +68,7 @@ def held_and_foreseen(decoder: str, threads: int) -> tuple[float, int, int]:
     and what if they take the place of others."""
     settings = wanted(f"decoder={decoder}", "engine=numba", "budget=3", "field.resolution=64", f"threads={threads}")
     with pytest.MonkeyPatch.context() as patch:
-        ticking(patch, 0.05)
+        ticking(patch, 0.1)
         field = fit_field(sphere_views(), scene(), settings).field
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
@@ -103,11 +103,11 @@ def test_a_fit_climbs_where_there_is_little_memory_but_enough(monkeypatch: pytes
 
 
 def test_a_level_that_does_not_fit_is_not_made_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    ticking(monkeypatch, 0.02)
+    ticking(monkeypatch, 0.05)
     monkeypatch.setattr(Schedule, "worth", lambda self, voxels, rays_left: True)
     settings = wanted("engine=torch", "budget=3", "field.resolution=64")
     assert fit_field(sphere_views(), scene(), settings).field.resolution == 64
-    ticking(monkeypatch, 0.02)
+    ticking(monkeypatch, 0.05)
     allow(monkeypatch, memory.SPARE + 2**21)
     result = fit_field(sphere_views(), scene(), settings)
     assert result.field.resolution == 32 and result.timeline[-1]["psnr"] > 12
