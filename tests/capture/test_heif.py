@@ -33,7 +33,8 @@ def heic(path: Path, picture: Array, orientation: int = 1, **options: object) ->
     tags = Image.Exif()
     tags[0x0112] = orientation
     tags.get_ifd(0x8769).update({0xA405: 26})
-    Image.fromarray(picture).save(path, format="HEIF", exif=tags.tobytes(), **{"quality": 90, "enc_params": {"preset": "ultrafast"}, **options})
+    options = {"quality": 90, "enc_params": {"preset": "ultrafast"}, **options}
+    Image.fromarray(picture).save(path, format="HEIF", exif=tags.tobytes(), **options)
     return path
 
 

@@ -143,7 +143,7 @@ def test_fox_points_reproject_within_two_pixels():
     from toolkit.capture import open_capture
 
     fox = open_capture(shared_data("fox_540x960"))
-    fox = fox.with_frames(fox.frames[:8])
+    fox = fox.with_frames(fox.frames[:12])
     cloud = triangulate(fox)
     assert len(cloud.points) > 500
     off = []
