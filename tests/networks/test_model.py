@@ -98,8 +98,8 @@ def test_outside_the_local_volume_every_bit_stays() -> None:
 
 # Eight seeds: with gates twice as strong as at the start the state moves by 0.03 at the most after step 100; three times as strong, where
 # the candidate's answer to the state comes near to one, by 0.33, and by 0.04 in the mean.
-# By step 300 the latter has moved as far as it does.
-@pytest.mark.parametrize(("gain", "times", "most", "mean"), [(2.0, 1000, 0.05, 0.005), (3.0, 300, 0.5, 0.05)])
+# Of the latter the first 300 steps are made, in which two of the seeds moved by 0.13 and 0.19, and by 0.02 in the mean.
+@pytest.mark.parametrize(("gain", "times", "most", "mean"), [(2.0, 1000, 0.05, 0.005), (3.0, 300, 0.3, 0.03)])
 def test_the_same_frame_a_thousand_times_does_not_drift(gain: float, times: int, most: float, mean: float) -> None:
     model = small_model(2).eval()
     for parameter in model.fusion.parameters():

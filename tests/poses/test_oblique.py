@@ -145,7 +145,7 @@ def test_six_photos_of_a_real_capture(tmp_path):
     (tmp_path / "photos").mkdir()
     for name in names:
         (tmp_path / "photos" / f"{name}.jpg").symlink_to(shared_data(f"fox_540x960/images/{name}.jpg"))
-    result = find_poses(open_capture(tmp_path / "photos"), tmp_path, PosesSettings(max_features=1024), seed=0, threads=1)
+    result = find_poses(open_capture(tmp_path / "photos"), tmp_path, PosesSettings(max_features=2048), seed=0, threads=1)
     true = {frame.name: frame.world_from_camera for frame in given_poses.frames}
     assert result.registered == 6 and not any("contradict" in warning for warning in result.warnings)
     assert aligned_error(result.world_from_camera[:, :3, 3], np.array([true[name] for name in result.names])[:, :3, 3]) < 0.01
