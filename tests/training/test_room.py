@@ -103,11 +103,11 @@ def test_a_fit_climbs_where_there_is_little_memory_but_enough(monkeypatch: pytes
 
 
 def test_a_level_that_does_not_fit_is_not_made_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    ticking(monkeypatch, 0.05)
+    ticking(monkeypatch, 0.02)
     monkeypatch.setattr(Schedule, "worth", lambda self, voxels, rays_left: True)
     settings = wanted("engine=torch", "budget=3", "field.resolution=64")
     assert fit_field(sphere_views(), scene(), settings).field.resolution == 64
-    ticking(monkeypatch, 0.05)
+    ticking(monkeypatch, 0.02)
     allow(monkeypatch, memory.SPARE + 2**21)
     result = fit_field(sphere_views(), scene(), settings)
     assert result.field.resolution == 32 and result.timeline[-1]["psnr"] > 12
