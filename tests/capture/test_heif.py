@@ -27,13 +27,14 @@ pillow_heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not inst
 
 
 def heic(path: Path, picture: Array, orientation: int = 1, **options: object) -> Path:
-    """A HEIF file with `picture`, stored so that `orientation` turns it upright."""
+    """A HEIF file with `picture`, stored so that `orientation` turns it upright; encoded in haste, which on two busy cores is a fifth."""
     pillow_heif.register_heif_opener()
     path.parent.mkdir(parents=True, exist_ok=True)
     tags = Image.Exif()
     tags[0x0112] = orientation
     tags.get_ifd(0x8769).update({0xA405: 26})
-    Image.fromarray(picture).save(path, format="HEIF", exif=tags.tobytes(), **{"quality": 90, **options})
+    options = {"quality": 90, "enc_params": {"preset": "ultrafast"}, **options}
+    Image.fromarray(picture).save(path, format="HEIF", exif=tags.tobytes(), **options)
     return path
 
 
@@ -104,12 +105,12 @@ def test_what_is_there_as_jpeg_too_is_used_once(tmp_path: Path) -> None:
 def test_the_small_copy_in_the_file_is_looked_at_where_there_is_one(tmp_path: Path) -> None:
     from toolkit.capture.checks import THUMB_SIDE, thumbnail
 
-    seen = smooth(0, 600, 800)
+    seen = smooth(0, 360, 480)
     for name, options in (("with", {"thumbnails": [400]}), ("without", {})):
         path = heic(tmp_path / f"{name}.heic", seen, **options)
         data = path.read_bytes()
         grey = thumbnail(data, read_header(data, path), path)
-        assert max(grey.shape) == THUMB_SIDE or THUMB_SIDE <= max(grey.shape) <= THUMB_SIDE / 0.75
+        assert max(grey.shape) == (400 if options else THUMB_SIDE)
         expected = cv2.resize(cv2.cvtColor(seen, cv2.COLOR_RGB2GRAY), grey.shape[::-1], interpolation=cv2.INTER_AREA)
         assert close(grey, expected)
 
@@ -131,8 +132,8 @@ def test_a_truncated_picture_is_refused_by_name(tmp_path: Path, share: float) ->
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damage_anywhere_gives_a_picture_or_a_sentence(tmp_path: Path, data: st.DataObject) -> None:
-    path = tmp_path / "a.heic"
-    whole = bytearray(heic(path, smooth()).read_bytes())
+    path, sound = tmp_path / "a.heic", tmp_path / "sound.heic"
+    whole = bytearray((sound if sound.exists() else heic(sound, smooth())).read_bytes())
     at = data.draw(st.integers(0, len(whole) - 1))
     whole[at : at + data.draw(st.integers(0, 9))] = data.draw(st.binary(max_size=9))
     path.write_bytes(bytes(whole))

@@ -91,7 +91,7 @@ def test_against_dense_convolutions() -> None:
     torch.testing.assert_close(found[inside], expected[inside], atol=1e-10, rtol=1e-8)
 
 
-def test_two_thousand_steps_stay_bounded() -> None:
+def test_a_thousand_steps_stay_bounded() -> None:
     topology = Topology(torch.tensor([[0, 0, 0]]))
     torch.manual_seed(0)
     gru = FusionGRU(CHANNELS, 6, layers=1)
@@ -100,10 +100,10 @@ def test_two_thousand_steps_stay_bounded() -> None:
     given = inputs(topology, 0, 0.2)
     mask = torch.cat([given["inside"], given["inside"].new_zeros(1)])[:, None]
     with torch.no_grad():
-        for step in range(2000):
+        for step in range(1000):
             given["state"] = gru(**given, topology=topology)
             given["count"] = given["count"] + given["weight"]
-            if step % 200 == 199:  # now and then something else is seen, without measure
+            if step % 100 == 99:  # now and then something else is seen, without measure
                 given["raw"] = torch.randn_like(given["raw"]) * 10 * mask
                 given["local"] = torch.tanh(given["raw"])
     assert bool(torch.isfinite(given["state"]).all()) and 0.5 < float(given["state"].abs().max()) <= 1

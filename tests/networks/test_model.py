@@ -98,8 +98,9 @@ def test_outside_the_local_volume_every_bit_stays() -> None:
 
 # Eight seeds: with gates twice as strong as at the start the state moves by 0.03 at the most after step 100; three times as strong, where
 # the candidate's answer to the state comes near to one, by 0.33, and by 0.04 in the mean.
-@pytest.mark.parametrize(("gain", "most", "mean"), [(2.0, 0.05, 0.005), (3.0, 0.5, 0.05)])
-def test_the_same_frame_a_thousand_times_does_not_drift(gain: float, most: float, mean: float) -> None:
+# Of the latter the first 300 steps are made, in which two of the seeds moved by 0.13 and 0.19, and by 0.02 in the mean.
+@pytest.mark.parametrize(("gain", "times", "most", "mean"), [(2.0, 1000, 0.05, 0.005), (3.0, 300, 0.3, 0.03)])
+def test_the_same_frame_a_thousand_times_does_not_drift(gain: float, times: int, most: float, mean: float) -> None:
     model = small_model(2).eval()
     for parameter in model.fusion.parameters():
         parameter.data.mul_(gain)
@@ -112,14 +113,14 @@ def test_the_same_frame_a_thousand_times_does_not_drift(gain: float, most: float
         one = model.local_volume(model.encode(pictures(1), seen_by), seen_by, small, Topology(torch.tensor([[0, 0, 0]])), near=0.1)
         assert int(one.known.sum()) > 20
         state, moves, early = model.start(small), [], None
-        for step in range(1000):
+        for step in range(times):
             after = model.fuse(state, one)
             if step >= 1:
                 moves.append(float((after.rows - state.rows).abs().max()))
             state = after
             early = state.rows if step == 99 else early
     assert bool(torch.isfinite(state.rows).all()) and float(state.rows.abs().max()) <= 1
-    torch.testing.assert_close(state.count, 1000 * one.weight * one.known, rtol=1e-3, atol=0.0)
+    torch.testing.assert_close(state.count, times * one.weight * one.known, rtol=1e-3, atol=0.0)
     assert early is not None
     drift = (state.rows - early)[:-1][one.known].abs()
     assert float(drift.max()) < most and float(drift.mean()) < mean

@@ -124,15 +124,15 @@ def test_a_fold_that_pairs_tell_of_is_never_mapped(tmp_path):
 
 def test_a_circle_without_a_fold_is_mapped_as_ever(tmp_path):
     """All sides differ, and the second turn meets the first."""
-    planes = post((3, 4, 13, 14))
-    capture = write_capture(tmp_path / "photos", [render(pose, planes=planes)[0] for pose in POSES], ordered=True)
+    poses, planes = orbit(30, TURNS), post((3, 4, 13, 14))
+    capture = write_capture(tmp_path / "photos", [render(pose, planes=planes)[0] for pose in poses], ordered=True)
     result = find_poses(capture, tmp_path, SMALL, seed=3, threads=1)
-    assert result.registered == FRAMES and aligned_error(result.world_from_camera[:, :3, 3], POSES[:, :3, 3]) < 0.005
+    assert result.registered == len(poses) and aligned_error(result.world_from_camera[:, :3, 3], poses[:, :3, 3]) < 0.005
     job = Job.load(tmp_path / "sparse" / "job.json")
     seen = loops.turns(job)
-    assert loops.contradicted(seen, loops.chained(seen, FRAMES)) > 0.5  # with a guessed lens the circle does not close
+    assert loops.contradicted(seen, loops.chained(seen, len(poses))) > 0.5  # with a guessed lens the circle does not close
     seen = loops.turns(job, loops._calibrated(job, seen))
-    assert np.count_nonzero(seen.apart > loops.NEAR[0]) > 10 and loops.contradicted(seen, loops.chained(seen, FRAMES)) < 0.2
+    assert np.count_nonzero(seen.apart > loops.NEAR[0]) > 10 and loops.contradicted(seen, loops.chained(seen, len(poses))) < 0.2
     assert loops.never_folded(job, silent) is None
     assert json.loads((tmp_path / "sparse" / "result.json").read_text())["folded"] is None
 

@@ -35,7 +35,7 @@ def featured(tmp_path_factory) -> Job:
     planes = post((3, 4, 13, 14))
     pictures = [render(pose, planes=planes)[0] for pose in orbit(COUNT, 0.35)]
     capture = write_capture(folder / "photos", pictures, ordered=True)
-    job = plan(capture, folder / "sparse", PosesSettings(max_features=800), seed=3, threads=1)
+    job = plan(capture, folder / "sparse", PosesSettings(max_features=500), seed=3, threads=1)
     Path(job.folder).mkdir()
     database = store.open_database(job)
     store.extract(job, database, silent)
@@ -67,13 +67,20 @@ def found(job: Job) -> dict[tuple[int, int], tuple[Any, ...]]:
         database.close()
 
 
-def test_what_is_matched_does_not_hang_on_the_threads(featured, tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def alone(featured, tmp_path_factory) -> dict[tuple[int, int], tuple[Any, ...]]:
+    """What one process finds."""
+    job = copy_of(featured, tmp_path_factory.mktemp("alone") / "one", 1)
+    match.match(job, PAIRS, silent)
+    return found(job)
+
+
+def test_what_is_matched_does_not_hang_on_the_threads(featured, alone, tmp_path, monkeypatch):
     monkeypatch.setattr(match, "PAIRS_A_STEP", 8)  # nine steps
-    alone, together = copy_of(featured, tmp_path / "one", 1), copy_of(featured, tmp_path / "three", 3)
+    together = copy_of(featured, tmp_path / "three", 3)
     told: list[float] = []
-    match.match(alone, PAIRS, silent)
     match.match(together, PAIRS, lambda done, total, note: told.append(done))
-    first, second = found(alone), found(together)
+    first, second = alone, found(together)
     assert set(first) == set(second) and len(first) == len(PAIRS)
     for pair, values in first.items():
         for one, other in zip(values, second[pair], strict=True):
@@ -119,10 +126,10 @@ def test_without_room_for_copies_fewer_match(featured, tmp_path, monkeypatch, ro
 
 
 @pytest.mark.parametrize("broken", ["database", "process"])
-def test_what_fails_together_is_matched_alone(featured, tmp_path, monkeypatch, broken):
+def test_what_fails_together_is_matched_alone(featured, alone, tmp_path, monkeypatch, broken):
     """A copy that is no database, and a process that dies: neither is taken for pairs without matches, and all are matched in the end."""
     monkeypatch.setattr(match, "PAIRS_A_STEP", 8)
-    job, alone = copy_of(featured, tmp_path / "job", 2), copy_of(featured, tmp_path / "alone", 1)
+    job = copy_of(featured, tmp_path / "job", 2)
     if broken == "process":
         monkeypatch.setattr(match, "_end_with_parent", os.abort)
     real = shutil.copyfile
@@ -135,8 +142,6 @@ def test_what_fails_together_is_matched_alone(featured, tmp_path, monkeypatch, b
     monkeypatch.setattr(match.shutil, "copyfile", copyfile)
     told: list[float] = []
     match.match(job, PAIRS, lambda done, total, note: told.append(done))
-    monkeypatch.undo()
-    match.match(alone, PAIRS, silent)
-    first, second = found(job), found(alone)
+    first, second = found(job), alone
     assert set(first) == set(second) and all(len(first[pair][0]) == len(second[pair][0]) for pair in second)
     assert told[-1] == len(PAIRS) and not (tmp_path / "job" / "matching").exists()

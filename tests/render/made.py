@@ -15,7 +15,13 @@ from toolkit.volume.space import Space
 
 
 def random_field(
-    background: float = 0.0, resolution: int = 32, decoder: str = "deferred", keep: float = 1.0, seed: int = 0, raw: float = -1.0
+    background: float = 0.0,
+    resolution: int = 32,
+    decoder: str = "deferred",
+    keep: float = 1.0,
+    seed: int = 0,
+    raw: float = -1.0,
+    channels: int = 8,
 ) -> Field:
     """A field whose voxels are occupied with probability `keep`, with random densities, features and decoder."""
     generator = torch.Generator().manual_seed(seed)
@@ -23,10 +29,10 @@ def random_field(
     space = Space((0.2, -0.1, 0.05), 1.3, background)
     places = all_places(space, resolution)
     places = places[torch.rand(len(places), generator=generator) < keep]
-    net = make_decoder(decoder, 8, 16)
+    net = make_decoder(decoder, channels, 16)
     for parameter in net.parameters():
         parameter.data.add_(0.2 * torch.randn(parameter.shape, generator=generator))
-    field = first_field(space, resolution, places, 8, raw, net, torch.tensor([0.2, 0.4, 0.6]), 0.0, 4, TorchHost(), generator)
+    field = first_field(space, resolution, places, channels, raw, net, torch.tensor([0.2, 0.4, 0.6]), 0.0, 4, TorchHost(), generator)
     field.density_rows[:-1] += torch.randn(len(field.density_rows) - 1, generator=generator)
     field.feature_rows[:-1] += torch.randn(field.feature_rows[:-1].shape, generator=generator)
     return field

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
+from functools import cache
 from types import ModuleType
 from typing import Any
 
@@ -78,10 +80,18 @@ def test_what_is_not_listed_is_never_called_and_changes_no_bit(bank: TextureBank
     assert counted(filmed(bank, depth=True)) == expected
 
 
+@pytest.fixture(scope="module")
+def clean_of(bank: TextureBank) -> Callable[[str], tuple[int, str]]:
+    """Operations and shot of a kind of scene without any effect, filmed once each."""
+    return cache(lambda kind: counted(filmed(bank, kind=kind, depth=True)))
+
+
 @pytest.mark.parametrize("name", sorted(MODULES))
-def test_each_effect_alone_calls_no_other(bank: TextureBank, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_effect_alone_calls_no_other(
+    bank: TextureBank, clean_of: Callable[[str], tuple[int, str]], name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     kind = {"background": "street", "highlights": "sphere"}.get(name, "room")
-    clean = counted(filmed(bank, kind=kind, depth=True))
+    clean = clean_of(kind)
     for other in MODULES:
         if other != name:
             forbid(monkeypatch, other)

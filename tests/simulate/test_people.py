@@ -134,7 +134,7 @@ def test_they_stand_in_the_captures_truth(tmp_path: Path) -> None:
 
 def test_what_passes_in_a_film_is_found_as_moving(bank: TextureBank) -> None:
     """By what a depth camera measures; the film's own mask is the truth."""
-    camera = Intrinsics(128, 96, 96.0, 96.0, 64.0, 48.0)
+    camera = Intrinsics(96, 72, 72.0, 72.0, 48.0, 36.0)
     film = filmed(bank, "passers:strong", camera=camera)
     shots = [film.shot(index) for index in range(len(film))]
     names, poses = [f"{shot.index:03d}" for shot in shots], np.array([shot.world_from_camera for shot in shots])

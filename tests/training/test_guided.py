@@ -33,7 +33,7 @@ def wanted(*pairs: str) -> Settings:
     return load_settings(pairs=["budget=4", *small, "device=cpu", "engine=numba", "threads=1", *pairs])
 
 
-def steady(step: float = 0.005) -> Callable[[], float]:
+def steady(step: float = 0.01) -> Callable[[], float]:
     """A clock that goes on by as much at every look, so that a fit has as many steps on every machine."""
     looks = count()
     return lambda: next(looks) * step
@@ -54,8 +54,8 @@ def depth_error(field: Field) -> float:
 
 
 def test_depth_by_matching_makes_geometry_better() -> None:
-    guided = fit_guided(views(), SCENE, wanted(), ticks=steady())
-    alone = fit_guided(views(), SCENE, wanted("fit.depth_from=sensor"), ticks=steady())
+    guided = fit_guided(views(), SCENE, wanted(), ticks=steady(0.005))
+    alone = fit_guided(views(), SCENE, wanted("fit.depth_from=sensor"), ticks=steady(0.005))
     assert alone.matched is None
     assert guided.matched is not None and guided.matched["views"] == 6 and guided.matched["share"] > 0.3
     assert depth_error(guided.field) < 0.6 * depth_error(alone.field)
@@ -66,7 +66,7 @@ def test_matching_is_a_part_of_the_budget(monkeypatch: pytest.MonkeyPatch) -> No
     whole, took = quick.guided, []
 
     def slow(*given: object, **options: object) -> object:
-        took.append([now() for _ in range(200)])  # a second
+        took.append([now() for _ in range(100)])  # a second
         return whole(*given, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr(quick, "guided", slow)
@@ -88,8 +88,8 @@ def test_a_fit_does_without_what_moves(measured: bool, monkeypatch: pytest.Monke
     monkeypatch.setattr(moving, "FEWEST", 6)
     made, depths, masks = with_passer()
     given = replace(made, test=np.arange(len(made)) == 3, depths=list(depths) if measured else [])
-    without = fit_guided(given, SCENE, wanted(), ticks=steady())
-    everything = fit_guided(given, SCENE, wanted("fit.moving=off"), ticks=steady())
+    without = fit_guided(given, SCENE, wanted(), ticks=steady(0.005))
+    everything = fit_guided(given, SCENE, wanted("fit.moving=off"), ticks=steady(0.005))
     assert everything.left_out is None
     assert without.left_out is not None and set(without.left_out.masks) == {made.names[index] for index in PASSED}
     assert without.left_out.looked_at == 6 and without.left_out.share == pytest.approx(sum(mask.mean() for mask in masks) / 6, rel=0.35)
@@ -120,7 +120,7 @@ def test_looking_for_what_moves_is_a_part_of_the_budget(monkeypatch: pytest.Monk
     now, whole = steady(), moving.moving
 
     def slow(*given: object, **options: object) -> object:
-        assert [now() for _ in range(200)]  # a second
+        assert [now() for _ in range(100)]  # a second
         return whole(*given, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr(moving, "moving", slow)
@@ -187,7 +187,7 @@ def test_a_fit_begins_with_what_is_known_of_depth_within_its_budget(monkeypatch:
     now, whole, begun = steady(), depth_start.depth_start, []
 
     def slow(*given: object, **options: object) -> Field:
-        assert [now() for _ in range(200)]  # a second
+        assert [now() for _ in range(100)]  # a second
         begun.append(whole(*given, **options))  # type: ignore[arg-type]
         return begun[-1]
 
@@ -228,7 +228,7 @@ def test_a_guess_leaves_the_coarsest_lattice_sooner_where_validation_views_tell_
         def update(self, done: float, total: float, note: str = "") -> None:
             self.seen += [note.split(",")[0]] if "³" in note else []
 
-    rough = fit_guided(views(), SCENE, wanted("budget=1", "field.resolution=32"), ticks=steady()).field
+    rough = fit_guided(views(), SCENE, wanted("budget=1", "field.resolution=32"), ticks=steady(0.005)).field
     few = views()
     many = few.subset(np.tile(np.arange(len(few)), -(-LEAST_VIEWS // np.count_nonzero(~few.test))))
     for shown, factor, tick in ((many, 0.7, 0.002), (few, 1.0, 0.005)):

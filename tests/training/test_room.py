@@ -68,7 +68,7 @@ def held_and_foreseen(decoder: str, threads: int) -> tuple[float, int, int]:
     and what if they take the place of others."""
     settings = wanted(f"decoder={decoder}", "engine=numba", "budget=3", "field.resolution=64", f"threads={threads}")
     with pytest.MonkeyPatch.context() as patch:
-        ticking(patch, 0.05)
+        ticking(patch, 0.1)
         field = fit_field(sphere_views(), scene(), settings).field
     before = torch.get_num_threads()
     torch.set_num_threads(threads)

@@ -275,11 +275,12 @@ import json, sys, torch
 from pathlib import Path
 sys.path.insert(0, {root!r})
 from tests.training.nerfusion.tiny import tiny_settings
-from toolkit.training.nerfusion import mixture, procedural
+from toolkit.training.nerfusion import curve, mixture, procedural
 from toolkit.training.nerfusion.distributed import join_crew
 from toolkit.training.nerfusion.train import Trainer
 torch.set_num_threads(1)
 procedural.TEXELS, mixture.BANKS = 128, 1
+curve.draw_curve = lambda *_: None
 with join_crew("cpu") as crew:
     trainer = Trainer(tiny_settings(stage={{"steps": 1, "fused_steps": 2}}), Path({out!r}), crew)
     first = trainer.mixture.sample(0, 1).pictures.images.double().sum().item()
