@@ -65,7 +65,7 @@ def large_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
 def unchecked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The interpreter looks for overflow at each sum and product of integers, half of its time: not where kernels follow each other that
     have tests of their own."""
-    if request.function in (test_key_frames_are_fused, test_a_local_volume, test_a_sweep_and_its_witnesses, test_convolutions_side_by_side):
+    if request.function in (test_key_frames_are_fused, test_a_local_volume, test_a_sweep_and_its_witnesses):
         from triton.runtime.interpreter import interpreter_builder
 
         monkeypatch.setattr(interpreter_builder, "options", replace(interpreter_builder.options, sanitize_overflow=False))

@@ -20,6 +20,7 @@ from toolkit.volume.space import Space
 from toolkit.volume.topology import VOXELS, Topology
 
 GROUP = "prune and split"
+CHANNELS = 16  # of a field, as by default: kernels are compiled for each number of them
 
 
 def sparse_volume(seed: int, blocks: int = 6, share: float = 0.1) -> tuple[Topology, Tensor, Tensor]:
@@ -126,9 +127,9 @@ def small_field(seed: int = 0, share: float = 0.3, resolution: int = 32, shell: 
     topology = Topology(torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1).view(-1, 3))
     topology, occupied = with_corner_blocks(topology, torch.rand(topology.zero_row, generator=generator) < share)
     raw = torch.randn(topology.zero_row + 1, generator=generator) - 1
-    features = torch.randn(topology.zero_row + 1, 6, generator=generator)
+    features = torch.randn(topology.zero_row + 1, CHANNELS, generator=generator)
     raw[-1], features[-1] = 0, 0
-    net = make_decoder(decoder, 6, 16)
+    net = make_decoder(decoder, CHANNELS, 16)
     for parameter in net.parameters():
         parameter.data.add_(0.1 * torch.randn(parameter.shape, generator=generator))
     return Field(Space((0.1, -0.2, 0.3), 1.2, shell), resolution, topology, occupied, raw, features, net, torch.tensor([0.2, 0.5, 0.7]))
