@@ -15,12 +15,15 @@ import torch
 from PIL import Image
 
 from pipelines.folder import RunFolder
+from tests.capture.layouts import write_record3d, write_sens
 from tests.evaluate.test_compare_page import made, pictures
 from tests.evaluate.test_tradeoff import ladder
 from tests.simulate.test_simulate import SMALL
 from tests.training.nerfusion.tiny import tiny_settings
 from toolkit.camera import Intrinsics
+from toolkit.capture import open_capture
 from toolkit.capture.convert import convert_pictures
+from toolkit.capture.film import Film
 from toolkit.capture.photos import read_photos
 from toolkit.capture.select import select_frames
 from toolkit.capture.video import read_video
@@ -74,6 +77,9 @@ def more_writers(place: Path) -> dict[str, Write]:
         writer.write(texture(index, 48, 64))
     writer.release()
     film = read_video(video)
+    write_sens(place / "scan")
+    write_record3d(place / "recording")
+    scan, recording = open_capture(place / "scan"), Film.of(open_capture(place / "recording"))
     photos = place / "photos"
     photos.mkdir()
     for index in range(3):
@@ -112,6 +118,9 @@ def more_writers(place: Path) -> dict[str, Write]:
         "write_picture": lambda folder: write_picture(folder / "a.png", texture(0, 48, 64)),
         "simulate": filmed,
         "select_frames": lambda folder: select_frames(film, folder / f"video{next(numbers)}", CaptureSettings(max_frames=4)),
+        "select_frames, a scan": lambda folder: select_frames(scan, folder / f"scan{next(numbers)}", CaptureSettings(max_frames=4)),
+        "Film.write_depth, a recording's": lambda folder: recording.write_depth(0, folder / "0.npy"),
+        "Film.write_depth, a scan's": lambda folder: Film.of(scan).write_depth(0, folder / "0.png"),
         "convert_pictures": lambda folder: convert_pictures(read_photos(photos), folder / f"photos{next(numbers)}", 2),
         "RunFolder": run_folder,
     }  # fmt: skip
