@@ -127,7 +127,7 @@ class Film:
         except InputError:
             return
         with atomic_path(target) as temporary:
-            np.save(temporary, depth)
+            np.save(temporary, depth * np.float32(self.capture.depth_scale))  # in the capture's own unit, as what is read is taken to be
 
     def written(self, number: int, picture: Path) -> Frame:
         """Frame `number` as it is now that its picture is at `picture`, and its depth where `depth_at` says."""
