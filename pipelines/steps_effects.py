@@ -13,6 +13,7 @@ from toolkit.effects.correct import Corrections
 from toolkit.files import write_json
 
 if TYPE_CHECKING:
+    from toolkit.camera import Array
     from toolkit.capture.types import Capture
     from toolkit.poses.result import PoseResult
 
@@ -40,8 +41,15 @@ def find_effects(job: Job, posed: Capture) -> Corrections:
     def make() -> dict[str, Any]:
         from toolkit.capture.prepare import held_out
 
+        from toolkit.training.trial import Trial
+
+        def trials(capture: Capture, validation: Array) -> Trial:
+            job.progress.update(0, 1, "trying what was found in short fits")
+            set_seeds(job.settings.seed)
+            return Trial(capture, validation, job.settings, job.progress)
+
         set_seeds(job.settings.seed)
-        return decide(posed, held_out(posed, holdout), settings, job.progress).to_dict()
+        return decide(posed, held_out(posed, holdout), settings, job.progress, trials=trials).to_dict()
 
     def save(data: dict[str, Any]) -> list[Path]:
         write_json(path, data)
@@ -54,7 +62,7 @@ def find_effects(job: Job, posed: Capture) -> Corrections:
         load=lambda: read_kept(path, EFFECTS),
         uses=[asdict(settings), holdout, [frame.name for frame in posed.frames], pixel_state(posed)],
         after=["poses"],
-        version=3 if posed.has_depth else 2,
+        version=4,
     )
     corrections = Corrections.from_dict(data.get("corrections", {}) if isinstance(data, dict) else {})
     choose_field(field, data["effects"], settings.off)

@@ -308,8 +308,12 @@ def vectors(rotations: Array) -> Array:
     return np.asarray(axis * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)[:, None])
 
 
-def resect(problem: Problem, frame: int, steps: int = 10) -> Array:
-    """(4, 4) the pose of one frame against points that stay where they are."""
+def resect(problem: Problem, frame: int, steps: int = 20) -> tuple[Array, Array]:
+    """The pose of one frame against points that stay where they are, by damped Gauss-Newton steps from the pose it has.
+
+    Returns:
+        (4, 4) world_from_camera, and (O',) how far its points are then off in the image, working pixels.
+    """
     keep = problem.frame == frame
     alone = replace(
         problem,
@@ -322,16 +326,23 @@ def resect(problem: Problem, frame: int, steps: int = 10) -> Array:
         motion=problem.motion[[frame]],
         depth=None,
     )
-    left = residuals(alone)
+    left, damping = residuals(alone), 1e-3
     for _ in range(steps):
         width = TUNING * max(scatter(left), 1e-3)
         _, slope, _, _ = _slopes(alone, frozenset({POSES}))
         weight = _weights(left, width)
         matrix = np.einsum("oa,oac,oad->cd", weight, slope, slope)
-        step = -np.linalg.solve(matrix + 1e-9 * np.trace(matrix) * np.eye(6), np.einsum("oa,oac,oa->c", weight, slope, left))
-        moved = _with(alone, step, frozenset({POSES}))
+        downhill = np.einsum("oa,oac,oa->c", weight, slope, left)
+        matrix[np.diag_indices(6)] *= 1 + damping
+        moved = _with(alone, -np.linalg.solve(matrix + 1e-9 * np.trace(matrix) * np.eye(6), downhill), frozenset({POSES}))
         new = residuals(moved)
-        if not _cost(new, width) < _cost(left, width):
+        before, after = _cost(left, width), _cost(new, width)
+        if not after < before:
+            damping *= 10
+            if damping > 1e4:
+                break
+            continue
+        alone, left, damping = moved, new, max(damping / 10, 1e-7)
+        if after > (1 - SLACK) * before:
             break
-        alone, left = moved, new
-    return np.asarray(alone.poses[0])
+    return np.asarray(alone.poses[0]), np.linalg.norm(left, axis=1)

@@ -1,10 +1,15 @@
-"""From evidence and the user's wishes to what is corrected."""
+"""From evidence and the user's wishes to what is corrected.
+
+What evidence speaks for is corrected only if three guards let it pass: no correction is larger than cameras explain (`bounds`), held-out
+frames are placed by their own points or like their neighbours (`refine`), and a short fit to some training frames shows others better
+with it than without (`Trial`). What the user switches on by name is corrected whatever the guards say.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +18,8 @@ from toolkit.camera import Array
 from toolkit.capture.types import Capture
 from toolkit.config import EffectsSettings, FieldSettings
 from toolkit.effects import light, vignetting
-from toolkit.effects.adjust import LENS, POSES, ROWS, adjust
+from toolkit.effects.adjust import LENS, POSES, ROWS, adjust, predict
+from toolkit.effects.bounds import beyond, beyond_depth, bounded_gains
 from toolkit.effects.correct import Corrections, correctable
 from toolkit.effects.depth_camera import NOTHING, look_for_offset
 from toolkit.effects.light import EXPOSURE, VIGNETTING
@@ -40,6 +46,13 @@ OF_FIELD = {  # no correction of pictures, but what the field is made of
     FAR: "whether space beyond the region is modelled is decided with the scene (field.background)",
 }
 PLAIN_VIEW = "full"  # what the decoder sees of the direction where nothing speaks for view dependence
+GROUPS = ((POSES, LENS), (EXPOSURE, VIGNETTING), (BLUR,))  # what a trial switches at once, in this order
+WINS = {POSES: 0.0, LENS: 0.0, EXPOSURE: 0.1, VIGNETTING: 0.1, BLUR: 0.1}  # decibels by which a trial has to be better with a group
+TRIED, VALIDATED = 56, 8  # training frames that take part in a trial, and those of them that it scores, at most
+FEWEST_TRIED = 6  # training frames without which there is no trial
+EVIDENCE, BOUND, CHECK, TRIAL = "evidence", "bound", "check", "trial"  # which guard had the last word
+Trial = Callable[[Corrections], Array | None]  # (V,) decibels of validation frames after a short fit with what is corrected
+Trials = Callable[[Capture, Array], Trial]  # … made for training frames and (F,) bool those of them that are validation frames
 
 
 @dataclass(frozen=True)
@@ -50,9 +63,23 @@ class Decision:
     wish: str  # auto, on or off
     on: bool  # corrected
     note: str = ""
+    decided_by: str = EVIDENCE
+    trial: dict[str, float] = field(default_factory=dict)  # decibels of validation frames `without` and `with`; empty: none was made
 
     def to_dict(self) -> dict[str, Any]:
-        return {**self.finding.to_dict(), "wish": self.wish, "on": bool(self.on), "note": self.note}
+        tried = {"trial": {name: round(value, 2) for name, value in self.trial.items()}} if self.trial else {}
+        return {
+            **self.finding.to_dict(),
+            "wish": self.wish,
+            "on": bool(self.on),
+            "note": self.note,
+            "decided_by": self.decided_by,
+            **tried,
+        }
+
+    def dropped(self, guard: str, why: str, trial: dict[str, float] | None = None) -> Decision:
+        """Not corrected after all."""
+        return replace(self, on=False, note=f"not corrected: {why}", decided_by=guard, trial=trial or {})
 
 
 @dataclass(frozen=True)
@@ -86,13 +113,21 @@ def asleep(settings: EffectsSettings) -> bool:
     return settings.mode == "off" and not settings.on
 
 
-def decide(capture: Capture, test: Array, settings: EffectsSettings, progress: Progress = SILENT, found: Survey | None = None) -> Decided:
+def decide(
+    capture: Capture,
+    test: Array,
+    settings: EffectsSettings,
+    progress: Progress = SILENT,
+    found: Survey | None = None,
+    trials: Trials | None = None,
+) -> Decided:
     """Look at the training frames of a posed capture, decide, and work out the corrections of all frames.
 
     Args:
         test: (N,) bool: held-out frames. They enter nothing that training frames get; afterwards they are brought to the same colours and
             poses by the points that training frames found.
         found: what a survey of these training frames found before; None: they are looked at.
+        trials: makes short fits that have the last word; None: there are none.
 
     Raises:
         InputError: a picture cannot be read.
@@ -101,18 +136,117 @@ def decide(capture: Capture, test: Array, settings: EffectsSettings, progress: P
     train = [int(index) for index in np.flatnonzero(~test)]
     known: dict[int, Look] = {}
     found = found or survey(capture, train, progress, known=known, quick=not settings.on)
-    decisions = [_decision(finding, wish(settings, name), capture, found) for name, finding in found.findings.items()]
-    on = frozenset(decision.finding.effect for decision in decisions if decision.on)
-    corrections, seen, agreed = _corrections(capture, test, found, on, progress, known)
-    if agreed is not None:
-        decisions = [replace(one, note=agreed.note) if one.finding.effect == POSES else one for one in decisions]
+    decisions = {name: _decision(finding, wish(settings, name), capture, found) for name, finding in found.findings.items()}
+    chosen, aside = tried_frames(train, len(test))
+    worked = _worked_out(capture, test, found, _corrected(decisions), progress, known, aside)
+    decisions, worked = _guarded(decisions, worked, capture, found)
+    if trials is not None and any(one.wish == "auto" for one in decisions.values() if one.on and _tried(one)):
+        decisions = _judged(decisions, worked, capture, found, trials, chosen, aside)
+    corrections = worked.parts(_corrected(decisions))
+    if worked.agreed is not None and decisions[POSES].on:
+        decisions[POSES] = replace(decisions[POSES], note=worked.agreed.note)
     if capture.has_depth:
         with found.paid.by(DEPTH_OFFSET):
-            finding, pose = look_for_offset(corrections.on_capture(capture), train, seen, progress, known)
+            finding, pose = look_for_offset(corrections.on_capture(capture), train, worked.seen, progress, known)
         decision = _of_depth(finding, wish(settings, DEPTH_OFFSET), pose is not None)
-        decisions.append(decision)
+        why = beyond_depth(pose, capture.metric, usual_depth(found)) if pose is not None else None
+        if decision.on and decision.wish == "auto" and why is not None:
+            decision = decision.dropped(BOUND, why)
+        decisions[DEPTH_OFFSET] = decision
         corrections = replace(corrections, depth=pose if decision.on else None)
-    return Decided(tuple(decisions), corrections, time.monotonic() - began, found.facts, found.paid)
+    return Decided(tuple(decisions.values()), corrections, time.monotonic() - began, found.facts, found.paid)
+
+
+def tried_frames(train: Sequence[int], count: int) -> tuple[list[int], Array]:
+    """The training frames that a trial uses, evenly spread, and (count,) bool those of them that it scores."""
+    chosen = [train[k] for k in np.unique(np.linspace(0, len(train) - 1, min(TRIED, len(train))).round().astype(int))] if train else []
+    aside = np.zeros(count, dtype=bool)
+    if len(chosen) >= FEWEST_TRIED:
+        every = max(len(chosen) // VALIDATED, 4)
+        aside[chosen[every // 2 :: every]] = True
+    return chosen, aside
+
+
+def usual_depth(found: Survey) -> float:
+    """Median depth of the points that images share, units of the poses; 0: there are none."""
+    depth = np.zeros(0) if found.explained is None else predict(found.explained.problem)[0][:, 2]
+    return float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
+
+
+def better(without: Array, with_it: Array) -> float:
+    """Decibels by which validation frames are better, less the standard error of their mean: a few frames may be so by chance."""
+    gain = with_it - without
+    return float(gain.mean() - gain.std(ddof=1) / np.sqrt(len(gain))) if len(gain) > 1 else float(gain.mean())
+
+
+def _corrected(decisions: dict[str, Decision]) -> frozenset[str]:
+    return frozenset(name for name, decision in decisions.items() if decision.on)
+
+
+def _tried(decision: Decision) -> bool:
+    return any(decision.finding.effect in group for group in GROUPS)
+
+
+def _guarded(
+    decisions: dict[str, Decision], worked: Worked, capture: Capture, found: Survey
+) -> tuple[dict[str, Decision], Worked]:
+    """Without what no camera explains, and without poses by which held-out frames cannot be placed."""
+    cameras = [frame.intrinsics for frame in capture.frames if frame.intrinsics is not None]
+    given = {frame.name: frame.world_from_camera for frame in capture.frames if frame.world_from_camera is not None}
+    reasons = {name: (BOUND, why) for name, why in beyond(worked.all, cameras, given, usual_depth(found)).items()}
+    if worked.misplaced is not None:
+        reasons.setdefault(POSES, (CHECK, worked.misplaced))
+    out = dict(decisions)
+    for name, (guard, why) in reasons.items():
+        if out[name].on and out[name].wish == "auto":
+            out[name] = out[name].dropped(guard, why)
+    if not out[LENS].on and decisions[LENS].on and out[POSES].on:
+        out[POSES] = out[POSES].dropped(BOUND, "poses were refined beside a lens that no camera has")
+    both, tried = (replace(one, gain=bounded_gains(one.gain) or one.gain) for one in (worked.all, worked.tried))
+    return out, replace(worked, all=both, tried=tried)
+
+
+def _judged(
+    decisions: dict[str, Decision],
+    worked: Worked,
+    capture: Capture,
+    found: Survey,
+    trials: Trials,
+    chosen: Sequence[int],
+    aside: Array,
+) -> dict[str, Decision]:
+    """By short fits, group after group: what is not better with than without is not corrected."""
+    out = dict(decisions)
+    names = [group for group in GROUPS if any(out[name].on and out[name].wish == "auto" for name in group)]
+    if len(chosen) < FEWEST_TRIED:
+        for name in (name for group in names for name in group if out[name].on and out[name].wish == "auto"):
+            out[name] = out[name].dropped(CHECK, f"{len(chosen)} training images are too few to see whether it helps")
+        return out
+    some = capture.with_frames([capture.frames[index] for index in chosen])
+    if some.points is None and found.explained is not None:
+        some = replace(some, points=found.explained.problem.points)
+    score = trials(some, aside[chosen])
+    fixed = {name for name, decision in out.items() if decision.on and decision.wish != "auto"}
+    with found.paid.by(*(name for group in names for name in group if out[name].on)):
+        best = score(worked.parts(frozenset(fixed), tried=True))
+        for group in names:
+            members = {name for name in group if out[name].on}
+            value = score(worked.parts(frozenset(fixed | members), tried=True))
+            if best is None or value is None:
+                for name in members:
+                    out[name] = replace(out[name], note="; ".join(filter(None, [out[name].note, "a trial was not possible"])))
+                fixed |= members
+                continue
+            trial = {"without": float(best.mean()), "with": float(value.mean())}
+            if better(best, value) >= max(WINS[name] for name in members):
+                fixed, best = fixed | members, value
+                out |= {name: replace(out[name], decided_by=TRIAL, trial=trial) for name in members}
+                continue
+            for name in (name for name in members if out[name].wish == "auto"):
+                unsure = ", which differs too much between them to be believed" if trial["with"] > trial["without"] else ""
+                why = f"in a short fit validation images have {trial['with']:.2f} dB with it and {trial['without']:.2f} dB without{unsure}"
+                out[name] = out[name].dropped(TRIAL, why, trial)
+    return out
 
 
 def choose_field(field: FieldSettings, effects: list[dict[str, Any]], off: Sequence[str] = ()) -> None:
@@ -157,12 +291,47 @@ def _of_depth(finding: Finding, wished: str, told: bool) -> Decision:
     return Decision(finding, wished, True, "" if finding.there else "switched on by hand, nothing speaks for it")
 
 
-def _corrections(
-    capture: Capture, test: Array, found: Survey, on: frozenset[str], progress: Progress, known: dict[int, Look]
-) -> tuple[Corrections, Sightings | None, Agreed | None]:
-    """Corrections, what was seen in most pictures, and how poses agree with a sensor's depth where it took part.
+@dataclass(frozen=True)
+class Worked:
+    """Corrections of everything that evidence speaks for, of which some will be used.
+
+    Attributes:
+        tried: the same for a trial: its validation frames are placed and toned as if they were held out.
+        seen: what was seen in most images.
+        agreed: how poses agree with a sensor's depth, where it took part.
+        misplaced: why poses cannot be used; None: they can.
+    """
+
+    all: Corrections
+    tried: Corrections
+    seen: Sightings | None
+    agreed: Agreed | None = None
+    misplaced: str | None = None
+
+    def parts(self, on: frozenset[str], tried: bool = False) -> Corrections:
+        """What is corrected with the effects `on`."""
+        whole = self.tried if tried else self.all
+        gain, corner = whole.gain if EXPOSURE in on else {}, whole.corner if VIGNETTING in on else None
+        return Corrections(
+            gain=gain,
+            corner=corner,
+            dimmed=room_for_light(self.seen, corner, gain),
+            lens=whole.lens if LENS in on else None,
+            poses=whole.poses if POSES in on else {},
+            by_depth=whole.by_depth and POSES in on,
+            weight=whole.weight if BLUR in on else {},
+        )
+
+
+def _worked_out(
+    capture: Capture, test: Array, found: Survey, on: frozenset[str], progress: Progress, known: dict[int, Look], aside: Array
+) -> Worked:
+    """Corrections for the effects `on`.
 
     Per-frame corrections need every frame: then all are looked at, and only then.
+
+    Args:
+        aside: (N,) bool training frames that a trial holds out.
     """
     seen, corner = found.seen, found.light.corner if found.light is not None and VIGNETTING in on else None
     lens = None
@@ -170,36 +339,36 @@ def _corrections(
         explained = found.explained
         with found.paid.by(LENS):
             lens = (explained.problem if LENS in explained.kept else adjust(explained.problem, explained.kept | {LENS}).problem).lens
-    if seen is None or not on & {EXPOSURE, POSES, BLUR}:
-        return Corrections(corner=corner, dimmed=room_for_light(seen, corner, {}), lens=lens), seen, None
-    gain: dict[str, Gain] = {}
-    poses: dict[str, Array] = {}
     weight: dict[str, float] = {}
-    every: Sightings | None = None
-    agreed: Agreed | None = None
-    if BLUR in on:
+    if seen is not None and BLUR in on:
         weight = _weights([frame.name for frame, held in zip(capture.frames, test, strict=True) if not held], seen.names, found.sharpness)
-    if on & {EXPOSURE, POSES}:
-        with found.paid.by(POINTS):
-            every = gather(capture, range(len(capture.frames)), progress, known=known)
-        if EXPOSURE in on:
-            with found.paid.by(EXPOSURE):
-                tracks = every.tracks()
-                flat = tracks if corner is None else vignetting.corrected(tracks, corner)
-                gains = light.frame_gains(flat, len(every.names), ~test)
-            gain = {name: (float(r), float(g), float(b)) for name, (r, g, b) in zip(every.names, gains, strict=True)}
-        if POSES in on:
-            kept = found.explained.kept if found.explained is not None else frozenset[str]()
-            with found.paid.by(POSES):
-                refined = refined_poses(every, ~test, kept | on, capture, progress)
-            poses = dict(zip(every.names, refined.poses, strict=True))
-            lens, agreed = refined.lens if LENS in on else None, refined.agreed
-    dimmed = room_for_light(seen, corner, gain)
-    return (
-        Corrections(gain, corner=corner, dimmed=dimmed, lens=lens, poses=poses, by_depth=agreed is not None, weight=weight),
-        every or seen,
-        agreed,
-    )
+    both = Corrections(corner=corner, lens=lens, weight=weight)
+    if seen is None or not on & {EXPOSURE, POSES}:
+        return Worked(both, both, seen)
+    tried, agreed, misplaced = both, None, None
+    with found.paid.by(POINTS):
+        every = gather(capture, range(len(capture.frames)), progress, known=known)
+    if EXPOSURE in on:
+        with found.paid.by(EXPOSURE):
+            tracks = every.tracks()
+            flat = tracks if corner is None else vignetting.corrected(tracks, corner)
+            gains = [_by_name(every.names, light.frame_gains(flat, len(every.names), train)) for train in (~test, ~test & ~aside)]
+        both, tried = replace(both, gain=gains[0]), replace(tried, gain=gains[1])
+    if POSES in on:
+        kept = found.explained.kept if found.explained is not None else frozenset[str]()
+        with found.paid.by(POSES):
+            refined = refined_poses(every, ~test, kept | on, capture, progress, aside)
+        agreed, lens = refined.agreed, refined.lens if LENS in on else None
+        placed = refined.poses if refined.aside is None else refined.aside
+        both = replace(both, poses=dict(zip(every.names, refined.poses, strict=True)), lens=lens, by_depth=agreed is not None)
+        tried = replace(tried, poses=dict(zip(every.names, placed, strict=True)), lens=lens, by_depth=agreed is not None)
+        if refined.fails:
+            misplaced = f"{refined.borrowed} of {refined.placed} held-out frames cannot be placed by the points that the others share"
+    return Worked(both, tried, every, agreed, misplaced)
+
+
+def _by_name(names: Sequence[str], gains: Array) -> dict[str, Gain]:
+    return {name: (float(r), float(g), float(b)) for name, (r, g, b) in zip(names, gains, strict=True)}
 
 
 def room_for_light(seen: Sightings | None, corner: float | None, gain: dict[str, Gain]) -> float:

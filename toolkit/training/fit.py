@@ -62,6 +62,7 @@ class FitResult:
     notes: list[str] = default(default_factory=list)  # a sentence on each step that was not finite, and on what it had to do without
     matched: dict[str, float] | None = None  # what was matched before the fit: pictures, pixels, share with depth, seconds (`guided.py`)
     left_out: LeftOut | None = None  # what the fit did without, since it moves (`guided.py`)
+    held_out: list[float] = default(default_factory=list)  # the timeline's last PSNR by held-out view
 
     def after(self, seconds: float) -> list[dict[str, float]]:
         """The timeline, with so many seconds before it."""
@@ -240,6 +241,7 @@ def _ladder(views: Views, train: Views, scene: Scene, settings: Settings) -> tup
 
 
 def _measure(result: FitResult, held_out: Sample, engine: Engine, seconds: float) -> None:
-    value = held_out.psnr(engine)
-    if value is not None and math.isfinite(value):
-        result.timeline.append({"seconds": round(seconds, 3), "psnr": round(value, 4)})
+    each = held_out.each(engine)
+    if len(each) and np.isfinite(each).all():
+        result.held_out = [float(value) for value in each]
+        result.timeline.append({"seconds": round(seconds, 3), "psnr": round(float(each.mean()), 4)})

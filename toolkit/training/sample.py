@@ -28,12 +28,18 @@ class Sample:
             self.batch, self.factor = pool.take(pick), _factors(some, *(place.cpu().numpy() for place in pool.seen_at(pick)))
 
     def psnr(self, engine: Engine) -> float | None:
+        """Decibels, the mean over views; None: there are none."""
+        each = self.each(engine)
+        return float(each.mean()) if len(each) else None
+
+    def each(self, engine: Engine) -> Array:
+        """(V,) decibels of each view that has pixels in the sample."""
         if self.batch is None:
-            return None
+            return np.zeros(0)
         error = (self._as_taken(engine.colours(self.batch.origins, self.batch.directions)) - self.batch.colour).square().mean(-1)
         views, pixels = self.batch.view.unique(return_inverse=True, return_counts=True)[1:]
         of_views = torch.zeros(len(pixels), device=error.device).index_add(0, views, error) / pixels
-        return float(-10 * of_views.clamp_min(1e-10).log10().mean())
+        return np.asarray((-10 * of_views.clamp_min(1e-10).log10()).cpu().numpy())
 
     def _as_taken(self, shown: torch.Tensor) -> torch.Tensor:
         """(P, 3) colours of the sample's pixels with what was taken out of their pictures put back."""
