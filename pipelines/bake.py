@@ -26,7 +26,7 @@ def bake(
     json: Json = False,
 ) -> None:
     """Quantise the field of a run to bytes and say what that costs at the held-out views."""
-    from pipelines.job import bound_threads
+    from pipelines.thread_limits import bound_threads
 
     options = gather(None, config, pairs, threads=threads)
     bound_threads(options)

@@ -32,7 +32,7 @@ def speed(
     quiet: Quiet = False,
 ) -> None:
     """Time each part beside a reference loop in the same run, and say how many times faster it is."""
-    from pipelines.job import bound_threads
+    from pipelines.thread_limits import bound_threads
 
     bound_threads({"flags": {"threads": threads}})
     data = measure(chosen(parts), threads, repetitions, budget, quiet)

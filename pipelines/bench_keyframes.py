@@ -28,16 +28,16 @@ def keyframes(
     quiet: Quiet = False,
 ) -> None:
     """Fuse key frames of a walk through a made-up room, and say how many a second: pictures encoded, swept, held against each other."""
-    from pipelines.job import bound_threads, choose_device, set_threads
+    from pipelines.thread_limits import bound_threads
 
     bound_threads({"flags": {"threads": threads}})
-
     import os
     import time
 
     import torch
 
     from pipelines.console import make_progress
+    from pipelines.job import choose_device, set_threads
     from toolkit.evaluate.key_frames import NEAR, key_frame_rates, walk
     from toolkit.evaluate.speed import machine
     from toolkit.files import write_json

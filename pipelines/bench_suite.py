@@ -61,7 +61,7 @@ def _command(name: str) -> Any:
         quiet: Quiet = False,
         json: Json = False,
     ) -> None:
-        from pipelines.job import bound_threads
+        from pipelines.thread_limits import bound_threads
 
         flags = {"budget": budget, "image_size": image_size, "device": device, "threads": threads, "seed": seed}
         options = gather(preset, None, pairs, **flags)

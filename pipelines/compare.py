@@ -60,7 +60,7 @@ def compare(
 
     With the folder of an earlier run its results are used as they are. A capture with `ground_truth/mesh.ply` has its meshes measured.
     """
-    from pipelines.job import bound_threads
+    from pipelines.thread_limits import bound_threads
 
     flags = {"budget": budget, "image_size": image_size, "holdout": holdout, "device": device, "threads": threads, "seed": seed}
     wanted = list(pairs or [])

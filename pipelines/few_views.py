@@ -137,7 +137,7 @@ def opened(source: Path, out: Path, options: dict[str, Any], quiet: bool) -> Ite
     """A job of one thread on `source`, with everything up to the effects done as a run does it with all training pictures, so that poses
     are the same for every number of views."""
     from pipelines.console import make_progress
-    from pipelines.job import bound_threads
+    from pipelines.thread_limits import bound_threads
 
     bound_threads(options)
     from pipelines.job import open_job

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pipelines.console import ConsoleProgress
 from pipelines.folder import RunFolder, is_run_folder
 from pipelines.stages import Stages
-from toolkit import memory
+from pipelines.thread_limits import THREAD_VARIABLES
 from toolkit.config import Settings, load_settings
 from toolkit.errors import InputError
 
@@ -23,10 +23,8 @@ if TYPE_CHECKING:
     from toolkit.effects.correct import Corrections
     from toolkit.keyframes import KeyFrames
 
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 CAMERAS = "transforms.json"
 MOST_A_CORE, LEAST_MOST_THREADS = 4, 64  # threads that may be asked for: more of them only wait for each other
-SHORT_SPIN = "1000"  # turns, microseconds
 
 
 @dataclass
@@ -174,21 +172,6 @@ def _read_settings(options: dict[str, Any], stored: dict[str, Any] | None, pairs
         stored = None  # a preset is a new start: the stored settings would hide what it sets
     preset = options.get("preset") or (stored or {}).get("preset") or "balanced"
     return load_settings(preset, options.get("config"), pairs, options.get("flags"), stored)
-
-
-def bound_threads(options: dict[str, Any]) -> None:
-    """Tell numeric libraries the thread count that the command line gives, which they read once, when they are loaded; and that all threads
-    allocate from one heap."""
-    # Threads that spin while they wait take the cores from whatever else runs: on a busy machine with two cores a fit made 83 steps
-    # in 15 s with spinning threads and 306 with sleeping ones. So they sleep, but not at once (GNU's library counts the turns): to wake
-    # one for each of the networks' many short operations would cost a quarter of their time (docs/measured/performance.md).
-    if os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE").upper() == "PASSIVE":
-        os.environ.setdefault("GOMP_SPINCOUNT", SHORT_SPIN)
-    pairs = [pair.removeprefix("threads=") for pair in options.get("pairs") or [] if pair.startswith("threads=")]
-    wanted = options.get("flags", {}).get("threads") or next(iter(pairs), None)
-    if wanted is not None and str(wanted).isdigit() and int(wanted) > 0:
-        os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(wanted)))
-    memory.one_heap()
 
 
 def set_threads(threads: int | None) -> None:

@@ -32,7 +32,7 @@ def render(
     json: Json = False,
 ) -> None:
     """Render the field of a run (of a source, it is fitted first)."""
-    from pipelines.job import bound_threads
+    from pipelines.thread_limits import bound_threads
 
     options = gather(None, config, pairs, device=device, threads=threads)
     bound_threads(options)

@@ -25,9 +25,11 @@ def selftest(
     json: Json = False,
 ) -> None:
     """Run the hard cases: each kernel where numbers usually break. Ends with 1 if a bound is missed."""
-    from pipelines.job import bound_threads, set_threads
+    from pipelines.thread_limits import bound_threads
 
     bound_threads({"flags": {"threads": threads}})
+    from pipelines.job import set_threads
+
     set_threads(threads)
     outcomes = run(fast, only, quiet or json)
     if json:

@@ -40,7 +40,6 @@ def find_effects(job: Job, posed: Capture) -> Corrections:
 
     def make() -> dict[str, Any]:
         from toolkit.capture.prepare import held_out
-
         from toolkit.training.trial import Trial
 
         def trials(capture: Capture, validation: Array) -> Trial:

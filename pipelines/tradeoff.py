@@ -69,7 +69,7 @@ def tradeoff(
 
     Each point is kept as soon as it is measured: run the same command again after an interruption and it goes on.
     """
-    from pipelines.job import bound_threads
+    from pipelines.thread_limits import bound_threads
 
     flags = {"image_size": image_size, "holdout": holdout, "device": device, "threads": threads, "seed": seed, "decoder": decoder}
     options = gather(preset, config, pairs, **flags, **{"poses.source": poses})

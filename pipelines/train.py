@@ -20,7 +20,7 @@ def train(
     quiet: Quiet = False,
 ) -> None:
     """Train the networks that turn pictures into a field without fitting; writes `weights.safetensors`."""
-    from pipelines.job import bound_threads
+    from pipelines.thread_limits import bound_threads
 
     bound_threads({"flags": {"threads": threads}})
     from pipelines.console import make_progress

@@ -25,7 +25,7 @@ def view(
     quiet: Quiet = False,
 ) -> None:
     """Walk through the field of a run in the browser (of a source, it is fitted first). Ctrl-C ends it."""
-    from pipelines.job import bound_threads
+    from pipelines.thread_limits import bound_threads
 
     options = gather(None, config, pairs, device=device, threads=threads)
     bound_threads(options)

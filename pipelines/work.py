@@ -25,7 +25,7 @@ def work(
     go_on: bool = False,
 ) -> None:
     """Make `goals` in the run's folder and show the report's numbers."""
-    from pipelines.job import bound_threads
+    from pipelines.thread_limits import bound_threads
 
     bound_threads(options)
     from pipelines.reconstruct import BEFORE, run_job

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
 import pytest
 
 from pipelines.folder import FILES, SUBFOLDERS
-from pipelines.job import THREAD_VARIABLES, bound_threads
+from pipelines.thread_limits import THREAD_VARIABLES, bound_threads
 from tests.pipelines.made import call, make_room
 from tests.pipelines.short import FAST, finished, report, stages
 from toolkit.errors import InputError
@@ -187,3 +189,9 @@ def test_waiting_threads_sleep_soon_unless_told_otherwise(
     bound_threads({"flags": {"threads": 3}})
     assert os.environ["OMP_WAIT_POLICY"] == policy and os.environ.get("GOMP_SPINCOUNT") == spins
     assert {os.environ[name] for name in THREAD_VARIABLES} == {"3"}
+
+
+def test_threads_are_bounded_before_numpy_is_loaded() -> None:
+    """NumPy's BLAS reads the count when it is loaded; later it is too late."""
+    code = "import sys, pipelines.cli, pipelines.run, pipelines.work, pipelines.thread_limits; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

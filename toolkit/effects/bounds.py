@@ -66,7 +66,10 @@ def beyond_depth(depth_pose: Array, metric: bool, depth: float) -> str | None:
     way = float(np.linalg.norm(depth_pose[:3, 3]))
     turn = float(apart(np.eye(4)[None], depth_pose[None])[1][0])
     if metric and way > DEPTH_CAMERA:
-        return f"the depth camera would stand {100 * way:.1f} cm beside the images', more than {100 * DEPTH_CAMERA:.0f} cm, which no phone or sensor has"
+        return (
+            f"the depth camera would stand {100 * way:.1f} cm beside the images', "
+            f"and none of a phone or a sensor stands farther than {100 * DEPTH_CAMERA:.0f} cm"
+        )
     if not metric and way > DEPTH_SHARE * depth:
         return f"the depth camera would stand {100 * way / max(depth, 1e-12):.0f}% of the usual depth beside the images'"
     if turn > DEPTH_TURN:

@@ -120,10 +120,10 @@ class Placing:
         """(F, 4, 4) the fitted poses; those that leave their neighbours' way while their own points disagree are brought back to it."""
         poses = np.where(self.fitted[:, None, None], self.problem.poses, self.given)
         off = np.linalg.norm(residuals(self.problem), axis=1)
-        for frame in np.flatnonzero(self.fitted):
-            if self.fitted.sum() > 1 and self._apart(int(frame), poses[frame], *self._expected(int(frame))) > self.most:
-                if not self._explains(off[self.problem.frame == frame]):
-                    poses[frame] = self._moved(int(frame), *self._expected(int(frame)))
+        for frame in (int(number) for number in np.flatnonzero(self.fitted)):
+            expected = self._expected(frame)
+            if self._apart(frame, poses[frame], *expected) > self.most and not self._explains(off[self.problem.frame == frame]):
+                poses[frame] = self._moved(frame, *expected)
         return poses
 
     def placed(self, frame: int) -> tuple[Array, bool]:

@@ -6,7 +6,6 @@ Held-out views are looked at for one purpose: the timeline of their PSNR, whose 
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
