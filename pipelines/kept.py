@@ -52,7 +52,8 @@ NETWORK = {
 HELD_OUT = {"before": NUMBER, "after": NUMBER, "unit": TEXT, "*": ANY}
 FINDING = {
     "effect": TEXT, "there": FLAG, "number": NUMBER, "threshold": NUMBER, "reason": TEXT, "?held_out": (None, HELD_OUT),
-    "?wish": TEXT, "?on": FLAG, "?note": TEXT, "?seconds": NUMBER, "*": ANY
+    "?wish": TEXT, "?on": FLAG, "?note": TEXT, "?seconds": NUMBER, "?decided_by": TEXT, "?trial": {"without": NUMBER, "with": NUMBER},
+    "*": ANY
 }  # fmt: skip
 EFFECTS = {
     "effects": [FINDING], "seconds": NUMBER, "?corrections": {"*": ANY},

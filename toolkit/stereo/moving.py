@@ -41,6 +41,9 @@ REACH = 0.08  # of the long side: how far a part goes on through what nothing co
 CLOSE = 0.03  # of the long side: gaps that are closed
 GAINS = (0.5, 2.0)  # by which a picture may be darker or brighter than the others
 FEW = 200  # pixels that tell a picture's gain
+# Share of all images, and of a single one, beyond which it is no longer something that moves before a still scene: poses, light or depth
+# disagree, and a fit without those pixels would have holes.
+MOST_OF_ALL, MOST_OF_ONE = 0.25, 0.6
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,14 @@ class _Difference:
     own: Array  # (H, W) bool the picture has depth of its own there, too
     before: Array  # (H, W) bool this depth lies well before the consensus
     scatter: Array  # (H, W) float32 levels, of the colours that agree
+
+
+def bounded(masks: Sequence[Array]) -> list[Array]:
+    """The masks (h, w) bool that may show what moves: none where they take too much of all images, and none of a single one that is taken
+    nearly whole."""
+    if not masks or float(np.mean([mask.mean() for mask in masks])) > MOST_OF_ALL:
+        return [np.zeros_like(mask) for mask in masks]
+    return [np.zeros_like(mask) if mask.mean() > MOST_OF_ONE else mask for mask in masks]
 
 
 def moving(

@@ -142,4 +142,5 @@ def find_moving(
     at = {int(index): place for place, index in enumerate(training)}
     found = None if matched is None else {at[index]: one for index, one in matched.depths.items()}
     depths, cameras = moving.depths_at(some, side, found)
-    return LeftOut.of(some.names, moving.moving(some, depths, cameras, scene.median_depth, not views.matched, progress))
+    masks = moving.moving(some, depths, cameras, scene.median_depth, not views.matched, progress)
+    return LeftOut.of(some.names, moving.bounded(masks))
