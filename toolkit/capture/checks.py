@@ -14,9 +14,10 @@ from toolkit.camera import Array
 from toolkit.capture import heif
 from toolkit.capture.depth_checks import check_depth
 from toolkit.capture.headers import Header, read_bytes, read_header
-from toolkit.capture.images import turns_by_exif
-from toolkit.capture.listing import counted, fitted
-from toolkit.capture.types import Capture
+from toolkit.capture.images import largest, read_picture, turns_by_exif
+from toolkit.capture.listing import TIFFS, counted, fitted
+from toolkit.capture.tiff import unturned
+from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 from toolkit.progress import SILENT, Progress
 
@@ -27,6 +28,7 @@ FLAT = 2.0  # grey levels of standard deviation below which a picture shows noth
 DARK = 40  # grey level that 95% of a dark picture's pixels stay under
 BLOWN = 253  # grey level from which a pixel counts as saturated
 BLURRED = 0.25  # of the usual sharpness of the capture
+FEWER_BITS = (1023, 4095, 16383)  # largest values of sensors that store 10, 12 and 14 bits in 16
 NOTICE = 0.1  # share of pictures from which a warning is worth reading
 
 
@@ -60,6 +62,7 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
         return capture
     if len(frames) == 1:
         raise InputError(f"{capture.root} holds only one picture; take at least 20 from different places")
+    capture = scaled_to_white(capture, progress)
     headers, looks, copies = _look_at_all(capture, progress)
     _refuse_blank(capture, looks)
     _refuse_same(capture, looks)
@@ -69,6 +72,32 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
     return replace(
         capture, extra=extra, warnings=capture.warnings + tuple(warning for warning in warnings if warning not in capture.warnings)
     )
+
+
+def scaled_to_white(capture: Capture, progress: Progress = SILENT) -> Capture:
+    """The capture with `Frame.white` where its images use 10, 12 or 14 of 16 bits, by the files' own word or their largest value.
+
+    Raises:
+        InputError: an image cannot be read.
+    """
+    deep = [frame for frame in capture.frames if frame.image.suffix.lower() in (*TIFFS, ".png") and frame.video_index is None]
+    most, said = 0, True
+    for number, frame in enumerate(deep):
+        progress.check()
+        header = read_header(read_bytes(frame.image), frame.image)
+        if not header.deep:
+            return capture
+        said = said and header.white is not None
+        most = max(most, header.white if header.white is not None else largest(frame.image))
+        if most > FEWER_BITS[-1]:
+            return capture
+        progress.update(number, len(deep), frame.name)
+    if not deep or len(deep) < len(capture.frames) or most <= 255:
+        return capture
+    white = next(bits for bits in FEWER_BITS if most <= bits)
+    why = "as the files say" if said else f"as no value exceeds {most}"
+    remark = f"the images use {white.bit_length()} of 16 bits, {why}; {white} is taken for white"
+    return replace(capture, frames=tuple(replace(frame, white=white) for frame in capture.frames), warnings=(*capture.warnings, remark))
 
 
 def _look_at_all(capture: Capture, progress: Progress) -> tuple[list[Header], list[Look], int]:
@@ -92,12 +121,12 @@ def _look_at_all(capture: Capture, progress: Progress) -> tuple[list[Header], li
         if frame.intrinsics is not None:
             fitted(frame.intrinsics, _upright_size(header, exif), str(frame.image))
         if index % every == 0:
-            looks.append(_look(frame.name, frame.image, data, header))
+            looks.append(_look(frame, data, header))
     return headers, looks, len(capture.frames) - len(hashes)
 
 
-def _look(name: str, path: Path, data: bytes, header: Header) -> Look:
-    thumb = thumbnail(data, header, path)
+def _look(frame: Frame, data: bytes, header: Header) -> Look:
+    name, thumb = frame.name, thumbnail(data, header, frame.image, frame.white)
     grey = thumb.astype(np.float32)
     deviation = float(grey.std())
     # Divided by the contrast, so that a dim picture does not pass for a blurred one.
@@ -106,7 +135,7 @@ def _look(name: str, path: Path, data: bytes, header: Header) -> Look:
     return Look(name, tiny, deviation, sharpness, float(np.quantile(grey, 0.95)), float((thumb >= BLOWN).mean()))
 
 
-def thumbnail(data: bytes, header: Header, path: Path) -> Array:
+def thumbnail(data: bytes, header: Header, path: Path, white: int | None = None) -> Array:
     """A small grey picture (h, w) uint8, long side about `THUMB_SIDE`; JPEG is decoded at an eighth, a quarter or half its size.
 
     Raises:
@@ -122,8 +151,10 @@ def thumbnail(data: bytes, header: Header, path: Path) -> Array:
     try:
         if header.format == heif.FORMAT:
             grey = heif.small(data, THUMB_SIDE, path)
+        elif header.deep or header.format == "AVIF":
+            grey = np.asarray(cv2.cvtColor(read_picture(path, white)[0][..., :3], cv2.COLOR_RGB2GRAY))
         else:
-            grey = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+            grey = cv2.imdecode(np.frombuffer(unturned(data), np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         grey = None
     if grey is None:

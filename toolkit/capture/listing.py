@@ -15,10 +15,12 @@ from PIL import Image
 from toolkit import files
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture import heif
+from toolkit.capture.tiff import read_tiff
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError, first_line
 
-PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", *heif.SUFFIXES)
+PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".avif", *heif.SUFFIXES)
+TIFFS = (".tif", ".tiff")
 MAX_TEXT_BYTES = 64 * 2**20
 
 
@@ -119,6 +121,8 @@ def picture_header(path: Path) -> Header:
         if path.suffix.lower() == ".npy":
             height, width = np.load(path, mmap_mode="r", allow_pickle=False).shape[:2]
             return Header(int(width), int(height), False)
+        if path.suffix.lower() in TIFFS and (tiff := read_tiff(path.read_bytes())) is not None:
+            return Header(tiff.width, tiff.height, tiff.alpha)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # only the header is read; large photos are welcome
             picture = Image.open(path)
