@@ -18,6 +18,10 @@ def open_capture(source: Path | str) -> Capture:
         InputError: nothing there, nothing known, or the layout's own files are broken.
     """
     # Imported late: training and rendering need the types above on machines without Pillow.
+    from toolkit.camera import lenient_poses
     from toolkit.capture.detect import read_source
+    from toolkit.capture.usable import with_usable_poses
 
-    return read_source(Path(source))
+    with lenient_poses() as notes:
+        capture = read_source(Path(source))
+    return with_usable_poses(capture, notes)

@@ -171,6 +171,15 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 
 
+def number(word: str) -> float:
+    """A number as text, NaN also as Microsoft's C library writes it (`-1.#IND`, `nan(ind)`).
+
+    Raises:
+        ValueError: the text is no number.
+    """
+    return float("nan") if word.lower().lstrip("+-").startswith(("1.#", "nan")) else float(word)
+
+
 def read_numbers(path: Path) -> Array:
     """All numbers of a text file, float64; values may be infinite or NaN.
 
@@ -178,7 +187,7 @@ def read_numbers(path: Path) -> Array:
         InputError: missing, not text, or a word that is not a number.
     """
     try:
-        return np.array([float(word) for word in read_text(path).split()], dtype=np.float64)
+        return np.array([number(word) for word in read_text(path).split()], dtype=np.float64)
     except ValueError as error:
         raise InputError(f"{path} must hold numbers only ({first_line(error)}); check how it was written") from error
 
