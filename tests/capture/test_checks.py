@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -74,6 +75,11 @@ def test_a_truncated_picture_is_named(tmp_path: Path, suffix: str, capfd: pytest
     capture = photos(tmp_path, scenery(), suffix)
     path = capture.frames[5].image
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    checked = check_capture(capture)
+    assert capture.frames[5].name not in {frame.name for frame in checked.frames} and len(checked.frames) == len(capture.frames) - 1
+    assert any(re.search(rf"left out.*05\{suffix}.*cut short", warning) for warning in checked.warnings)
+    for frame in capture.frames[6:]:
+        frame.image.write_bytes(path.read_bytes())
     refused(capture, rf"05\{suffix}.*cut short")
     assert capfd.readouterr().err == ""
 
@@ -81,6 +87,9 @@ def test_a_truncated_picture_is_named(tmp_path: Path, suffix: str, capfd: pytest
 def test_a_missing_picture_is_named(tmp_path: Path) -> None:
     capture = photos(tmp_path, scenery())
     capture.frames[3].image.unlink()
+    assert any("03.jpg" in warning for warning in check_capture(capture).warnings)
+    for frame in capture.frames[4:]:
+        frame.image.write_bytes(b"")
     refused(capture, r"03\.jpg")
 
 

@@ -18,6 +18,7 @@ from toolkit.capture.images import largest, read_picture, turns_by_exif
 from toolkit.capture.listing import TIFFS, counted, fitted
 from toolkit.capture.tiff import unturned
 from toolkit.capture.types import Capture, Frame
+from toolkit.capture.usable import without
 from toolkit.errors import InputError
 from toolkit.progress import SILENT, Progress
 
@@ -63,7 +64,7 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
     if len(frames) == 1:
         raise InputError(f"{capture.root} holds only one picture; take at least 20 from different places")
     capture = scaled_to_white(capture, progress)
-    headers, looks, copies = _look_at_all(capture, progress)
+    capture, headers, looks, copies = _look_at_all(capture, progress)
     _refuse_blank(capture, looks)
     _refuse_same(capture, looks)
     sizes = Counter(_upright_size(header, turns_by_exif(capture)) for header in headers)
@@ -75,20 +76,19 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
 
 
 def scaled_to_white(capture: Capture, progress: Progress = SILENT) -> Capture:
-    """The capture with `Frame.white` where its images use 10, 12 or 14 of 16 bits, by the files' own word or their largest value.
-
-    Raises:
-        InputError: an image cannot be read.
-    """
+    """The capture with `Frame.white` where its images use 10, 12 or 14 of 16 bits, by the files' own word or their largest value."""
     deep = [frame for frame in capture.frames if frame.image.suffix.lower() in (*TIFFS, ".png") and frame.video_index is None]
     most, said = 0, True
     for number, frame in enumerate(deep):
         progress.check()
-        header = read_header(read_bytes(frame.image), frame.image)
+        try:
+            header = read_header(read_bytes(frame.image), frame.image)
+            value = 0 if not header.deep else header.white if header.white is not None else largest(frame.image)
+        except InputError:
+            continue  # said where images are looked at
         if not header.deep:
             return capture
-        said = said and header.white is not None
-        most = max(most, header.white if header.white is not None else largest(frame.image))
+        said, most = said and header.white is not None, max(most, value)
         if most > FEWER_BITS[-1]:
             return capture
         progress.update(number, len(deep), frame.name)
@@ -100,29 +100,39 @@ def scaled_to_white(capture: Capture, progress: Progress = SILENT) -> Capture:
     return replace(capture, frames=tuple(replace(frame, white=white) for frame in capture.frames), warnings=(*capture.warnings, remark))
 
 
-def _look_at_all(capture: Capture, progress: Progress) -> tuple[list[Header], list[Look], int]:
-    """Headers of all pictures, thumbnail measures of as many as `PIXEL_BUDGET` allows, and the number of exact copies."""
+def _look_at_all(capture: Capture, progress: Progress) -> tuple[Capture, list[Header], list[Look], int]:
+    """The capture without images that cannot be used, headers of all others, thumbnail measures of as many as `PIXEL_BUDGET` allows, and
+    the number of exact copies.
+
+    Raises:
+        InputError: more than a few images cannot be used.
+    """
     headers: list[Header] = []
     looks: list[Look] = []
     hashes: Counter[bytes] = Counter()
+    bad: dict[str, str] = {}
     every = 1
     exif = turns_by_exif(capture)
     for index, frame in enumerate(capture.frames):
         progress.check()
         progress.update(index, len(capture.frames), frame.name)
-        data = read_bytes(frame.image)
-        header = read_header(data, frame.image)
+        try:
+            data = read_bytes(frame.image)
+            header = read_header(data, frame.image)
+            if not headers:
+                # Entropy decoding of a JPEG costs about a third of a PNG's, whatever size it is reduced to.
+                cost = header.width * header.height * len(capture.frames) * (0.35 if header.format in ("JPEG", "MPO") else 1.0)
+                every = max(1, min(int(np.ceil(cost / PIXEL_BUDGET)), len(capture.frames) // 20))
+            if frame.intrinsics is not None:
+                fitted(frame.intrinsics, _upright_size(header, exif), str(frame.image))
+            if index % every == 0:
+                looks.append(_look(frame, data, header))
+        except InputError as error:
+            bad[frame.name] = str(error)
+            continue
         headers.append(header)
         hashes[hashlib.blake2b(data, digest_size=16).digest()] += 1
-        if index == 0:
-            # Entropy decoding of a JPEG costs about a third of a PNG's, whatever size it is reduced to.
-            cost = header.width * header.height * len(capture.frames) * (0.35 if header.format in ("JPEG", "MPO") else 1.0)
-            every = max(1, min(int(np.ceil(cost / PIXEL_BUDGET)), len(capture.frames) // 20))
-        if frame.intrinsics is not None:
-            fitted(frame.intrinsics, _upright_size(header, exif), str(frame.image))
-        if index % every == 0:
-            looks.append(_look(frame, data, header))
-    return headers, looks, len(capture.frames) - len(hashes)
+    return without(capture, bad), headers, looks, len(headers) - len(hashes)
 
 
 def _look(frame: Frame, data: bytes, header: Header) -> Look:
