@@ -19,7 +19,7 @@ from pathlib import Path
 
 from toolkit.capture.archive import SUFFIXES as ARCHIVES
 from toolkit.capture.blender import looks_like_blender, read_blender
-from toolkit.capture.colmap import image_folders, looks_like_colmap, read_colmap
+from toolkit.capture.colmap import has_images, looks_like_colmap, read_colmap
 from toolkit.capture.dtu import looks_like_dtu, read_dtu
 from toolkit.capture.listing import PICTURES, counted, pictures_in, require_folder
 from toolkit.capture.llff import looks_like_llff, read_llff
@@ -48,7 +48,7 @@ CAMERA_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".
 def _colmap_without_llff(path: Path) -> bool:
     if not looks_like_colmap(path):
         return False
-    return not looks_like_llff(path) or any(pictures_in(folder) for folder in image_folders(path))
+    return not looks_like_llff(path) or has_images(path)
 
 
 def _photos_without_film(path: Path) -> bool:
