@@ -54,7 +54,7 @@ def test_missing_pictures_are_counted(tmp_path: Path) -> None:
     assert capture.warnings == ("1 of the 5 listed pictures do not exist; the other 4 are used",)
     for frame in capture.frames:
         frame.image.unlink()
-    with pytest.raises(InputError, match="none of the 5 pictures"):
+    with pytest.raises(InputError, match="none of the 5 images"):
         read_blender(tmp_path)
 
 

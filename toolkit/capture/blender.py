@@ -39,9 +39,10 @@ def read_blender(path: Path | str) -> Capture:
             entries = nerf_json.frame_list(data, json_path)
             listed += [(data, entry, f"frame {index} of {json_path.name}") for index, entry in enumerate(entries)]
             splits += [split] * len(entries)
-    found = CaptureFiles(root).find([entry["file_path"] for _, entry, _ in listed], source="transforms_*.json")
+    folder = CaptureFiles(root)
+    found = folder.find([entry["file_path"] for _, entry, _ in listed], source="transforms_*.json")
     if not found.count:
-        raise nerf_json.none_exists(root, f"{root}/transforms_*.json", len(listed), found)
+        raise folder.none_exists("transforms_*.json", len(listed), found)
     there = [index for index, image in enumerate(found.files) if image is not None]
     images = [image for image in found.files if image is not None]
     read, remarks = nerf_json.read_frames([listed[index] for index in there], images)

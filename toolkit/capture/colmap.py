@@ -45,6 +45,7 @@ class CandidateModel:
     images: dict[int, Path]  # index of an image of the model → its file
     fit: int  # images whose shape is their camera's, by those looked at
     exact: float  # share of those looked at whose size is their camera's to the pixel
+    outside: int  # paths of images that lead outside the capture's folder
     remarks: tuple[str, ...] = ()
 
 
@@ -56,7 +57,19 @@ def model_folders(root: Path) -> list[Path]:
 
 def looks_like_colmap(path: Path) -> bool:
     """Whether a model is where COLMAP and what is made for it put one."""
-    return any(USUAL.fullmatch(folder.relative_to(path).as_posix()) for folder in model_folders(path))
+    return path in owners(path)
+
+
+def owners(root: Path) -> list[Path]:
+    """Folders at and below `root` whose models they are: `scene` of `scene/sparse/0`."""
+    out = []
+    for folder in model_folders(root):
+        if root.name == "sparse" and folder.parent == root and folder.name.isdecimal():
+            out.append(root)
+            continue
+        above = [root, *(root / parent for parent in reversed(folder.relative_to(root).parents)), folder]
+        out.append(next(owner for owner in above if USUAL.fullmatch(folder.relative_to(owner).as_posix())))
+    return list(dict.fromkeys(out))
 
 
 def has_images(root: Path) -> bool:
@@ -114,7 +127,7 @@ def _capture(root: Path, candidate: CandidateModel) -> Capture:
     model, images = candidate.model, candidate.images
     listed = len(model.images)
     if not images:
-        raise InputError(f"none of the {counted(listed, 'image')} of the model in {root} exists; put them in {root / 'images'}")
+        raise CaptureFiles(_above_model(root)).none_exists(f"the model {candidate.name}", listed, Found([], outside=candidate.outside))
     located, warnings = sorted(images), list(candidate.remarks)
     frames, scaled = [], 0
     for index, name in zip(located, unique_names([images[index] for index in located]), strict=True):
@@ -152,7 +165,7 @@ def _candidate(root: Path, folder: Path, files: CaptureFiles) -> CandidateModel:
             break
     remarks: list[str] = []
     if found is None:
-        found = files.find(names, source=name, base="images")
+        found = files.find(names, source=name, base="images", anywhere=files.root == root.resolve())
         best = _fit(model, found)
         places = sorted({path.parent.relative_to(files.root).as_posix() for path in found.files if path is not None})
         if places:
@@ -161,7 +174,8 @@ def _candidate(root: Path, folder: Path, files: CaptureFiles) -> CandidateModel:
         remarks += found.remarks
     if not USUAL.fullmatch(name):
         remarks.append(f"the COLMAP model was found in {name}")
-    return CandidateModel(name, model, {i: path for i, path in enumerate(found.files) if path is not None}, *best, tuple(remarks))
+    there = {index: path for index, path in enumerate(found.files) if path is not None}
+    return CandidateModel(name, model, there, *best, found.outside, tuple(remarks))
 
 
 def _bases(folder: Path, files: CaptureFiles) -> list[str]:
@@ -197,10 +211,12 @@ def _shape(camera: Intrinsics, path: Path | None) -> int:
 
 def _above_model(root: Path) -> Path:
     """The folder that holds a model's images: above `root` when this is the model's own folder (`sparse/0`, `colmap/sparse`)."""
-    top = root.parent if root.name.isdecimal() and root.parent.name == "sparse" else root
-    if top.name != "sparse":
-        return root.resolve()
-    return (top.parent.parent if top.parent.name == "colmap" else top.parent).resolve()
+    top = root.resolve()
+    if top.name.isdecimal() and top.parent.name == "sparse":
+        top = top.parent
+    for name in ("sparse", "colmap"):
+        top = top.parent if top.name == name else top
+    return top
 
 
 def _name(root: Path, folder: Path) -> str:

@@ -18,7 +18,7 @@ from toolkit.capture.images import read_picture
 from toolkit.errors import InputError
 
 IMAGES, SIDE, FEATURES = 10, 640, 3000
-NEAR = 3.0  # pixels of an image of the longer side SIDE from the epipolar line
+NEAR = 0.005  # of the focal length, from the epipolar line: about three pixels
 RATIO = 0.8  # of the distances of the nearest and the second descriptor
 LEAST, CLEAR = 40, 2.5  # matches on their lines, and how many times as many as for any other axes
 AXES = {
@@ -78,7 +78,7 @@ def _features(path: Path, camera: Intrinsics) -> tuple[Array, Array]:
         return np.zeros((0, 3)), np.zeros((0, 128), np.float32)
     sized = camera.scaled(small.shape[1], small.shape[0])
     pixels = np.array([point.pt for point in points]) + 0.5
-    return unproject(sized, np.eye(4), pixels, np.ones(len(pixels))) * 1.0, np.asarray(descriptors)
+    return unproject(sized, np.eye(4), pixels, np.ones(len(pixels))), np.asarray(descriptors)
 
 
 def _matched(one: tuple[Array, Array], two: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -89,7 +89,7 @@ def _matched(one: tuple[Array, Array], two: tuple[Array, Array]) -> tuple[Array,
 
 
 def _agreement(rotations: tuple[Array, Array], between: Array, one: Array, two: Array) -> tuple[Array, Array]:
-    """(N,) whether rays of two cameras meet within NEAR pixels, and whether they do so in front of both.
+    """(N,) whether rays of two cameras meet within NEAR, and whether they do so in front of both.
 
     Args:
         rotations: world from camera (3, 3) of either.
@@ -106,4 +106,4 @@ def _agreement(rotations: tuple[Array, Array], between: Array, one: Array, two: 
     a, b, c = (first * first).sum(1), (first * second).sum(1), (second * second).sum(1)
     d, e = first @ between, second @ between
     apart = np.maximum(a * c - b * b, 1e-12)
-    return off < NEAR / SIDE, ((c * d - b * e) / apart > 0) & ((b * d - a * e) / apart > 0)
+    return off < NEAR, ((c * d - b * e) / apart > 0) & ((b * d - a * e) / apart > 0)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from toolkit.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, checked_pose, world_from_opengl
 from toolkit.capture.listing import counted, fitted, picture_header
 from toolkit.capture.mirrored import mirrors, unmirrored
-from toolkit.capture.resolve import CaptureFiles, Found
+from toolkit.capture.resolve import Found
 from toolkit.capture.types import Frame
 from toolkit.errors import InputError
 
@@ -98,26 +97,6 @@ def listed_names(entries: Sequence[Mapping[str, Any]], keys: Sequence[str], path
             raise InputError(f"{path}, frame {index}: a file's name is expected, not {str(listed)[:40]!r}; correct it")
         out.append(listed)
     return out
-
-
-def find_beside(
-    folder: CaptureFiles, listed: Sequence[str | None], kind: re.Pattern[str], taken: Collection[Path], source: str, base: str = ""
-) -> tuple[list[Path | None], list[str]]:
-    """The files of `kind` (`resolve.DEPTH`, …) that belong to images, in the order of `listed`, and remarks."""
-    names = [name for name in listed if name is not None]
-    found = folder.find(names, source=source, base=base, kind=kind, taken=taken)
-    files = iter(found.files)
-    return [None if name is None else next(files) for name in listed], found.remarks
-
-
-def none_exists(root: Path, source: str, count: int, found: Found) -> InputError:
-    """That no listed image is there, and what to do about it."""
-    if found.outside:
-        return InputError(
-            f"none of the {counted(count, 'picture')} listed in {source} exists below {root}, and their paths lead outside the capture "
-            "folder; give the folder that holds both, or correct the paths"
-        )
-    return InputError(f"none of the {counted(count, 'picture')} listed in {source} exists below {root}; put them there or correct the paths")
 
 
 def missing_remarks(count: int, found: Found) -> list[str]:

@@ -112,6 +112,25 @@ class CaptureFiles:
                 outside += sum(bool(name.foreign) for name in group) if len(chosen) == before else 0
         return Found([chosen.get(name) for name in names], _remarks(moved, spelled, source, kind), outside)
 
+    def none_exists(self, source: str, count: int, found: Found) -> InputError:
+        """That none of the `count` images that `source` lists is there, with what is there instead."""
+        held = [(folder, [name for name in names if _split(name)[1]]) for folder, names in self._listing.items()]
+        there = [f"{folder or '.'}/ holds {counted(len(names), 'image')} ({names[0]}, …)" for folder, names in held if names]
+        instead = f"; {', '.join(there[:2])}" if there else ""
+        if found.outside:
+            instead = f", and their paths lead outside the capture folder; give the folder that holds both, or correct the paths{instead}"
+        else:
+            instead = f"; put them there or correct the paths{instead}"
+        return InputError(f"none of the {counted(count, 'image')} listed in {source} exists below {self.root}{instead}")
+
+    def find_beside(
+        self, listed: Sequence[str | None], kind: re.Pattern[str], taken: Collection[Path], source: str, base: str = ""
+    ) -> tuple[list[Path | None], list[str]]:
+        """The files of a kind (DEPTH, MASK, POINTS) that belong to images, in the order of `listed`, and remarks."""
+        found = self.find([name for name in listed if name is not None], source=source, base=base, kind=kind, taken=taken)
+        there = iter(found.files)
+        return [None if name is None else next(there) for name in listed], found.remarks
+
     def folders(self) -> list[str]:
         """Folders below the root, itself among them, relative to it: those of fewest parts first."""
         return sorted(self._listing, key=lambda folder: (len(_parts(folder)), folder))
@@ -199,11 +218,16 @@ class CaptureFiles:
         for rank in sorted({ranks[folder] for folder in hits}, reverse=True):
             here = [folder for folder in hits if ranks[folder] == rank]
             level = {folder: {name: hit for name, hit in hits[folder].items() if name in left} for folder in here}
-            for listed_name, name in list(left.items()):
-                places = [folder for folder, found in level.items() if listed_name in found]
-                if not places:
-                    continue
-                place = self._one_of(places, level, name, source, kind)
+            places_of: dict[str, list[str]] = {}
+            for folder, found in level.items():
+                for listed_name in found:
+                    places_of.setdefault(listed_name, []).append(folder)
+            decided: dict[tuple[str, ...], str | None] = {}
+            for listed_name, places in places_of.items():
+                name = left[listed_name]
+                if tuple(places) not in decided:
+                    decided[tuple(places)] = self._one_of(places, level, name, source, kind)
+                place = decided[tuple(places)]
                 if place is None:
                     continue
                 file, quality = level[place][listed_name]

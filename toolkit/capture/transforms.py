@@ -47,14 +47,14 @@ def read_transforms(path: Path | str, within: Path | None = None) -> Capture:
     folder = CaptureFiles(root)
     found = folder.find([entry["file_path"] for entry in entries], source=json_path.name, base=base)
     if not found.count:
-        raise nerf_json.none_exists(root, str(json_path), len(entries), found)
+        raise folder.none_exists(json_path.name, len(entries), found)
     there = [(index, entry, image) for index, (entry, image) in enumerate(zip(entries, found.files, strict=True)) if image is not None]
     taken = [image for _, _, image in there]
     beside: dict[str, list[Path | None]] = {}
     absent = []
     for what, keys, kind in (("depth picture", DEPTH_KEYS, DEPTH), ("mask", ("mask_path",), MASK)):
         listed = nerf_json.listed_names([entry for _, entry, _ in there], keys, json_path)
-        beside[what], found_remarks = nerf_json.find_beside(folder, listed, kind, taken, json_path.name, base)
+        beside[what], found_remarks = folder.find_beside(listed, kind, taken, json_path.name, base)
         gone = beside[what].count(None) - listed.count(None)
         absent += [f"{counted(gone, f'listed {what}')} not found"] if gone else []
         remarks += found_remarks
@@ -156,5 +156,5 @@ def _points(folder: CaptureFiles, data: dict[str, Any], json_path: Path, base: s
     listed = nerf_json.listed_names([data], ("ply_file_path",), json_path)
     if listed == [None]:
         return None, []
-    (path,), remarks = nerf_json.find_beside(folder, listed, POINTS, (), json_path.name, base)
+    (path,), remarks = folder.find_beside(listed, POINTS, (), json_path.name, base)
     return (None, ["the points listed in 'ply_file_path' were not found"]) if path is None else (read_ply_points(path), remarks)
