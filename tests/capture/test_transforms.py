@@ -332,7 +332,8 @@ def test_poses_that_all_mirror_space(tmp_path: Path, turn: np.ndarray | None, sa
         rays = eye.forward + ((u - 160) / 300)[..., None] * eye.right + ((v - 120) / 300)[..., None] * eye.down
         points = (eye.centre + rays * depth[..., None]) * 240 + 480
         maps = points[..., :2].astype(np.float32)
-        save_picture(tmp_path / f"images/{index}.png", cv2.remap(noise, maps[..., 0], maps[..., 1], cv2.INTER_AREA, borderMode=cv2.BORDER_WRAP))
+        image = cv2.remap(noise, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        save_picture(tmp_path / f"images/{index}.png", image)
         pose = np.diag([1.0, 1, -1, 1]) @ eye.opengl() if turn is None else eye.opengl() @ turn
         frames.append({"file_path": f"images/{index}.png", "transform_matrix": pose.tolist()})
     (tmp_path / "transforms.json").write_text(json.dumps({"w": 320, "h": 240, "fl_x": 300, "fl_y": 300, "frames": frames}))

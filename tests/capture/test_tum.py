@@ -80,7 +80,7 @@ def test_without_depth(tmp_path: Path) -> None:
         ("rgb.txt", "soon rgb/a.png\n", "line 1"),
         ("rgb.txt", "1000.0\n", "line 1"),
         ("rgb.txt", "1000.0 ../../etc/passwd\n", "outside the capture folder"),
-        ("rgb.txt", "5.0 rgb/1000.000000.png\n", "none of the 1 ),
+        ("rgb.txt", "5.0 rgb/1000.000000.png\n", "none of the 1 picture"),
         ("groundtruth.txt", "1000.0 0 0 0 0 0 0 0\n", "not a rotation"),
         ("groundtruth.txt", "1000.0 0 0 0 nan 0 0 1\n", "not a rotation"),
         ("groundtruth.txt", "1000.0 inf 0 0 0 0 0 1\n", "not finite"),

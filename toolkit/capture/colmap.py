@@ -182,9 +182,7 @@ def _bases(folder: Path, files: CaptureFiles) -> list[str]:
     """Where the images of the model in `folder` may lie: in `images/` beside it, then beside it, then further up to the top."""
     out = []
     for above in (folder, *folder.parents):
-        for place in (above / "images", above):
-            if place.is_dir():
-                out.append(place.relative_to(files.root).as_posix())
+        out += [place.relative_to(files.root).as_posix() for place in (above / "images", above) if place.is_dir()]
         if above == files.root:
             return out
     return out
@@ -225,7 +223,8 @@ def _name(root: Path, folder: Path) -> str:
 
 def _among(one: CandidateModel, ranked: list[CandidateModel], remarks: tuple[str, ...]) -> CandidateModel:
     """The candidate with a remark on those that it was chosen from."""
-    others = [f"{other.name} ({counted(len(other.model.images), 'image')}, {other.fit} of which fit)" for other in ranked if other is not one]
+    rest = [other for other in ranked if other is not one]
+    others = [f"{other.name} ({counted(len(other.model.images), 'image')}, {other.fit} of which fit)" for other in rest]
     if others:
         more = ", …" if len(others) > 3 else ""
         remarks += (f"of several models that in {one.name} is used, which {one.fit} images fit; not used: {', '.join(others[:3])}{more}",)

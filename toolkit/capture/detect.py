@@ -97,7 +97,23 @@ def _read_below(folder: Path) -> Capture | None:
         found = [below for below in _folders_below(folder) if len(pictures_in(below)) > 1 or len(pictures_in(below, FILMS)) == 1]
     if len(found) != 1:
         return None
-    below = found[0]
+    return _descended(folder, found[0])
+
+
+def _posed_below(folder: Path) -> Capture | None:
+    """The capture whose images are photos of this folder and whose json lies further down; None where there is none."""
+    found = captures_below(folder)
+    if len(found) != 1 or not looks_like_transforms(found[0]):
+        return None
+    try:
+        capture = _descended(folder, found[0])
+    except InputError:
+        return None  # another's
+    photos = {photo.resolve() for photo in photo_files(folder)}
+    return capture if all(frame.image in photos for frame in capture.frames) else None
+
+
+def _descended(folder: Path, below: Path) -> Capture:
     # What its json lists may lie beside its folder.
     capture = read_transforms(below, within=folder) if detect_kind(below) == "transforms" else read_source(below)
     return replace(capture, warnings=(f"the capture was found in {below.relative_to(folder).as_posix()}/", *capture.warnings))
@@ -151,9 +167,9 @@ def read_source(path: Path) -> Capture:
         return read_sens(path) if is_sens(path) else read_video(path)
     folder = require_folder(path)
     try:
-        for _, looks_like, read in READERS:
+        for kind, looks_like, read in READERS:
             if looks_like(folder):
-                return read(folder)
+                return (_posed_below(folder) if kind == "photos" else None) or read(folder)
         videos = pictures_in(folder, FILMS)
     except OSError as error:
         raise InputError(f"cannot read {error.filename or folder}: {error.strerror or error}") from error

@@ -73,7 +73,7 @@ def _features(path: Path, camera: Intrinsics) -> tuple[Array, Array]:
     grey = cv2.cvtColor(np.ascontiguousarray(picture[..., :3]), cv2.COLOR_RGB2GRAY)
     factor = min(1.0, SIDE / max(grey.shape))
     small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    points, descriptors = cv2.SIFT_create(FEATURES).detectAndCompute(small, None)
+    points, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(small, None)
     if descriptors is None:
         return np.zeros((0, 3)), np.zeros((0, 128), np.float32)
     sized = camera.scaled(small.shape[1], small.shape[0])

@@ -21,6 +21,7 @@ SAME_FACTOR = 0.1  # how far a principal point may lie from a larger picture's c
 SQUARE = 1.15  # ratio of the focal lengths up to which pixels are nearly square
 FOCALS = (0.1, 50.0)  # of an image's longer side: focal lengths that cameras have
 OTHER_KEYS = (("f1_x", "f1_y", "c1_x", "c1_y"), ("fx", "fy", "cx", "cy"), ("f_x", "f_y", "c_x", "c_y"), ("focal_x", "focal_y", "cx", "cy"))
+Listed = tuple[Mapping[str, Any], Mapping[str, Any], str]  # what all frames share, an entry, and where it stands (for messages)
 MODELS = {
     "OPENCV": OPENCV,
     "SIMPLE_RADIAL": OPENCV,
@@ -117,16 +118,23 @@ def once_each(frames: Sequence[Frame]) -> tuple[list[Frame], list[str]]:
     first: dict[Path, Frame] = {}
     for frame in frames:
         other = first.setdefault(frame.image, frame)
-        if other is not frame and not (
-            np.allclose(other.world_from_camera, frame.world_from_camera, atol=1e-9) and other.intrinsics == frame.intrinsics
-        ):
+        if other is not frame and (other.intrinsics != frame.intrinsics or _apart(other.world_from_camera, frame.world_from_camera)):
             raise InputError(f"{frame.image} is listed twice, with different poses or cameras; keep the entry that is right")
     copies = len(frames) - len(first)
     return list(first.values()), [f"{counted(copies, 'picture')} listed once more with the same pose, used once"] if copies else []
 
 
+def pose(entry: Mapping[str, Any], where: str) -> Array:
+    """world_from_camera (4, 4) in OpenCV axes from an entry's OpenGL `transform_matrix`.
+
+    Raises:
+        InputError: absent, not finite, singular or not rigid.
+    """
+    return checked_pose(_pose_matrix(entry, where), where)
+
+
 def _pose_matrix(entry: Mapping[str, Any], where: str) -> Array:
-    """(4, 4) in OpenCV axes from an entry's OpenGL `transform_matrix`; its values are not judged."""
+    """The same whose values are not judged."""
     if entry.get("transform_matrix") is None:
         raise InputError(f"{where} has no 'transform_matrix'; remove this frame or add its pose")
     return world_from_opengl(matrix(entry["transform_matrix"], f"{where}: 'transform_matrix'"))
@@ -150,13 +158,13 @@ def camera(shared: Mapping[str, Any], entry: Mapping[str, Any], size: tuple[int,
     height = round(value("h") or size[1])
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         raise InputError(f"{where}: the picture size {width:g}×{height:g} is not usable; correct 'w' and 'h'")
+    fx, fy = value("fl_x"), value("fl_y")
     cx, cy = value("cx"), value("cy")
-    if value("fl_x") is None and value("fl_y") is None and (other := _other_keys(value, width, height)) is not None:
+    if fx is None and fy is None and (other := _other_keys(value, width, height)) is not None:
         fx, fy, cx, cy = other
     else:
-        angles = _turned_back(value("camera_angle_x"), value("camera_angle_y"), width, height)
-        fx = _focal(value("fl_x"), angles[0], width, where)
-        fy = _focal(value("fl_y"), None if value("fl_x") else angles[1], height, where)
+        across, down = _turned_back(value("camera_angle_x"), value("camera_angle_y"), width, height)
+        fx, fy = _focal(fx, across, width, where), _focal(fy, None if fx else down, height, where)
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     if fx is None or fy is None:
         raise InputError(f"{where}: there is no focal length ('fl_x' or 'camera_angle_x'); add it, or use the pictures alone as photos")
@@ -203,8 +211,12 @@ def bent_remarks(count: int) -> list[str]:
     ]
 
 
-def read_frames(listed: Sequence[tuple[Mapping[str, Any], Mapping[str, Any], str]], images: Sequence[Path]) -> tuple[list[Frame], list[str]]:
-    """Frames without names of entries (what all share, the entry, where it stands for messages) whose images are there; and remarks.
+def _apart(one: Array | None, two: Array | None) -> bool:
+    return one is None or two is None or not np.allclose(one, two, atol=1e-9)
+
+
+def read_frames(listed: Sequence[Listed], images: Sequence[Path]) -> tuple[list[Frame], list[str]]:
+    """Frames, without names yet, of entries whose images are there; and remarks.
 
     Raises:
         InputError: a pose or camera is not usable, or an image is of another shape than its camera.
@@ -229,7 +241,7 @@ def read_frames(listed: Sequence[tuple[Mapping[str, Any], Mapping[str, Any], str
 
 
 def _poses(
-    listed: Sequence[tuple[Mapping[str, Any], Mapping[str, Any], str]], images: Sequence[Path], cameras: Sequence[Intrinsics]
+    listed: Sequence[Listed], images: Sequence[Path], cameras: Sequence[Intrinsics]
 ) -> tuple[list[Array], list[str]]:
     """world_from_camera (4, 4) of each entry in OpenCV axes, and remarks."""
     raw = [_pose_matrix(entry, where) for _, entry, where in listed]
@@ -240,7 +252,7 @@ def _poses(
     return [checked_pose(matrix, where) for matrix, (*_, where) in zip(raw, listed, strict=True)], []
 
 
-def _camera_remarks(listed: Sequence[tuple[Mapping[str, Any], Mapping[str, Any], str]], sizes: Sequence[tuple[int, int]]) -> list[str]:
+def _camera_remarks(listed: Sequence[Listed], sizes: Sequence[tuple[int, int]]) -> list[str]:
     """What to say of intrinsics that are not read as instant-ngp and nerfstudio write them."""
     others = swapped = centred = 0
     for (shared, entry, _), size in zip(listed, sizes, strict=True):
@@ -259,8 +271,8 @@ def _camera_remarks(listed: Sequence[tuple[Mapping[str, Any], Mapping[str, Any],
         remarks.append(f"the intrinsics of {counted(others, 'picture')} were read from other keys than 'fl_x', 'fl_y', 'cx', 'cy'")
     if swapped:
         remarks.append(
-            f"'camera_angle_x' and 'camera_angle_y' of {counted(swapped, 'picture')} were exchanged: as they stand, pixels would be far from "
-            "square"
+            f"'camera_angle_x' and 'camera_angle_y' of {counted(swapped, 'picture')} were exchanged: as they stand, pixels would be "
+            "far from square"
         )
     if centred:
         remarks.append(f"the principal point of {counted(centred, 'picture')} is given as (0, 0); the middle of the picture is used")

@@ -86,16 +86,16 @@ class CaptureFiles:
             InputError: two folders or files fit equally well, or a link leads outside the capture's folder.
         """
         chosen: dict[str, Path] = {}
-        for name in dict.fromkeys(names):
-            if (path := self._exact(base, name)) is not None:
-                chosen[name] = path
-        missing = [_parsed(base, name) for name in dict.fromkeys(names) if name not in chosen]
+        for listed in dict.fromkeys(names):
+            if (exact := self._exact(base, listed)) is not None:
+                chosen[listed] = exact
+        missing = [_parsed(base, listed) for listed in dict.fromkeys(names) if listed not in chosen]
         moved: list[tuple[_Name, str]] = []
         spelled: list[tuple[_Name, str]] = []
         outside = 0
         if missing:
             used = {*chosen.values(), *taken}
-            at_home = {_parsed(base, name).folder for name in chosen}
+            at_home = {_parsed(base, listed).folder for listed in chosen}
             groups: dict[tuple[str, ...], list[_Name]] = {}
             for name in missing:
                 groups.setdefault(name.folder, []).append(name)
@@ -200,11 +200,11 @@ class CaptureFiles:
         for name in group:
             by_folder: dict[str, list[str]] = {}
             key = _key(name.name)
-            candidates_of_name = self._by_key.get((_last(listed), key)) or self._by_key.get(("", key), ())
-            self._looked += len(candidates_of_name)
+            alike = self._by_key.get((_last(listed), key)) or self._by_key.get(("", key), [])
+            self._looked += len(alike)
             if self._looked > MAX_PLACES:
-                raise InputError(f"{self.root} holds too many files of the same names to tell which {source} lists; give one capture's folder")
-            for folder, file in candidates_of_name:
+                raise InputError(f"{self.root} holds too many files of the same names to tell which {source} lists; give one capture")
+            for folder, file in alike:
                 by_folder.setdefault(folder, []).append(file)
             for folder, candidates in by_folder.items():
                 if folder not in ranks:
