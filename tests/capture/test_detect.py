@@ -20,6 +20,7 @@ from tests.capture.layouts import (
     write_transforms,
 )
 from tests.capture.made import colour_difference, eyes, pixel_error, render, reprojection, save_picture
+from tests.conftest import shared_data
 from toolkit.camera import Intrinsics
 from toolkit.capture import open_capture
 from toolkit.capture.checks import check_capture
@@ -235,3 +236,23 @@ def test_a_camera_is_scaled_with_its_picture() -> None:
     assert fitted(camera, (4032, 3024), "here") is camera
     with pytest.raises(InputError, match="another shape"):
         fitted(camera, (3024, 4032), "here")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "count"),
+    [
+        ("bart-toy", "transforms", 15),
+        ("cairo-terrace", "transforms", 60),
+        ("cat-toy", "transforms", 47),
+        ("chess-king", "colmap", 23),
+        ("chickens", "transforms", 7),
+        ("computer-mouse", "colmap", 56),
+        ("kangaroo", "transforms", 29),
+        ("living-room-ten", "colmap", 10),
+        ("office-pc", "transforms", 16),
+        ("ultraman-figure", "transforms", 69),
+    ],
+)
+def test_captures_as_other_people_made_them(name: str, kind: str, count: int) -> None:
+    capture = open_capture(shared_data(f"zoo/{name}"))
+    assert (capture.kind, len(capture.frames), capture.posed) == (kind, count, True)

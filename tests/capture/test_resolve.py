@@ -112,6 +112,13 @@ def test_a_file_serves_one_name(tmp_path: Path) -> None:
     assert found(tmp_path, "images/b_c.jpg", "images/b c.jpg") == [None, "images/b c.jpg"]
 
 
+def test_a_name_of_two_listed_folders_needs_the_folder(tmp_path: Path) -> None:
+    put(tmp_path, "all/1.jpg", "all/2.jpg")
+    assert found(tmp_path, "cam1/1.jpg", "cam2/1.jpg", "cam1/2.jpg") == [None, None, "all/2.jpg"]
+    put(tmp_path, "x/cam2/1.jpg")
+    assert found(tmp_path, "cam1/1.jpg", "cam2/1.jpg") == [None, "x/cam2/1.jpg"]
+
+
 def test_what_is_gone_is_not_taken_from_elsewhere(tmp_path: Path) -> None:
     """Where others of its folder are in their place: an image of its name in another folder is another one."""
     put(tmp_path, "images/1.jpg", "old/2.jpg", "renders/2.jpg")

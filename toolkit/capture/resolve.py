@@ -99,9 +99,15 @@ class CaptureFiles:
             groups: dict[tuple[str, ...], list[_Name]] = {}
             for name in missing:
                 groups.setdefault(name.folder, []).append(name)
+            listed_in: dict[str, set[tuple[str, ...]]] = {}
+            for name in missing:
+                listed_in.setdefault(_key(name.name), set()).add(name.folder)
+            # Of two folders (`cam1/1.jpg`, `cam2/1.jpg`) one alone left might be either.
+            twice = {key for key, of in listed_in.items() if len(of) > 1}
             for folder, group in groups.items():
                 before = len(chosen)
-                for name, place, quality in self._relocated(folder, group, used, anywhere and folder not in at_home, kind, source):
+                elsewhere = anywhere and folder not in at_home
+                for name, place, quality in self._relocated(folder, group, used, twice, elsewhere, kind, source):
                     path = files.inside(self.root, place)
                     used.add(path)
                     chosen[name.listed] = path
@@ -192,7 +198,14 @@ class CaptureFiles:
             return None
 
     def _relocated(
-        self, listed: tuple[str, ...], group: list[_Name], used: set[Path], elsewhere: bool, kind: re.Pattern[str] | None, source: str
+        self,
+        listed: tuple[str, ...],
+        group: list[_Name],
+        used: set[Path],
+        twice: set[str],
+        elsewhere: bool,
+        kind: re.Pattern[str] | None,
+        source: str,
     ) -> Iterable[tuple[_Name, str, int]]:
         """Names of one listed folder with the place of their file below the root, and how far its name is from the listed one."""
         ranks: dict[str, tuple[int, int, int]] = {}
@@ -209,7 +222,7 @@ class CaptureFiles:
             for folder, candidates in by_folder.items():
                 if folder not in ranks:
                     ranks[folder] = _rank(listed, _folded(folder), self.root)
-                if not _eligible(listed, _folded(folder), name, ranks[folder], elsewhere, kind):
+                if not _eligible(listed, _folded(folder), name, ranks[folder], elsewhere, kind) or (key in twice and ranks[folder][0] == 0):
                     continue
                 best = self._nearest(name, folder, candidates, used, source)
                 if best is not None:
