@@ -117,7 +117,10 @@ def put_cameras(folder: Path, poses: PoseResult, posed: Capture) -> None:
 
     made_here = SELECTED in posed.extra or all_converted(posed)  # then the pictures lie in the run's folder
     root = posed.frames[0].image.parent.parent if made_here else posed.root
-    files = [frame.image.relative_to(root).as_posix() if frame.image.is_relative_to(root) else str(frame.image) for frame in posed.frames]
+    # A capture that is reached through a link has its images where the link leads.
+    bases = (root, root.resolve())
+    paths = [frame.image for frame in posed.frames]
+    files = [next((path.relative_to(base).as_posix() for base in bases if path.is_relative_to(base)), str(path)) for path in paths]
     # Those of the frames that take part, which may be fewer than have a pose.
     intrinsics, world_from_camera = stored_cameras(posed)
     write_cameras(folder, files, intrinsics, world_from_camera, poses.points)

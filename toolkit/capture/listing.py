@@ -133,6 +133,12 @@ def picture_header(path: Path) -> Header:
         raise InputError(f"{path} cannot be read as a picture; remove it or replace it") from error
 
 
+def fits_shape(intrinsics: Intrinsics, size: tuple[int, int]) -> bool:
+    """Whether a picture of `size` (width, height) may be the camera's, made smaller or larger."""
+    width, height = size
+    return abs(intrinsics.height * width / intrinsics.width - height) <= max(2.0, 0.005 * height)
+
+
 def fitted(intrinsics: Intrinsics, size: tuple[int, int], where: str) -> Intrinsics:
     """The camera for a picture of `size` (width, height): itself, or scaled when the aspect ratio agrees.
 
@@ -142,8 +148,7 @@ def fitted(intrinsics: Intrinsics, size: tuple[int, int], where: str) -> Intrins
     width, height = size
     if (width, height) == (intrinsics.width, intrinsics.height):
         return intrinsics
-    expected = intrinsics.height * width / intrinsics.width
-    if abs(expected - height) > max(2.0, 0.005 * height):
+    if not fits_shape(intrinsics, size):
         raise InputError(
             f"{where}: the picture is {width}×{height} but its intrinsics are for "
             f"{intrinsics.width}×{intrinsics.height}, which is another shape; "
