@@ -196,6 +196,18 @@ def undistort_maps(intrinsics: Intrinsics, width: int, height: int) -> tuple[Int
     return target, *resample_maps(intrinsics, target)
 
 
+def pinhole_share(intrinsics: Intrinsics, across: int = 64) -> float:
+    """Share of a distorted image's pixels that the pinhole image of the same size and focal length shows."""
+    height = max(2, round(across * intrinsics.height / intrinsics.width))
+    seen = np.zeros((height, across), dtype=bool)
+    fine = intrinsics.pinhole().scaled(4 * across, 4 * height)
+    map_x, map_y, valid = resample_maps(intrinsics, fine)
+    column = np.clip(map_x[valid] / intrinsics.width * across, 0, across - 1).astype(int)
+    row = np.clip(map_y[valid] / intrinsics.height * height, 0, height - 1).astype(int)
+    seen[row, column] = True
+    return float(seen.mean())
+
+
 # --------------------------------------------------------------------------------------------------- poses
 
 

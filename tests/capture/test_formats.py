@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from pathlib import Path
 
@@ -10,11 +11,12 @@ import numpy as np
 import pytest
 from PIL import Image, TiffImagePlugin
 
+from tests.pipelines.made import make_room
 from toolkit.camera import Array
 from toolkit.capture import open_capture
 from toolkit.capture.checks import check_capture
 from toolkit.capture.headers import orientation_of, read_bytes, read_header
-from toolkit.capture.images import load_image, read_picture
+from toolkit.capture.images import load_image, read_picture, turns_by_exif
 from toolkit.capture.listing import picture_header
 from toolkit.capture.storage import capture_from_dict, capture_to_dict
 from toolkit.capture.tiff import read_tiff, unturned
@@ -126,3 +128,76 @@ def test_damaged_tiffs_are_no_tiffs(tmp_path: Path) -> None:
         unturned(bytes(broken))
     loop = b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", 60000)
     assert read_tiff(loop) is None
+
+
+# ------------------------------------------------------------------------------------------------ what is beside poses
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    make_room(tmp_path / "room", 8)
+    return tmp_path / "room"
+
+
+def turned_jpegs(room: Path, orientation: int) -> None:
+    """The room's images as photos that EXIF turns upright by `orientation`, beside cameras for the upright images."""
+    path = room / "transforms.json"
+    data = json.loads(path.read_text())
+    for entry in data["frames"]:
+        upright = np.asarray(Image.open(room / entry["file_path"]))
+        stored = {3: upright[::-1, ::-1], 6: np.rot90(upright), 8: np.rot90(upright, -1)}[orientation]
+        exif = Image.Exif()
+        exif[274] = orientation
+        entry["file_path"] = str(Path(entry["file_path"]).with_suffix(".jpg"))
+        Image.fromarray(np.ascontiguousarray(stored)).save(room / entry["file_path"], exif=exif, quality=95)
+    path.write_text(json.dumps(data))
+
+
+@pytest.mark.parametrize("orientation", [6, 8])
+def test_photos_beside_cameras_of_upright_images_are_turned(orientation: int, room: Path) -> None:
+    whole = open_capture(room)
+    before = [load_image(frame).astype(int) for frame in whole.frames]
+    turned_jpegs(room, orientation)
+    capture = check_capture(open_capture(room))
+    assert turns_by_exif(capture) and any("only when turned by EXIF" in warning for warning in capture.warnings)
+    for frame, shown in zip(capture.frames, before, strict=True):
+        assert np.abs(load_image(frame, exif=turns_by_exif(capture)).astype(int) - shown).mean() < 8
+    assert turns_by_exif(capture_from_dict(capture_to_dict(capture)))
+
+
+def test_images_that_exif_turns_by_180_degrees_are_remarked(room: Path) -> None:
+    turned_jpegs(room, 3)
+    capture = check_capture(open_capture(room))
+    assert not turns_by_exif(capture) and any("by 180°" in warning for warning in capture.warnings)
+
+
+def test_panoramas_are_refused_for_what_they_are(room: Path, tmp_path: Path) -> None:
+    xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:ProjectionType>equirectangular</GPano:ProjectionType></x:xmpmeta>'
+    for number, path in enumerate(photos(tmp_path / "p", ".jpg", 6)):
+        Image.fromarray(np.repeat(scene(9 * number), 2, axis=1)).save(path, xmp=xmp)
+    with pytest.raises(InputError, match="panoramas .* are not read; cut each into perspective views"):
+        check_capture(open_capture(tmp_path / "p"))
+    path = room / "transforms.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "camera_model": "EQUIRECTANGULAR"}))
+    with pytest.raises(InputError, match="panoramas .* are not read"):
+        open_capture(room)
+
+
+def test_openexr_is_named(room: Path) -> None:
+    path = room / "transforms.json"
+    data = json.loads(path.read_text())
+    for number, entry in enumerate(data["frames"]):
+        (room / f"{number}.exr").write_bytes(b"\x76\x2f\x31\x01" + bytes(100))
+        entry["depth_file_path"] = f"{number}.exr"
+    path.write_text(json.dumps(data))
+    with pytest.raises(InputError, match="OpenEXR, which is not read; write depth as 16-bit PNG"):
+        open_capture(room)
+
+
+def test_how_much_of_a_wide_lens_is_not_used_is_said(room: Path) -> None:
+    path = room / "transforms.json"
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps({**data, "camera_model": "OPENCV_FISHEYE", "fl_x": 45.0, "fl_y": 45.0, "k1": -0.03}))
+    assert any("outside of the pinhole view" in warning for warning in check_capture(open_capture(room)).warnings)
+    path.write_text(json.dumps({**data, "camera_model": "OPENCV", "k1": -0.02}))
+    assert not any("outside of the pinhole view" in warning for warning in check_capture(open_capture(room)).warnings)

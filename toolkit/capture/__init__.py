@@ -20,8 +20,8 @@ def open_capture(source: Path | str) -> Capture:
     # Imported late: training and rendering need the types above on machines without Pillow.
     from toolkit.camera import lenient_poses
     from toolkit.capture.detect import read_source
-    from toolkit.capture.usable import with_usable_poses
+    from toolkit.capture.usable import turned_by_exif, with_usable_poses
 
     with lenient_poses() as notes:
         capture = read_source(Path(source))
-    return with_usable_poses(capture, notes)
+    return turned_by_exif(with_usable_poses(capture, notes))

@@ -10,10 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
+from toolkit.camera import Array, pinhole_share
 from toolkit.capture import heif
 from toolkit.capture.depth_checks import check_depth
-from toolkit.capture.headers import Header, read_bytes, read_header
+from toolkit.capture.headers import PANORAMA, Header, is_panorama, read_bytes, read_header
 from toolkit.capture.images import largest, read_picture, turns_by_exif
 from toolkit.capture.listing import TIFFS, counted, fitted
 from toolkit.capture.tiff import unturned
@@ -29,6 +29,7 @@ FLAT = 2.0  # grey levels of standard deviation below which a picture shows noth
 DARK = 40  # grey level that 95% of a dark picture's pixels stay under
 BLOWN = 253  # grey level from which a pixel counts as saturated
 BLURRED = 0.25  # of the usual sharpness of the capture
+CUT_OFF = 0.1  # share of an image that is not used, from which on that is said
 FEWER_BITS = (1023, 4095, 16383)  # largest values of sensors that store 10, 12 and 14 bits in 16
 NOTICE = 0.1  # share of pictures from which a warning is worth reading
 
@@ -68,7 +69,7 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
     _refuse_blank(capture, looks)
     _refuse_same(capture, looks)
     sizes = Counter(_upright_size(header, turns_by_exif(capture)) for header in headers)
-    warnings = [*_size_warnings(capture, sizes), *_picture_warnings(capture, looks, copies), *check_depth(capture, progress)]
+    warnings = [*_size_warnings(capture, sizes), *_lens_warnings(capture), *_picture_warnings(capture, looks, copies), *check_depth(capture, progress)]
     extra = {**capture.extra, "sizes": {f"{width}x{height}": number for (width, height), number in sizes.most_common()}}
     return replace(
         capture, extra=extra, warnings=capture.warnings + tuple(warning for warning in warnings if warning not in capture.warnings)
@@ -119,6 +120,8 @@ def _look_at_all(capture: Capture, progress: Progress) -> tuple[Capture, list[He
         try:
             data = read_bytes(frame.image)
             header = read_header(data, frame.image)
+            if is_panorama(data):
+                raise InputError(f"{frame.image}: {PANORAMA}")
             if not headers:
                 # Entropy decoding of a JPEG costs about a third of a PNG's, whatever size it is reduced to.
                 cost = header.width * header.height * len(capture.frames) * (0.35 if header.format in ("JPEG", "MPO") else 1.0)
@@ -214,6 +217,18 @@ def _size_warnings(capture: Capture, sizes: Counter[tuple[int, int]]) -> list[st
     if all(frame.intrinsics is not None for frame in capture.frames):
         return [f"the pictures have {len(sizes)} sizes: {listed}; each comes with its own camera, so this is fine"]
     return [f"the pictures have {len(sizes)} sizes: {listed}; each size gets its own camera, which is less certain than one camera for all"]
+
+
+def _lens_warnings(capture: Capture) -> list[str]:
+    """That much of a wide lens's image lies outside of the pinhole image that is made of it."""
+    cameras = {frame.intrinsics for frame in capture.frames if frame.intrinsics is not None and frame.intrinsics.distorted}
+    shares = [pinhole_share(camera) for camera in cameras]
+    if not shares or min(shares) > 1 - CUT_OFF:
+        return []
+    return [
+        f"{100 * (1 - float(np.mean(shares))):.0f}% of the images' pixels lie outside of the pinhole view that is made of them (a wide lens) "
+        "and are not used; cut the images into several perspective views to use all"
+    ]
 
 
 def _picture_warnings(capture: Capture, looks: list[Look], copies: int) -> list[str]:

@@ -133,7 +133,7 @@ def _capture(root: Path, candidate: CandidateModel) -> Capture:
     for index, name in zip(located, unique_names([images[index] for index in located]), strict=True):
         entry = model.images[index]
         described = model.cameras[entry.camera]
-        intrinsics = fitted(described, picture_header(images[index]).size, f"{entry.name} in {root / candidate.name}")
+        intrinsics = fitted(described, picture_header(images[index]).size, f"{entry.name} in {root / candidate.name}", images[index])
         scaled += intrinsics is not described
         frames.append(Frame(name=name, image=images[index], intrinsics=intrinsics, world_from_camera=entry.world_from_camera))
     missing = listed - len(frames)

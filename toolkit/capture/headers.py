@@ -17,7 +17,11 @@ from toolkit.capture.tiff import Tiff, is_tiff, read_tiff, unturned
 from toolkit.errors import InputError
 
 MAX_PIXELS = 200_000_000
+PANORAMA = "360° panoramas (equirectangular) are not read; cut each into perspective views first, and give these"
+XMP_WITHIN = 2**18  # bytes of a file's beginning in which its XMP stands
 PNG_BITS = 24  # where a PNG's bit depth stands
+EXR = b"\x76\x2f\x31\x01"
+NOT_EXR = "is OpenEXR, which is not read; write depth as 16-bit PNG in millimetres or as float .npy, and images as PNG or TIFF"
 _ORIENTATION = 0x0112  # EXIF tag, 1 to 8
 _pillow_limit = threading.Lock()
 
@@ -63,6 +67,8 @@ def read_header(data: bytes, path: Path) -> Header:
         heif.register(path)
     if (heif.is_heif(data) or is_avif(data)) and not heif.complete(data):
         raise _cut_short(path)
+    if data[:4] == EXR:
+        raise InputError(f"{path} {NOT_EXR}")
     tiff = read_tiff(data) if is_tiff(data) else None
     try:
         # Pillow's own limit is lower than ours and global; it is lifted for the header only, and ours is applied below.
@@ -89,6 +95,12 @@ def read_header(data: bytes, path: Path) -> Header:
         raise _cut_short(path)
     deep = deep or (kind == "PNG" and len(data) > PNG_BITS and data[PNG_BITS] == 16)
     return Header(width, height, kind, orientation, profile, deep, None if tiff is None else tiff.maximum)
+
+
+def is_panorama(data: bytes) -> bool:
+    """Whether the file says that its image is equirectangular (Google's photo sphere XMP)."""
+    head = data[:XMP_WITHIN]
+    return b"GPano:" in head and b"equirectangular" in head
 
 
 def is_avif(data: bytes) -> bool:

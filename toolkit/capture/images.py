@@ -21,12 +21,16 @@ from toolkit.capture.video import iterate_video
 from toolkit.errors import InputError
 
 
+EXIF_TURNS = "exif_turns"  # in `Capture.extra`: the cameras are those of images that are turned by EXIF
+
+
 def turns_by_exif(capture: Capture) -> bool:
     """Whether this capture's pictures are turned upright by their EXIF orientation.
 
-    Only plain photo folders are: every other source brings cameras that were made for the pixels as they are stored.
+    Plain photo folders are. Other sources bring cameras that were made for the pixels as they are stored, unless only the turned images
+    have the cameras' shape (`usable.turned_by_exif`).
     """
-    return capture.kind == "photos"
+    return capture.kind == "photos" or capture.extra.get(EXIF_TURNS) is True
 
 
 def load_image(frame: Frame, *, exif: bool = False) -> Array:

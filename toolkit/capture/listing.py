@@ -15,11 +15,13 @@ from PIL import Image
 from toolkit import files
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture import heif
+from toolkit.capture.headers import NOT_EXR, orientation_of
 from toolkit.capture.tiff import read_tiff
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError, first_line
 
 PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".avif", *heif.SUFFIXES)
+LYING = 5  # EXIF orientations from here on turn by 90°
 TIFFS = (".tif", ".tiff")
 MAX_TEXT_BYTES = 64 * 2**20
 
@@ -117,6 +119,8 @@ def picture_header(path: Path) -> Header:
     """
     if heif.file_is_heif(path):
         heif.register(path)
+    if path.suffix.lower() == ".exr":
+        raise InputError(f"{path} {NOT_EXR}")
     try:
         if path.suffix.lower() == ".npy":
             height, width = np.load(path, mmap_mode="r", allow_pickle=False).shape[:2]
@@ -139,8 +143,11 @@ def fits_shape(intrinsics: Intrinsics, size: tuple[int, int]) -> bool:
     return abs(intrinsics.height * width / intrinsics.width - height) <= max(2.0, 0.005 * height)
 
 
-def fitted(intrinsics: Intrinsics, size: tuple[int, int], where: str) -> Intrinsics:
+def fitted(intrinsics: Intrinsics, size: tuple[int, int], where: str, image: Path | None = None) -> Intrinsics:
     """The camera for a picture of `size` (width, height): itself, or scaled when the aspect ratio agrees.
+
+    Args:
+        image: a file whose EXIF orientation may turn it by 90° into the camera's shape; then the camera is that of the upright image.
 
     Raises:
         InputError: the picture has another shape (cropped, or turned).
@@ -149,6 +156,8 @@ def fitted(intrinsics: Intrinsics, size: tuple[int, int], where: str) -> Intrins
     if (width, height) == (intrinsics.width, intrinsics.height):
         return intrinsics
     if not fits_shape(intrinsics, size):
+        if image is not None and fits_shape(intrinsics, (height, width)) and orientation_of(image) >= LYING:
+            return fitted(intrinsics, (height, width), where)
         raise InputError(
             f"{where}: the picture is {width}×{height} but its intrinsics are for "
             f"{intrinsics.width}×{intrinsics.height}, which is another shape; "

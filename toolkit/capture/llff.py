@@ -42,7 +42,7 @@ def read_llff(path: Path | str) -> Capture:
             raise InputError(f"{where}: the picture size {width:g}×{height:g} is not usable; correct it")
         camera = Intrinsics(round(width), round(height), float(focal), float(focal), float(width) / 2, float(height) / 2).checked(where)
         frames.append(
-            Frame(name=name, image=picture, intrinsics=fitted(camera, picture_header(picture).size, where), world_from_camera=pose)
+            Frame(name=name, image=picture, intrinsics=fitted(camera, picture_header(picture).size, where, picture), world_from_camera=pose)
         )
     bounds = rows[:, 15:]
     extra = {"near": float(bounds[:, 0].min()), "far": float(bounds[:, 1].max())} if np.isfinite(bounds).all() else {}

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from toolkit.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, checked_pose, world_from_opengl
+from toolkit.capture.headers import PANORAMA
 from toolkit.capture.listing import counted, fitted, picture_header
 from toolkit.capture.mirrored import mirrors, unmirrored
 from toolkit.capture.resolve import Found
@@ -17,6 +18,7 @@ from toolkit.capture.types import Frame
 from toolkit.errors import InputError
 
 MAX_SIDE = 1_000_000  # pixels
+PANORAMAS = ("EQUIRECTANGULAR", "SPHERICAL", "VR180_L", "VR180_R", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R")
 SAME_FACTOR = 0.1  # how far a principal point may lie from a larger picture's centre to be taken for it
 SQUARE = 1.15  # ratio of the focal lengths up to which pixels are nearly square
 FOCALS = (0.1, 50.0)  # of an image's longer side: focal lengths that cameras have
@@ -224,9 +226,9 @@ def read_frames(listed: Sequence[Listed], images: Sequence[Path]) -> tuple[list[
     scaled = bent = 0
     sizes = [picture_header(image).size for image in images]
     cameras = []
-    for (shared, entry, where), size in zip(listed, sizes, strict=True):
+    for (shared, entry, where), size, image in zip(listed, sizes, images, strict=True):
         described = picture_camera(shared, entry, size, where)
-        cameras.append(fitted(described, size, where))
+        cameras.append(fitted(described, size, where, image))
         scaled += cameras[-1] is not described
         bent += described.distorted and says_pinhole(shared, entry)
     poses, turned = _poses(listed, images, cameras)
@@ -323,6 +325,8 @@ def _lens(shared: Mapping[str, Any], entry: Mapping[str, Any], value: Any, where
     if name is None:
         name = "OPENCV_FISHEYE" if fisheye else "OPENCV"
     if not isinstance(name, str) or name.upper() not in MODELS:
+        if isinstance(name, str) and name.upper() in PANORAMAS:
+            raise InputError(f"{where}: {PANORAMA}")
         raise InputError(f"{where}: the camera model {str(name)[:40]!r} is not known; undistort the pictures to PINHOLE or OPENCV first")
     k1, k2, k3, k4, k5, k6, p1, p2 = (value(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"))
     if MODELS[name.upper()] == FISHEYE:

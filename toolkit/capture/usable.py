@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from toolkit.camera import PoseNotes
-from toolkit.capture.listing import counted
+from toolkit.capture.headers import orientation_of
+from toolkit.capture.images import EXIF_TURNS
+from toolkit.capture.listing import LYING, counted, picture_header
 from toolkit.capture.types import Capture
 from toolkit.errors import InputError
 
 MOST_BAD = 0.2  # share of the frames that may be left out; with more of them something is wrong with the capture
 LEAST = 3  # frames that have to stay
+BESIDE = ("transforms", "blender", "colmap", "llff")  # kinds whose images may be photos as a camera wrote them
 NAMED = 3  # frames that a remark names
 
 
@@ -36,6 +40,30 @@ def without(capture: Capture, bad: Mapping[str, str], refusal: str | None = None
     cause = first.rsplit("; ", 1)[0]
     remark = f"{counted(lost, 'frame')} of {total} {'is' if lost == 1 else 'are'} left out ({names}): {cause}"
     return capture.with_frames(kept, remark)
+
+
+def turned_by_exif(capture: Capture) -> Capture:
+    """The capture with the switch that has its images turned by EXIF, where its cameras have the shape of the upright images only; and with
+    a remark on images that EXIF turns by 180° or mirrors, where the shape says nothing."""
+    if capture.kind not in BESIDE or not capture.posed or any(frame.video_index is not None for frame in capture.frames):
+        return capture
+    turns = [orientation_of(frame.image) for frame in capture.frames]
+    lying = sum(
+        turn >= LYING and (frame.intrinsics.width, frame.intrinsics.height) == picture_header(frame.image).size[::-1]
+        for frame, turn in zip(capture.frames, turns, strict=True)
+        if frame.intrinsics is not None and frame.intrinsics.width != frame.intrinsics.height
+    )
+    if lying:
+        remark = f"{counted(lying, 'image fits its camera', 'images fit their cameras')} only when turned by EXIF, so all are turned by it"
+        return replace(capture.with_frames(capture.frames, remark), extra={**capture.extra, EXIF_TURNS: True})
+    over = sum(1 < turn < LYING for turn in turns)
+    if not over:
+        return capture
+    remark = (
+        f"EXIF turns {over} of {len(turns)} images (by 180°, or mirrored), and poses are taken to be for the images as they are stored; "
+        "if renders come out wrong, write the images anew without that tag"
+    )
+    return capture.with_frames(capture.frames, remark)
 
 
 def with_usable_poses(capture: Capture, notes: PoseNotes) -> Capture:
