@@ -15,7 +15,6 @@ from toolkit.poses.database import MIN_INLIERS
 from toolkit.poses.job import Job
 from toolkit.poses.mapping import SMALLEST, Model
 
-NEAR = 4.0  # pixels from a match to the epipolar line, COLMAP's own bound for a pair's inliers
 
 
 def agreement(job: Job, model: Model) -> dict[int, float]:
@@ -42,7 +41,7 @@ def agreement(job: Job, model: Model) -> dict[int, float]:
         ]
         moved = placed[there].cam_from_world() * placed[here].cam_from_world().inverse()
         off = epipolar_distance(rays[0], rays[1], moved.rotation.matrix(), np.asarray(moved.translation))
-        near = int(np.count_nonzero(off * cameras[0].mean_focal_length() < NEAR))
+        near = int(np.count_nonzero(off * cameras[0].mean_focal_length() < job.tolerance))
         for i in (here, there):
             agree[i] += near
             total[i] += len(matches)

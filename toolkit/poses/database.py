@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from toolkit.capture.images import load_image, load_mask
 from toolkit.errors import InputError
 from toolkit.files import read_json, remove, write_json
 from toolkit.poses.features import floats, learned, sift
-from toolkit.poses.job import SIFT, Job, Picture
+from toolkit.poses.job import SIFT, TOLERANCE, Job, Picture
 from toolkit.poses.pairs import coarse
 
 THUMBNAIL = 32  # pixels a side of the picture kept to tell identical ones
@@ -105,7 +106,7 @@ def _describe(picture: Picture, job: Job) -> tuple[dict[str, Any], Array, Array]
     if pixels.shape[2] == 4:
         solid = pixels[..., 3] >= 128
         usable = solid if usable is None or usable.shape != solid.shape else usable & solid
-    factor = min(1.0 if job.features == SIFT else ENLARGED, job.image_size / max(width, height))
+    factor = _factor(job, width, height)
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
     seen = grey if factor == 1.0 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA if factor < 1.0 else cv2.INTER_CUBIC)
     keypoints, descriptors = sift(seen, job.max_features) if job.features == SIFT else learned(seen, job.max_features)
@@ -125,6 +126,18 @@ def _describe(picture: Picture, job: Job) -> tuple[dict[str, Any], Array, Array]
         "thumbnail": thumbnail.ravel().tolist(),
     }
     return record, keypoints, descriptors
+
+
+def _factor(job: Job, width: int, height: int) -> float:
+    """Size of an image in which features are looked for, in sizes of its own."""
+    return min(1.0 if job.features == SIFT else ENLARGED, job.image_size / max(width, height))
+
+
+def tolerant(job: Job, records: list[dict[str, Any]]) -> Job:
+    """The job with the tolerance that suits its features: learned ones lie within COLMAP's pixels of the image in which they were found."""
+    if job.features == SIFT:
+        return job
+    return replace(job, tolerance=TOLERANCE / float(np.median([_factor(job, record["width"], record["height"]) for record in records])))
 
 
 def label(index: int) -> str:

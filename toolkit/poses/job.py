@@ -14,6 +14,7 @@ from toolkit.files import fingerprint, read_json, write_json
 
 MAX_EXHAUSTIVE = 40  # photos; beyond it pairs are chosen
 SIFT, XFEAT = "sift", "xfeat"  # features that images are matched by
+TOLERANCE = 4.0  # pixels, COLMAP's own
 MAX_ASKED_AGAIN = 120  # photos; up to it those that find no place so are matched with all others
 GONE_ON = "incremental, gone on with small angles"  # the attempt that adds to the strict one's model what that had no place for
 GONE_FAR = "incremental, gone on with tiny angles"  # the same from there, where cameras turn before a wall and hardly move
@@ -65,6 +66,7 @@ class Job:
     seed: int
     threads: int
     features: str = SIFT
+    tolerance: float = TOLERANCE  # pixels that a match may be off its epipolar line, and a point off where it is seen
     second: str | None = None  # features that are tried where the first place too few
 
     @property

@@ -14,7 +14,7 @@ import pycolmap
 from toolkit.camera import OPENCV, Intrinsics
 from toolkit.errors import PoseError
 from toolkit.files import remove
-from toolkit.poses.job import GLOBAL, GONE_FAR, GONE_ON, LOOSE, Job
+from toolkit.poses.job import GLOBAL, GONE_FAR, GONE_ON, LOOSE, TOLERANCE, Job
 
 Report = Callable[[float, float, str], None]
 STRICT = "incremental"  # the attempt by COLMAP's own rules
@@ -68,7 +68,7 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
         models = [model for model in models if len(model.registered) >= SMALLEST]
         history.append({"attempt": name, "models": [len(model.registered) for model in models]})
         for model in models:
-            if model.error <= MAX_ERROR and (best is None or _better(model, best)):
+            if model.error <= MAX_ERROR * max(1.0, job.tolerance / TOLERANCE) and (best is None or _better(model, best)):
                 best = model
     if best is not None:
         settle(best)
@@ -109,6 +109,10 @@ def _options(job: Job, angle: float | None = None) -> pycolmap.IncrementalPipeli
     options.triangulation.random_seed = job.seed
     # COLMAP would go on to the last bit after every few pictures, and find the same in twice the time (docs/measured/performance.md).
     options.ba_global_frames_ratio = options.ba_global_points_ratio = ADJUSTED_AFTER
+    if job.tolerance > TOLERANCE:
+        options.mapper.filter_max_reproj_error = options.triangulation.complete_max_reproj_error = job.tolerance
+        options.triangulation.merge_max_reproj_error = job.tolerance
+        options.mapper.abs_pose_max_error *= job.tolerance / TOLERANCE
     options.ba_local_function_tolerance = options.ba_global_function_tolerance = STEP_TOLERANCE
     if angle is not None:
         options.mapper.init_min_tri_angle = 4.0

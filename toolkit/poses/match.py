@@ -21,6 +21,9 @@ from toolkit.poses.database import Report, label
 from toolkit.poses.features import floats
 from toolkit.poses.job import XFEAT, Job
 
+# Learned features nearly always match something, and of hundreds of false matches some dozens agree with some geometry or other.
+LEAST_RATIO = 0.25  # share of such a pair's matches that have to
+MOST_TRIALS = 3000  # which so many trials find
 PAIRS_A_STEP = 40  # matched between two progress reports
 MOST_MATCHERS = 8  # processes, each of a hundred megabytes and more
 MOST_DESCRIBED = 128  # images whose learned descriptors are held in memory, of a megabyte each
@@ -169,6 +172,10 @@ def _match(job: Job, folder: Path, pairs: list[tuple[int, int]]) -> None:
     matching.guided_matching = False
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job.seed
+    verification.ransac.max_error = job.tolerance
+    if job.features == XFEAT:
+        verification.min_inlier_ratio = LEAST_RATIO
+        verification.ransac.max_num_trials = MOST_TRIALS
     pairing = pycolmap.ImportedPairingOptions()
     with atomic_path(folder / "pairs.txt") as listing:
         listing.write_text("".join(f"{label(i)} {label(j)}\n" for i, j in pairs), encoding="utf-8")

@@ -11,7 +11,7 @@ import pycolmap
 from toolkit.files import read_json, remove
 from toolkit.poses import loops
 from toolkit.poses.agreement import agreement, leave_out
-from toolkit.poses.database import extract, open_database, pair_facts
+from toolkit.poses.database import extract, open_database, pair_facts, tolerant
 from toolkit.poses.health import AGREES, failure, hopeless, turned_only
 from toolkit.poses.job import GLOBAL, LOOSE, MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, Job
 from toolkit.poses.mapping import LEFT_OUT, LEFT_OUT_SHARE, Model, Report, map_pictures, plain
@@ -44,12 +44,11 @@ def place(job: Job, report: Report) -> Placed:
             better, told = _mapped(copy, again)
         if len(_missing(job, better)) < len(missing):
             model, facts = better, told
-    few = not job.sequential and len(job.pictures) <= FEW
     facts["agreement"] = {} if model is None else agreement(job, model)
-    doubtful = few and (_fell_back(model) or min(facts["agreement"].values(), default=0.0) < SURE)
+    doubtful = _few(job) and (_fell_back(model) or min(facts["agreement"].values(), default=0.0) < SURE)
     if job.second is not None and (doubtful or _too_many(job, _missing(job, model))) and not turned_only({**facts, "pictures": _records(job)}):
         model, facts = _otherwise(job, (model, facts), report)
-    facts["agreement"] = leave_out(model, facts["agreement"], AGREES) if few and model is not None else {}
+    facts["agreement"] = leave_out(model, facts["agreement"], AGREES) if _few(job) and model is not None else {}
     return model, facts
 
 
@@ -70,12 +69,15 @@ def _otherwise(job: Job, before: Placed, report: Report) -> Placed:
     database = open_database(other)
     try:
         records = extract(other, database, again)
+        other = tolerant(other, records)
         pairs = [] if hopeless(records) else choose_pairs(other, database, again)
     finally:
         database.close()
     match(other, pairs, again)
     model, facts = _mapped(other, again)
     facts |= {"pictures": records, "agreement": {} if model is None else agreement(other, model)}
+    if model is not None and _few(job):
+        facts["agreement"] = leave_out(model, facts["agreement"], AGREES)
     if model is not None and _sane(job, model, facts) and _better((model, facts), before):
         return model, facts
     remove(Path(other.folder))
@@ -94,6 +96,10 @@ def _better(after: Placed, before: Placed) -> bool:
     gained = sum(share >= AGREES for share in new) - sum(share >= AGREES for share in old)
     clean, clearer = min(new, default=0.0) >= AGREES, min(new, default=0.0) > min(old, default=0.0)
     return (gained > 0 and (clean or not _fell_back(after[0]))) or (gained == 0 and clean and (clearer or _fell_back(before[0])))
+
+
+def _few(job: Job) -> bool:
+    return not job.sequential and len(job.pictures) <= FEW
 
 
 def _too_many(job: Job, missing: list[int]) -> bool:
