@@ -22,7 +22,7 @@ from toolkit.poses.features import floats
 from toolkit.poses.job import XFEAT, Job
 
 # Learned features nearly always match something, and of hundreds of false matches some dozens agree with some geometry or other.
-LEAST_RATIO = 0.25  # share of such a pair's matches that have to
+LEAST_RATIO = 0.2  # share of such a pair's matches that have to
 MOST_TRIALS = 3000  # which so many trials find
 PAIRS_A_STEP = 40  # matched between two progress reports
 MOST_MATCHERS = 8  # processes, each of a hundred megabytes and more
