@@ -17,8 +17,9 @@ from toolkit.poses.mapping import SMALLEST, Model
 
 
 
-def agreement(job: Job, model: Model) -> dict[int, float]:
-    """For each placed picture (its index in the job) the share of its matches with other placed ones that agree with their cameras."""
+def agreement(job: Job, model: Model, apart: int = 0) -> dict[int, float]:
+    """For each placed picture (its index in the job) the share of its matches with other placed ones, more than `apart` away in their order,
+    that agree with their cameras; 0 without any."""
     database = pycolmap.Database.open(job.database)
     try:
         index = {image.image_id: int(image.name) for image in database.read_all_images()}
@@ -32,7 +33,7 @@ def agreement(job: Job, model: Model) -> dict[int, float]:
         first, second = pycolmap.pair_id_to_image_pair(pair_id)
         matches = np.asarray(geometry.inlier_matches).reshape(-1, 2)
         here, there = index[first], index[second]
-        if len(matches) < MIN_INLIERS or here not in placed or there not in placed:
+        if len(matches) < MIN_INLIERS or here not in placed or there not in placed or abs(here - there) <= apart:
             continue
         cameras = [model.reconstruction.camera(placed[i].camera_id) for i in (here, there)]
         rays = [

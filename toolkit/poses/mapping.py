@@ -75,6 +75,16 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
     return best, history
 
 
+def joined(job: Job, model: Model, report: Report) -> Model | None:
+    """The model, adjusted once more with what the job's pictures match besides, and with those that had no place; None where COLMAP fails."""
+    found = [Model(one, STRICT, _registered(one)) for one in _incremental(job, report, None, model.reconstruction)]
+    best = max(found, key=lambda one: one.size, default=None)
+    if best is None or len(best.registered) < SMALLEST or best.error > MAX_ERROR:
+        return None
+    settle(best)
+    return best
+
+
 def _enough(attempt: str, pictures: int) -> float:
     """Registered pictures from which an attempt is not worth its time."""
     if attempt == GONE_ON:
@@ -131,7 +141,7 @@ def _incremental(
     options = _options(job, angle)
     total = len(job.pictures)
     how = "small" if angle == SMALL_ANGLE else "tiny"
-    what = "mapping" if angle is None else f"mapping again with {how} angles" if start is None else f"going on with {how} angles"
+    what = ("mapping" if start is None else "closing loops") if angle is None else f"{'mapping again' if start is None else 'going on'} with {how} angles"
     count = 0 if start is None else start.num_reg_images()
 
     def started() -> None:
@@ -150,8 +160,8 @@ def _incremental(
     given: Path | str = ""  # nothing
     if start is not None:
         options.multiple_models = False
-        # What it begins with was adjusted, and `finish` adjusts all that it adds.
-        options.ba_local_max_refinements = options.ba_global_max_refinements = 1
+        if angle is not None:  # what it begins with was adjusted, and `finish` adjusts all that it adds
+            options.ba_local_max_refinements = options.ba_global_max_refinements = 1
         given = _empty(Path(job.folder) / "start")
         start.write_binary(given)
     try:
