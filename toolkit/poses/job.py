@@ -111,7 +111,9 @@ class Job:
         return cls(**{**data, "pictures": tuple(Picture(**picture) for picture in data["pictures"])})
 
 
-def plan(capture: Capture, folder: Path, settings: PosesSettings, seed: int, threads: int, features: str = SIFT, second: str | None = None) -> Job:
+def plan(
+    capture: Capture, folder: Path, settings: PosesSettings, seed: int, threads: int, features: str = SIFT, second: str | None = None
+) -> Job:
     """The job for `capture`. Intrinsics and poses that the capture brings are not used; focal lengths from EXIF are."""
     pictures = tuple(
         Picture(

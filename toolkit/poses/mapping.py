@@ -76,7 +76,7 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
 
 
 def joined(job: Job, model: Model, report: Report) -> Model | None:
-    """The model, adjusted once more with what the job's pictures match besides, and with those that had no place; None where COLMAP fails."""
+    """The model, gone on from by COLMAP's own rules with what the job's pictures match besides; None where nothing sound comes of it."""
     found = [Model(one, STRICT, _registered(one)) for one in _incremental(job, report, None, model.reconstruction)]
     best = max(found, key=lambda one: one.size, default=None)
     if best is None or len(best.registered) < SMALLEST or best.error > MAX_ERROR:
@@ -141,7 +141,10 @@ def _incremental(
     options = _options(job, angle)
     total = len(job.pictures)
     how = "small" if angle == SMALL_ANGLE else "tiny"
-    what = ("mapping" if start is None else "closing loops") if angle is None else f"{'mapping again' if start is None else 'going on'} with {how} angles"
+    if angle is None:
+        what = "mapping" if start is None else "closing loops"
+    else:
+        what = f"{'mapping again' if start is None else 'going on'} with {how} angles"
     count = 0 if start is None else start.num_reg_images()
 
     def started() -> None:

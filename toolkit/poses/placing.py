@@ -46,7 +46,8 @@ def place(job: Job, report: Report) -> Placed:
             model, facts = better, told
     facts["agreement"] = {} if model is None else agreement(job, model)
     doubtful = _few(job) and (_fell_back(model) or min(facts["agreement"].values(), default=0.0) < SURE)
-    if job.second is not None and (doubtful or _too_many(job, _missing(job, model))) and not turned_only({**facts, "pictures": _records(job)}):
+    wanting = doubtful or _too_many(job, _missing(job, model))
+    if job.second is not None and wanting and not turned_only({**facts, "pictures": _records(job)}):
         model, facts = _otherwise(job, (model, facts), report)
     facts["agreement"] = leave_out(model, facts["agreement"], AGREES) if _few(job) and model is not None else {}
     return model, facts
@@ -59,7 +60,9 @@ def _otherwise(job: Job, before: Placed, report: Report) -> Placed:
     Their database stays in the job's folder, for a run that is taken up again.
     """
     assert job.second is not None
-    other = replace(job, folder=str(Path(job.folder) / job.second), features=job.second, second=None)
+    # Comparing all with all takes the longest, and grows with their square.
+    most = job.max_features if len(job.pictures) <= FEW else job.max_features // 2
+    other = replace(job, folder=str(Path(job.folder) / job.second), features=job.second, second=None, max_features=most)
     Path(other.folder).mkdir(exist_ok=True)
     total = len(job.pictures)
 

