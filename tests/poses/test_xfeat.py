@@ -23,7 +23,7 @@ from toolkit.errors import InputError, PoseError
 from toolkit.poses import database as store
 from toolkit.poses import placing, sfm, xfeat
 from toolkit.poses.features import floats, learned, sift
-from toolkit.poses.job import SIFT, XFEAT, Job, plan
+from toolkit.poses.job import GONE_ON, SIFT, XFEAT, Job, plan
 from toolkit.poses.mapping import Model, plain
 from toolkit.poses.match import match
 from toolkit.poses.pairs import exhaustive_pairs
@@ -223,7 +223,8 @@ def test_more_images_are_taken_where_their_matches_agree():
     assert placing._better(placed(strict, 0.9, 0.9, 0.9), placed(strict))
     assert placing._better(placed(strict, 0.9, 0.9, 0.9), placed(strict, 0.9, 0.9, 0.75))  # as many, and clearer
     assert not placing._better(placed(strict, 0.9, 0.9, 0.9, 0.4), before)  # the one more contradicts its matches
-    assert not placing._better(placed(loose, 0.9, 0.9, 0.9, 0.9, 0.4), before)
+    assert not placing._better(placed(loose, 0.9, 0.9, 0.9, 0.9), before) and not placing._better(placed(GONE_ON, 0.9, 0.9, 0.9, 0.9), before)
+    assert placing._better(placed(loose, 0.9, 0.9, 0.9), placed(strict)) and not placing._better(placed(loose, 0.9, 0.4, 0.9), placed(strict))
     assert not placing._better(placed(strict, 0.9, 0.9), before)
     assert not placing._better(placed(strict, 0.8, 0.9, 0.9), before)
 

@@ -17,8 +17,8 @@ from toolkit.poses.mapping import SMALLEST, Model
 
 
 def agreement(job: Job, model: Model, apart: int = 0) -> dict[int, float]:
-    """For each placed picture (its index in the job) the share of its matches with other placed ones that agree with their cameras, of those
-    more than `apart` away in order; 0 without any."""
+    """For each placed picture (its index in the job) the share of its matches with other placed ones that agree with their cameras, of
+    those more than `apart` away in order; 0 without any."""
     database = pycolmap.Database.open(job.database)
     try:
         index = {image.image_id: int(image.name) for image in database.read_all_images()}

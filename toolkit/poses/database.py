@@ -97,7 +97,7 @@ def _features(job: Job, indices: list[int]) -> Iterator[tuple[int, tuple[dict[st
 
 
 def _describe(picture: Picture, job: Job) -> tuple[dict[str, Any], Array, Array]:
-    """One picture as every later stage loads it, its keypoints (N, 4) in its own pixels and its descriptors (N, 128) in the database's form."""
+    """One picture as every later stage loads it, its keypoints (N, 4) in its own pixels and descriptors (N, 128) for the database."""
     frame = picture.frame()
     pixels = load_image(frame, exif=job.exif)
     height, width = pixels.shape[:2]

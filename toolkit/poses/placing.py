@@ -14,7 +14,7 @@ from toolkit.poses.agreement import agreement, leave_out
 from toolkit.poses.database import extract, open_database, pair_facts, tolerant
 from toolkit.poses.health import AGREES, failure, hopeless, turned_only
 from toolkit.poses.job import GLOBAL, LOOSE, MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, Job
-from toolkit.poses.mapping import LEFT_OUT, LEFT_OUT_SHARE, Model, Report, map_pictures, plain
+from toolkit.poses.mapping import LEFT_OUT, LEFT_OUT_SHARE, STRICT, Model, Report, map_pictures, plain
 from toolkit.poses.match import match
 from toolkit.poses.pairs import pairs_with
 from toolkit.poses.selection import choose_pairs
@@ -55,7 +55,7 @@ def place(job: Job, report: Report) -> Placed:
 
 def _otherwise(job: Job, before: Placed, report: Report) -> Placed:
     """What the second kind of features gives where that is better than `before`: more pictures whose matches agree with their place, or
-    as many and none that does not. What only the loose attempts found has to be beyond doubt, and no way of a camera folded.
+    as many and none that does not. It has to come from COLMAP's own rules unless there is no other, and no way of a camera be folded.
 
     Their database stays in the job's folder, for a run that is taken up again.
     """
@@ -98,7 +98,11 @@ def _better(after: Placed, before: Placed) -> bool:
     old, new = (list(facts["agreement"].values()) for _, facts in (before, after))
     gained = sum(share >= AGREES for share in new) - sum(share >= AGREES for share in old)
     clean, clearer = min(new, default=0.0) >= AGREES, min(new, default=0.0) > min(old, default=0.0)
-    return (gained > 0 and (clean or not _fell_back(after[0]))) or (gained == 0 and clean and (clearer or _fell_back(before[0])))
+    # Learned matches between pictures that see hardly any parallax get places by looser rules that agree with them and are wrong.
+    strict = after[0] is not None and after[0].attempt == STRICT
+    if before[0] is not None and not strict:
+        return False
+    return (gained > 0 and (clean or strict)) or (gained == 0 and clean and (clearer or _fell_back(before[0])))
 
 
 def _few(job: Job) -> bool:
