@@ -36,6 +36,7 @@ class PosesSettings:
     matching: str = "auto"  # auto | exhaustive | sequential
     image_size: int = 1600  # long side for feature extraction
     max_features: int = 4096
+    features: str = "auto"  # auto (SIFT, and XFeat where SIFT places too few) | sift | xfeat (learned; needs its weights)
 
 
 @dataclass
@@ -185,6 +186,7 @@ CHOICES = {
     "device": ("auto", "cpu", "cuda"),
     "poses.source": ("auto", "given", "sfm"),
     "poses.matching": ("auto", "exhaustive", "sequential"),
+    "poses.features": ("auto", "sift", "xfeat"),
     "field.decoder": ("deferred", "per_sample"),
     "network.depth_from": ("sensor", "off"),
     "network.precision": ("auto", "float32", "bfloat16"),
