@@ -151,7 +151,8 @@ def runs_of(source: Path, plan: Plan, progress: ConsoleProgress) -> Iterator[dic
         if first and not (plan.compare_effects and worth(variant, first)):
             continue
         for seed in plan.seeds:
-            row = {"variant": variant, "seed": seed, **run_one(source, plan, [*options, "--seed", str(seed)], f"{variant}-{seed}", progress)}
+            made = run_one(source, plan, [*options, "--seed", str(seed)], f"{variant}-{seed}", progress)
+            row = {"variant": variant, "seed": seed, **made}
             first = first or row
             yield row
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +110,8 @@ def test_variants_and_seeds_have_folders_of_their_own(tmp_path: Path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("code", "state", "words"), [(2, "refused", "no poses"), (1, "failed", "exit code 1"), (-9, "failed", "SIGKILL"), (None, "failed", "100 s")]
+    ("code", "state", "words"),
+    [(2, "refused", "no poses"), (1, "failed", "exit code 1"), (-9, "failed", "SIGKILL"), (None, "failed", "100 s")],
 )
 def test_how_a_run_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int | None, state: str, words: str) -> None:
     def run(arguments: list[str], log: Path, *_: Any) -> int:
@@ -128,14 +128,14 @@ def test_how_a_run_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: i
 
 def test_a_child_that_hangs_or_is_not_wanted_any_more_is_ended(tmp_path: Path) -> None:
     sleeping = ["-c", "import time; time.sleep(600)"]
-    with pytest.raises(TimeoutError, match="longer than 0.3 s"):
+    with pytest.raises(TimeoutError, match=r"longer than 0\.3 s"):
         child.run_logged(sleeping, tmp_path / "log", lambda _: None, 0.3)
     progress = ConsoleProgress()
     progress.request_stop()
     with pytest.raises(Interrupted):
         child.run_logged(sleeping, tmp_path / "log", lambda _: progress.check())
     assert child.run_logged(["-c", "import sys; print('said'); sys.exit(7)"], tmp_path / "log", lambda _: None) == 7
-    assert child.log_tail(tmp_path / "log") == "said" and sys.executable
+    assert child.log_tail(tmp_path / "log") == "said"
     assert child.end_reason(7) == "failed with exit code 7"
 
 
