@@ -47,7 +47,7 @@ def test_what_is_not_known_is_no_failure() -> None:
     ("found", "words"),
     [
         (report(12.3, 14.6, 18.3, **GIVEN), "--poses sfm"),
-        (report(13.3, 14.6, 27.0, **GIVEN), "learned its images by heart"),
+        (report(13.3, 14.6, 27.0, **GIVEN), "27.0 at training views"),
         (report(13.3, 14.6, 14.0, **GIVEN, field={"matched": {"share": 0.03}}), "--poses sfm"),
         (report(10.3, 13.5, 27.6, **GIVEN, on=["exposure"], nearest={"psnr_uncorrected": 15.1}), "--set effects=off"),
         (report(12.0, 13.0, 14.0, scores={"psnr_corrected": 17.0}), "lock both"),
@@ -69,7 +69,7 @@ def test_the_likeliest_cause_comes_first(found: dict[str, Any], words: str) -> N
 
 def test_a_field_that_shows_its_training_images_alone_is_poor() -> None:
     (text,) = failures(report(16.4, 12.8, 27.3, **GIVEN))
-    assert text.startswith("this field is poor") and "16.4 dB" in text and "12.8 dB" in text and "27.3 dB" in text
+    assert text.startswith("this field is poor") and "16.4 dB at held-out views, 12.8 by the nearest training image, 27.3 at" in text
 
 
 def view(name: str, psnr: float, seen: float | None = 1.0) -> dict[str, Any]:
@@ -91,3 +91,12 @@ def test_views_where_nobody_filmed_are_named() -> None:
         assert failures(report(scores={"per_view": [*good, harmless]})) == []
     (text,) = failures(report(scores={"per_view": [view("1", 20.0, 0.3), view("2", 20.0, 0.5)]}))
     assert text.startswith("60% of what held-out views show")
+
+
+def test_depth_that_does_not_fit_is_told() -> None:
+    deep = {"capture": {"depth": 30}, "settings": {"fit": {"depth_from": "auto"}}, "scores": {"depth": {"median_rel": 0.14}}}
+    (text,) = failures(report(**deep))
+    assert "14% off the capture's depth" in text and "--set fit.depth_from=off" in text
+    assert failures(report(**{**deep, "scores": {"depth": {"median_rel": 0.03}}})) == []
+    assert failures(report(**{**deep, "settings": {"fit": {"depth_from": "off"}}})) == []
+    assert failures(report(**{**deep, "capture": {"depth": 0}})) == []
