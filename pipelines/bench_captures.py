@@ -6,7 +6,7 @@ import json as writer
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ from pipelines.options import Budget, Config, Device, ImageSize, Json, Out, Pair
 FILE = "captures"
 RUNS = "runs"  # OUT/runs/CAPTURE/VARIANT-SEED are ordinary run folders
 VARIANTS = {"default": [], "effects off": ["--set", "effects=off"], "own poses": ["--poses", "sfm"]}
-UNPOSED = ("photos", "video", None)  # kinds whose poses are estimated anyway
+UNPOSED = ("photos", "video")  # kinds whose poses are estimated anyway
 REFUSED = 2  # exit code of bad input
 MARK = "fieldfuse: "  # what the one sentence of an error begins with
 MODELLED = ("view_dependence", "background")  # parts of the field, no corrections
@@ -74,7 +74,7 @@ def captures(
         raise InputError(f"--seeds {seeds!r} must be whole numbers separated by commas")
     if threads is None and jobs > 1:
         threads = max(1, (os.cpu_count() or 1) // jobs)
-    flags = {"budget": budget, "image_size": image_size, "device": device, "threads": threads}
+    flags: dict[str, Any] = {"budget": budget, "image_size": image_size, "device": device, "threads": threads}
     read_settings(gather(preset, config, pairs, **flags))  # a bad setting is refused once, not by each run
     flags |= {"preset": preset, "config": config}
     options = [word for name, value in flags.items() if value is not None for word in (f"--{name.replace('_', '-')}", str(value))]
@@ -98,15 +98,17 @@ def sources(data: Path, out: Path, only: str | None = None) -> list[Path]:
     from toolkit.capture.sens import is_sens
     from toolkit.errors import InputError
 
-    if not data.is_dir():
-        raise InputError(f"{data} is not a folder; give the one that holds the captures")
+    try:
+        held = sorted(data.absolute().iterdir(), key=lambda path: natural_key(path.name))
+    except OSError as error:
+        raise InputError(f"cannot list {data} ({error.strerror or error}); give the folder that holds the captures") from error
 
     def is_source(path: Path) -> bool:
-        if path.name.startswith(".") or path.resolve() == out.resolve():
+        if path.name.startswith(".") or os.path.realpath(path) == os.path.realpath(out):
             return False
         return path.is_dir() or (path.is_file() and (path.suffix.lower() in FILMS or is_sens(path)))
 
-    found = {path.name: path for path in sorted(data.iterdir(), key=lambda path: natural_key(path.name)) if is_source(path)}
+    found = {path.name: path for path in held if is_source(path)}
     wanted = [name.strip() for name in only.split(",") if name.strip()] if only is not None else list(found)
     if missing := [name for name in wanted if name not in found]:
         raise InputError(f"{data} holds no capture {missing[0]!r}; there are {', '.join(found) or 'none'}")
@@ -125,7 +127,7 @@ def bench_captures(found: Sequence[Path], plan: Plan, jobs: int, progress: Conso
     with progress.listening(), ThreadPoolExecutor(jobs) as pool:
         progress.begin(FILE)
         began = time.monotonic()
-        waiting = {pool.submit(lambda source=source: list(runs_of(source, plan, progress))): source for source in found}
+        waiting = {pool.submit(runs_of, source, plan, progress): source for source in found}
         try:
             while waiting:
                 progress.check()
@@ -133,7 +135,7 @@ def bench_captures(found: Sequence[Path], plan: Plan, jobs: int, progress: Conso
                 for future in done:
                     source = waiting.pop(future)
                     rows[source.name] = future.result()
-                    progress.say(f"{source.name}: {said(rows[source.name][0])}")
+                    progress.say(f"{shown(source)}: {said(rows[source.name][0])}")
                     put(found, rows, plan)
                 progress.update(len(rows), len(found), f"{len(rows)} of {len(found)}")
         except BaseException:
@@ -144,21 +146,21 @@ def bench_captures(found: Sequence[Path], plan: Plan, jobs: int, progress: Conso
     return put(found, rows, plan)
 
 
-def runs_of(source: Path, plan: Plan, progress: ConsoleProgress) -> Iterator[dict[str, Any]]:
+def runs_of(source: Path, plan: Plan, progress: ConsoleProgress) -> list[dict[str, Any]]:
     """The runs of one capture: by default settings, and those that it is compared with."""
-    first: dict[str, Any] = {}
+    rows: list[dict[str, Any]] = []
     for variant, options in VARIANTS.items():
-        if first and not (plan.compare_effects and worth(variant, first)):
+        if rows and not (plan.compare_effects and worth(variant, rows[0])):
             continue
         for seed in plan.seeds:
             made = run_one(source, plan, [*options, "--seed", str(seed)], f"{variant}-{seed}", progress)
-            row = {"variant": variant, "seed": seed, **made}
-            first = first or row
-            yield row
+            rows.append({"variant": variant, "seed": seed, **made})
+    return rows
 
 
 def worth(variant: str, first: dict[str, Any]) -> bool:
-    """Whether the run can differ from the first: what came without poses has its own anyway, and what is refused for its files stays so."""
+    """Whether the run can differ from the first: what came without poses has its own anyway, and effects do
+    not decide what is refused."""
     if variant == "own poses":
         return first["poses"] != "sfm" and first["kind"] not in UNPOSED
     return first["state"] == "read"
@@ -166,7 +168,7 @@ def worth(variant: str, first: dict[str, Any]) -> bool:
 
 def run_one(source: Path, plan: Plan, options: list[str], name: str, progress: ConsoleProgress) -> dict[str, Any]:
     """One run in a process of its own, as far as it came: `state` is "read", "refused" (bad input, with its sentence) or "failed"."""
-    from toolkit.capture.detect import detect_kind
+    from toolkit.errors import FieldfuseError, Interrupted, first_line
     from toolkit.files import read_json, remove
     from toolkit.poses.child import end_reason, import_path, log_tail, run_logged
 
@@ -174,20 +176,37 @@ def run_one(source: Path, plan: Plan, options: list[str], name: str, progress: C
     log = folder.with_name(f"{folder.name}.log")
     log.parent.mkdir(parents=True, exist_ok=True)
     command = ["-m", "pipelines.bench_captures", "run", str(source), "--out", str(folder), *plan.options, *options, "--quiet"]
-    nothing = {"kind": detect_kind(source) if source.is_dir() else "video", "poses": None}
     try:
         code = run_logged(command, log, lambda _: progress.check(), plan.timeout, import_path())
-    except TimeoutError as error:
-        return {**nothing, "state": "failed", "error": f"{error}"}
-    if code == 0:
-        try:
-            return {"state": "read", "error": None, **facts(read_json(folder / "report.json"))}
-        finally:
+        if code == 0:
+            found = facts(read_json(folder / "report.json"))
             remove(log)
-    said = log_tail(log).removeprefix(MARK)
-    if code == REFUSED:
-        return {**nothing, "state": "refused", "error": said}
-    return {**nothing, "state": "failed", "error": f"its process {end_reason(code)}: {said}"}
+            return {"state": "read", "error": None, **found}
+        said = log_tail(log).removeprefix(MARK)
+        state, why = ("refused", said) if code == REFUSED else ("failed", f"its process {end_reason(code)}: {said}")
+    except Interrupted:
+        raise
+    except TimeoutError as error:
+        state, why = "failed", f"{error}"
+    except (FieldfuseError, LookupError, TypeError, AttributeError) as error:
+        state, why = "failed", f"its report cannot be read ({first_line(error)})"
+    return {"state": state, "error": why, "kind": kind_of(folder), "poses": None}
+
+
+def kind_of(folder: Path) -> str | None:
+    """What a run that was refused later had found its source to be; None: it did not come so far."""
+    from toolkit.errors import FieldfuseError
+    from toolkit.files import read_json
+
+    try:
+        return str(read_json(folder / "capture.json")["kind"])
+    except (FieldfuseError, LookupError, TypeError):
+        return None
+
+
+def shown(source: Path) -> str:
+    """The capture's name as text, whatever bytes it is made of."""
+    return " ".join(os.fsencode(source.name).decode("utf-8", "replace").split())
 
 
 def facts(report: dict[str, Any]) -> dict[str, Any]:
@@ -222,7 +241,7 @@ def put(found: Sequence[Path], rows: dict[str, list[dict[str, Any]]], plan: Plan
         "version": __version__,
         "command": command_line(),
         "machine": {**machine(int(threads)), "measured": time.strftime("%Y-%m-%d")},
-        "captures": [{"capture": source.name, "runs": rows[source.name]} for source in found if source.name in rows],
+        "captures": [{"capture": shown(source), "runs": rows[source.name]} for source in found if source.name in rows],
     }
     write_json(plan.out / f"{FILE}.json", data)
     with atomic_path(plan.out / f"{FILE}.md") as temporary:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -68,13 +69,27 @@ def test_what_is_a_source(tmp_path: Path) -> None:
     assert [path.name for path in sources(tmp_path, tmp_path / "out", "c.sens, b9,c.sens")] == ["c.sens", "b9"]
     with pytest.raises(InputError, match="holds no captures"):
         sources(tmp_path / "b9", tmp_path / "out")
-    with pytest.raises(InputError, match="is not a folder"):
-        sources(tmp_path / "a.mp4", tmp_path / "out")
+    for nothing in ("a.mp4", "nowhere"):
+        with pytest.raises(InputError, match="cannot list"):
+            sources(tmp_path / nothing, tmp_path / "out")
+
+
+def test_names_are_no_options_and_any_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "--help").mkdir()
+    (tmp_path / os.fsdecode(b"a\xff |\nb")).mkdir()
+    found = sources(Path(), tmp_path / "out")
+    assert all(str(path).startswith("/") for path in found)
+    monkeypatch.setattr(child, "run_logged", lambda *_: 1)
+    bench_captures.bench_captures(found, plan(tmp_path, seeds=(0,), compare_effects=False), 1, ConsoleProgress())
+    assert [one["capture"] for one in read_json(tmp_path / "out" / "captures.json")["captures"]] == ["--help", "a\ufffd | b"]
+    assert "| a\ufffd / b |" in (tmp_path / "out" / "captures.md").read_text(encoding="utf-8")
 
 
 def test_only_what_can_differ_is_compared() -> None:
     assert worth("own poses", {"state": "read", "kind": "llff", "poses": "given"})
     assert worth("own poses", {"state": "refused", "kind": "colmap", "poses": None})
+    assert worth("own poses", {"state": "refused", "kind": None, "poses": None})
     assert not worth("own poses", {"state": "read", "kind": "llff", "poses": "sfm"})
     assert not worth("own poses", {"state": "refused", "kind": "photos", "poses": None})
     assert not worth("effects off", {"state": "refused", "kind": "llff", "poses": None})
@@ -98,7 +113,7 @@ def test_variants_and_seeds_have_folders_of_their_own(tmp_path: Path, monkeypatc
 
     monkeypatch.setattr(child, "run_logged", run)
     (tmp_path / "fern").mkdir()
-    rows = list(runs_of(tmp_path / "fern", plan(tmp_path), ConsoleProgress()))
+    rows = runs_of(tmp_path / "fern", plan(tmp_path), ConsoleProgress())
     assert [(row["variant"], row["seed"], row["psnr"]) for row in rows] == [
         (variant, seed, 21.0 + 2 * place + seed)
         for place, variant in enumerate(("default", "effects off", "own poses"))
@@ -106,12 +121,12 @@ def test_variants_and_seeds_have_folders_of_their_own(tmp_path: Path, monkeypatc
     ]
     assert len({arguments[arguments.index("--out") + 1] for arguments in asked}) == 6
     assert all("effects=off" in asked[place] for place in (2, 3)) and all("sfm" in asked[place] for place in (4, 5))
-    assert len(list(runs_of(tmp_path / "fern", plan(tmp_path, compare_effects=False), ConsoleProgress()))) == 2
+    assert len(runs_of(tmp_path / "fern", plan(tmp_path, compare_effects=False), ConsoleProgress())) == 2
 
 
 @pytest.mark.parametrize(
     ("code", "state", "words"),
-    [(2, "refused", "no poses"), (1, "failed", "exit code 1"), (-9, "failed", "SIGKILL"), (None, "failed", "100 s")],
+    [(2, "refused", "no poses"), (1, "failed", "exit code 1"), (-9, "failed", "SIGKILL"), (None, "failed", "100 s"), (0, "failed", "report")],
 )
 def test_how_a_run_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int | None, state: str, words: str) -> None:
     def run(arguments: list[str], log: Path, *_: Any) -> int:
@@ -123,7 +138,7 @@ def test_how_a_run_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: i
     monkeypatch.setattr(child, "run_logged", run)
     (tmp_path / "fern").mkdir()
     row = bench_captures.run_one(tmp_path / "fern", plan(tmp_path), [], "default-0", ConsoleProgress())
-    assert row["state"] == state and words in row["error"] and not row["error"].startswith("fieldfuse: ")
+    assert row["kind"] is None and row["state"] == state and words in row["error"] and not row["error"].startswith("fieldfuse: ")
 
 
 def test_a_child_that_hangs_or_is_not_wanted_any_more_is_ended(tmp_path: Path) -> None:

@@ -39,8 +39,8 @@ def nearest_image_scores(views: Views, indices: Sequence[int] | Array) -> dict[s
     """PSNR of the nearest training picture at each of `indices`, resized where sizes differ.
 
     Returns:
-        `views`, the mean `psnr` (dB), `psnr_uncorrected` (the same of images of which colours were corrected, as they were taken; None where
-        none was), and `per_view` with `index`, `name`, `nearest` (a name) and both; None without training views.
+        `views`, the mean `psnr` (dB), `psnr_uncorrected` (the same of images as they were taken, where colours were corrected; else None),
+        and `per_view` with `index`, `name`, `nearest` (a name) and both; None without training views.
     """
     per_view: list[dict[str, Any]] = []
     for index in (int(i) for i in indices):

@@ -77,8 +77,8 @@ def _depth(report: dict[str, Any], field: dict[str, Any]) -> list[str]:
     if off is None or off < DEPTH or not used:
         return []
     return [
-        f"the field is {100 * off:.0f}% off the capture's depth in the median, though it was fitted to it; likely its unit is another one, or "
-        "it is not registered with the images: check the depth scale, or run again with --set fit.depth_from=off"
+        f"the field is {100 * off:.0f}% off the capture's depth in the median, though it was fitted to it; likely its unit is another one, "
+        "or it is not registered with the images: check the depth scale, or run again with --set fit.depth_from=off"
     ]
 
 
