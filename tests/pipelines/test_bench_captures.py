@@ -126,7 +126,13 @@ def test_variants_and_seeds_have_folders_of_their_own(tmp_path: Path, monkeypatc
 
 @pytest.mark.parametrize(
     ("code", "state", "words"),
-    [(2, "refused", "no poses"), (1, "failed", "exit code 1"), (-9, "failed", "SIGKILL"), (None, "failed", "100 s"), (0, "failed", "report")],
+    [
+        (2, "refused", "no poses"),
+        (1, "failed", "exit code 1"),
+        (-9, "failed", "SIGKILL"),
+        (None, "failed", "100 s"),
+        (0, "failed", "report"),
+    ],
 )
 def test_how_a_run_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int | None, state: str, words: str) -> None:
     def run(arguments: list[str], log: Path, *_: Any) -> int:

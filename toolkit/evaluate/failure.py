@@ -17,11 +17,11 @@ COLOURS = 3.0  # dB that an affine correction of colours gains where colours are
 MEMORISED = 2.5  # times the gain over the nearest image: so much more was learned of single images than of the scene
 GOOD = 26.0  # dB at which an image looks right: more of the training images' grain than that is no failure
 NEAR = 30.0  # dB of the nearest image above which the camera hardly moved between them
-HARM = 1.0  # dB by which neighbouring images are more alike before their colours are corrected than after, where the correction is wrong
+HARM = 0.5  # dB by which neighbouring images are more alike before their colours are corrected than after, where the correction is wrong
 DEPTH = 0.1  # median share by which a fit's depth is off the depth that it was fitted to: sensors err by 0.01 to 0.03
 DARK = 6.0  # dB below the median view at which a view is named
 UNSEEN = 0.25  # share of a view that fewer than two training cameras see, above which its score says little
-FEW = 8  # training images below which docs/few_views.md applies, whatever else is the matter
+FEW = 12  # training images below which docs/few_views.md applies
 PLACED = 0.7  # share of frames with a pose below which something of the scene is missing
 MATCHED = 0.1  # share of pixels whose depth is found by matching: right poses give a third and more, wrong ones a few per cent
 MOVING = 0.05  # share of training pixels that were left out since they show what moves
@@ -92,7 +92,7 @@ def _causes(report: dict[str, Any], field: dict[str, Any], nearest: dict[str, An
     held = field["psnr"]
     given, registered, total = poses.get("source") == "given", poses.get("registered") or 0, poses.get("total") or 0
     apart = matched is not None and matched < MATCHED
-    if train < FEW:
+    if train < FEW and not (given and apart):
         yield f"there are too few training images ({train}): film more from places in between, or see docs/few_views.md"
     if nearest["psnr"] >= NEAR:
         yield "the camera hardly moved, so that held-out images are nearly training images: film while moving sideways"
