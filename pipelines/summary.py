@@ -206,6 +206,7 @@ def put_report(
     seconds: float,
 ) -> dict[str, Any]:
     """Write report.json and report.html; `seconds` is what this command took so far, reused stages count as they took."""
+    from toolkit.evaluate.failure import failures
     from toolkit.evaluate.pictures import method_pictures, moving_pictures
     from toolkit.evaluate.report import report_data, write_report
 
@@ -237,6 +238,7 @@ def put_report(
         "export_facts": export_facts,
         "seconds_total": round(seconds + job.stages.fresh_seconds(), 3),
     }
+    data["warnings"] = unique([*failures(report_data(data)), *data["warnings"]])
     if job.plan is not None and told is not None:
         data |= {"budget": told, "notes": [job.plan.note(told), *data["notes"]]}
     shown = {name: [*found.pictures] for name, found in pictures.items()}
