@@ -317,7 +317,7 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
         notes.rounding.append(float(off))
     elif not off <= tolerance:  # NaN, too
         raise InputError(
-            f"{where}: the pose is not rigid (its rotation is sheared, or its axes have different lengths: R'R is {off:.2g} off 1); correct it"
+            f"{where}: the pose is not rigid (its rotation is sheared or its axes differ in length: R'R is {off:.2g} off 1); correct it"
         )
     checked_place(pose[:3, 3], where)
     out = np.eye(4)

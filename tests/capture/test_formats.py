@@ -51,7 +51,7 @@ def test_a_damaged_avif_is_refused_by_name(tmp_path: Path) -> None:
         Image.fromarray(scene(3 * number)).save(path)
     path = tmp_path / "a" / "02.avif"
     path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(InputError, match="02.avif is cut short"):
+    with pytest.raises(InputError, match=r"02\.avif is cut short"):
         read_picture(path)
 
 
@@ -175,11 +175,11 @@ def test_panoramas_are_refused_for_what_they_are(room: Path, tmp_path: Path) -> 
     xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:ProjectionType>equirectangular</GPano:ProjectionType></x:xmpmeta>'
     for number, path in enumerate(photos(tmp_path / "p", ".jpg", 6)):
         Image.fromarray(np.repeat(scene(9 * number), 2, axis=1)).save(path, xmp=xmp)
-    with pytest.raises(InputError, match="panoramas .* are not read; cut each into perspective views"):
+    with pytest.raises(InputError, match=r"panoramas .* are not read; cut each into perspective views"):
         check_capture(open_capture(tmp_path / "p"))
     path = room / "transforms.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "camera_model": "EQUIRECTANGULAR"}))
-    with pytest.raises(InputError, match="panoramas .* are not read"):
+    with pytest.raises(InputError, match=r"panoramas .* are not read"):
         open_capture(room)
 
 

@@ -69,7 +69,8 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
     _refuse_blank(capture, looks)
     _refuse_same(capture, looks)
     sizes = Counter(_upright_size(header, turns_by_exif(capture)) for header in headers)
-    warnings = [*_size_warnings(capture, sizes), *_lens_warnings(capture), *_picture_warnings(capture, looks, copies), *check_depth(capture, progress)]
+    warnings = [*_size_warnings(capture, sizes), *_lens_warnings(capture), *_picture_warnings(capture, looks, copies)]
+    warnings += check_depth(capture, progress)
     extra = {**capture.extra, "sizes": {f"{width}x{height}": number for (width, height), number in sizes.most_common()}}
     return replace(
         capture, extra=extra, warnings=capture.warnings + tuple(warning for warning in warnings if warning not in capture.warnings)
@@ -226,8 +227,8 @@ def _lens_warnings(capture: Capture) -> list[str]:
     if not shares or min(shares) > 1 - CUT_OFF:
         return []
     return [
-        f"{100 * (1 - float(np.mean(shares))):.0f}% of the images' pixels lie outside of the pinhole view that is made of them (a wide lens) "
-        "and are not used; cut the images into several perspective views to use all"
+        f"{100 * (1 - float(np.mean(shares))):.0f}% of the images' pixels lie outside of the pinhole view that is made of them (a wide "
+        "lens) and are not used; cut the images into several perspective views to use all"
     ]
 
 

@@ -20,7 +20,6 @@ from toolkit.capture.types import Capture, Frame
 from toolkit.capture.video import iterate_video
 from toolkit.errors import InputError
 
-
 EXIF_TURNS = "exif_turns"  # in `Capture.extra`: the cameras are those of images that are turned by EXIF
 
 
@@ -209,7 +208,7 @@ def _decode_avif(data: bytes, path: Path) -> Array:
             picture.load()
             rgb = np.asarray(picture.convert("RGBA" if picture.mode in ("RGBA", "LA") else "RGB"))
     except Exception as error:  # Pillow's decoders raise many families on damaged files
-        raise InputError(f"the picture {path} (AVIF) is damaged or of a kind that cannot be decoded; copy it again or convert it to PNG") from error
+        raise InputError(f"the picture {path} (AVIF) is damaged or cannot be decoded; copy it again or convert it to PNG") from error
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGBA2BGRA if rgb.shape[2] == 4 else cv2.COLOR_RGB2BGR))
 
 

@@ -85,5 +85,6 @@ def with_usable_poses(capture: Capture, notes: PoseNotes) -> Capture:
         remarks.append(f"the rotations of {counted(len(notes.scales), 'pose')} were scaled by {by}, which was taken out")
     if notes.rounding:
         most = max(notes.rounding)
-        remarks.append(f"the rotations of {counted(len(notes.rounding), 'pose')} were off by up to {most:.2g} (rounded?) and were made rigid")
+        many = counted(len(notes.rounding), "pose")
+        remarks.append(f"the rotations of {many} were off by up to {most:.2g} (rounded?) and were made rigid")
     return capture.with_frames(capture.frames, *remarks) if remarks else capture
