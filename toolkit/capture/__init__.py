@@ -9,7 +9,7 @@ from toolkit.capture.types import Capture, Frame, Views
 __all__ = ["Capture", "Frame", "Views", "open_capture"]
 
 
-def open_capture(source: Path | str) -> Capture:
+def open_capture(source: Path | str, masks: str = "auto") -> Capture:
     """The capture at `source`: a video, a folder of a known layout, a `.sens` file, or one of a layout's JSON files. Found by looking.
 
     Only listings, metadata and picture headers are read; pixels are decoded of a video's first frame, and of a few pictures with alpha.
@@ -19,5 +19,6 @@ def open_capture(source: Path | str) -> Capture:
     """
     # Imported late: training and rendering need the types above on machines without Pillow.
     from toolkit.capture.detect import read_source
+    from toolkit.capture.masks import with_masks
 
-    return read_source(Path(source))
+    return with_masks(read_source(Path(source)), masks)

@@ -31,6 +31,7 @@ class Frame:
     as_stored: bool = False  # of a video: its frames are not turned, and those count too that its edit list hides
     confidence: Path | None = None  # picture of the depth map's size; 0 = the sensor does not believe this depth itself
     depth_pose: Array | None = None  # (4, 4) picture's camera from the depth camera, units of the poses; None: both at the same place
+    mask_excludes: bool = False  # the mask is the other way round: what is not 0 is not used
 
 
 @dataclass(frozen=True)
