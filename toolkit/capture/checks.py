@@ -13,9 +13,10 @@ import numpy as np
 from toolkit.camera import Array
 from toolkit.capture import heif
 from toolkit.capture.depth_checks import check_depth
+from toolkit.capture.duplicates import copies, suspects
 from toolkit.capture.headers import Header, read_bytes, read_header
-from toolkit.capture.images import turns_by_exif
-from toolkit.capture.listing import counted, fitted
+from toolkit.capture.images import turns_by_exif, upright
+from toolkit.capture.listing import counted, fitted, unique_names
 from toolkit.capture.types import Capture
 from toolkit.errors import InputError
 from toolkit.progress import SILENT, Progress
@@ -60,22 +61,26 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
         return capture
     if len(frames) == 1:
         raise InputError(f"{capture.root} holds only one picture; take at least 20 from different places")
-    headers, looks, copies = _look_at_all(capture, progress)
+    headers, looks, exact = _look_at_all(capture, progress)
     _refuse_blank(capture, looks)
     _refuse_same(capture, looks)
+    capture, headers, looks, copy_warnings = _once_each(capture, headers, looks, exact)
     sizes = Counter(_upright_size(header, turns_by_exif(capture)) for header in headers)
-    warnings = [*_size_warnings(capture, sizes), *_picture_warnings(capture, looks, copies), *check_depth(capture, progress)]
+    warnings = [*_size_warnings(capture, sizes), *copy_warnings, *_picture_warnings(capture, looks), *check_depth(capture, progress)]
     extra = {**capture.extra, "sizes": {f"{width}x{height}": number for (width, height), number in sizes.most_common()}}
     return replace(
         capture, extra=extra, warnings=capture.warnings + tuple(warning for warning in warnings if warning not in capture.warnings)
     )
 
 
-def _look_at_all(capture: Capture, progress: Progress) -> tuple[list[Header], list[Look], int]:
-    """Headers of all pictures, thumbnail measures of as many as `PIXEL_BUDGET` allows, and the number of exact copies."""
+def _look_at_all(capture: Capture, progress: Progress) -> tuple[list[Header], list[Look], dict[int, int]]:
+    """Headers of all pictures, thumbnail measures of as many as `PIXEL_BUDGET` allows and of all that may be copies by their names, and
+    the indices of exact copies with those that they are copies of."""
     headers: list[Header] = []
     looks: list[Look] = []
-    hashes: Counter[bytes] = Counter()
+    first: dict[bytes, int] = {}
+    exact: dict[int, int] = {}
+    named = suspects(capture.frames)
     every = 1
     exif = turns_by_exif(capture)
     for index, frame in enumerate(capture.frames):
@@ -84,21 +89,48 @@ def _look_at_all(capture: Capture, progress: Progress) -> tuple[list[Header], li
         data = read_bytes(frame.image)
         header = read_header(data, frame.image)
         headers.append(header)
-        hashes[hashlib.blake2b(data, digest_size=16).digest()] += 1
+        same = first.setdefault(hashlib.blake2b(data, digest_size=16).digest(), index)
+        if same != index:
+            exact[index] = same
         if index == 0:
             # Entropy decoding of a JPEG costs about a third of a PNG's, whatever size it is reduced to.
             cost = header.width * header.height * len(capture.frames) * (0.35 if header.format in ("JPEG", "MPO") else 1.0)
             every = max(1, min(int(np.ceil(cost / PIXEL_BUDGET)), len(capture.frames) // 20))
         if frame.intrinsics is not None:
             fitted(frame.intrinsics, _upright_size(header, exif), str(frame.image))
-        if index % every == 0:
-            looks.append(_look(frame.name, frame.image, data, header))
-    return headers, looks, len(capture.frames) - len(hashes)
+        if index % every == 0 or index in named:
+            looks.append(_look(frame.name, frame.image, data, header, exif))
+    return headers, looks, exact
 
 
-def _look(name: str, path: Path, data: bytes, header: Header) -> Look:
+def _once_each(
+    capture: Capture, headers: list[Header], looks: list[Look], exact: dict[int, int]
+) -> tuple[Capture, list[Header], list[Look], list[str]]:
+    """The same without copies of photos, of which nothing but pixels is given; copies among posed pictures are remarked on."""
+    place = {frame.name: index for index, frame in enumerate(capture.frames)}
+    seen = [place[look.name] for look in looks if look.deviation >= FLAT]
+    sizes = [headers[index].width * headers[index].height for index in seen]
+    near = copies([look.tiny for look in looks if look.deviation >= FLAT], sizes, [capture.frames[index].name for index in seen])
+    double = {**exact, **{seen[copy]: seen[other] for copy, other in near.items()}}
+    if not double:
+        return capture, headers, looks, []
+    names = [f"{capture.frames[copy].image.name} of {capture.frames[other].image.name}" for copy, other in sorted(double.items())]
+    listed = ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
+    many = counted(len(double), "picture is a copy", "pictures are copies")
+    if capture.kind != "photos" or capture.filmed or len(capture.frames) - len(double) < 2:
+        return capture, headers, looks, [f"{many} of others ({listed}); where the one is held out and the other is not, scores say little"]
+    stays = [index for index in range(len(capture.frames)) if index not in double]
+    names_left = {capture.frames[index].name for index in stays}
+    shorter = unique_names([capture.frames[index].image for index in stays])
+    frames = tuple(replace(capture.frames[index], name=name) for index, name in zip(stays, shorter, strict=True))
+    left = replace(capture, frames=frames)
+    looks = [look for look in looks if look.name in names_left]
+    return left, [headers[index] for index in stays], looks, [f"{many} of others ({listed}) and {'counts' if len(double) == 1 else 'count'} once"]
+
+
+def _look(name: str, path: Path, data: bytes, header: Header, exif: bool) -> Look:
     thumb = thumbnail(data, header, path)
-    grey = thumb.astype(np.float32)
+    grey = upright(thumb, header.orientation if exif and header.format != heif.FORMAT else 1).astype(np.float32)
     deviation = float(grey.std())
     # Divided by the contrast, so that a dim picture does not pass for a blurred one.
     sharpness = float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 0.8), cv2.CV_32F).var()) / max(deviation**2, 1.0)
@@ -175,11 +207,9 @@ def _size_warnings(capture: Capture, sizes: Counter[tuple[int, int]]) -> list[st
     return [f"the pictures have {len(sizes)} sizes: {listed}; each size gets its own camera, which is less certain than one camera for all"]
 
 
-def _picture_warnings(capture: Capture, looks: list[Look], copies: int) -> list[str]:
+def _picture_warnings(capture: Capture, looks: list[Look]) -> list[str]:
     warnings = []
     total = len(looks)
-    if copies:
-        warnings.append(f"{counted(copies, 'picture is an exact copy', 'pictures are exact copies')} of others; copies add nothing")
     blank = [look for look in looks if look.deviation < FLAT]
     if blank:
         names = ", ".join(look.name for look in blank[:3]) + (", …" if len(blank) > 3 else "")

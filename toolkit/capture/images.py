@@ -36,7 +36,7 @@ def load_image(frame: Frame, *, exif: bool = False) -> Array:
     """The frame's picture, (H, W, 3) or with alpha (H, W, 4), uint8 RGB(A), alpha not premultiplied.
 
     Grey pictures become RGB; 16-bit ones are rounded to 8 bits; floating-point ones are taken as 0 to 1. Colours are sRGB's, whatever
-    profile the file has. With `exif` the EXIF orientation is applied (see `turns_by_exif`), without it the pixels stay as stored.
+    profile the file has. A mask that is alpha (`mask_is_alpha`) becomes the picture's. With `exif` the EXIF orientation is applied (see `turns_by_exif`), without it the pixels stay as stored.
 
     Raises:
         InputError: naming the file, when it is missing, no picture, cut short or too large.
@@ -45,8 +45,12 @@ def load_image(frame: Frame, *, exif: bool = False) -> Array:
         for _, picture in iterate_video(frame.image, {frame.video_index}, as_stored=frame.as_stored):
             return picture
         raise InputError(f"frame {frame.video_index} of the video {frame.image} cannot be decoded; the file may be damaged")
-    picture, orientation = read_picture(frame.image)
-    return upright(picture, orientation if exif else 1)
+    stored, orientation = read_picture(frame.image)
+    picture = upright(stored, orientation if exif else 1)
+    mask = load_mask(frame, exif=exif) if frame.mask_is_alpha else None
+    if mask is None or picture.shape[2] == 4:
+        return picture
+    return np.dstack([picture, cv2.resize(mask.astype(np.uint8) * 255, picture.shape[1::-1], interpolation=cv2.INTER_LINEAR)])
 
 
 def read_picture(path: Path) -> tuple[Array, int]:

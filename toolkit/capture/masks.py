@@ -7,6 +7,7 @@ named after the images (`NAME.png`, COLMAP's `NAME.jpg.png`, `NAME_mask.png`, â€
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -17,7 +18,7 @@ import cv2
 import numpy as np
 
 from toolkit import files
-from toolkit.capture.images import LOSSY, decode, load_mask, turns_by_exif
+from toolkit.capture.images import LOSSY, decode, load_image, load_mask, turns_by_exif, usable_pixels
 from toolkit.capture.listing import counted, natural_key, picture_header, pictures_in
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
@@ -31,6 +32,7 @@ PIXELS = 150e6  # of masks that are decoded at once; of more, evenly spread ones
 SHAPE = 0.02  # how far a mask's ratio of width to height may be from its image's
 LITTLE = 0.1  # of the pixels; masks that leave less, all of them, may mark the wrong side
 NOTHING, WHOLE = 1e-3, 1 - 1e-5
+PLAIN = 0.99  # of the pixels outside the masks that are white (or black) in images that are cut out
 INSTEAD = "if white marks what is to be left out, give --set capture.masks=inverted; --set capture.masks=off uses none"
 
 
@@ -68,7 +70,8 @@ def with_masks(capture: Capture, use: str = "auto") -> Capture:
                 frames[index] = replace(frames[index], mask=path, mask_excludes=found.excludes)
     if use == "inverted":
         frames = [replace(frame, mask_excludes=not frame.mask_excludes) if frame.mask is not None else frame for frame in frames]
-    frames = _without_bad(frames, turns_by_exif(capture), remarks)
+    exif = turns_by_exif(capture)
+    frames = _without_bad(frames, exif, remarks)
     masked = [index for index, frame in enumerate(frames) if frame.mask is not None]
     if not masked:
         return capture.with_frames(frames, *remarks)
@@ -84,6 +87,10 @@ def with_masks(capture: Capture, use: str = "auto") -> Capture:
         return capture.with_frames([replace(frame, mask=None, mask_excludes=False) for frame in frames], *remarks)
     if max(shares.values()) < NOTHING:
         raise InputError(f"the masks{place} of {capture.root} leave nothing of any image (black is left out); {INSTEAD}")
+    if len(masked) == len(frames) and not unreadable and (colour := _cut_out_on([frames[at] for at in shares], exif)):
+        frames = [replace(frame, mask_is_alpha=True) for frame in frames]
+        remarks.append(f"the images are cut out on {colour} already, so {counted(len(frames), 'mask')}{place} are taken as their alpha")
+        return replace(capture.with_frames(frames, *remarks), alpha=True)
     excluding = frames[masked[0]].mask_excludes
     empty = {masked[at] for at, share in shares.items() if share == 0}
     frames = [frame for index, frame in enumerate(frames) if index not in empty]
@@ -264,6 +271,26 @@ def _shows_mask(path: Path) -> bool:
     top = max(float(few.max()), 1.0)
     flat = ((high < 0.12 * top) | (low > 0.88 * top)).mean() > 0.9
     return bool(flat) or (header.format not in LOSSY and len(np.unique(few, axis=0)) <= 64)
+
+
+def _cut_out_on(frames: Sequence[Frame], exif: bool) -> str:
+    """`white` or `black` where a few images show nothing else outside their masks, and enough of it; else empty."""
+    chosen = [frames[int(at)] for at in np.unique(np.linspace(0, len(frames) - 1, 5).round())]
+    plain = {"white": True, "black": True}
+    for frame in chosen:
+        try:
+            picture = load_image(frame, exif=exif)
+        except InputError:
+            return ""
+        usable = usable_pixels(frame, picture[:, :, :3], exif=exif)
+        if usable is None or usable.mean() > 1 - LITTLE:
+            return ""
+        # Masks of another size, or drawn by hand, are off by a pixel or two at the edge.
+        reach = 2 * math.ceil(max(picture.shape) / 200) + 1
+        outside = picture[cv2.dilate(usable.astype(np.uint8), np.ones((reach, reach), np.uint8)) == 0][:, :3]
+        plain["white"] &= len(outside) > 0 and bool((outside.min(axis=1) >= 240).mean() > PLAIN)
+        plain["black"] &= len(outside) > 0 and bool((outside.max(axis=1) <= 15).mean() > PLAIN)
+    return next((colour for colour, is_so in plain.items() if is_so), "")
 
 
 def _without_bad(frames: list[Frame], exif: bool, remarks: list[str]) -> list[Frame]:

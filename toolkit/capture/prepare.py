@@ -157,7 +157,7 @@ def _nearest(values: Array, camera: Intrinsics, target: Intrinsics) -> Array:
 
 def _usable(frame: Frame, source: Intrinsics, target: Intrinsics, exif: bool) -> Array:
     """(H, W) bool: pixels of `target` whose whole footprint the frame's mask allows."""
-    mask = load_mask(frame, exif=exif)
+    mask = None if frame.mask_is_alpha else load_mask(frame, exif=exif)
     if mask is None:
         return np.ones((target.height, target.width), dtype=bool)
     camera = source.scaled(mask.shape[1], mask.shape[0])

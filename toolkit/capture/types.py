@@ -32,6 +32,7 @@ class Frame:
     confidence: Path | None = None  # picture of the depth map's size; 0 = the sensor does not believe this depth itself
     depth_pose: Array | None = None  # (4, 4) picture's camera from the depth camera, units of the poses; None: both at the same place
     mask_excludes: bool = False  # the mask is the other way round: what is not 0 is not used
+    mask_is_alpha: bool = False  # nothing is there where the mask is 0, as the image shows: it is cut out
 
 
 @dataclass(frozen=True)
