@@ -16,7 +16,7 @@ from toolkit.capture.depth_checks import check_depth
 from toolkit.capture.duplicates import copies, suspects
 from toolkit.capture.headers import Header, read_bytes, read_header
 from toolkit.capture.images import turns_by_exif, upright
-from toolkit.capture.listing import counted, fitted, unique_names
+from toolkit.capture.listing import counted, fitted, natural_key, unique_names
 from toolkit.capture.types import Capture
 from toolkit.errors import InputError
 from toolkit.progress import SILENT, Progress
@@ -123,7 +123,7 @@ def _once_each(
     names_left = {capture.frames[index].name for index in stays}
     shorter = unique_names([capture.frames[index].image for index in stays])
     frames = tuple(replace(capture.frames[index], name=name) for index, name in zip(stays, shorter, strict=True))
-    left = replace(capture, frames=frames)
+    left = replace(capture, frames=tuple(sorted(frames, key=lambda frame: natural_key(frame.name))))
     looks = [look for look in looks if look.name in names_left]
     return left, [headers[index] for index in stays], looks, [f"{many} of others ({listed}) and {'counts' if len(double) == 1 else 'count'} once"]
 

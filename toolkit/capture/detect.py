@@ -52,8 +52,8 @@ def _colmap_without_llff(path: Path) -> bool:
 
 
 def _photos_without_film(path: Path) -> bool:
-    """One picture beside a film is its cover, not a capture."""
-    return looks_like_photos(path) and (len(photo_files(path)) > 1 or not pictures_in(path, FILMS))
+    """One picture beside a film is its cover, not a capture; and what lies in other folders may have been made of the film."""
+    return len(photo_files(path)) > 1 if pictures_in(path, FILMS) else looks_like_photos(path)
 
 
 READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ...] = (
