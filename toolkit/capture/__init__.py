@@ -12,13 +12,17 @@ __all__ = ["Capture", "Frame", "Views", "open_capture"]
 def open_capture(source: Path | str, masks: str = "auto") -> Capture:
     """The capture at `source`: a video, a folder of a known layout, a `.sens` file, or one of a layout's JSON files. Found by looking.
 
+    Args:
+        masks: what masks beside the images mean: auto (black is left out) | inverted | off.
+
     Only listings, metadata and picture headers are read; pixels are decoded of a video's first frame, and of a few pictures with alpha.
 
     Raises:
         InputError: nothing there, nothing known, or the layout's own files are broken.
     """
     # Imported late: training and rendering need the types above on machines without Pillow.
+    from toolkit.capture.beside import with_unused
     from toolkit.capture.detect import read_source
     from toolkit.capture.masks import with_masks
 
-    return with_masks(read_source(Path(source)), masks)
+    return with_unused(with_masks(read_source(Path(source)), masks))

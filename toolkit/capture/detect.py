@@ -8,7 +8,8 @@ The order is deliberate: what somebody wrote for this very purpose goes before w
 4. DTU's `cameras*.npz`;
 5. a COLMAP model before LLFF's `poses_bounds.npy`: sets that have both keep lens and points only in the model, but only
    when its pictures are there (sets at 1/8 size often come without them);
-6. photos; 7. one video (or recording in one file) in a folder, alone or with one picture (its cover).
+6. colour and depth in folders of any name, with a list of poses;
+7. photos; 8. one video (or recording in one file) in a folder, alone or with one picture (its cover).
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from toolkit.capture.record3d import SUFFIX as RECORD3D
 from toolkit.capture.record3d import holds_record3d, looks_like_record3d, read_record3d
 from toolkit.capture.redwood import looks_like_redwood, read_redwood
 from toolkit.capture.replica import looks_like_replica, read_replica
+from toolkit.capture.rgbd_folder import looks_like_rgbd, read_rgbd
 from toolkit.capture.scanner3d import looks_like_scanner3d, read_scanner3d
 from toolkit.capture.scannet import looks_like_scannet, read_scannet, read_sens
 from toolkit.capture.sens import is_sens
@@ -71,6 +73,7 @@ READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ..
     ("dtu", looks_like_dtu, read_dtu),
     ("colmap", _colmap_without_llff, read_colmap),
     ("llff", looks_like_llff, read_llff),
+    ("rgbd", looks_like_rgbd, read_rgbd),
     ("photos", _photos_without_film, read_photos),
 )
 

@@ -40,7 +40,7 @@ class Capture:
     """A source as found on disk, in its own frame of reference."""
 
     kind: str  # "video", "photos", "transforms", "blender", "colmap", "7scenes", "tum", "scannet", "llff", "dtu", "redwood",
-    # "replica", "polycam", "stray", "record3d", "scanner3d"
+    # "replica", "polycam", "stray", "record3d", "scanner3d", "rgbd"
     root: Path
     frames: tuple[Frame, ...]
     ordered: bool = False  # neighbours in the list are neighbours in time
