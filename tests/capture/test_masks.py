@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from tests.capture.layouts import write_blender, write_colmap_bin, write_llff, write_transforms
+from tests.conftest import shared_data
 from toolkit.camera import Array, Similarity
 from toolkit.capture import Capture, open_capture
 from toolkit.capture.images import load_image, load_mask, usable_pixels
@@ -51,7 +52,9 @@ def kept(capture: Capture) -> list[float]:
     return [1.0 if mask is None else round(float(mask.mean()), 3) for mask in masks]
 
 
-@pytest.mark.parametrize("name", ["masks/{stem}.png", "masks/{name}.png", "images_mask/{stem}.png", "mask/{stem}_mask.png", "imageMasks/mask_{stem}.png"])
+@pytest.mark.parametrize(
+    "name", ["masks/{stem}.png", "masks/{name}.png", "images_mask/{stem}.png", "mask/{stem}_mask.png", "imageMasks/mask_{stem}.png"]
+)
 @pytest.mark.parametrize("write", [write_transforms, write_colmap_bin, write_llff])
 def test_masks_in_a_folder_of_any_layout(tmp_path: Path, write, name: str) -> None:
     write(tmp_path)
@@ -163,7 +166,7 @@ def test_masks_that_leave_nothing_are_refused_and_those_that_leave_little_remark
     photos(tmp_path, [f"images/{index}.jpg" for index in range(4)])
     for index in range(4):
         save(tmp_path / f"masks/{index}.png", half(left=0))
-    with pytest.raises(InputError, match="leave nothing of any image .*capture.masks=inverted"):
+    with pytest.raises(InputError, match=r"leave nothing of any image .*capture.masks=inverted"):
         open_capture(tmp_path)
     assert kept(open_capture(tmp_path, "off")) == [1.0] * 4
     assert kept(open_capture(tmp_path, "inverted")) == [1.0] * 4
@@ -209,7 +212,7 @@ def test_masks_by_number_and_the_folder_of_the_same_size(tmp_path: Path) -> None
         save(tmp_path / f"masks/mask_{index:03d}.png", half())
         save(tmp_path / f"masks_2/mask_{index:03d}.png", half(40, 30, 10))
     capture = open_capture(tmp_path)
-    assert [frame.mask.relative_to(tmp_path.resolve()).as_posix() for frame in capture.frames] == [f"masks/mask_{i:03d}.png" for i in (1, 2, 10)]
+    assert [frame.mask for frame in capture.frames] == [tmp_path.resolve() / f"masks/mask_{index:03d}.png" for index in (1, 2, 10)]
     assert any("masks_2/ are not used: other masks are" in warning for warning in capture.warnings)
 
 
@@ -241,3 +244,11 @@ def test_no_point_is_triangulated_from_what_masks_leave_out(tmp_path: Path) -> N
     for frame in bare.frames:
         save(tmp_path / f"masks/{frame.image.stem}.png", half(left=8))
     assert len(triangulate(bare).points) > len(triangulate(open_capture(tmp_path)).points)
+
+
+def test_real_masks() -> None:
+    cape = open_capture(shared_data("zoo/gold-cape"))
+    assert sum(frame.mask is not None for frame in cape.frames) == 64 and not cape.alpha
+    assert 0.4 < np.mean(kept(cape)[::16]) < 0.6
+    carton = open_capture(shared_data("zoo/milk-carton"))
+    assert carton.alpha and all(frame.mask_is_alpha for frame in carton.frames)

@@ -16,7 +16,8 @@ from toolkit.capture.video import VIDEO_SUFFIXES
 
 DEEP, MOST_FILES, LISTED = 2, 20_000, 3
 POSE_FILES = re.compile(
-    r"transforms.*\.json|cameras.*\.(npz|json|xml)|poses_bounds.*\.npy|.*\.(nvm|out|abc|psz)|traj(ectory)?\.(txt|log)|groundtruth\.txt", re.I
+    r"transforms.*\.json|cameras.*\.(npz|json|xml)|poses_bounds.*\.npy|.*\.(nvm|out|abc|psz)|traj(ectory)?\.(txt|log)|groundtruth\.txt",
+    re.IGNORECASE,
 )
 # Files with poses that a kind reads; of the others nobody knows what they are for.
 READ = {
@@ -35,7 +36,8 @@ def with_unused(capture: Capture) -> Capture:
     root = capture.root
     if capture.film or not root.is_dir():
         return capture
-    used = {path.resolve() for frame in capture.frames for path in (frame.image, frame.depth, frame.mask, frame.confidence) if path is not None}
+    of_frames = (path for frame in capture.frames for path in (frame.image, frame.depth, frame.mask, frame.confidence))
+    used = {path.resolve() for path in of_frames if path is not None}
     images: Counter[str] = Counter()
     videos: list[str] = []
     poses: list[str] = []
@@ -54,7 +56,7 @@ def with_unused(capture: Capture) -> Capture:
             poses.append(f"{relative.as_posix()}/ (COLMAP model)")
         for name in sorted(names, key=natural_key):
             suffix = Path(name).suffix.lower()
-            if name.startswith(".") or suffix not in (*PICTURES, *VIDEO_SUFFIXES) and not POSE_FILES.fullmatch(name):
+            if name.startswith(".") or (suffix not in (*PICTURES, *VIDEO_SUFFIXES) and not POSE_FILES.fullmatch(name)):
                 continue
             if (folder / name).resolve() in used:
                 continue

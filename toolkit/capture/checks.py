@@ -125,7 +125,8 @@ def _once_each(
     frames = tuple(replace(capture.frames[index], name=name) for index, name in zip(stays, shorter, strict=True))
     left = replace(capture, frames=tuple(sorted(frames, key=lambda frame: natural_key(frame.name))))
     looks = [look for look in looks if look.name in names_left]
-    return left, [headers[index] for index in stays], looks, [f"{many} of others ({listed}) and {'counts' if len(double) == 1 else 'count'} once"]
+    warning = f"{many} of others ({listed}) and {'counts' if len(double) == 1 else 'count'} once"
+    return left, [headers[index] for index in stays], looks, [warning]
 
 
 def _look(name: str, path: Path, data: bytes, header: Header, exif: bool) -> Look:

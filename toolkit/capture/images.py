@@ -36,7 +36,8 @@ def load_image(frame: Frame, *, exif: bool = False) -> Array:
     """The frame's picture, (H, W, 3) or with alpha (H, W, 4), uint8 RGB(A), alpha not premultiplied.
 
     Grey pictures become RGB; 16-bit ones are rounded to 8 bits; floating-point ones are taken as 0 to 1. Colours are sRGB's, whatever
-    profile the file has. A mask that is alpha (`mask_is_alpha`) becomes the picture's. With `exif` the EXIF orientation is applied (see `turns_by_exif`), without it the pixels stay as stored.
+    profile the file has. A mask that is alpha (`mask_is_alpha`) becomes the picture's. With `exif` the EXIF orientation is applied (see
+    `turns_by_exif`), without it the pixels stay as stored.
 
     Raises:
         InputError: naming the file, when it is missing, no picture, cut short or too large.

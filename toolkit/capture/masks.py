@@ -142,7 +142,8 @@ def _find(capture: Capture, remarks: list[str]) -> _Found | None:
             places.setdefault(place, {})[indices[at]] = _inside(capture.root, path)
         places.setdefault(place, {})
     names = {place: _name(capture.root, place) for place in places}
-    ranked = sorted(places, key=lambda place: (-len(places[place]), _factor(names[place]) != _factor(_usual_folder(capture)), len(names[place])))
+    usual = _factor(Counter(frame.image.parent.name for frame in capture.frames).most_common(1)[0][0])
+    ranked = sorted(places, key=lambda place: (-len(places[place]), _factor(names[place]) != usual, len(names[place])))
     best = None
     for place in ranked:
         masks = places[place]
@@ -234,10 +235,6 @@ def _factor(name: str) -> str:
     """By how much images of a folder were made smaller: of `images_4` 4."""
     match = re.search(r"_([0-9]+)/?$", name)
     return match[1] if match else ""
-
-
-def _usual_folder(capture: Capture) -> str:
-    return Counter(frame.image.parent.name for frame in capture.frames).most_common(1)[0][0]
 
 
 def _name(root: Path, place: Path) -> str:

@@ -114,7 +114,8 @@ def _of_one_capture(root: Path, folders: dict[Path, list[Path]]) -> tuple[list[P
 
     if others and not usual and any(len(folders[folder]) > 1 for folder in others):
         raise InputError(
-            f"{root} holds photos of different sizes in {listed([*taken, *others])}, which look like several captures; give one of the folders"
+            f"{root} holds photos of different sizes in {listed([*taken, *others])}, which look like several captures; "
+            "give one of the folders"
         )
     remarks = []
     if len(taken) > 1:

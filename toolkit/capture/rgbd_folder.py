@@ -11,13 +11,14 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
 from toolkit.camera import OPENCV, Array, Intrinsics, checked_pose
 from toolkit.capture.calibration import from_matrix, sensor
-from toolkit.capture.depth_checks import Sample, unit_factor
+from toolkit.capture.depth_checks import FACTORS, Sample, agreement
 from toolkit.capture.images import load_depth
 from toolkit.capture.listing import (
     PICTURES,
@@ -48,8 +49,11 @@ WORD = re.compile(rf"{NUMBER.pattern}|[-+]?(?:nan|inf|infinity)", re.IGNORECASE)
 MOST_CAMERA = 2**18  # bytes of a file that holds a camera
 NEAR = 0.03  # seconds between an image and its pose or depth
 MILLIMETRES = 1000.0
+BETTER = 1.1  # how much better another unit than the usual one must fit the poses
 LOOKED_AT = 12  # depth maps that the unit is found by
 MOST_FOLDERS = 200
+DEPTH_FACTORS = ("depthmapfactor", "depth_scale", "depth_factor", "png_depth_scale")
+VALUE = re.compile(r"""\b([A-Za-z_][\w.]{0,60})["']?[ \t]{0,20}[:=]\s{0,99}(\[[^\]]{0,2000}\]|[-+.0-9eE]{1,40})""")
 
 
 @dataclass(frozen=True)
@@ -234,9 +238,8 @@ def _times(names: Sequence[str]) -> Array | None:
 def _nearest(wanted: Array, times: Array) -> dict[int, int]:
     """Index of a wanted time → that of the nearest time, where it is near enough."""
     order = np.argsort(times)
-    place = np.clip(np.searchsorted(times[order], wanted), 1, max(len(times) - 1, 1))
-    near = np.where(abs(times[order[place - 1]] - wanted) <= abs(times[order[np.minimum(place, len(times) - 1)]] - wanted), place - 1, place)
-    near = order[np.minimum(near, len(times) - 1)]
+    between = (times[order][1:] + times[order][:-1]) / 2
+    near = order[np.searchsorted(between, wanted)]
     return {index: int(at) for index, at in enumerate(near) if abs(times[at] - wanted[index]) <= NEAR}
 
 
@@ -289,8 +292,8 @@ def _poses_of(images: Sequence[Path], poses: _Poses, root: Path) -> dict[int, Ar
             pairs = {index: number for index, (number,) in enumerate(numbers)}  # every n-th frame of a longer list
     if not pairs:
         raise InputError(
-            f"{root} holds {counted(len(images), 'image')} but {poses.file.name} {counted(len(poses.matrices), 'pose')}, and neither times nor "
-            "numbers in the names tell which belong together; give one pose for each image, in the images' order"
+            f"{root} holds {counted(len(images), 'image')} but {poses.file.name} {counted(len(poses.matrices), 'pose')}, and neither times "
+            "nor numbers in the names tell which belong together; give one pose for each image, in the images' order"
         )
     return {index: poses.matrices[at] for index, at in pairs.items()}
 
@@ -314,7 +317,7 @@ def _camera(root: Path, layout: _Layout, size: tuple[int, int]) -> tuple[Intrins
         values = _values(file)
         if values:
             camera = _intrinsics(values, size, str(file))
-            factor = next((values[key][0] for key in ("depthmapfactor", "depth_scale", "depth_factor", "png_depth_scale") if key in values), None)
+            factor = next((values[key][0] for key in DEPTH_FACTORS if key in values), None)
             if factor is not None and not 0 < factor < 1e9:
                 raise InputError(f"{file}: the depth factor is {factor:g}, it must be positive; correct it")
             return camera, factor, file.relative_to(root).as_posix()
@@ -338,7 +341,7 @@ def _values(file: Path) -> dict[str, list[float]]:
             return {"matrix": np.array(numbers).reshape({9: (3, 3), 12: (3, 4), 16: (4, 4)}[len(numbers)])[:3, :3].ravel().tolist()}
         return dict(zip(("fx", "fy", "cx", "cy"), ([value] for value in numbers), strict=True)) if len(numbers) == 4 else {}
     out: dict[str, list[float]] = {}
-    for name, value in re.findall(r"""\b([A-Za-z_][\w.]{0,60})["']?[ \t]{0,20}[:=]\s{0,99}(\[[^\]]{0,2000}\]|[-+.0-9eE]{1,40})""", _without_nesting(text)):
+    for name, value in VALUE.findall(_without_nesting(text)):
         numbers = [float(number) for number in NUMBER.findall(value)]
         if numbers:
             out.setdefault(name.split(".")[-1].lower(), numbers)
@@ -360,9 +363,10 @@ def _without_nesting(text: str) -> str:
 
 def _intrinsics(values: dict[str, list[float]], size: tuple[int, int], where: str) -> Intrinsics:
     """The camera for images of `size`: as given, or scaled from the size that the file gives. Pixel centres are at whole numbers."""
-    width, height = (round(next((values[key][0] for key in keys if key in values), default)) for keys, default in zip(
-        (("width", "image_width", "w"), ("height", "image_height", "h")), size, strict=True
-    ))
+    width, height = (
+        round(next((values[key][0] for key in keys if key in values), default))
+        for keys, default in zip((("width", "image_width", "w"), ("height", "image_height", "h")), size, strict=True)
+    )
     if not (0 < width < 10**6 and 0 < height < 10**6):
         raise InputError(f"{where}: the image size {width}×{height} is not usable; correct it")
     if "matrix" in values:
@@ -388,7 +392,7 @@ def _in_own_unit(capture: Capture) -> Capture:
         if camera is not None and frame.world_from_camera is not None and depth.any():
             camera = fitted(camera, (depth.shape[1], depth.shape[0]), str(frame.depth))
             samples.append(Sample.of(depth / np.float32(scaled.depth_scale), camera, frame.world_from_camera))
-    factor = unit_factor(samples)
+    factor = _best_factor(samples)
     scale = scaled.depth_scale / factor
     how = "which fits the poses" if factor != 1 else "as is usual"
     return replace(
@@ -396,3 +400,11 @@ def _in_own_unit(capture: Capture) -> Capture:
         depth_scale=scale,
         warnings=(*capture.warnings, f"no file gives the unit of depth; {scale:g} for each unit of the poses is taken, {how}"),
     )
+
+
+def _best_factor(samples: Sequence[Sample]) -> float:
+    """What depth must be multiplied by to agree best with the poses; 1 where no factor is better than the usual unit."""
+    pairs = [(a, b) for a, b in combinations(samples, 2) if a.pose[:3, 2] @ b.pose[:3, 2] > 0.5]
+    scores = {factor: sum(agreement(a, b, factor) for a, b in pairs) for factor in (1.0, *FACTORS)}
+    best = max(scores, key=lambda factor: scores[factor])
+    return best if scores[best] > BETTER * scores[1.0] else 1.0
