@@ -14,6 +14,7 @@ from tests.capture.films import film, quarters
 from tests.capture.layouts import write_colmap_bin, write_transforms
 from toolkit.camera import Array
 from toolkit.capture import Capture, open_capture
+from toolkit.capture.beside import unused
 from toolkit.capture.checks import check_capture
 from toolkit.capture.duplicates import copies
 from toolkit.errors import InputError
@@ -57,7 +58,7 @@ def test_photos_in_the_folder_and_below_are_one_capture(tmp_path: Path) -> None:
     assert [frame.name for frame in capture.frames] == [f"IMG_{index}" for index in range(7)]
     text = " | ".join(capture.warnings)
     assert "the photos of 2 folders are taken as one capture: the folder itself (4), day2/ (3)" in text
-    assert "cameras.xml" in text and capture.extra["unused"] == ["1 file with poses (cameras.xml)"]
+    assert "cameras.xml" in text and unused(capture) == ["1 file with poses (cameras.xml)"]
 
 
 def test_photos_in_folders_alone_have_names_of_their_own(tmp_path: Path) -> None:
@@ -85,7 +86,7 @@ def test_what_is_no_photo_or_another_capture_is_not_taken(tmp_path: Path) -> Non
     capture = open_capture(tmp_path)
     assert [frame.name for frame in capture.frames] == ["00", "01", "02", "03"]
     assert any("the photos in phone/ (3) look like others and are not used" in warning for warning in capture.warnings)
-    assert "3 in phone/" in open_with(tmp_path, "thumbnails", "depth", "masks").extra["unused"][0]
+    assert "3 in phone/" in unused(open_with(tmp_path, "thumbnails", "depth", "masks"))[0]
 
 
 def test_folders_of_different_captures_are_refused(tmp_path: Path) -> None:
@@ -105,7 +106,7 @@ def test_videos_and_poses_beside_are_said(tmp_path: Path) -> None:
     posed = tmp_path / "posed"
     write_transforms(posed)
     write_colmap_bin(posed)
-    assert open_capture(posed).extra["unused"][-1] == "1 file with poses (sparse/0/ (COLMAP model))"
+    assert unused(open_capture(posed))[-1] == "1 file with poses (sparse/0/ (COLMAP model))"
 
 
 # ------------------------------------------------------------------------------------------------ copies

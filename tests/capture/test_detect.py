@@ -80,7 +80,7 @@ def test_what_is_written_on_purpose_goes_before_what_is_left_behind(tmp_path: Pa
 
 def test_each_kind_has_one_reader() -> None:
     kinds = [kind for kind, _, _ in READERS]
-    assert len(set(kinds)) == len(kinds) == 15
+    assert len(set(kinds)) == len(kinds) == 16
 
 
 def test_a_json_file_names_its_capture(tmp_path: Path) -> None:

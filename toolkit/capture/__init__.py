@@ -21,8 +21,8 @@ def open_capture(source: Path | str, masks: str = "auto") -> Capture:
         InputError: nothing there, nothing known, or the layout's own files are broken.
     """
     # Imported late: training and rendering need the types above on machines without Pillow.
-    from toolkit.capture.beside import with_unused
+    from toolkit.capture.beside import with_remark
     from toolkit.capture.detect import read_source
     from toolkit.capture.masks import with_masks
 
-    return with_unused(with_masks(read_source(Path(source)), masks))
+    return with_remark(with_masks(read_source(Path(source)), masks))

@@ -27,15 +27,20 @@ READ = {
     "dtu": r"cameras.*\.npz",
 }
 OTHER_KINDS = ("photos", "video", "transforms", "blender", "llff", "dtu", "colmap")  # whose reader takes none of the lists of poses
-UNUSED = "unused"  # in `Capture.extra`
 
 
-def with_unused(capture: Capture) -> Capture:
-    """The capture with a few lines in `extra["unused"]`: what its folder holds besides. A warning, too, where these are videos or poses
-    beside photos, as they may have been meant."""
+def with_remark(capture: Capture) -> Capture:
+    """The capture with a warning where it is photos and videos or other programs' poses lie beside them: these may have been meant."""
+    lines = unused(capture) if capture.kind == "photos" else []
+    meant = [line for line in lines if "video" in line or "with poses" in line]
+    return replace(capture, warnings=(*capture.warnings, f"beside the photos lie and are not used: {'; '.join(meant)}")) if meant else capture
+
+
+def unused(capture: Capture) -> list[str]:
+    """A few lines on what a capture's folder holds besides what is used: images, videos, files with poses; each names three at most."""
     root = capture.root
     if capture.film or not root.is_dir():
-        return capture
+        return []
     of_frames = (path for frame in capture.frames for path in (frame.image, frame.depth, frame.mask, frame.confidence))
     used = {path.resolve() for path in of_frames if path is not None}
     images: Counter[str] = Counter()
@@ -77,7 +82,4 @@ def with_unused(capture: Capture) -> Capture:
         if found:
             many = one.replace("file", "files") if " " in one else None
             lines.append(f"{counted(len(found), one, many)} ({', '.join(found[:LISTED])}{', …' if len(found) > LISTED else ''})")
-    if not lines:
-        return capture
-    remark = [f"beside the photos lie and are not used: {'; '.join(lines)}"] if capture.kind == "photos" and (videos or poses) else []
-    return replace(capture, extra={**capture.extra, UNUSED: lines}, warnings=(*capture.warnings, *remark))
+    return lines

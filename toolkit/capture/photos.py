@@ -101,7 +101,8 @@ def _of_one_capture(root: Path, folders: dict[Path, list[Path]]) -> tuple[list[P
     main = max(usual or list(folders), key=lambda folder: len(folders[folder]), default=None)
     if main is None:
         return [], []
-    taken, others = [main], []
+    taken: list[Path] = [main]
+    others: list[Path] = []
     sizes = _sizes(folders[main])
     for folder, pictures in folders.items():
         if folder != main:
