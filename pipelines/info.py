@@ -56,6 +56,7 @@ def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
     from pipelines.console import make_progress
     from pipelines.summary import describe_capture
     from toolkit.capture import open_capture
+    from toolkit.capture.beside import unused
     from toolkit.capture.checks import check_capture
 
     capture = open_capture(source)
@@ -73,6 +74,7 @@ def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
         "points": 0 if capture.points is None else len(capture.points),
         "ordered": capture.ordered,
         "depth_scale": capture.depth_scale if capture.has_depth else None,
+        "unused": unused(capture),
         "warnings": list(capture.warnings),
     }
 

@@ -31,9 +31,11 @@ def find_capture(job: Job) -> Capture:
     from toolkit.capture.storage import capture_from_dict, capture_to_dict
 
     path = job.folder / "capture.json"
+    masks = job.settings.capture.masks
+    state = source_state(job.source, job.folder.path)
 
     def make() -> Capture:
-        capture = open_capture(job.source)
+        capture = open_capture(job.source, masks)
         return capture if to_convert(capture) else check_capture(capture, job.progress)
 
     def save(capture: Capture) -> list[Path]:
@@ -45,7 +47,7 @@ def find_capture(job: Job) -> Capture:
         make=make,
         save=save,
         load=lambda: capture_from_dict(read_json(path)),
-        uses=source_state(job.source, job.folder.path),
+        uses=state if masks == "auto" else [state, masks],
     )
 
 

@@ -28,6 +28,7 @@ class CaptureSettings:
     image_size: int | None = None  # long side in pixels; None: 640, or the picture's own when smaller
     holdout: int = 8  # every n-th frame by name is a test view; 0: none (the source's own split wins)
     max_frames: int = 150  # frames taken from a video
+    masks: str = "auto"  # auto: black is left out | inverted: white is | off: masks beside the images are not used
 
 
 @dataclass
@@ -184,6 +185,7 @@ CHOICES = {
     "preset": ("fast", "balanced", "quality"),
     "engine": ("auto", "numba", "triton", "torch"),
     "device": ("auto", "cpu", "cuda"),
+    "capture.masks": ("auto", "inverted", "off"),
     "poses.source": ("auto", "given", "sfm"),
     "poses.matching": ("auto", "exhaustive", "sequential"),
     "poses.features": ("auto", "sift", "xfeat"),

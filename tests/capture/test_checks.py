@@ -140,9 +140,9 @@ def test_some_bad_pictures_are_told(tmp_path: Path) -> None:
     for index in (1, 9):
         pictures[index] = cv2.GaussianBlur(pictures[index], (0, 0), 5)
     text = warnings_of(photos(tmp_path, pictures))
-    assert "1 of 12 pictures show nothing but one colour (04)" in text
-    assert "exact cop" in text
-    assert "2 of 12 pictures are much less sharp" in text
+    assert "1 of 11 pictures show nothing but one colour (04)" in text
+    assert "1 picture is a copy of others (07.jpg of 06.jpg) and counts once" in text
+    assert "2 of 11 pictures are much less sharp" in text
 
 
 def test_dark_and_overexposed_pictures_are_told(tmp_path: Path) -> None:

@@ -129,7 +129,7 @@ def test_photos_further_down(tmp_path: Path) -> None:
 
 def test_each_kind_has_one_reader() -> None:
     kinds = [kind for kind, _, _ in READERS]
-    assert len(set(kinds)) == len(kinds) == 15
+    assert len(set(kinds)) == len(kinds) == 16
 
 
 def test_a_json_file_names_its_capture(tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def test_pictures_are_matched_by_number(tmp_path: Path) -> None:
 def test_masks(tmp_path: Path) -> None:
     write_dtu(tmp_path)
     for index in range(5):
-        save_picture(tmp_path / f"mask/{index:03d}.png", np.full((60, 80, 3), 255, np.uint8))
+        save_picture(tmp_path / f"mask/{index:03d}.png", np.repeat(np.eye(60, 80, dtype=np.uint8)[..., None] * 255, 3, axis=2))
     assert [frame.mask.name for frame in open_capture(tmp_path).frames] == [f"{i:03d}.png" for i in range(5)]
     (tmp_path / "mask/000.png").unlink()
     with pytest.raises(InputError, match="5 pictures but 4 masks"):

@@ -13,9 +13,10 @@ import numpy as np
 from toolkit.camera import Array, pinhole_share
 from toolkit.capture import heif
 from toolkit.capture.depth_checks import check_depth
+from toolkit.capture.duplicates import copies, suspects
 from toolkit.capture.headers import PANORAMA, Header, is_panorama, read_bytes, read_header
-from toolkit.capture.images import largest, read_picture, turns_by_exif
-from toolkit.capture.listing import TIFFS, counted, fitted
+from toolkit.capture.images import largest, read_picture, turns_by_exif, upright
+from toolkit.capture.listing import TIFFS, counted, fitted, natural_key, unique_names
 from toolkit.capture.tiff import unturned
 from toolkit.capture.types import Capture, Frame
 from toolkit.capture.usable import without
@@ -65,11 +66,12 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
     if len(frames) == 1:
         raise InputError(f"{capture.root} holds only one picture; take at least 20 from different places")
     capture = scaled_to_white(capture, progress)
-    capture, headers, looks, copies = _look_at_all(capture, progress)
+    capture, headers, looks, exact = _look_at_all(capture, progress)
     _refuse_blank(capture, looks)
     _refuse_same(capture, looks)
+    capture, headers, looks, copy_warnings = _once_each(capture, headers, looks, exact)
     sizes = Counter(_upright_size(header, turns_by_exif(capture)) for header in headers)
-    warnings = [*_size_warnings(capture, sizes), *_lens_warnings(capture), *_picture_warnings(capture, looks, copies)]
+    warnings = [*_size_warnings(capture, sizes), *_lens_warnings(capture), *copy_warnings, *_picture_warnings(capture, looks)]
     warnings += check_depth(capture, progress)
     extra = {**capture.extra, "sizes": {f"{width}x{height}": number for (width, height), number in sizes.most_common()}}
     return replace(
@@ -102,17 +104,19 @@ def scaled_to_white(capture: Capture, progress: Progress = SILENT) -> Capture:
     return replace(capture, frames=tuple(replace(frame, white=white) for frame in capture.frames), warnings=(*capture.warnings, remark))
 
 
-def _look_at_all(capture: Capture, progress: Progress) -> tuple[Capture, list[Header], list[Look], int]:
-    """The capture without images that cannot be used, headers of all others, thumbnail measures of as many as `PIXEL_BUDGET` allows, and
-    the number of exact copies.
+def _look_at_all(capture: Capture, progress: Progress) -> tuple[Capture, list[Header], list[Look], dict[int, int]]:
+    """The capture without images that cannot be used, headers of all others, thumbnail measures of as many as `PIXEL_BUDGET` allows and of
+    all that may be copies by their names, and the indices of exact copies with those that they are copies of.
 
     Raises:
         InputError: more than a few images cannot be used.
     """
     headers: list[Header] = []
     looks: list[Look] = []
-    hashes: Counter[bytes] = Counter()
+    first: dict[bytes, int] = {}
+    exact: dict[int, int] = {}
     bad: dict[str, str] = {}
+    named = suspects(capture.frames)
     every = 1
     exif = turns_by_exif(capture)
     for index, frame in enumerate(capture.frames):
@@ -129,19 +133,47 @@ def _look_at_all(capture: Capture, progress: Progress) -> tuple[Capture, list[He
                 every = max(1, min(int(np.ceil(cost / PIXEL_BUDGET)), len(capture.frames) // 20))
             if frame.intrinsics is not None:
                 fitted(frame.intrinsics, _upright_size(header, exif), str(frame.image))
-            if index % every == 0:
-                looks.append(_look(frame, data, header))
+            if index % every == 0 or index in named:
+                looks.append(_look(frame, data, header, exif))
         except InputError as error:
             bad[frame.name] = str(error)
             continue
         headers.append(header)
-        hashes[hashlib.blake2b(data, digest_size=16).digest()] += 1
-    return without(capture, bad), headers, looks, len(headers) - len(hashes)
+        same = first.setdefault(hashlib.blake2b(data, digest_size=16).digest(), len(headers) - 1)
+        if same != len(headers) - 1:
+            exact[len(headers) - 1] = same
+    return without(capture, bad), headers, looks, exact
 
 
-def _look(frame: Frame, data: bytes, header: Header) -> Look:
+def _once_each(
+    capture: Capture, headers: list[Header], looks: list[Look], exact: dict[int, int]
+) -> tuple[Capture, list[Header], list[Look], list[str]]:
+    """The same without copies of photos, of which nothing but pixels is given; copies among posed pictures are remarked on."""
+    place = {frame.name: index for index, frame in enumerate(capture.frames)}
+    seen = [place[look.name] for look in looks if look.deviation >= FLAT]
+    sizes = [headers[index].width * headers[index].height for index in seen]
+    near = copies([look.tiny for look in looks if look.deviation >= FLAT], sizes, [capture.frames[index].name for index in seen])
+    double = {**exact, **{seen[copy]: seen[other] for copy, other in near.items()}}
+    if not double:
+        return capture, headers, looks, []
+    names = [f"{capture.frames[copy].image.name} of {capture.frames[other].image.name}" for copy, other in sorted(double.items())]
+    listed = ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
+    many = counted(len(double), "picture is a copy", "pictures are copies")
+    if capture.kind != "photos" or capture.filmed or len(capture.frames) - len(double) < 2:
+        return capture, headers, looks, [f"{many} of others ({listed}); where the one is held out and the other is not, scores say little"]
+    stays = [index for index in range(len(capture.frames)) if index not in double]
+    names_left = {capture.frames[index].name for index in stays}
+    shorter = unique_names([capture.frames[index].image for index in stays])
+    frames = tuple(replace(capture.frames[index], name=name) for index, name in zip(stays, shorter, strict=True))
+    left = replace(capture, frames=tuple(sorted(frames, key=lambda frame: natural_key(frame.name))))
+    looks = [look for look in looks if look.name in names_left]
+    warning = f"{many} of others ({listed}) and {'counts' if len(double) == 1 else 'count'} once"
+    return left, [headers[index] for index in stays], looks, [warning]
+
+
+def _look(frame: Frame, data: bytes, header: Header, exif: bool) -> Look:
     name, thumb = frame.name, thumbnail(data, header, frame.image, frame.white)
-    grey = thumb.astype(np.float32)
+    grey = upright(thumb, header.orientation if exif and header.format != heif.FORMAT else 1).astype(np.float32)
     deviation = float(grey.std())
     # Divided by the contrast, so that a dim picture does not pass for a blurred one.
     sharpness = float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 0.8), cv2.CV_32F).var()) / max(deviation**2, 1.0)
@@ -232,11 +264,9 @@ def _lens_warnings(capture: Capture) -> list[str]:
     ]
 
 
-def _picture_warnings(capture: Capture, looks: list[Look], copies: int) -> list[str]:
+def _picture_warnings(capture: Capture, looks: list[Look]) -> list[str]:
     warnings = []
     total = len(looks)
-    if copies:
-        warnings.append(f"{counted(copies, 'picture is an exact copy', 'pictures are exact copies')} of others; copies add nothing")
     blank = [look for look in looks if look.deviation < FLAT]
     if blank:
         names = ", ".join(look.name for look in blank[:3]) + (", …" if len(blank) > 3 else "")

@@ -27,6 +27,7 @@ from toolkit.capture.listing import (
     require_folder,
     unique_names,
 )
+from toolkit.capture.masks import masks_among
 from toolkit.capture.resolve import CaptureFiles, Found
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
@@ -142,7 +143,10 @@ def _capture(root: Path, candidate: CandidateModel) -> Capture:
     if scaled:
         warnings.append(f"{counted(scaled, 'picture')} of another size than the model tells; intrinsics were scaled to fit")
     used = set(images.values())
-    unregistered = sum(1 for folder in {image.parent for image in used} for picture in pictures_in(folder) if picture not in used)
+    unregistered = 0
+    for folder in {image.parent for image in used}:
+        pictures = pictures_in(folder)
+        unregistered += len(set(pictures) - used - masks_among(pictures))
     if unregistered:
         warnings.append(f"{counted(unregistered, 'picture')} beside these are not in the model and are left out")
     extra = {"listed": listed, "missing": missing, "unregistered": unregistered}

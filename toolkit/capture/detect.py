@@ -8,8 +8,9 @@ The order is deliberate: what somebody wrote for this very purpose goes before w
 4. DTU's `cameras*.npz`;
 5. a COLMAP model before LLFF's `poses_bounds.npy`: sets that have both keep lens and points only in the model, but only
    when its pictures are there (sets at 1/8 size often come without them);
-6. photos; 7. one video (or recording in one file) in a folder, alone or with one picture (its cover);
-8. the only capture in a folder further down, as unpacking leaves it.
+6. colour and depth in folders of any name, with a list of poses;
+7. photos; 8. one video (or recording in one file) in a folder, alone or with one picture (its cover);
+9. the only capture in a folder further down, as unpacking leaves it.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from toolkit.capture.record3d import holds_record3d, looks_like_record3d, read_r
 from toolkit.capture.redwood import looks_like_redwood, read_redwood
 from toolkit.capture.replica import looks_like_replica, read_replica
 from toolkit.capture.resolve import CaptureFiles
+from toolkit.capture.rgbd_folder import looks_like_rgbd, read_rgbd
 from toolkit.capture.scanner3d import looks_like_scanner3d, read_scanner3d
 from toolkit.capture.scannet import looks_like_scannet, read_scannet, read_sens
 from toolkit.capture.sens import is_sens
@@ -120,8 +122,8 @@ def _descended(folder: Path, below: Path) -> Capture:
 
 
 def _photos_without_film(path: Path) -> bool:
-    """One picture beside a film is its cover, not a capture."""
-    return looks_like_photos(path) and (len(photo_files(path)) > 1 or not pictures_in(path, FILMS))
+    """One picture beside a film is its cover, not a capture; and what lies in other folders may have been made of the film."""
+    return len(photo_files(path)) > 1 if pictures_in(path, FILMS) else looks_like_photos(path)
 
 
 READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ...] = (
@@ -139,6 +141,7 @@ READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ..
     ("dtu", looks_like_dtu, read_dtu),
     ("colmap", _colmap_without_llff, read_colmap),
     ("llff", looks_like_llff, read_llff),
+    ("rgbd", looks_like_rgbd, read_rgbd),
     ("photos", _photos_without_film, read_photos),
 )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,8 @@ from PIL import Image
 from toolkit.camera import Array
 from toolkit.capture import heif, lzfse
 from toolkit.capture.colours import to_srgb
-from toolkit.capture.headers import MAX_PIXELS, Header, read_bytes, read_header
+from toolkit.capture.headers import MAX_PIXELS, Header, orientation_of, read_bytes, read_header
+from toolkit.capture.listing import picture_header
 from toolkit.capture.sens import is_sens
 from toolkit.capture.sens_frames import sens_depth
 from toolkit.capture.tiff import unturned
@@ -21,6 +23,9 @@ from toolkit.capture.video import iterate_video
 from toolkit.errors import InputError
 
 EXIF_TURNS = "exif_turns"  # in `Capture.extra`: the cameras are those of images that are turned by EXIF
+LOSSY = ("JPEG", "MPO", "WEBP", heif.FORMAT)  # formats whose black and white come out as greys
+WHITE = 255
+FEW_LEVELS = 32  # grey levels of a mask up to which they are labels, not soft edges
 
 
 def turns_by_exif(capture: Capture) -> bool:
@@ -36,7 +41,8 @@ def load_image(frame: Frame, *, exif: bool = False) -> Array:
     """The frame's picture, (H, W, 3) or with alpha (H, W, 4), uint8 RGB(A), alpha not premultiplied.
 
     Grey pictures become RGB; 16-bit ones are rounded to 8 bits; floating-point ones are taken as 0 to 1. Colours are sRGB's, whatever
-    profile the file has. With `exif` the EXIF orientation is applied (see `turns_by_exif`), without it the pixels stay as stored.
+    profile the file has. A mask that is alpha (`mask_is_alpha`) becomes the picture's. With `exif` the EXIF orientation is applied (see
+    `turns_by_exif`), without it the pixels stay as stored.
 
     Raises:
         InputError: naming the file, when it is missing, no picture, cut short or too large.
@@ -45,8 +51,12 @@ def load_image(frame: Frame, *, exif: bool = False) -> Array:
         for _, picture in iterate_video(frame.image, {frame.video_index}, as_stored=frame.as_stored):
             return picture
         raise InputError(f"frame {frame.video_index} of the video {frame.image} cannot be decoded; the file may be damaged")
-    picture, orientation = read_picture(frame.image, frame.white)
-    return upright(picture, orientation if exif else 1)
+    stored, orientation = read_picture(frame.image, frame.white)
+    picture = upright(stored, orientation if exif else 1)
+    mask = load_mask(frame, exif=exif) if frame.mask_is_alpha else None
+    if mask is None or picture.shape[2] == 4:
+        return picture
+    return np.dstack([picture, cv2.resize(mask.astype(np.uint8) * 255, picture.shape[1::-1], interpolation=cv2.INTER_LINEAR)])
 
 
 def read_picture(path: Path, white: int | None = None) -> tuple[Array, int]:
@@ -58,7 +68,7 @@ def read_picture(path: Path, white: int | None = None) -> tuple[Array, int]:
     Raises:
         InputError: naming the file.
     """
-    picture, header = _decode(path)
+    picture, header = decode(path)
     return to_srgb(to_rgba(picture, white), header.profile), 1 if header.format == heif.FORMAT else header.orientation
 
 
@@ -68,7 +78,7 @@ def largest(path: Path) -> int:
     Raises:
         InputError: naming the file.
     """
-    image = _decode(path)[0]
+    image = decode(path)[0]
     return int(image[..., :3].max() if image.ndim == 3 else image.max()) if image.dtype == np.uint16 else 0
 
 
@@ -78,7 +88,7 @@ def see_through(path: Path) -> bool:
     Raises:
         InputError: naming the file.
     """
-    picture = to_rgba(_decode(path)[0])
+    picture = to_rgba(decode(path)[0])
     return picture.shape[2] == 4 and bool((picture[:, :, 3] < 255).any())
 
 
@@ -127,18 +137,57 @@ def load_depth(frame: Frame, capture: Capture) -> Array:
     return carried(depth, camera.scaled(width, height), frame.depth_pose)
 
 
-def load_mask(frame: Frame) -> Array | None:
-    """(H, W) bool, True where the pixel may be used; None when the frame has no mask. A pixel is masked where every channel is 0.
+def load_mask(frame: Frame, *, exif: bool = False) -> Array | None:
+    """(H, W) bool, True where the pixel may be used; None when the frame has no mask. A mask may have another size than its image.
+
+    Left out is what is 0 in every channel (what is not, where `frame.mask_excludes`). Masks with soft edges, and those of a lossy format,
+    are cut at half of white. Alpha that is not the same everywhere is the mask, whatever the colours are. With `exif` the mask is turned
+    as its image is: by its own orientation or, if only its image has one and it fits no other way, by that.
 
     Raises:
         InputError: naming the file, when it is missing or damaged.
     """
     if frame.mask is None:
         return None
-    mask = _decode(frame.mask)[0]
-    if mask.ndim == 3:
-        mask = mask[:, :, : min(mask.shape[2], 3)].max(axis=2)
-    return np.asarray(mask > 0)
+    stored, header = decode(frame.mask)
+    mask = _white(stored, header.format in LOSSY)
+    if exif:
+        mask = upright(mask, 1 if header.format == heif.FORMAT else header.orientation)
+        orientation = orientation_of(frame.image)
+        if orientation >= 5:
+            width, height = picture_header(frame.image).size
+            as_stored, turned = (abs(math.log(mask.shape[1] * b / (mask.shape[0] * a))) for a, b in ((width, height), (height, width)))
+            mask = upright(mask, orientation) if as_stored < turned else mask
+    return np.asarray(mask != frame.mask_excludes)
+
+
+def usable_pixels(frame: Frame, picture: Array, *, exif: bool = False) -> Array | None:
+    """(H, W) bool: pixels of the frame's `picture` (H, W, 3 or 4) that its mask allows and that are not see-through; None: all.
+
+    Raises:
+        InputError: as `load_mask`.
+    """
+    height, width = picture.shape[:2]
+    usable = load_mask(frame, exif=exif)
+    if usable is not None and usable.shape != (height, width):
+        usable = np.asarray(cv2.resize(usable.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0)
+    if picture.shape[2] == 4:
+        opaque = picture[:, :, 3] >= 128
+        usable = opaque if usable is None else usable & opaque
+    return usable
+
+
+def _white(mask: Array, lossy: bool) -> Array:
+    """(H, W) bool: what a decoded mask of any depth and number of channels marks."""
+    if mask.ndim == 3 and mask.shape[2] in (2, 4):
+        alpha = mask[:, :, -1]
+        if alpha.min() < alpha.max():
+            return np.asarray(alpha > alpha.max() / 2)
+    grey = mask if mask.ndim == 2 else mask[:, :, :3].max(axis=2)
+    if lossy:
+        return np.asarray(grey > WHITE / 2)
+    soft = grey.dtype.kind == "f" or np.count_nonzero(np.bincount(grey.ravel())) > FEW_LEVELS
+    return np.asarray(grey > grey.max() / 2 if soft else grey > 0)
 
 
 def to_rgba(picture: Array, white: int | None = None) -> Array:
@@ -178,10 +227,10 @@ def _values(path: Path, frame: Frame) -> Array:
     camera = frame.depth_intrinsics
     if path.suffix.lower() in lzfse.TYPES and camera is not None:
         return lzfse.load_map(path, camera.width, camera.height)
-    return _decode(path)[0]
+    return decode(path)[0]
 
 
-def _decode(path: Path) -> tuple[Array, Header]:
+def decode(path: Path) -> tuple[Array, Header]:
     """The pixels as stored (OpenCV's channel order and depth; of HEIF as they are seen), and the file's header."""
     data = read_bytes(path)
     header = read_header(data, path)

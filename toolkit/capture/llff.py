@@ -12,6 +12,7 @@ import numpy as np
 
 from toolkit.camera import Array, Intrinsics, checked_pose, world_from_llff
 from toolkit.capture.listing import assemble, counted, fitted, picture_header, pictures_in, require_folder, unique_names
+from toolkit.capture.masks import is_mask_folder, masks_among
 from toolkit.capture.resolve import BESIDE, CaptureFiles
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError, first_line
@@ -64,7 +65,10 @@ def _pictures(root: Path, rows: int) -> tuple[list[Path], list[str]]:
     counts: dict[str, int] = {}
     candidates: list[tuple[bool, int, list[Path]]] = []
     for folder in sorted(path for path in root.iterdir() if path.is_dir() and (path.name == "images" or path.name.startswith("images_"))):
-        found = sorted(pictures_in(folder), key=lambda path: path.name)
+        if is_mask_folder(folder.name):
+            continue
+        listed = pictures_in(folder)
+        found = sorted(set(listed) - masks_among(listed), key=lambda path: path.name)
         counts[folder.name] = len(found)
         if found and len(found) == rows:
             candidates.append((folder.name == "images", picture_header(found[0]).width, found))

@@ -7,19 +7,30 @@ intrinsics are for the stored pixels). The focal length in pixels is the same ei
 from __future__ import annotations
 
 import math
+import os
+import re
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
 from toolkit.capture.heif import SUFFIXES as HEIF_SUFFIXES
-from toolkit.capture.listing import assemble, counted, picture_header, pictures_in, require_folder, unique_names
+from toolkit.capture.listing import assemble, counted, natural_key, picture_header, pictures_in, require_folder, unique_names
+from toolkit.capture.masks import is_mask_folder, masks_among
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 from toolkit.files import require_utf8
 
 FOLDERS = (".", "images", "input")
+DEEP, MOST_FILES = 3, 100_000
+OWN_CAPTURE = re.compile(r"transforms.*\.json|poses_bounds\.npy|cameras.*\.npz|sparse|colmap|run\.json|groundtruth\.txt|.*\.(sens|r3d)")
+NO_PHOTOS = {
+    *("depth", "depths", "disparity", "normal", "normals", "confidence", "flow", "segmentation", "segmentations", "semantic", "labels"),
+    *("thumb", "thumbs", "thumbnail", "thumbnails", "preview", "previews", "render", "renders", "results", "output", "outputs"),
+}
+SMALLER = re.compile(r".*_(2|4|8|16|32)")  # the same photos made smaller, as in images_4
 FILM_DIAGONAL = math.hypot(36.0, 24.0)  # mm
 EXIF_FOLDER = 0x8769
 FOCAL_LENGTH, FOCAL_LENGTH_35 = 0x920A, 0xA405
@@ -28,7 +39,7 @@ PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 
 
 def looks_like_photos(path: Path) -> bool:
-    return any(pictures_in(path / folder) for folder in FOLDERS)
+    return any(pictures_in(path / folder) for folder in FOLDERS) or bool(photo_folders(path))
 
 
 def photo_files(root: Path) -> list[Path]:
@@ -36,24 +47,100 @@ def photo_files(root: Path) -> list[Path]:
     return max((pictures_in(root / folder) for folder in FOLDERS), key=len)
 
 
+def photo_folders(root: Path) -> dict[Path, list[Path]]:
+    """Folders at and below `root` that hold photos, and these: without masks, and without what is no photo (depth, small copies) or a
+    capture of its own. At most `DEEP` folders down; links are not followed."""
+    out: dict[Path, list[Path]] = {}
+    looked = 0
+    for place, children, names in os.walk(root):
+        folder = Path(place)
+        below = folder.relative_to(root).parts
+        looked += 1 + len(names)
+        if looked > MOST_FILES:
+            break
+        if below and (any(OWN_CAPTURE.fullmatch(name) for name in [*names, *children])):
+            children.clear()
+            continue
+        children[:] = [] if len(below) >= DEEP else sorted((name for name in children if _may_hold_photos(name)), key=natural_key)
+        pictures = pictures_in(folder)
+        masks = masks_among(pictures)
+        if len(masks) < len(pictures):
+            out[folder] = [picture for picture in pictures if picture not in masks]
+    return out
+
+
 def read_photos(path: Path | str) -> Capture:
-    """Photos directly in the folder, or in its `images/` or `input/` (whichever holds most).
+    """Photos in the folder and in folders below it that look like the same capture: of one size, or in folders that are numbered (`cam1/`).
 
     Raises:
-        InputError: missing or empty folder, no photo, or a file that is not a picture.
+        InputError: missing or empty folder, no photo, a file that is not a picture, or folders of different captures.
     """
     root = require_folder(path)
-    pictures = photo_files(root)
+    pictures, remarks = _of_one_capture(root, photo_folders(root))
     if not pictures:
         raise InputError(f"no photo (jpg, heic, png, webp, bmp, tif) was found in {root}; give the folder that holds them")
     for picture in pictures:
         require_utf8(picture)
-    pictures, remarks = _once_each(pictures)
+    pictures, double = _once_each(pictures)
+    remarks += double
     frames = [
         Frame(name=name, image=picture, focal_prior=focal_from_exif(picture))
         for name, picture in zip(unique_names(pictures), pictures, strict=True)
     ]
     return assemble("photos", root, frames, remarks)
+
+
+def _may_hold_photos(name: str) -> bool:
+    words = set(re.findall(r"[a-z]+", name.lower()))
+    return not (name.startswith((".", "__")) or words & NO_PHOTOS or is_mask_folder(name) or SMALLER.fullmatch(name.lower()))
+
+
+def _of_one_capture(root: Path, folders: dict[Path, list[Path]]) -> tuple[list[Path], list[str]]:
+    """The photos of the folders that belong to the one with most, the usual ones (`FOLDERS`) first; and remarks on the others."""
+    usual = [folder for name in FOLDERS if (folder := root / name) in folders and len(folders[folder]) > 1]
+    main = max(usual or list(folders), key=lambda folder: len(folders[folder]), default=None)
+    if main is None:
+        return [], []
+    taken: list[Path] = [main]
+    others: list[Path] = []
+    sizes = _sizes(folders[main])
+    for folder, pictures in folders.items():
+        if folder != main:
+            alike = len(pictures) > 1 and (bool(sizes & _sizes(pictures)) or _numbered(folder.name) == _numbered(main.name) != "")
+            (taken if alike else others).append(folder)
+
+    def listed(some: list[Path]) -> str:
+        names = [f"{folder.relative_to(root).as_posix()}/ ({len(folders[folder])})" for folder in some]
+        return ", ".join(names[:4]).replace("./ ", "the folder itself ") + (", …" if len(names) > 4 else "")
+
+    if others and not usual and any(len(folders[folder]) > 1 for folder in others):
+        raise InputError(
+            f"{root} holds photos of different sizes in {listed([*taken, *others])}, which look like several captures; "
+            "give one of the folders"
+        )
+    remarks = []
+    if len(taken) > 1:
+        remarks.append(f"the photos of {len(taken)} folders are taken as one capture: {listed(taken)}; give one folder to use it alone")
+    if others:
+        remarks.append(f"the photos in {listed(others)} look like others and are not used")
+    order = [folder for folder in folders if folder in taken]
+    return [picture for folder in order for picture in folders[folder]], remarks
+
+
+def _sizes(pictures: list[Path]) -> set[tuple[int, int]]:
+    """Long and short side of a few of the pictures; what cannot be read is left to whoever reads it all."""
+    out = set()
+    for picture in pictures[:: max(1, len(pictures) // 5)]:
+        with suppress(InputError):
+            width, height = picture_header(picture).size
+            out.add((max(width, height), min(width, height)))
+    return out
+
+
+def _numbered(name: str) -> str:
+    """What folders of one kind share: `cam` of `cam1` and `cam_2`; empty for a name without a number."""
+    match = re.fullmatch(r"([a-z]+)[ _-]*[0-9]+", name.lower())
+    return match[1] if match else ""
 
 
 def _once_each(pictures: list[Path]) -> tuple[list[Path], list[str]]:

@@ -64,7 +64,7 @@ def prepare_views(capture: Capture, working_from_input: Similarity, settings: Ca
             raise InputError(f"the frame {frame.name} of {capture.root} has no pose or no intrinsics; find poses first")
         source, colour, alpha = _loaded(frame, frame.intrinsics, capture, exif)
         target, image, seen = shrink(source, colour)
-        usable = seen & _usable(frame, source, target)
+        usable = seen & _usable(frame, source, target, exif)
         views.names.append(frame.name)
         views.images.append(image)
         views.intrinsics.append(target)
@@ -155,12 +155,12 @@ def _nearest(values: Array, camera: Intrinsics, target: Intrinsics) -> Array:
     return np.where(seen, values[row, column], values.dtype.type(0))
 
 
-def _usable(frame: Frame, source: Intrinsics, target: Intrinsics) -> Array:
+def _usable(frame: Frame, source: Intrinsics, target: Intrinsics, exif: bool) -> Array:
     """(H, W) bool: pixels of `target` whose whole footprint the frame's mask allows."""
-    mask = load_mask(frame)
+    mask = None if frame.mask_is_alpha else load_mask(frame, exif=exif)
     if mask is None:
         return np.ones((target.height, target.width), dtype=bool)
-    camera = fitted(source, (mask.shape[1], mask.shape[0]), str(frame.mask))
+    camera = source.scaled(mask.shape[1], mask.shape[0])
     # Grown by half a target pixel, then looked up: a pixel is used only where nothing forbidden goes into it.
     reach = 2 * math.ceil(max(camera.width / target.width, camera.height / target.height) / 2) + 1
     allowed = cv2.erode(mask.astype(np.uint8), np.ones((reach, reach), np.uint8), borderValue=1)

@@ -32,6 +32,8 @@ class Frame:
     confidence: Path | None = None  # picture of the depth map's size; 0 = the sensor does not believe this depth itself
     white: int | None = None  # largest value of the image's channels, where they use fewer bits than they are stored in; None: all bits
     depth_pose: Array | None = None  # (4, 4) picture's camera from the depth camera, units of the poses; None: both at the same place
+    mask_excludes: bool = False  # the mask is the other way round: what is not 0 is not used
+    mask_is_alpha: bool = False  # nothing is there where the mask is 0, as the image shows: it is cut out
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Capture:
     """A source as found on disk, in its own frame of reference."""
 
     kind: str  # "video", "photos", "transforms", "blender", "colmap", "7scenes", "tum", "scannet", "llff", "dtu", "redwood",
-    # "replica", "polycam", "stray", "record3d", "scanner3d"
+    # "replica", "polycam", "stray", "record3d", "scanner3d", "rgbd"
     root: Path
     frames: tuple[Frame, ...]
     ordered: bool = False  # neighbours in the list are neighbours in time

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from toolkit.camera import Array, Intrinsics
-from toolkit.capture.images import load_image, turns_by_exif
+from toolkit.capture.images import load_image, load_mask, turns_by_exif
 from toolkit.capture.types import Capture, Frame
 from toolkit.effects.evidence import Tracks
 from toolkit.poses.overlap import best_neighbours, guessed_depth, overlap, parallax
@@ -123,7 +123,7 @@ def gather(
         progress.update(number, 2 * len(frames), f"looking for effects, picture {number + 1} of {len(frames)}")
         look = None if known is None else known.get(chosen[number])
         if look is None:
-            look = _look(load_image(frame, exif=exif), cameras[number], effort)
+            look = _look(load_image(frame, exif=exif), load_mask(frame, exif=exif), cameras[number], effort)
             if known is not None:
                 known[chosen[number]] = look
         seen.append(look)
@@ -200,7 +200,7 @@ class Look:
     grey: Array  # (h, w) uint8
 
 
-def _look(picture: Array, camera: Intrinsics, effort: Effort) -> Look:
+def _look(picture: Array, mask: Array | None, camera: Intrinsics, effort: Effort) -> Look:
     height, width = picture.shape[:2]
     scale = min(1.0, effort.long_side / max(width, height))
     small = np.ascontiguousarray(picture[..., :3])
@@ -220,9 +220,10 @@ def _look(picture: Array, camera: Intrinsics, effort: Effort) -> Look:
     pixel = (at.astype(np.float64) + 0.5) * [camera.width / small.shape[1], camera.height / small.shape[0]]
     rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)).astype(np.float32)
     keep = np.ones(len(at), dtype=bool)
-    if picture.shape[2] == 4:
-        solid = cv2.resize(picture[..., 3], (small.shape[1], small.shape[0]), interpolation=cv2.INTER_AREA) >= 250
-        keep = solid[np.clip(np.rint(at[:, 1]).astype(int), 0, None), np.clip(np.rint(at[:, 0]).astype(int), 0, None)]
+    for shown in (picture[..., 3] if picture.shape[2] == 4 else None, None if mask is None else mask.astype(np.uint8) * 255):
+        if shown is not None:
+            solid = cv2.resize(shown, (small.shape[1], small.shape[0]), interpolation=cv2.INTER_AREA) >= 250
+            keep &= solid[np.clip(np.rint(at[:, 1]).astype(int), 0, None), np.clip(np.rint(at[:, 0]).astype(int), 0, None)]
     slope = cv2.remap(slopes, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
     return Look(
         pixel=pixel[keep],

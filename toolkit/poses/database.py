@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 
 from toolkit.camera import Array
-from toolkit.capture.images import load_image, load_mask
+from toolkit.capture.images import load_image, usable_pixels
 from toolkit.errors import InputError
 from toolkit.files import read_json, remove, write_json
 from toolkit.poses.features import floats, learned, sift
@@ -102,16 +102,13 @@ def _describe(picture: Picture, job: Job) -> tuple[dict[str, Any], Array, Array]
     pixels = load_image(frame, exif=job.exif)
     height, width = pixels.shape[:2]
     grey = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
-    usable = load_mask(frame)
-    if pixels.shape[2] == 4:
-        solid = pixels[..., 3] >= 128
-        usable = solid if usable is None or usable.shape != solid.shape else usable & solid
+    usable = usable_pixels(frame, pixels, exif=job.exif)
     factor = _factor(job, width, height)
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
     seen = grey if factor == 1.0 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA if factor < 1.0 else cv2.INTER_CUBIC)
     keypoints, descriptors = sift(seen, job.max_features) if job.features == SIFT else learned(seen, job.max_features)
     keypoints = keypoints * np.array([width / size[0], height / size[1], width / size[0], 1.0], dtype=np.float32)
-    if usable is not None and usable.shape == (height, width) and len(keypoints):
+    if usable is not None and len(keypoints):
         column = np.clip(keypoints[:, 0].astype(int), 0, width - 1)
         row = np.clip(keypoints[:, 1].astype(int), 0, height - 1)
         keep = usable[row, column]

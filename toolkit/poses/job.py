@@ -34,6 +34,7 @@ class Picture:
     video_index: int | None = None
     focal_prior: float | None = None
     as_stored: bool = False
+    mask_excludes: bool = False
 
     def frame(self) -> Frame:
         """As the capture's readers want it."""
@@ -44,12 +45,13 @@ class Picture:
             video_index=self.video_index,
             focal_prior=self.focal_prior,
             as_stored=self.as_stored,
+            mask_excludes=self.mask_excludes,
         )
 
     def key(self) -> dict[str, Any]:
         """Of what is seen in it."""
         # Named only where it is so: what was found for other pictures before there was such a thing stays good.
-        return {name: value for name, value in asdict(self).items() if name != "as_stored" or value}
+        return {name: value for name, value in asdict(self).items() if name not in ("as_stored", "mask_excludes") or value}
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,7 @@ def plan(
             video_index=frame.video_index,
             focal_prior=frame.focal_prior,
             as_stored=frame.as_stored,
+            mask_excludes=frame.mask_excludes,
         )
         for frame in capture.frames
     )

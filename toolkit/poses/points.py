@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from toolkit.camera import FISHEYE, Array, Intrinsics, distort, invert
-from toolkit.capture.images import load_image, turns_by_exif
+from toolkit.capture.images import load_image, turns_by_exif, usable_pixels
 from toolkit.capture.types import Capture
 from toolkit.poses.cloud import Cloud, every
 from toolkit.poses.overlap import best_neighbours, guessed_depth, overlap, parallax
@@ -37,7 +37,8 @@ def triangulate(capture: Capture, progress: Progress = SILENT) -> Cloud:
     for i, (frame, camera) in enumerate(zip(frames, cameras, strict=True)):
         progress.check()
         progress.update(i, 2 * len(frames), f"points, picture {i + 1} of {len(frames)}")
-        ideal, described, scale = _features(load_image(frame, exif=exif), camera)
+        picture = load_image(frame, exif=exif)
+        ideal, described, scale = _features(picture, usable_pixels(frame, picture, exif=exif), camera)
         flat.append(ideal)
         descriptors.append(described)
         focal[i] = 0.5 * (camera.fx + camera.fy) * scale
@@ -62,7 +63,7 @@ def triangulate(capture: Capture, progress: Progress = SILENT) -> Cloud:
     return Cloud(points, point, chosen[owner[keypoint[kept]]], z, "triangulated")
 
 
-def _features(picture: Array, camera: Intrinsics) -> tuple[Array, Array, float]:
+def _features(picture: Array, usable: Array | None, camera: Intrinsics) -> tuple[Array, Array, float]:
     """(N, 2) keypoints on the ideal image plane (x/z, y/z), (N, 128) float32 descriptors, and the working scale."""
     height, width = picture.shape[:2]
     scale = min(1.0, LONG_SIDE / max(width, height))
@@ -72,11 +73,10 @@ def _features(picture: Array, camera: Intrinsics) -> tuple[Array, Array, float]:
     if descriptors is None or len(keypoints) == 0:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32), scale * width / camera.width
     pixels = (np.array([k.pt for k in keypoints]) + 0.5) * [camera.width / small.shape[1], camera.height / small.shape[0]]
-    if picture.shape[2] == 4:
-        alpha = picture[..., 3]
+    if usable is not None:
         column = np.clip((pixels[:, 0] * width / camera.width).astype(int), 0, width - 1)
         row = np.clip((pixels[:, 1] * height / camera.height).astype(int), 0, height - 1)
-        pixels, descriptors = pixels[alpha[row, column] >= 128], descriptors[alpha[row, column] >= 128]
+        pixels, descriptors = pixels[usable[row, column]], descriptors[usable[row, column]]
     # Root-SIFT: Euclidean distances of these compare histograms better than those of plain descriptors.
     rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)).astype(np.float32)
     return undistorted(camera, pixels), rooted, scale * width / camera.width

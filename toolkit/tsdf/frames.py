@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from toolkit.camera import Array, Intrinsics, Similarity, undistort_maps
-from toolkit.capture.images import load_depth, load_image, load_mask
+from toolkit.capture.images import load_depth, load_image, usable_pixels
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 from toolkit.tone import Tone
@@ -56,10 +56,7 @@ def load_depth_frame(frame: Frame, capture: Capture, working_from_input: Similar
     depth = load_depth(frame, capture)
     colour_camera = _at_size(frame.intrinsics, picture)
     depth_camera = _at_size(frame.depth_intrinsics or frame.intrinsics, depth)
-    usable = load_mask(frame)
-    if picture.shape[2] == 4:
-        opaque = picture[:, :, 3] >= 128
-        usable = opaque if usable is None else _resized(usable, opaque.shape) & opaque
+    usable = usable_pixels(frame, picture)
     if usable is not None:
         depth = np.where(_seen_from(usable, colour_camera, depth_camera), depth, np.float32(0))
     colour = np.ascontiguousarray(picture[:, :, :3])
@@ -137,10 +134,6 @@ def _valid(depths: Sequence[Array]) -> Array:
 def _at_size(intrinsics: Intrinsics, picture: Array) -> Intrinsics:
     height, width = picture.shape[:2]
     return intrinsics if (intrinsics.width, intrinsics.height) == (width, height) else intrinsics.scaled(width, height)
-
-
-def _resized(mask: Array, shape: tuple[int, ...]) -> Array:
-    return np.asarray(cv2.resize(mask.astype(np.uint8), (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST) > 0)
 
 
 def _seen_from(mask: Array, colour_camera: Intrinsics, depth_camera: Intrinsics) -> Array:

@@ -1,0 +1,330 @@
+"""Masks that lie beside a capture's images, found by their names. White is used, black is left out: of fits, scores, features and depth.
+
+Read are folders named as masks are (`masks/`, `images_mask/`, `silhouettes/`, …), beside the images' folder or above it, with files
+named after the images (`NAME.png`, COLMAP's `NAME.jpg.png`, `NAME_mask.png`, …) or numbered as they are; and masks among the images
+(`NAME_mask.png`, `NAME.alpha.png`). instant-ngp's `dynamic_mask_NAME.png` are the other way round: white is left out.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from toolkit import files
+from toolkit.capture.images import LOSSY, decode, load_image, load_mask, turns_by_exif, usable_pixels
+from toolkit.capture.listing import counted, natural_key, picture_header, pictures_in
+from toolkit.capture.types import Capture, Frame
+from toolkit.errors import InputError
+
+FOLDER_WORDS = {"mask", "masks", "matte", "mattes", "silhouette", "silhouettes"}
+FILE_WORDS = {*FOLDER_WORDS, "alpha"}
+OTHER_WORDS = {"depth", "depths", "normal", "normals", "confidence", "overlay", "overlays"}  # `depth_masks/` is of something else
+OTHER_WAY_ROUND = "dynamic"  # what such a mask marks is left out
+SAMPLED = 16  # images whose names are compared with all masks' to find how these are called
+PIXELS = 150e6  # of masks that are decoded at once; of more, evenly spread ones
+SHAPE = 0.02  # how far a mask's ratio of width to height may be from its image's
+LITTLE = 0.1  # of the pixels; masks that leave less, all of them, may mark the wrong side
+NOTHING, WHOLE = 1e-3, 1 - 1e-5
+PLAIN = 0.99  # of the pixels outside the masks that are white (or black) in images that are cut out
+INSTEAD = "if white marks what is to be left out, give --set capture.masks=inverted; --set capture.masks=off uses none"
+
+
+@dataclass(frozen=True)
+class _Found:
+    masks: dict[int, Path]  # index of a frame → its mask
+    place: str  # as it is named to people
+    excludes: bool
+
+
+def with_masks(capture: Capture, use: str = "auto") -> Capture:
+    """The capture with the masks that lie beside its images, unless it lists its own; and remarks on how many are used.
+
+    Masks that leave every pixel are dropped, and so are those of another shape than their image and those that cannot be read. Images of
+    which nothing is left are dropped themselves.
+
+    Args:
+        use: auto | inverted (white is left out) | off.
+
+    Raises:
+        InputError: the masks leave nothing of any image.
+    """
+    if use == "off":
+        return replace(capture, frames=tuple(replace(frame, mask=None, mask_excludes=False) for frame in capture.frames))
+    if capture.filmed:
+        return capture
+    remarks: list[str] = []
+    frames = list(capture.frames)
+    place = ""
+    if all(frame.mask is None for frame in frames):
+        found = _find(capture, remarks)
+        if found is not None:
+            place = f" in {found.place}"
+            for index, path in found.masks.items():
+                frames[index] = replace(frames[index], mask=path, mask_excludes=found.excludes)
+    if use == "inverted":
+        frames = [replace(frame, mask_excludes=not frame.mask_excludes) if frame.mask is not None else frame for frame in frames]
+    exif = turns_by_exif(capture)
+    frames = _without_bad(frames, exif, remarks)
+    masked = [index for index, frame in enumerate(frames) if frame.mask is not None]
+    if not masked:
+        return capture.with_frames(frames, *remarks)
+    shares, unreadable = _shares([frames[index] for index in masked])
+    for at in unreadable:
+        frames[masked[at]] = replace(frames[masked[at]], mask=None)
+    if unreadable:
+        first = capture.frames[masked[unreadable[0]]].name
+        remarks.append(f"{counted(len(unreadable), 'mask')} cannot be read (of {first}{', …' if len(unreadable) > 1 else ''}) and not used")
+    if not shares:
+        return capture.with_frames(frames, *remarks)
+    if len(shares) + len(unreadable) == len(masked) and min(shares.values()) > WHOLE:
+        return capture.with_frames([replace(frame, mask=None, mask_excludes=False) for frame in frames], *remarks)
+    if max(shares.values()) < NOTHING:
+        raise InputError(f"the masks{place} of {capture.root} leave nothing of any image (black is left out); {INSTEAD}")
+    if len(masked) == len(frames) and not unreadable and (colour := _cut_out_on([frames[at] for at in shares], exif)):
+        frames = [replace(frame, mask_is_alpha=True) for frame in frames]
+        remarks.append(f"the images are cut out on {colour} already, so {counted(len(frames), 'mask')}{place} are taken as their alpha")
+        return replace(capture.with_frames(frames, *remarks), alpha=True)
+    excluding = frames[masked[0]].mask_excludes
+    empty = {masked[at] for at, share in shares.items() if share == 0}
+    frames = [frame for index, frame in enumerate(frames) if index not in empty]
+    count = sum(frame.mask is not None for frame in frames)
+    share = float(np.mean([share for share in shares.values() if share > 0]))
+    remarks.append(
+        f"{count} of {counted(len(frames), 'image')} {'has' if count == 1 else 'have'} a mask{place}, which leaves "
+        f"{100 * share:.0f}% of the pixels: {'white' if excluding else 'black'} is left out of the fit and of scores"
+        + ("" if count == len(frames) else "; images without one are used whole")
+    )
+    if empty:
+        remarks.append(f"{counted(len(empty), 'image')} of which the masks leave nothing {'is' if len(empty) == 1 else 'are'} not used")
+    if max(shares.values()) < LITTLE:
+        remarks.append(f"the masks leave less than {100 * LITTLE:.0f}% of every image; {INSTEAD}")
+    return capture.with_frames(frames, *remarks)
+
+
+def masks_among(pictures: Sequence[Path]) -> set[Path]:
+    """Those of a folder's pictures that are masks of others, by their names (`NAME_mask.png`) and by what a few of them show."""
+    named = [path for path in pictures if _words(path.stem) & FILE_WORDS]
+    if not named:
+        return set()
+    images = [path for path in pictures if path not in set(named)]
+    found = set(_match(images, named, among=True).values())
+    return found if _show_masks(sorted(found)) else set()
+
+
+def is_mask_folder(name: str) -> bool:
+    """Whether a folder of that name holds masks."""
+    words = _words(name)
+    return bool(words & FOLDER_WORDS) and not words & OTHER_WORDS
+
+
+# ------------------------------------------------------------------------------------------------ found by names
+
+
+def _find(capture: Capture, remarks: list[str]) -> _Found | None:
+    """The masks of the place that has most of them; remarks on masks that are not used."""
+    places: dict[Path, dict[int, Path]] = {}
+    among: set[Path] = set()  # folders of images that hold masks, too
+    for place, directory, indices in _places(capture):
+        images = [capture.frames[index].image for index in indices]
+        beside = pictures_in(directory)
+        if place == directory == images[0].resolve().parent:
+            used = {image.name for image in images}
+            beside = [path for path in beside if path.name not in used and _words(path.stem) & FILE_WORDS]
+            among.add(place)
+        for at, path in _match(images, beside, among=place in among).items():
+            places.setdefault(place, {})[indices[at]] = _inside(capture.root, path)
+        places.setdefault(place, {})
+    names = {place: _name(capture.root, place) for place in places}
+    usual = _factor(Counter(frame.image.parent.name for frame in capture.frames).most_common(1)[0][0])
+    ranked = sorted(places, key=lambda place: (-len(places[place]), _factor(names[place]) != usual, len(names[place])))
+    best = None
+    for place in ranked:
+        masks = places[place]
+        if masks and best is None and not _show_masks([masks[index] for index in sorted(masks)]):
+            remarks.append(f"what lies in {names[place]} is not used: it is neither black and white nor has it alpha, as masks do")
+        elif masks and best is None:
+            marks = [path.stem if place in among else f"{names[place]} {path.stem}" for path in masks.values()]
+            best = _Found(masks, f"{names[place]}", sum(OTHER_WAY_ROUND in _words(mark) for mark in marks) > len(marks) / 2)
+        elif place not in among or masks:
+            why = "other masks are" if masks else "their names fit no image"
+            remarks.append(f"the masks in {names[place]} are not used: {why}")
+    return best
+
+
+def _places(capture: Capture) -> Iterator[tuple[Path, Path, list[int]]]:
+    """Folders that may hold masks: the place that they belong to, the folder itself, and the frames that it may hold masks of."""
+    root = capture.root.resolve()
+    by_folder: dict[Path, list[int]] = {}
+    for index, frame in enumerate(capture.frames):
+        by_folder.setdefault(frame.image.resolve().parent, []).append(index)
+    children: dict[Path, list[Path]] = {}
+    for folder, indices in by_folder.items():
+        if not folder.is_relative_to(root) or not folder.is_dir():
+            continue
+        yield folder, folder, indices
+        above = [folder, *(parent for parent in folder.parents if parent.is_relative_to(root))]
+        for base in above:
+            if base not in children:
+                children[base] = sorted(
+                    (child for child in base.iterdir() if child.is_dir() and is_mask_folder(child.name) and not child.name.startswith(".")),
+                    key=lambda child: natural_key(child.name),
+                )
+            for place in children[base]:
+                if place in above:
+                    continue
+                parts = folder.relative_to(base).parts
+                for rest in dict.fromkeys((parts, parts[1:])):
+                    directory = place.joinpath(*rest)
+                    if directory.resolve().is_relative_to(root) and pictures_in(directory):
+                        yield place, directory, indices
+                        break
+
+
+def _match(images: Sequence[Path], masks: Sequence[Path], *, among: bool) -> dict[int, Path]:
+    """Index of an image → its mask: by what all masks' names add to their images', else (not `among` the images) by the last number."""
+    by_name = {path.stem.lower(): path for path in reversed(masks)}
+    votes: Counter[tuple[str, str]] = Counter()
+    for at in np.unique(np.linspace(0, len(images) - 1, SAMPLED).round()) if images else ():
+        image = images[int(at)]
+        stem, suffix = image.stem.lower(), image.suffix.lower()
+        for name in by_name:
+            start = name.find(stem)
+            if start >= 0 and _apart(name[:start], stem[0]) and _apart(name[start + len(stem) :][::-1], stem[-1]):
+                before, after = name[:start], name[start + len(stem) :]
+                if after.startswith(suffix) or not among or _words(before + " " + after) & FILE_WORDS:
+                    votes[before, after.replace(suffix, "{}", 1) if after.startswith(suffix) else after] += 1
+    out: dict[int, Path] = {}
+    for before, after in sorted(votes, key=lambda affix: (-votes[affix], len(affix[0] + affix[1]), affix)):
+        for at, image in enumerate(images):
+            name = before + image.stem.lower() + (after.replace("{}", image.suffix.lower(), 1) if after.startswith("{}") else after)
+            if at not in out and name in by_name:
+                out[at] = by_name[name]
+    if out or among:
+        return out
+    numbers = Counter(_number(image) for image in images), Counter(_number(path) for path in masks)
+    by_number = {_number(path): path for path in masks}
+    if any(counts.get(None) or max(counts.values(), default=2) > 1 for counts in numbers):
+        return {}
+    out = {at: by_number[number] for at, image in enumerate(images) if (number := _number(image)) in by_number}
+    return out if 2 * len(out) >= len(images) else {}
+
+
+def _apart(beside: str, end: str) -> bool:
+    """Whether a name's end character `end` stands apart from what is beside it (its last character): `1` is no part of `11`."""
+    return not beside or not ((beside[-1].isdigit() and end.isdigit()) or (beside[-1].isalpha() and end.isalpha()))
+
+
+def _number(path: Path) -> int | None:
+    found = re.findall(r"[0-9]{1,18}", path.stem)
+    return int(found[-1]) if found else None
+
+
+def _words(name: str) -> set[str]:
+    """Words of a name, in lower case: of `imagesMask_2` images and mask."""
+    return set(re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower()))
+
+
+def _factor(name: str) -> str:
+    """By how much images of a folder were made smaller: of `images_4` 4."""
+    match = re.search(r"_([0-9]+)/?$", name)
+    return match[1] if match else ""
+
+
+def _name(root: Path, place: Path) -> str:
+    name = place.relative_to(root.resolve()).as_posix()
+    return "the folder of the images" if name == "." else f"{name}/"
+
+
+def _inside(root: Path, path: Path) -> Path:
+    return files.inside(root, str(path))
+
+
+# ------------------------------------------------------------------------------------------------ looked at
+
+
+def _show_masks(paths: Sequence[Path]) -> bool:
+    """Whether most of a few files are masks by what they show: alpha, black and white, or few flat colours. What cannot be read counts."""
+    chosen = [paths[int(at)] for at in np.unique(np.linspace(0, len(paths) - 1, 5).round())] if paths else []
+    return sum(map(_shows_mask, chosen)) * 2 > len(chosen)
+
+
+def _shows_mask(path: Path) -> bool:
+    try:
+        picture, header = decode(path)
+    except InputError:
+        return True
+    if picture.ndim == 3 and picture.shape[2] in (2, 4) and picture[:, :, -1].min() < picture[:, :, -1].max():
+        return True
+    step = max(1, int(max(picture.shape[:2]) / 256))
+    few = picture[::step, ::step].reshape(-1, 1 if picture.ndim == 2 else picture.shape[2])[:, :3].astype(np.float64)
+    low, high = few.min(axis=1), few.max(axis=1)
+    top = max(float(few.max()), 1.0)
+    flat = ((high < 0.12 * top) | (low > 0.88 * top)).mean() > 0.9
+    return bool(flat) or (header.format not in LOSSY and len(np.unique(few, axis=0)) <= 64)
+
+
+def _cut_out_on(frames: Sequence[Frame], exif: bool) -> str:
+    """`white` or `black` where a few images show nothing else outside their masks, and enough of it; else empty."""
+    chosen = [frames[int(at)] for at in np.unique(np.linspace(0, len(frames) - 1, 5).round())]
+    plain = {"white": True, "black": True}
+    for frame in chosen:
+        try:
+            picture = load_image(frame, exif=exif)
+        except InputError:
+            return ""
+        usable = usable_pixels(frame, picture[:, :, :3], exif=exif)
+        if usable is None or usable.mean() > 1 - LITTLE:
+            return ""
+        # Masks of another size, or drawn by hand, are off by a pixel or two at the edge.
+        reach = 2 * math.ceil(max(picture.shape) / 200) + 1
+        outside = picture[cv2.dilate(usable.astype(np.uint8), np.ones((reach, reach), np.uint8)) == 0][:, :3]
+        plain["white"] &= len(outside) > 0 and bool((outside.min(axis=1) >= 240).mean() > PLAIN)
+        plain["black"] &= len(outside) > 0 and bool((outside.max(axis=1) <= 15).mean() > PLAIN)
+    return next((colour for colour, is_so in plain.items() if is_so), "")
+
+
+def _without_bad(frames: list[Frame], exif: bool, remarks: list[str]) -> list[Frame]:
+    """Without masks of another shape than their image (turned ones fit, where images are turned), or that are no images."""
+    out, shapes, broken = [], [], []
+    for frame in frames:
+        if frame.mask is not None:
+            try:
+                width, height = picture_header(frame.mask).size
+            except InputError:
+                broken.append(frame.name)
+                frame = replace(frame, mask=None, mask_excludes=False)
+            else:
+                wide, high = picture_header(frame.image).size
+                fits = [abs(width * high / (height * wide) - 1) < SHAPE, exif and abs(width * wide / (height * high) - 1) < SHAPE]
+                if not any(fits):
+                    shapes.append(frame.name)
+                    frame = replace(frame, mask=None, mask_excludes=False)
+        out.append(frame)
+    for names, why in ((shapes, "of another shape than their image"), (broken, "no images that can be read")):
+        if names:
+            verb = "mask is" if len(names) == 1 else "masks are"
+            remarks.append(f"{len(names)} {verb} {why} (of {names[0]}{', …' if len(names) > 1 else ''}) and not used")
+    return out
+
+
+def _shares(frames: Sequence[Frame]) -> tuple[dict[int, float], list[int]]:
+    """Share of pixels that masks leave, by the index of the frame, of as many as `PIXELS` allows; and the indices of those unreadable."""
+    sizes = [picture_header(frame.mask).size for frame in frames if frame.mask is not None]
+    most = max(8, int(PIXELS / max(1.0, float(np.mean([width * height for width, height in sizes])))))
+    shares, unreadable = {}, []
+    for at in np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int)):
+        try:
+            mask = load_mask(frames[at])
+        except (InputError, cv2.error):
+            unreadable.append(int(at))
+        else:
+            assert mask is not None
+            shares[int(at)] = float(mask.mean())
+    return shares, unreadable

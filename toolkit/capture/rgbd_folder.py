@@ -1,0 +1,410 @@
+"""RGB-D frames in folders of no published layout: a folder of colour images, one of depth maps, a list of poses, a file with the camera.
+
+Poses are camera-to-world in OpenCV axes: a 4×4 or 3×4 matrix in each row (16 or 12 numbers), 4×4 blocks, one matrix a file, or TUM's
+`time tx ty tz qx qy qz qw` with or without the time. They belong to images by name, by time, by number, or row by row. The camera is a
+3×3 or 4×4 matrix, `fx fy cx cy`, ORB-SLAM's or OpenCV's yaml, or json. Depth is divided by `DepthMapFactor` (or `depth_scale`) where
+the camera's file has it; floating-point depth is in the poses' unit; else the unit is the one that fits the poses.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from toolkit.camera import OPENCV, Array, Intrinsics, checked_pose
+from toolkit.capture.calibration import from_matrix, sensor
+from toolkit.capture.depth_checks import FACTORS, Sample, agreement
+from toolkit.capture.images import load_depth
+from toolkit.capture.listing import (
+    PICTURES,
+    assemble,
+    counted,
+    files_in,
+    fitted,
+    natural_key,
+    picture_header,
+    pictures_in,
+    read_text,
+    require_folder,
+    unique_names,
+)
+from toolkit.capture.masks import is_mask_folder
+from toolkit.capture.quaternion import rigid
+from toolkit.capture.types import Capture, Frame
+from toolkit.errors import InputError
+
+DEPTH_WORDS, COLOUR_WORDS = {"depth", "depths"}, {"rgb", "color", "colors", "colour", "colours", "image", "images", "img", "imgs", "frames"}
+NO_COLOUR = {*DEPTH_WORDS, "normal", "normals", "confidence", "conf", "semantic", "label", "labels", "instance", "vis"}
+POSE_WORDS = {"pose", "poses", "traj", "trajectory", "groundtruth", "gt", "extrinsics", "extrinsic", "odometry", "camera", "cam", "cameras"}
+CAMERA_WORDS = {"intrinsic", "intrinsics", "camera", "cam", "calib", "calibration", "k"}
+DEPTH_FILES = (*PICTURES, ".npy", ".pfm", ".pgm", ".exr")
+POSE_FILES = ("*.txt", "*.log", "*.csv", "*.tum")
+NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
+WORD = re.compile(rf"{NUMBER.pattern}|[-+]?(?:nan|inf|infinity)", re.IGNORECASE)  # of a pose
+MOST_CAMERA = 2**18  # bytes of a file that holds a camera
+NEAR = 0.03  # seconds between an image and its pose or depth
+MILLIMETRES = 1000.0
+BETTER = 1.1  # how much better another unit than the usual one must fit the poses
+LOOKED_AT = 12  # depth maps that the unit is found by
+MOST_FOLDERS = 200
+DEPTH_FACTORS = ("depthmapfactor", "depth_scale", "depth_factor", "png_depth_scale")
+VALUE = re.compile(r"""\b([A-Za-z_][\w.]{0,60})["']?[ \t]{0,20}[:=]\s{0,99}(\[[^\]]{0,2000}\]|[-+.0-9eE]{1,40})""")
+
+
+@dataclass(frozen=True)
+class _Poses:
+    file: Path
+    matrices: Array  # (N, 4, 4) float64
+    keys: list[str]  # what stands before each: a time, a number or a name; empty: nothing
+
+
+@dataclass(frozen=True)
+class _Layout:
+    colour: Path
+    depth: Path
+    poses: _Poses
+
+
+def looks_like_rgbd(path: Path) -> bool:
+    try:
+        return _layout(path) is not None
+    except InputError:
+        return False
+
+
+def read_rgbd(path: Path | str) -> Capture:
+    """Frames that have a pose; depth where there is some of an image's name, number or time.
+
+    Raises:
+        InputError: no such folders, no camera, or names and numbers of poses that do not fit the images.
+    """
+    root = require_folder(path)
+    layout = _layout(root)
+    if layout is None:
+        raise InputError(f"{root} must hold a folder of colour images, one of depth maps (depth/) and a list of poses")
+    images = pictures_in(layout.colour)
+    depths = _depths_of(images, pictures_in(layout.depth, DEPTH_FILES), root)
+    poses = _poses_of(images, layout.poses, root)
+    camera, scale, source = _camera(root, layout, picture_header(images[0]).size)
+    frames = []
+    for index, (image, name) in enumerate(zip(images, unique_names(images), strict=True)):
+        if index not in poses or not np.isfinite(poses[index]).all():
+            continue
+        size = picture_header(image).size
+        depth = depths.get(index)
+        depth_size = size if depth is None or depth.suffix.lower() in (".pfm", ".exr") else picture_header(depth).size
+        intrinsics = fitted(camera, size, str(image))
+        frames.append(
+            Frame(
+                name=name,
+                image=image,
+                intrinsics=intrinsics,
+                world_from_camera=checked_pose(poses[index], f"{layout.poses.file}, the pose of {image.name}"),
+                depth=depth,
+                depth_intrinsics=None if depth_size == size else fitted(intrinsics, depth_size, str(depth)),
+            )
+        )
+    places = f"{layout.colour.relative_to(root)}/, {layout.depth.relative_to(root)}/, {layout.poses.file.relative_to(root)} and {source}"
+    warnings = [f"read as RGB-D from {places}; poses are taken as camera-to-world"]
+    if len(frames) < len(images):
+        warnings.append(f"{len(images) - len(frames)} of {counted(len(images), 'image')} have no (finite) pose and are not used")
+    capture = assemble("rgbd", root, frames, warnings, ordered=True, metric=scale is not None, depth_scale=scale or 1.0, alpha=False)
+    return capture if scale is not None else _in_own_unit(capture)
+
+
+# ------------------------------------------------------------------------------------------------ what lies where
+
+
+def _words(name: str) -> set[str]:
+    return set(re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower()))
+
+
+def _folders(root: Path) -> list[Path]:
+    """Folders at most two down, those higher up first; links are not followed."""
+    out = [root]
+    for base in out:
+        if len(base.relative_to(root).parts) < 2 and len(out) < MOST_FOLDERS:
+            children = [child for child in base.iterdir() if child.is_dir() and not child.is_symlink() and not child.name.startswith(".")]
+            out += sorted(children, key=lambda child: natural_key(child.name))
+    return out[1:MOST_FOLDERS]
+
+
+def _layout(root: Path) -> _Layout | None:
+    folders = _folders(root)
+    for depth in folders:
+        if not _words(depth.name) & DEPTH_WORDS or is_mask_folder(depth.name) or len(pictures_in(depth, DEPTH_FILES)) < 2:
+            continue
+        beside = [folder for folder in folders if folder.parent == depth.parent and not _words(folder.name) & NO_COLOUR]
+        ranked = sorted(
+            (folder for folder in beside if not is_mask_folder(folder.name) and len(pictures_in(folder)) > 1),
+            key=lambda folder: (not _words(folder.name) & COLOUR_WORDS, -len(pictures_in(folder))),
+        )
+        poses = _find_poses([depth.parent, root], beside) if ranked else None
+        if poses is not None:
+            return _Layout(ranked[0], depth, poses)
+    return None
+
+
+def _find_poses(places: Sequence[Path], folders: Sequence[Path]) -> _Poses | None:
+    """The first list of poses among files named so, or the folder of one matrix a file."""
+    for place in dict.fromkeys(places):
+        named = {file for pattern in POSE_FILES for file in files_in(place, pattern) if _words(file.stem) & POSE_WORDS}
+        for file in sorted(named, key=lambda file: (not _words(file.stem) & {"pose", "poses"}, natural_key(file.name))):
+            matrices, keys = _parse(file)
+            if len(matrices) > 1:
+                return _Poses(file, matrices, keys)
+    for folder in folders:
+        files = sorted(files_in(folder, "*.txt"), key=lambda file: natural_key(file.name))
+        if _words(folder.name) & POSE_WORDS and len(files) > 1:
+            one = [_parse(file)[0] for file in files]
+            if all(len(matrices) == 1 for matrices in one):
+                return _Poses(folder, np.concatenate(one), [file.stem for file in files])
+    return None
+
+
+def _parse(file: Path) -> tuple[Array, list[str]]:
+    """Poses of a text file as (N, 4, 4), and what stands before each; none where it holds something else."""
+    none: tuple[Array, list[str]] = np.zeros((0, 4, 4)), []
+    try:
+        text = read_text(file)
+    except InputError:
+        return none
+    rows: list[tuple[list[str], list[float]]] = []
+    for line in text.splitlines():
+        words = re.sub(r"[,;\[\]]", " ", line.split("#")[0]).split()
+        if not words:
+            continue
+        count = next((at for at, word in enumerate(reversed(words)) if not WORD.fullmatch(word)), len(words))
+        rows.append((words[: len(words) - count], [float(word) for word in words[len(words) - count :]]))
+    rows = rows[1:] if rows and not rows[0][1] else rows  # a table's heading
+    if not rows or len({len(numbers) for _, numbers in rows}) != 1 or any(len(before) > 1 for before, _ in rows):
+        return none
+    table = np.array([numbers for _, numbers in rows], dtype=np.float64)
+    width = table.shape[1]
+    keys = [before[0] for before, _ in rows] if all(before for before, _ in rows) else []
+    if width == 4 and not keys and len(table) % 4 == 0:
+        return _whole(table.reshape(-1, 4, 4)), []
+    if width in (8, 13, 17) and not keys:
+        keys, table, width = [repr(float(value)) for value in table[:, 0]], table[:, 1:], width - 1
+    if width == 16:
+        return _whole(table.reshape(-1, 4, 4)), keys
+    if width == 12:
+        bottom = np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(table), 1, 1))
+        return np.concatenate([table.reshape(-1, 3, 4), bottom], axis=1), keys
+    if width == 7:
+        out = np.full((len(table), 4, 4), np.nan)
+        for at in np.flatnonzero(np.isfinite(table).all(axis=1) & (np.abs(table[:, 3:]).max(axis=1) > 0)):
+            out[at] = rigid(table[at, [6, 3, 4, 5]], table[at, :3], f"{file}, row {at + 1}")
+        return out, keys
+    return none
+
+
+def _whole(matrices: Array) -> Array:
+    """The matrices, of those written column by column transposed; none where they are no poses."""
+    last = np.array([0.0, 0.0, 0.0, 1.0])
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    for some in (matrices, matrices.transpose(0, 2, 1)):
+        if finite.any() and np.allclose(some[finite, 3], last, atol=1e-6):
+            return some
+    return matrices[:0]
+
+
+# ------------------------------------------------------------------------------------------------ what belongs together
+
+
+def _numbers(paths: Sequence[Path]) -> list[tuple[int, ...]] | None:
+    """The numbers in each name that are not the same in all; None where they do not tell the files apart."""
+    found = [tuple(int(number) for number in re.findall(r"[0-9]{1,18}", path.stem)) for path in paths]
+    if len({len(numbers) for numbers in found}) != 1:
+        return None
+    differ = [at for at in range(len(found[0])) if len({numbers[at] for numbers in found}) > 1]
+    out = [tuple(numbers[at] for at in differ) for numbers in found]
+    return out if differ and len(set(out)) == len(out) else None
+
+
+def _times(names: Sequence[str]) -> Array | None:
+    try:
+        out = np.array([float(name) for name in names])
+    except ValueError:
+        return None
+    return out if np.isfinite(out).all() else None
+
+
+def _nearest(wanted: Array, times: Array) -> dict[int, int]:
+    """Index of a wanted time → that of the nearest time, where it is near enough."""
+    order = np.argsort(times)
+    between = (times[order][1:] + times[order][:-1]) / 2
+    near = order[np.searchsorted(between, wanted)]
+    return {index: int(at) for index, at in enumerate(near) if abs(times[at] - wanted[index]) <= NEAR}
+
+
+def _pairs(images: Sequence[Path], others: Sequence[Path]) -> dict[int, int]:
+    """Index of an image → that of the other file of its name, its number, or (names that are times) the nearest time; else empty."""
+    stems = {other.stem: at for at, other in enumerate(others)}
+    out = {index: stems[image.stem] for index, image in enumerate(images) if image.stem in stems}
+    if out:
+        return out
+    mine, theirs = _times([image.stem for image in images]), _times([other.stem for other in others])
+    if mine is not None and theirs is not None and ((mine % 1 != 0).any() or (theirs % 1 != 0).any()):
+        return _nearest(mine, theirs)
+    keys, other_keys = _numbers(images), _numbers(others)
+    if keys is None or other_keys is None:
+        return {}
+    place = {key: at for at, key in enumerate(other_keys)}
+    return {index: place[key] for index, key in enumerate(keys) if key in place}
+
+
+def _depths_of(images: Sequence[Path], depths: Sequence[Path], root: Path) -> dict[int, Path]:
+    pairs = _pairs(images, depths)
+    if not pairs and len(images) == len(depths):
+        pairs = {index: index for index in range(len(images))}
+    if not pairs:
+        raise InputError(
+            f"{root}: the names of {counted(len(images), 'image')} ({images[0].name}, …) and {counted(len(depths), 'depth map')} "
+            f"({depths[0].name}, …) do not fit each other; number both in the same way"
+        )
+    return {index: depths[at] for index, at in pairs.items()}
+
+
+def _poses_of(images: Sequence[Path], poses: _Poses, root: Path) -> dict[int, Array]:
+    """Index of an image → its pose: by name, by time or number, by row."""
+    pairs: dict[int, int] = {}
+    if poses.keys:
+        pairs = _pairs(images, [Path(key.replace("\\", "/")) for key in poses.keys]) if _times(poses.keys) is None else {}
+        mine, theirs = _times([image.stem for image in images]), _times(poses.keys)
+        numbers = _numbers(images)
+        if not pairs and theirs is not None:
+            if mine is not None and (theirs % 1 != 0).any():
+                pairs = _nearest(mine, theirs)
+            elif numbers is not None and len(numbers[0]) == 1 and (theirs % 1 == 0).all():
+                place = {int(key): at for at, key in enumerate(theirs)}
+                pairs = {index: place[number] for index, (number,) in enumerate(numbers) if number in place}
+    if not pairs and len(images) == len(poses.matrices):
+        pairs = {index: index for index in range(len(images))}
+    if not pairs and not poses.keys:
+        numbers = _numbers(images)
+        if numbers is not None and len(numbers[0]) == 1 and max(numbers)[0] < len(poses.matrices):
+            pairs = {index: number for index, (number,) in enumerate(numbers)}  # every n-th frame of a longer list
+    if not pairs:
+        raise InputError(
+            f"{root} holds {counted(len(images), 'image')} but {poses.file.name} {counted(len(poses.matrices), 'pose')}, and neither times "
+            "nor numbers in the names tell which belong together; give one pose for each image, in the images' order"
+        )
+    return {index: poses.matrices[at] for index, at in pairs.items()}
+
+
+# ------------------------------------------------------------------------------------------------ camera and unit
+
+
+def _camera(root: Path, layout: _Layout, size: tuple[int, int]) -> tuple[Intrinsics, float | None, str]:
+    """The colour camera, stored depth values for each unit (None: not given), and the file that has them.
+
+    Raises:
+        InputError: no file has a camera.
+    """
+    candidates = []
+    for place in dict.fromkeys((layout.depth.parent, root, layout.colour)):
+        for pattern in ("*.yaml", "*.yml", "*.json", "*.txt", "*.cfg"):
+            candidates += [file for file in files_in(place, pattern) if file != layout.poses.file]
+    named = [file for file in candidates if _words(file.stem) & CAMERA_WORDS or file.suffix in (".yaml", ".yml")]
+    order = sorted(named, key=lambda file: (bool(_words(file.stem) & DEPTH_WORDS), natural_key(file.name)))
+    for file in order:
+        values = _values(file)
+        if values:
+            camera = _intrinsics(values, size, str(file))
+            factor = next((values[key][0] for key in DEPTH_FACTORS if key in values), None)
+            if factor is not None and not 0 < factor < 1e9:
+                raise InputError(f"{file}: the depth factor is {factor:g}, it must be positive; correct it")
+            return camera, factor, file.relative_to(root).as_posix()
+    raise InputError(
+        f"{root} holds colour, depth and poses ({layout.poses.file.name}) but no camera; "
+        "add intrinsics.txt with fx fy cx cy (pixels), or a 3×3 matrix"
+    )
+
+
+def _values(file: Path) -> dict[str, list[float]]:
+    """`fx: 535.4`, `"cx": 320`, `data: [ … ]` and the like by their last name in lower case; a text of numbers alone is a matrix or four
+    values. Empty where there is no camera."""
+    try:
+        text = re.sub(r"#[^\n]*", "", read_text(file, MOST_CAMERA))
+    except InputError:
+        return {}
+    words = re.sub(r"[,;\[\]]", " ", text).split()
+    if words and all(NUMBER.fullmatch(word) for word in words):
+        numbers = [float(word) for word in words]
+        if len(numbers) in (9, 12, 16):
+            return {"matrix": np.array(numbers).reshape({9: (3, 3), 12: (3, 4), 16: (4, 4)}[len(numbers)])[:3, :3].ravel().tolist()}
+        return dict(zip(("fx", "fy", "cx", "cy"), ([value] for value in numbers), strict=True)) if len(numbers) == 4 else {}
+    out: dict[str, list[float]] = {}
+    for name, value in VALUE.findall(_without_nesting(text)):
+        numbers = [float(number) for number in NUMBER.findall(value)]
+        if numbers:
+            out.setdefault(name.split(".")[-1].lower(), numbers)
+    for key in ("intrinsic_matrix", "camera_matrix", "k", "matrix"):
+        if len(out.get(key, ())) == 9:
+            matrix = np.array(out[key]).reshape(3, 3)
+            out["matrix"] = (matrix.T if abs(matrix[2, 0]) > 1 else matrix).ravel().tolist()  # Open3D's is column by column
+    if len(out.get("intrinsics", ())) == 4:
+        out.update({name: [value] for name, value in zip(("fx", "fy", "cx", "cy"), out["intrinsics"], strict=True)})
+    return out if "matrix" in out or all(name in out for name in ("fx", "fy", "cx", "cy")) else {}
+
+
+def _without_nesting(text: str) -> str:
+    """Lists of lists as one list; a matrix's `data` (OpenCV's yaml) under the matrix's own name."""
+    flat = re.sub(r"\]\s{0,99},\s{0,99}\[", ", ", re.sub(r"\[\s{0,99}\[", "[", re.sub(r"\]\s{0,99}\]", "]", text)))
+    line = r"\n[ \t]{1,20}(?:rows|cols|dt)[ \t]{0,20}:[^\n]{0,80}"
+    return re.sub(rf"\b(\w{{1,60}})[ \t]{{0,20}}:[^\n]{{0,80}}(?:{line}){{1,3}}\n[ \t]{{1,20}}data[ \t]{{0,20}}:", r"\1:", flat)
+
+
+def _intrinsics(values: dict[str, list[float]], size: tuple[int, int], where: str) -> Intrinsics:
+    """The camera for images of `size`: as given, or scaled from the size that the file gives. Pixel centres are at whole numbers."""
+    width, height = (
+        round(next((values[key][0] for key in keys if key in values), default))
+        for keys, default in zip((("width", "image_width", "w"), ("height", "image_height", "h")), size, strict=True)
+    )
+    if not (0 < width < 10**6 and 0 < height < 10**6):
+        raise InputError(f"{where}: the image size {width}×{height} is not usable; correct it")
+    if "matrix" in values:
+        camera = from_matrix(np.array(values["matrix"]).reshape(3, 3), width, height, where)
+    else:
+        camera = sensor(width, height, *(values[name][0] for name in ("fx", "fy", "cx", "cy"))).checked(where)
+    lens = [values.get(name, [0.0])[0] for name in ("k1", "k2", "p1", "p2", "k3")]
+    if any(lens):
+        camera = replace(camera, lens=OPENCV, distortion=tuple(lens)).checked(where)
+    return fitted(camera.centred(where), size, where)
+
+
+def _in_own_unit(capture: Capture) -> Capture:
+    """With the unit of depth that nothing gives: of floating-point maps the poses' own, else millimetres if not another fits the poses."""
+    with_depth = [frame for frame in capture.frames if frame.depth is not None]
+    chosen = [with_depth[int(at)] for at in np.unique(np.linspace(0, len(with_depth) - 1, LOOKED_AT).round())] if with_depth else []
+    raw = [(frame, load_depth(frame, capture)) for frame in chosen]
+    whole = all(np.array_equal(depth, np.round(depth)) for _, depth in raw)
+    scaled = replace(capture, depth_scale=MILLIMETRES if whole else 1.0)
+    samples = []
+    for frame, depth in raw:
+        camera = frame.depth_intrinsics or frame.intrinsics
+        if camera is not None and frame.world_from_camera is not None and depth.any():
+            camera = fitted(camera, (depth.shape[1], depth.shape[0]), str(frame.depth))
+            samples.append(Sample.of(depth / np.float32(scaled.depth_scale), camera, frame.world_from_camera))
+    factor = _best_factor(samples)
+    scale = scaled.depth_scale / factor
+    how = "which fits the poses" if factor != 1 else "as is usual"
+    return replace(
+        scaled,
+        depth_scale=scale,
+        warnings=(*capture.warnings, f"no file gives the unit of depth; {scale:g} for each unit of the poses is taken, {how}"),
+    )
+
+
+def _best_factor(samples: Sequence[Sample]) -> float:
+    """What depth must be multiplied by to agree best with the poses; 1 where no factor is better than the usual unit."""
+    pairs = [(a, b) for a, b in combinations(samples, 2) if a.pose[:3, 2] @ b.pose[:3, 2] > 0.5]
+    scores = {factor: sum(agreement(a, b, factor) for a, b in pairs) for factor in (1.0, *FACTORS)}
+    best = max(scores, key=lambda factor: scores[factor])
+    return best if scores[best] > BETTER * scores[1.0] else 1.0
