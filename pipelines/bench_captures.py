@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +16,7 @@ import typer
 
 from pipelines.console import ConsoleProgress
 from pipelines.options import Budget, Config, Device, ImageSize, Json, Out, Pairs, Preset, Quiet, Threads, gather
+from toolkit.errors import Interrupted
 
 FILE = "captures"
 RUNS = "runs"  # OUT/runs/CAPTURE/VARIANT-SEED are ordinary run folders
@@ -128,19 +129,25 @@ def bench_captures(found: Sequence[Path], plan: Plan, jobs: int, progress: Conso
         progress.begin(FILE)
         began = time.monotonic()
         waiting = {pool.submit(runs_of, source, plan, progress): source for source in found}
+
+        def keep(future: Future[list[dict[str, Any]]]) -> None:
+            source = waiting.pop(future)
+            rows[source.name] = future.result()
+            progress.say(f"{shown(source)}: {said(rows[source.name][0])}")
+            put(found, rows, plan)
+            progress.update(len(rows), len(found), f"{len(rows)} of {len(found)}")
+
         try:
             while waiting:
                 progress.check()
-                done, _ = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
-                for future in done:
-                    source = waiting.pop(future)
-                    rows[source.name] = future.result()
-                    progress.say(f"{shown(source)}: {said(rows[source.name][0])}")
-                    put(found, rows, plan)
-                progress.update(len(rows), len(found), f"{len(rows)} of {len(found)}")
-        except BaseException:
+                for future in wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED).done:
+                    keep(future)
+        except BaseException as error:
             progress.request_stop()  # so that the others end their runs
             pool.shutdown(cancel_futures=True)
+            finished = [one for one in waiting if not one.cancelled() and one.exception() is None]
+            for future in finished if isinstance(error, Interrupted) else []:
+                keep(future)
             raise
         progress.finish(FILE, time.monotonic() - began, False)
     return put(found, rows, plan)
@@ -168,7 +175,7 @@ def worth(variant: str, first: dict[str, Any]) -> bool:
 
 def run_one(source: Path, plan: Plan, options: list[str], name: str, progress: ConsoleProgress) -> dict[str, Any]:
     """One run in a process of its own, as far as it came: `state` is "read", "refused" (bad input, with its sentence) or "failed"."""
-    from toolkit.errors import FieldfuseError, Interrupted, first_line
+    from toolkit.errors import FieldfuseError, first_line
     from toolkit.files import read_json, remove
     from toolkit.poses.child import end_reason, import_path, log_tail, run_logged
 

@@ -166,7 +166,7 @@ def test_what_is_finished_stays_when_the_user_stops(tmp_path: Path, monkeypatch:
     def run(source: Path, *_: Any) -> dict[str, Any]:
         if source.name == "b":
             progress.request_stop()
-            progress.check()
+        progress.check()
         return {"state": "refused", "error": "no", "kind": "llff", "poses": None}
 
     monkeypatch.setattr(bench_captures, "run_one", run)
