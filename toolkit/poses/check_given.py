@@ -1,0 +1,351 @@
+"""Poses that come with a capture are held against its images.
+
+Measured is the share of matches that agree with the epipolar geometry of the given poses, of matches that were found and verified without
+these (`two_view`). Right poses reach 0.8 to 1 where wrong ones reach 0.5 at most. Where the share is low, other readings of the poses are tried
+(`mistakes`): one that clearly fits, on pairs that had no part in choosing it too, is used. Poses that no reading saves are refused, if the
+evidence is strong: many pairs with parallax, most of which contradict even the rough motion. Noisy poses pass, since they are refined later.
+Single cameras that all of their matches contradict are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from toolkit.camera import Array, Intrinsics, invert
+from toolkit.capture.types import Capture
+from toolkit.errors import PoseError
+from toolkit.poses.mistakes import Reading, readings
+from toolkit.poses.points import Features
+from toolkit.poses.result import PoseResult, listed
+from toolkit.poses.two_view import Matches, deviation, find_matches, roughly_right
+from toolkit.progress import SILENT, Progress
+
+AS_IS = "as_is"
+MOST_IMAGES = 30  # that are matched at first
+MOST_SEARCHED = 300  # images that are matched when some of the first were wrong
+RUN = 3  # images next to each other that are looked at together
+NEAR = 8 / 3  # tolerances: so far off, poses are inexact rather than wrong
+FAR = 16 / 3  # tolerances: as far off as refining can mend
+FITS = 0.6  # share of matches that agree from which poses are taken as right
+BETTER = 0.25  # by which another reading must beat the given one
+CLEARLY = 0.1  # by which it must beat the next best of another geometry
+ROUGH = 0.3  # of the pairs with parallax: fewer that agree roughly with the poses contradict them
+FEW_PAIRS = 6  # pairs with parallax that a refusal needs
+LEAST_MATCHES = 100  # below which nothing is said
+WRONG, RIGHT = 0.25, 0.5  # share of a pair's matches that agree within `NEAR`: below, the pair contradicts; above, it confirms
+MOST_WRONG = 0.2  # share of the cameras that may be left out
+OUTLYING = 20.0  # times the median distance of cameras from their middle
+LOST = 100.0  # the same, of cameras that are left out if no match confirms them
+SUSPECTS = 8  # images that are looked at because their poses are odd
+SAME_TURN, SAME_WAY = 1.0, 5.0  # degrees within which two readings are one geometry
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well poses fit matches."""
+
+    share: float  # of matches that agree within the tolerance
+    matches: int
+    pairs: int
+
+    def __str__(self) -> str:
+        return f"matches agree with the poses: {100 * self.share:.0f}% of {self.matches:,} in {self.pairs} pairs"
+
+
+def check_given(
+    capture: Capture,
+    given: PoseResult,
+    convention: str = "auto",
+    progress: Progress = SILENT,
+    known: dict[str, Features] | None = None,
+) -> tuple[PoseResult, Agreement | None]:
+    """The poses as they fit the images, with warnings of what was changed or left out, and how well they do.
+
+    Args:
+        convention: `as_is` keeps the poses whatever is found; it is still said.
+        known: features by name; those found are added.
+
+    Returns:
+        the result, and None instead of an agreement where too few matches were found to say anything.
+
+    Raises:
+        PoseError: the poses contradict the images, and no other reading of them fits.
+    """
+    known = {} if known is None else known
+    frame_of = {frame.name: index for index, frame in enumerate(capture.frames)}
+    frames = [frame_of[name] for name in given.names]
+    posed = capture.with_frames(
+        [replace(capture.frames[index], intrinsics=camera) for index, camera in zip(frames, given.intrinsics, strict=True)]
+    )
+    poses = given.world_from_camera
+    twins = same_poses(poses)
+    chosen = choose_images(poses, twins)
+    matches = find_matches(posed, chosen, _links(chosen, twins), progress=progress, known=known)
+    checked, reading = given, None
+    agreement = _agreement(poses[chosen], matches)
+    if agreement.matches < LEAST_MATCHES:
+        checked, out = _leave_out(given, _outlying(poses, chosen, matches), set(), convention == AS_IS)
+        return checked, None
+    if agreement.share < FITS:
+        wrong = _contradicted(poses[chosen], matches)
+        sound = ~np.isin(matches.pairs, wrong).any(axis=1)
+        rest = matches.subset(sound)
+        few = len(wrong) <= MOST_WRONG * len(chosen) or set(wrong) <= {chosen.index(i) for i in chosen if twins[i] >= 0}
+        if not (few and len(rest.pair) >= LEAST_MATCHES and _agreement(poses[chosen], rest).share >= FITS):
+            reading, best = _other_reading(posed, poses, chosen, matches)
+            if reading is None:
+                return _doubt(capture, given, agreement, poses[chosen], matches, best, convention), agreement
+            if convention == AS_IS:
+                text = f"{_low(agreement)} of {_what(capture)}, and more would {reading.text}; they are kept as they came"
+                return replace(given, warnings=[*given.warnings, text]), agreement
+            matches = _seen_by(reading, matches, posed, chosen)
+            before, agreement = agreement, _agreement(reading.poses[chosen], matches)
+            checked = _read_so(given, reading)
+            checked.warnings.append(
+                f"the poses of {_what(capture)} do not fit its images as they came ({before.share:.0%} of {before.matches:,} matches agree); "
+                f"they fit {reading.text} ({agreement.share:.0%} agree), and are used so; --set poses.convention=as_is keeps them as they came"
+            )
+            poses = checked.world_from_camera
+    wrong = [chosen[i] for i in _contradicted(poses[chosen], matches)]
+    if wrong and len(chosen) < len(poses) <= MOST_SEARCHED and reading is None:
+        every = list(range(len(poses)))
+        more = find_matches(posed, every, alike=chosen, progress=progress, known=known)
+        wrong = _contradicted(poses, more)
+        chosen, matches = every, more
+    twin = {i for i in range(len(poses)) if twins[i] >= 0}
+    wrong = sorted({*wrong, *_twins_of(wrong, twins, chosen)})
+    lost = _outlying(poses, chosen, matches)
+    checked, out = _leave_out(checked, sorted({*wrong, *lost}), twin, convention == AS_IS)
+    if out:
+        keep = ~np.isin(np.array(chosen)[matches.pairs], out).any(axis=1)
+        agreement = _agreement(poses[chosen], matches.subset(keep))
+    return checked, agreement
+
+
+def best_fitting(captures: Sequence[Capture], progress: Progress = SILENT) -> int:
+    """Of several captures with the same images and poses from different sources, the one whose poses fit best; of equals the first."""
+    scores = []
+    for capture in captures:
+        known: dict[str, Features] = {}
+        posed = [i for i, frame in enumerate(capture.frames) if frame.world_from_camera is not None and frame.intrinsics is not None]
+        poses = np.array([capture.frames[i].world_from_camera for i in posed], dtype=np.float64).reshape(-1, 4, 4)
+        if len(poses) < 2:
+            scores.append(0.0)
+            continue
+        chosen = choose_images(poses, same_poses(poses))
+        matches = find_matches(capture, [posed[i] for i in chosen], progress=progress, known=known)
+        scores.append(float(_score(poses[chosen], matches)) if len(matches.pair) >= LEAST_MATCHES else 0.0)
+    return int(np.argmax(scores))
+
+
+# ------------------------------------------------------------------------------------------------- which images
+
+
+def same_poses(poses: Array) -> Array:
+    """(N,) number of the group of cameras with one and the same pose that each is in; -1 for those that are in none."""
+    _, group, count = np.unique(np.round(poses[:, :3].reshape(len(poses), -1), 9), axis=0, return_inverse=True, return_counts=True)
+    group = np.asarray(group).ravel()
+    return np.where(count[group] > 1, group, -1)
+
+
+def choose_images(poses: Array, twins: Array) -> list[int]:
+    """Up to about `MOST_IMAGES` images: all, or short runs spread over the capture, and with their neighbours those whose poses are odd."""
+    count = len(poses)
+    if count <= MOST_IMAGES:
+        return list(range(count))
+    centres = poses[:, :3, 3]
+    jump = np.zeros(count)
+    jump[1:-1] = np.linalg.norm(centres[1:-1] - 0.5 * (centres[:-2] + centres[2:]), axis=1)
+    far = _distances(centres)
+    odd = [i for group in np.unique(twins[twins >= 0]) for i in np.flatnonzero(twins == group)[:3]][:SUSPECTS]
+    odd += [int(i) for i in np.argsort(-far, kind="stable")[:2] if far[i] > OUTLYING]
+    odd += [int(i) for i in np.argsort(-jump, kind="stable")[:2]]
+    near = {j for i in odd for j in (i - 1, i, i + 1) if 0 <= j < count}
+    runs = max(2, (MOST_IMAGES - len(near)) // RUN)
+    starts = np.linspace(0, count - RUN, runs).round().astype(int)
+    return sorted(near | {int(start) + step for start in starts for step in range(RUN)})
+
+
+def _links(chosen: list[int], twins: Array) -> list[tuple[int, int]]:
+    """Pairs of cameras that are said to have one pose."""
+    groups: dict[int, list[int]] = {}
+    for position, index in enumerate(chosen):
+        if twins[index] >= 0:
+            groups.setdefault(int(twins[index]), []).append(position)
+    return [(group[0], other) for group in groups.values() for other in group[1 : 1 + SUSPECTS]]
+
+
+def _distances(centres: Array) -> Array:
+    """(N,) distance of each camera from their middle, in medians of it."""
+    distance = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    return np.asarray(distance / max(float(np.median(distance)), 1e-300))
+
+
+# ------------------------------------------------------------------------------------------------- what fits
+
+
+def _agreement(poses: Array, matches: Matches) -> Agreement:
+    off = deviation(poses, matches) if len(matches.pair) else np.zeros(0)
+    return Agreement(float(np.mean(off < 1)) if len(off) else 0.0, len(off), len(matches.pairs))
+
+
+def _score(poses: Array, matches: Matches) -> float:
+    """Mean of the shares that agree and that nearly agree: noise in otherwise right poses costs part of it."""
+    off = deviation(poses, matches)
+    return 0.5 * float(np.mean(off < 1) + np.mean(off < NEAR))
+
+
+def _seen_by(reading: Reading, matches: Matches, posed: Capture, chosen: Sequence[int]) -> Matches:
+    """The matches as the cameras of a reading see them."""
+    if reading.focal == 1 and not reading.centred:
+        return matches
+    cameras = [posed.frames[i].intrinsics for i in chosen]
+    shift = np.array([[(c.cx - c.width / 2) / c.fx, (c.cy - c.height / 2) / c.fy] for c in cameras if c is not None])
+    return matches.refocused(reading.focal, shift if reading.centred else np.zeros_like(shift))
+
+
+def _other_reading(posed: Capture, poses: Array, chosen: list[int], matches: Matches) -> tuple[Reading | None, Reading | None]:
+    """The reading of the poses that clearly fits, if one does; and the best guess, if there is one."""
+    first = np.arange(len(matches.pairs)) % 2 == 0
+    choosing, proving = matches.subset(first), matches.subset(~first)
+    if len(proving.pair) == 0:
+        return None, None
+    found = list(readings(poses, posed.kind))
+    scores = np.array([_score(r.poses[chosen], _seen_by(r, choosing, posed, chosen)) for r in found])
+    best = int(scores.argmax())
+    winner = found[best]
+    given = _score(poses[chosen], choosing)
+    if scores[best] < given + BETTER:
+        return None, None
+    rivals = [s for r, s in zip(found, scores, strict=True) if not _same(r, winner, chosen, matches)]
+    clear = scores[best] > max([given + BETTER, *(s + CLEARLY for s in rivals)]) and scores[best] >= FITS
+    proof = _score(winner.poses[chosen], _seen_by(winner, proving, posed, chosen))
+    proven = proof >= FITS and proof > _score(poses[chosen], proving) + BETTER
+    return (winner if clear and proven else None), (winner if scores[best] >= 0.5 else None)
+
+
+def _same(one: Reading, other: Reading, chosen: list[int], matches: Matches) -> bool:
+    """Whether two readings are nearly the same geometry of the matched pairs."""
+    if one is other:
+        return True
+    if abs(np.log(one.focal / other.focal)) > 0.25:
+        return False
+    i, j = matches.pairs.T
+    moved = [invert(r.poses[chosen][j]) @ r.poses[chosen][i] for r in (one, other)]
+    cosine = (np.einsum("nij,nij->n", moved[0][:, :3, :3], moved[1][:, :3, :3]) - 1) / 2
+    ways = [m[:, :3, 3] / np.maximum(np.linalg.norm(m[:, :3, 3], axis=1), 1e-300)[:, None] for m in moved]
+    turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    way = np.degrees(np.arccos(np.clip((ways[0] * ways[1]).sum(axis=1), -1, 1)))
+    return bool(np.median(turn) < SAME_TURN and np.median(way) < SAME_WAY)
+
+
+def _read_so(given: PoseResult, reading: Reading) -> PoseResult:
+    """The result by another reading. Points of the source may belong to the poses as they came, so they go."""
+
+    def lens(camera: Intrinsics) -> Intrinsics:
+        camera = replace(camera, fx=camera.fx * reading.focal, fy=camera.fy * reading.focal)
+        return replace(camera, cx=camera.width / 2, cy=camera.height / 2) if reading.centred else camera
+
+    return replace(
+        given,
+        intrinsics=[lens(camera) for camera in given.intrinsics],
+        world_from_camera=reading.poses,
+        points=None,
+        warnings=list(given.warnings),
+    )
+
+
+def _doubt(
+    capture: Capture, given: PoseResult, agreement: Agreement, poses: Array, matches: Matches, best: Reading | None, convention: str
+) -> PoseResult:
+    """Poses that do not fit and that no other reading saves: refused if the evidence is strong, else with a warning."""
+    rough = roughly_right(poses, matches)
+    near = float(np.mean(deviation(poses, matches) < FAR))
+    guess = f"; they would fit better {best.text}, but not clearly" if best is not None else ""
+    strong = len(rough) >= FEW_PAIRS and rough.mean() < ROUGH and agreement.share < RIGHT and near < 0.9
+    if strong and convention != AS_IS:
+        raise PoseError(
+            f"the poses that come with {capture.root} do not fit its images: {agreement.share:.0%} of {agreement.matches:,} matches in "
+            f"{agreement.pairs} pairs agree with them, {rough.mean():.0%} of {len(rough)} pairs with the motion{guess}; correct them, or find "
+            f"own poses with --poses sfm"
+        )
+    if agreement.share >= RIGHT and not strong:
+        return given
+    what = "are kept as they came" if strong else "may be inexact or wrong"
+    text = f"{_low(agreement)} of {_what(capture)}{guess}: they {what}; --poses sfm finds own ones"
+    return replace(given, warnings=[*given.warnings, text])
+
+
+def _low(agreement: Agreement) -> str:
+    return f"only {agreement.share:.0%} of {agreement.matches:,} matches agree with the poses"
+
+
+def _what(capture: Capture) -> str:
+    return str(capture.root.name or capture.root)
+
+
+# ------------------------------------------------------------------------------------------------- single cameras
+
+
+def _contradicted(poses: Array, matches: Matches) -> list[int]:
+    """Images whose verified pairs all contradict their poses, found one after the other: who is contradicted by a wrong one only stays."""
+    if len(matches.pair) == 0:
+        return []
+    off = deviation(poses, matches)
+    near, far = matches.by_pair(off < NEAR), matches.by_pair(off < FAR)
+    against, confirms = (near < WRONG) & (far < RIGHT), near >= RIGHT
+    alive = np.ones(len(matches.pairs), dtype=bool)
+    out: list[int] = []
+    while True:
+        bad = np.bincount(matches.pairs[alive & against].ravel(), minlength=len(poses))
+        good = np.bincount(matches.pairs[alive & confirms].ravel(), minlength=len(poses))
+        bad[good > 0] = 0
+        worst = int(bad.argmax())
+        if bad[worst] < 2:
+            return sorted(out)
+        out.append(worst)
+        alive &= (matches.pairs != worst).all(axis=1)
+
+
+def _twins_of(wrong: list[int], twins: Array, chosen: list[int]) -> list[int]:
+    """Images that were not looked at and have the very pose of others, all of which are wrong."""
+    bad, seen = set(wrong), set(chosen)
+    groups = {int(twins[i]) for i in wrong if twins[i] >= 0}
+    groups = {g for g in groups if all(int(i) in bad for i in np.flatnonzero(twins == g) if int(i) in seen)}
+    return [int(i) for g in groups for i in np.flatnonzero(twins == g) if int(i) not in seen]
+
+
+def _outlying(poses: Array, chosen: list[int], matches: Matches) -> list[int]:
+    """Cameras absurdly far from the others that no match confirms."""
+    far = _distances(poses[:, :3, 3])
+    off = deviation(poses[chosen], matches) if len(matches.pair) else np.zeros(0)
+    confirmed = np.unique(matches.pairs[matches.by_pair(off < NEAR) >= RIGHT]) if len(off) else []
+    held = {chosen[int(i)] for i in confirmed}
+    return [int(i) for i in np.flatnonzero(far > LOST) if int(i) not in held]
+
+
+def _leave_out(given: PoseResult, wrong: list[int], twins: set[int], as_is: bool) -> tuple[PoseResult, list[int]]:
+    """The result without the cameras `wrong`, where these are few, or have one pose for different images (`twins`)."""
+    count = len(given.names)
+    if not wrong or count - len(wrong) < 2:
+        return given, []
+    if len([i for i in wrong if i not in twins]) > MOST_WRONG * count or as_is:
+        text = f"the images contradict the poses of {len(wrong)} of {count} frames, which are kept"
+        return replace(given, warnings=[*given.warnings, f"{text}: {listed([given.names[i] for i in wrong])}"]), []
+    keep = [i for i in range(count) if i not in set(wrong)]
+    names = [given.names[i] for i in wrong]
+    same = sum(i in twins for i in wrong)
+    why = f" ({same} of them have one and the same pose for different images)" if same else ""
+    return replace(
+        given,
+        registered=len(keep),
+        names=[given.names[i] for i in keep],
+        intrinsics=[given.intrinsics[i] for i in keep],
+        world_from_camera=given.world_from_camera[keep],
+        models=[len(keep)],
+        missing=[*given.missing, *names],
+        warnings=[*given.warnings, f"{len(wrong)} of {count} frames are left out because the images contradict their poses{why}: {listed(names)}"],
+    ), wrong
