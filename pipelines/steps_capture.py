@@ -104,7 +104,9 @@ def last_of(job: Job, *names: str) -> list[str]:
 
 
 def find_camera_poses(job: Job, capture: Capture) -> PoseResult:
-    """Poses that the capture brings, or structure from motion."""
+    """Poses that the capture brings, as its images confirm them, or structure from motion."""
+    from toolkit.poses.check_given import VERSION as CHECKED
+    from toolkit.poses.check_given import check_given
     from toolkit.poses.given import given_poses
     from toolkit.poses.job import VERSION
     from toolkit.poses.result import PoseResult
@@ -116,7 +118,7 @@ def find_camera_poses(job: Job, capture: Capture) -> PoseResult:
 
     def make() -> PoseResult:
         if given:
-            return given_poses(capture)
+            return check_given(capture, given_poses(capture), settings.poses.convention, job.progress, job.features)
         set_seeds(settings.seed)
         return find_poses(capture, job.folder.path, settings.poses, settings.seed, settings.threads, job.progress)
 
@@ -125,8 +127,11 @@ def find_camera_poses(job: Job, capture: Capture) -> PoseResult:
         return [path]
 
     uses: list[Any] = [given]
-    if not given:
-        uses += [VERSION, asdict(settings.poses), settings.seed, pixel_state(capture)]
+    if given:
+        uses += [CHECKED, settings.poses.convention, pixel_state(capture)]
+    else:
+        found = {name: value for name, value in asdict(settings.poses).items() if name != "convention"}
+        uses += [VERSION, found, settings.seed, pixel_state(capture)]
     return job.stages.run(
         "poses",
         make=make,
@@ -151,11 +156,13 @@ def measure_scene(job: Job, posed: Capture) -> Scene:
 
     def make() -> Scene:
         set_seeds(job.settings.seed)
-        return describe_scene(posed, job.progress)
+        return describe_scene(posed, job.progress, job.features)
 
     uses = limit_of(job)
     after = last_of(job, "poses", "effects")
-    return job.stages.run("scene", make=make, save=save, load=lambda: Scene.from_dict(read_json(path)), uses=uses, after=after)
+    scene = job.stages.run("scene", make=make, save=save, load=lambda: Scene.from_dict(read_json(path)), uses=uses, after=after)
+    job.features.clear()
+    return scene
 
 
 def limit_of(job: Job) -> list[int] | None:

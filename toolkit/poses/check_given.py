@@ -10,7 +10,7 @@ Single cameras that all of their matches contradict are left out.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -23,19 +23,21 @@ from toolkit.poses.result import PoseResult, listed
 from toolkit.poses.two_view import Matches, deviation, find_matches, roughly_right
 from toolkit.progress import SILENT, Progress
 
+VERSION = 1  # of what is found; a change makes runs look again
 AS_IS = "as_is"
 MOST_IMAGES = 30  # that are matched at first
 MOST_SEARCHED = 300  # images that are matched when some of the first were wrong
 RUN = 3  # images next to each other that are looked at together
 NEAR = 8 / 3  # tolerances: so far off, poses are inexact rather than wrong
-FAR = 16 / 3  # tolerances: as far off as refining can mend
 FITS = 0.6  # share of matches that agree from which poses are taken as right
 BETTER = 0.25  # by which another reading must beat the given one
-CLEARLY = 0.1  # by which it must beat the next best of another geometry
-ROUGH = 0.3  # of the pairs with parallax: fewer that agree roughly with the poses contradict them
+CLEARLY = 0.1  # by which it must beat the next best of another geometry; where nearly all agrees less is enough (`BARELY`)
+BARELY = 0.03
+ROUGH = 0.4  # of the pairs with parallax: fewer that agree roughly with the poses contradict them (noise of 3° leaves 0.7)
+EXACT = 0.8  # median of the pairs' shares from which what is only nearly right stands out as wrong
 FEW_PAIRS = 6  # pairs with parallax that a refusal needs
 LEAST_MATCHES = 100  # below which nothing is said
-WRONG, RIGHT = 0.25, 0.5  # share of a pair's matches that agree within `NEAR`: below, the pair contradicts; above, it confirms
+WRONG, RIGHT = 0.3, 0.5  # share of a pair's matches that agree: below, the pair contradicts its poses; above, it confirms them
 MOST_WRONG = 0.2  # share of the cameras that may be left out
 OUTLYING = 20.0  # times the median distance of cameras from their middle
 LOST = 100.0  # the same, of cameras that are left out if no match confirms them
@@ -52,7 +54,7 @@ class Agreement:
     pairs: int
 
     def __str__(self) -> str:
-        return f"matches agree with the poses: {100 * self.share:.0f}% of {self.matches:,} in {self.pairs} pairs"
+        return f"matches agree with the poses: {self.share:.0%} of {self.matches:,} in {self.pairs} pairs"
 
 
 def check_given(
@@ -61,68 +63,56 @@ def check_given(
     convention: str = "auto",
     progress: Progress = SILENT,
     known: dict[str, Features] | None = None,
-) -> tuple[PoseResult, Agreement | None]:
-    """The poses as they fit the images, with warnings of what was changed or left out, and how well they do.
+) -> PoseResult:
+    """The poses as they fit the images, with warnings of what was changed or left out; `agreement` says how well they fit.
 
     Args:
         convention: `as_is` keeps the poses whatever is found; it is still said.
         known: features by name; those found are added.
 
-    Returns:
-        the result, and None instead of an agreement where too few matches were found to say anything.
-
     Raises:
         PoseError: the poses contradict the images, and no other reading of them fits.
     """
     known = {} if known is None else known
-    frame_of = {frame.name: index for index, frame in enumerate(capture.frames)}
-    frames = [frame_of[name] for name in given.names]
+    by_name = {frame.name: frame for frame in capture.frames}
     posed = capture.with_frames(
-        [replace(capture.frames[index], intrinsics=camera) for index, camera in zip(frames, given.intrinsics, strict=True)]
+        [replace(by_name[name], intrinsics=camera) for name, camera in zip(given.names, given.intrinsics, strict=True)]
     )
-    poses = given.world_from_camera
+    poses, keep_all = given.world_from_camera, convention == AS_IS
     twins = same_poses(poses)
     chosen = choose_images(poses, twins)
     matches = find_matches(posed, chosen, _links(chosen, twins), progress=progress, known=known)
-    checked, reading = given, None
-    agreement = _agreement(poses[chosen], matches)
+    checked, agreement, reading = given, _agreement(poses[chosen], matches), None
     if agreement.matches < LEAST_MATCHES:
-        checked, out = _leave_out(given, _outlying(poses, chosen, matches), set(), convention == AS_IS)
-        return checked, None
-    if agreement.share < FITS:
-        wrong = _contradicted(poses[chosen], matches)
-        sound = ~np.isin(matches.pairs, wrong).any(axis=1)
-        rest = matches.subset(sound)
-        few = len(wrong) <= MOST_WRONG * len(chosen) or set(wrong) <= {chosen.index(i) for i in chosen if twins[i] >= 0}
-        if not (few and len(rest.pair) >= LEAST_MATCHES and _agreement(poses[chosen], rest).share >= FITS):
-            reading, best = _other_reading(posed, poses, chosen, matches)
-            if reading is None:
-                return _doubt(capture, given, agreement, poses[chosen], matches, best, convention), agreement
-            if convention == AS_IS:
-                text = f"{_low(agreement)} of {_what(capture)}, and more would {reading.text}; they are kept as they came"
-                return replace(given, warnings=[*given.warnings, text]), agreement
-            matches = _seen_by(reading, matches, posed, chosen)
-            before, agreement = agreement, _agreement(reading.poses[chosen], matches)
-            checked = _read_so(given, reading)
-            checked.warnings.append(
-                f"the poses of {_what(capture)} do not fit its images as they came ({before.share:.0%} of {before.matches:,} matches agree); "
-                f"they fit {reading.text} ({agreement.share:.0%} agree), and are used so; --set poses.convention=as_is keeps them as they came"
-            )
-            poses = checked.world_from_camera
+        return _leave_out(given, _outlying(poses, chosen, matches), set(), keep_all)[0]
+    if agreement.share < FITS and not _few_wrong(poses[chosen], matches, twins[chosen]):
+        reading, guess = _other_reading(posed, poses, chosen, matches)
+        if reading is None:
+            return _told(_doubt(capture, given, agreement, poses[chosen], matches, guess, keep_all), agreement)
+        if keep_all:
+            text = f"{_low(agreement)} of {_what(capture)}, and more would {reading.text}; they are kept as they came"
+            return _told(replace(given, warnings=[*given.warnings, text]), agreement)
+        before, matches = agreement, _seen_by(reading, matches, posed, chosen)
+        agreement = _agreement(reading.poses[chosen], matches)
+        checked = _read_so(given, reading)
+        checked.warnings.append(
+            f"the poses of {_what(capture)} do not fit its images as they came ({before.share:.0%} of {before.matches:,} matches agree); they "
+            f"fit {reading.text} ({agreement.share:.0%} agree), and are used so; --set poses.convention=as_is keeps them as they came"
+        )
+        poses = checked.world_from_camera
     wrong = [chosen[i] for i in _contradicted(poses[chosen], matches)]
-    if wrong and len(chosen) < len(poses) <= MOST_SEARCHED and reading is None:
-        every = list(range(len(poses)))
-        more = find_matches(posed, every, alike=chosen, progress=progress, known=known)
-        wrong = _contradicted(poses, more)
-        chosen, matches = every, more
-    twin = {i for i in range(len(poses)) if twins[i] >= 0}
-    wrong = sorted({*wrong, *_twins_of(wrong, twins, chosen)})
-    lost = _outlying(poses, chosen, matches)
-    checked, out = _leave_out(checked, sorted({*wrong, *lost}), twin, convention == AS_IS)
-    if out:
-        keep = ~np.isin(np.array(chosen)[matches.pairs], out).any(axis=1)
-        agreement = _agreement(poses[chosen], matches.subset(keep))
-    return checked, agreement
+    if wrong and reading is None and len(chosen) < len(poses) <= MOST_SEARCHED:
+        everyone = list(range(len(poses)))
+        matches = find_matches(posed, everyone, alike=chosen, progress=progress, known=dict(known))
+        chosen, wrong = everyone, _contradicted(poses, matches)
+    wrong = sorted({*wrong, *_twins_of(wrong, twins, chosen), *_outlying(poses, chosen, matches)})
+    checked, out = _leave_out(checked, wrong, {int(i) for i in np.flatnonzero(twins >= 0)}, keep_all)
+    rest = matches.subset(~np.isin(np.array(chosen)[matches.pairs], out).any(axis=1))
+    return _told(checked, _agreement(poses[chosen], rest), reading)
+
+
+def _told(result: PoseResult, agreement: Agreement, reading: Reading | None = None) -> PoseResult:
+    return replace(result, agreement={**asdict(agreement), "reading": None if reading is None else reading.text})
 
 
 def best_fitting(captures: Sequence[Capture], progress: Progress = SILENT) -> int:
@@ -221,7 +211,8 @@ def _other_reading(posed: Capture, poses: Array, chosen: list[int], matches: Mat
     if scores[best] < given + BETTER:
         return None, None
     rivals = [s for r, s in zip(found, scores, strict=True) if not _same(r, winner, chosen, matches)]
-    clear = scores[best] > max([given + BETTER, *(s + CLEARLY for s in rivals)]) and scores[best] >= FITS
+    margin = min(CLEARLY, BARELY + 1 - scores[best])
+    clear = scores[best] >= FITS and scores[best] > max(rivals, default=0.0) + margin
     proof = _score(winner.poses[chosen], _seen_by(winner, proving, posed, chosen))
     proven = proof >= FITS and proof > _score(poses[chosen], proving) + BETTER
     return (winner if clear and proven else None), (winner if scores[best] >= 0.5 else None)
@@ -259,23 +250,23 @@ def _read_so(given: PoseResult, reading: Reading) -> PoseResult:
 
 
 def _doubt(
-    capture: Capture, given: PoseResult, agreement: Agreement, poses: Array, matches: Matches, best: Reading | None, convention: str
+    capture: Capture, given: PoseResult, agreement: Agreement, poses: Array, matches: Matches, guess: Reading | None, keep_all: bool
 ) -> PoseResult:
     """Poses that do not fit and that no other reading saves: refused if the evidence is strong, else with a warning."""
     rough = roughly_right(poses, matches)
-    near = float(np.mean(deviation(poses, matches) < FAR))
-    guess = f"; they would fit better {best.text}, but not clearly" if best is not None else ""
-    strong = len(rough) >= FEW_PAIRS and rough.mean() < ROUGH and agreement.share < RIGHT and near < 0.9
-    if strong and convention != AS_IS:
+    other = f"; they would fit better {guess.text}, but not clearly" if guess is not None else ""
+    strong = len(rough) >= FEW_PAIRS and rough.mean() < ROUGH and agreement.share < RIGHT
+    if strong and not keep_all:
         raise PoseError(
             f"the poses that come with {capture.root} do not fit its images: {agreement.share:.0%} of {agreement.matches:,} matches in "
-            f"{agreement.pairs} pairs agree with them, {rough.mean():.0%} of {len(rough)} pairs with the motion{guess}; correct them, or find "
+            f"{agreement.pairs} pairs agree with them, {rough.mean():.0%} of {len(rough)} pairs with the motion{other}; correct them, or find "
             f"own poses with --poses sfm"
         )
     if agreement.share >= RIGHT and not strong:
         return given
-    what = "are kept as they came" if strong else "may be inexact or wrong"
-    text = f"{_low(agreement)} of {_what(capture)}{guess}: they {what}; --poses sfm finds own ones"
+    inexact = "are inexact, and refined as far as the images allow" if len(rough) and rough.mean() > 1 - ROUGH else "may be inexact or wrong"
+    what = "are kept as they came" if strong else inexact
+    text = f"{_low(agreement)} of {_what(capture)}{other}: they {what}; --poses sfm finds own ones"
     return replace(given, warnings=[*given.warnings, text])
 
 
@@ -290,13 +281,25 @@ def _what(capture: Capture) -> str:
 # ------------------------------------------------------------------------------------------------- single cameras
 
 
+def _few_wrong(poses: Array, matches: Matches, twins: Array) -> bool:
+    """Whether the poses fit once a few wrong ones, or those that several images share (`twins` (N,) from 0), are left aside."""
+    wrong = _contradicted(poses, matches)
+    rest = matches.subset(~np.isin(matches.pairs, wrong).any(axis=1))
+    single = [i for i in wrong if twins[i] < 0]
+    return len(single) <= MOST_WRONG * len(poses) and len(rest.pair) >= LEAST_MATCHES and _agreement(poses, rest).share >= FITS
+
+
 def _contradicted(poses: Array, matches: Matches) -> list[int]:
     """Images whose verified pairs all contradict their poses, found one after the other: who is contradicted by a wrong one only stays."""
     if len(matches.pair) == 0:
         return []
     off = deviation(poses, matches)
-    near, far = matches.by_pair(off < NEAR), matches.by_pair(off < FAR)
-    against, confirms = (near < WRONG) & (far < RIGHT), near >= RIGHT
+    share, near = matches.by_pair(off < 1), matches.by_pair(off < NEAR)
+    one = np.abs(poses[matches.pairs[:, 0]] - poses[matches.pairs[:, 1]]).max(axis=(1, 2)) < 1e-9
+    # Two images with one pose are the same image, or one of the poses is wrong; that a third is right nobody can tell from them.
+    within = share if np.median(share) >= EXACT else near
+    against = np.where(one, share < RIGHT, within < WRONG)
+    confirms = (within >= RIGHT) & ~one
     alive = np.ones(len(matches.pairs), dtype=bool)
     out: list[int] = []
     while True:
@@ -322,17 +325,17 @@ def _outlying(poses: Array, chosen: list[int], matches: Matches) -> list[int]:
     """Cameras absurdly far from the others that no match confirms."""
     far = _distances(poses[:, :3, 3])
     off = deviation(poses[chosen], matches) if len(matches.pair) else np.zeros(0)
-    confirmed = np.unique(matches.pairs[matches.by_pair(off < NEAR) >= RIGHT]) if len(off) else []
+    confirmed = np.unique(matches.pairs[matches.by_pair(off < 1) >= FITS]) if len(off) else []
     held = {chosen[int(i)] for i in confirmed}
     return [int(i) for i in np.flatnonzero(far > LOST) if int(i) not in held]
 
 
-def _leave_out(given: PoseResult, wrong: list[int], twins: set[int], as_is: bool) -> tuple[PoseResult, list[int]]:
+def _leave_out(given: PoseResult, wrong: list[int], twins: set[int], keep_all: bool) -> tuple[PoseResult, list[int]]:
     """The result without the cameras `wrong`, where these are few, or have one pose for different images (`twins`)."""
     count = len(given.names)
     if not wrong or count - len(wrong) < 2:
         return given, []
-    if len([i for i in wrong if i not in twins]) > MOST_WRONG * count or as_is:
+    if len([i for i in wrong if i not in twins]) > MOST_WRONG * count or keep_all:
         text = f"the images contradict the poses of {len(wrong)} of {count} frames, which are kept"
         return replace(given, warnings=[*given.warnings, f"{text}: {listed([given.names[i] for i in wrong])}"]), []
     keep = [i for i in range(count) if i not in set(wrong)]
