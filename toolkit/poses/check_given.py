@@ -17,7 +17,7 @@ import numpy as np
 from toolkit.camera import Array, Intrinsics, invert
 from toolkit.capture.types import Capture
 from toolkit.errors import PoseError
-from toolkit.poses.mistakes import Reading, readings
+from toolkit.poses.mistakes import Reading, readings, refocused
 from toolkit.poses.points import Features
 from toolkit.poses.result import PoseResult, listed
 from toolkit.poses.two_view import Matches, deviation, find_matches, roughly_right
@@ -33,6 +33,9 @@ FITS = 0.6  # share of matches that agree from which poses are taken as right
 BETTER = 0.25  # by which another reading must beat the given one
 CLEARLY = 0.1  # by which it must beat the next best of another geometry; where nearly all agrees less is enough (`BARELY`)
 BARELY = 0.03
+LENS = 0.85  # share that agrees below which another focal length is tried, though the poses fit; it must beat the given one by `BETTER_LENS`
+BETTER_LENS = 0.1
+PLATEAU = 0.01  # of the score within which focal lengths fit alike
 ROUGH = 0.4  # of the pairs with parallax: fewer that agree roughly with the poses contradict them (noise of 3° leaves 0.7)
 EXACT = 0.8  # median of the pairs' shares from which what is only nearly right stands out as wrong
 FEW_PAIRS = 6  # pairs with parallax that a refusal needs
@@ -89,6 +92,9 @@ def check_given(
         reading, guess = _other_reading(posed, poses, chosen, matches)
         if reading is None:
             return _told(_doubt(capture, given, agreement, poses[chosen], matches, guess, keep_all), agreement)
+    elif agreement.share < LENS:
+        reading, _ = _other_reading(posed, poses, chosen, matches, lens_alone=True)
+    if reading is not None:
         if keep_all:
             text = f"{_low(agreement)} of {_what(capture)}, and more would {reading.text}; they are kept as they came"
             return _told(replace(given, warnings=[*given.warnings, text]), agreement)
@@ -197,33 +203,42 @@ def _seen_by(reading: Reading, matches: Matches, posed: Capture, chosen: Sequenc
     return matches.refocused(reading.focal, shift if reading.centred else np.zeros_like(shift))
 
 
-def _other_reading(posed: Capture, poses: Array, chosen: list[int], matches: Matches) -> tuple[Reading | None, Reading | None]:
-    """The reading of the poses that clearly fits, if one does; and the best guess, if there is one."""
+def _other_reading(
+    posed: Capture, poses: Array, chosen: list[int], matches: Matches, lens_alone: bool = False
+) -> tuple[Reading | None, Reading | None]:
+    """The reading of the poses that clearly fits, if one does; and the best guess, if there is one.
+
+    With `lens_alone` only other focal lengths are tried. Where there is depth, they are not: it may be of the same camera.
+    """
     first = np.arange(len(matches.pairs)) % 2 == 0
     choosing, proving = matches.subset(first), matches.subset(~first)
     if len(proving.pair) == 0:
         return None, None
-    found = list(readings(poses, posed.kind))
+    better = BETTER_LENS if lens_alone else BETTER
+    found = [r for r in readings(poses, posed.kind) if (not lens_alone and not r.of_lens) or (r.of_lens and not posed.has_depth)]
+    if not found:
+        return None, None
     scores = np.array([_score(r.poses[chosen], _seen_by(r, choosing, posed, chosen)) for r in found])
     best = int(scores.argmax())
     winner = found[best]
     given = _score(poses[chosen], choosing)
-    if scores[best] < given + BETTER:
+    if scores[best] < given + better:
         return None, None
+    if winner.focal != 1:  # what fits is a range of focal lengths, of which the middle is taken
+        alike = [r.focal for r, s in zip(found, scores, strict=True) if r.centred == winner.centred and s > scores[best] - PLATEAU]
+        winner = refocused(winner, float(np.exp(np.mean(np.log(alike)))))
     rivals = [s for r, s in zip(found, scores, strict=True) if not _same(r, winner, chosen, matches)]
     margin = min(CLEARLY, BARELY + 1 - scores[best])
     clear = scores[best] >= FITS and scores[best] > max(rivals, default=0.0) + margin
     proof = _score(winner.poses[chosen], _seen_by(winner, proving, posed, chosen))
-    proven = proof >= FITS and proof > _score(poses[chosen], proving) + BETTER
+    proven = proof >= FITS and proof > _score(poses[chosen], proving) + better
     return (winner if clear and proven else None), (winner if scores[best] >= 0.5 else None)
 
 
 def _same(one: Reading, other: Reading, chosen: list[int], matches: Matches) -> bool:
     """Whether two readings are nearly the same geometry of the matched pairs."""
-    if one is other:
+    if one is other or (one.of_lens and other.of_lens):
         return True
-    if abs(np.log(one.focal / other.focal)) > 0.25:
-        return False
     i, j = matches.pairs.T
     moved = [invert(r.poses[chosen][j]) @ r.poses[chosen][i] for r in (one, other)]
     cosine = (np.einsum("nij,nij->n", moved[0][:, :3, :3], moved[1][:, :3, :3]) - 1) / 2

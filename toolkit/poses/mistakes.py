@@ -8,7 +8,7 @@ quaternion, a camera's centre for a translation, swapped axes of positions, anot
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
@@ -31,6 +31,10 @@ class Reading:
     focal: float = 1.0  # times the given focal length
     centred: bool = False  # the principal point is the middle of the image
 
+    @property
+    def of_lens(self) -> bool:
+        return self.focal != 1 or self.centred
+
 
 def readings(poses: Array, kind: str) -> Iterator[Reading]:
     """Other ways to read `poses` (N, 4, 4), which a capture of this kind came with, those that change least first."""
@@ -49,8 +53,13 @@ def readings(poses: Array, kind: str) -> Iterator[Reading]:
     yield from _other(raw, inverse, axes)
     for factor, centred in product((1.0, *FOCAL), (False, True)):
         if factor != 1 or centred:
-            both = [f"with {factor:.2f} times the focal length"] * (factor != 1) + ["with the principal point in the middle"] * centred
-            yield Reading(" and ".join(both), poses, factor, centred)
+            yield refocused(Reading("", poses, factor, centred), factor)
+
+
+def refocused(reading: Reading, factor: float) -> Reading:
+    """A reading of the lens with another focal length."""
+    texts = [f"with {factor:.2f} times the focal length"] * (factor != 1) + ["with the principal point in the middle"] * reading.centred
+    return replace(reading, focal=factor, text=" and ".join(texts))
 
 
 def _other(raw: Array, inverse: Array, axes: Array) -> Iterator[Reading]:
