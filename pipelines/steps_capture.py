@@ -30,6 +30,8 @@ def find_capture(job: Job) -> Capture:
     from toolkit.capture.convert import to_convert
     from toolkit.capture.storage import capture_from_dict, capture_to_dict
 
+    from toolkit.capture.photos import with_unposed
+
     path = job.folder / "capture.json"
 
     def make() -> Capture:
@@ -40,13 +42,14 @@ def find_capture(job: Job) -> Capture:
         write_json(path, capture_to_dict(capture))
         return [path]
 
-    return job.stages.run(
+    found = job.stages.run(
         "capture",
         make=make,
         save=save,
         load=lambda: capture_from_dict(read_json(path)),
         uses=source_state(job.source, job.folder.path),
     )
+    return with_unposed(found) if job.settings.poses.source == "sfm" else found
 
 
 def choose_frames(job: Job, capture: Capture) -> Capture:

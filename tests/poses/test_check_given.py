@@ -15,6 +15,7 @@ from tests.conftest import shared_data
 from tests.poses.textured import CAMERA, arc, render
 from toolkit.camera import Array, invert
 from toolkit.capture import open_capture
+from toolkit.capture.photos import with_unposed
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import PoseError
 from toolkit.poses import check_given as module
@@ -270,3 +271,16 @@ def test_right_captures_raise_no_alarm(name):
     capture = open_capture(shared_data(name))
     result = check_given(capture, given_poses(capture))
     assert result.warnings == [] and result.missing == [] and result.agreement is not None and result.agreement["share"] > 0.9
+
+
+def test_a_model_of_a_few_of_many_images_is_refused_and_finding_poses_takes_all_of_them(folder, tmp_path):
+    for n in range(40):
+        (tmp_path / f"{n:02d}.png").write_bytes((folder / "00.png").read_bytes())
+    few = capture_of(RIGHT[:3], tmp_path)
+    few = replace(few, extra={"unregistered": 37}, warnings=("37 pictures beside these are not in the model and are left out", "another"))
+    with pytest.raises(PoseError, match=r"of 3 of 40 images only.*--poses sfm"):
+        given_poses(few)
+    whole = with_unposed(few)
+    assert [frame.name for frame in whole.frames] == [f"{n:02d}" for n in range(40)] and whole.warnings == ("another",)
+    assert sum(frame.world_from_camera is not None for frame in whole.frames) == 3 and with_unposed(whole) is whole
+    assert given_poses(replace(few, extra={"unregistered": 2})).registered == 3

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,20 @@ def read_photos(path: Path | str) -> Capture:
         for name, picture in zip(unique_names(pictures), pictures, strict=True)
     ]
     return assemble("photos", root, frames, remarks)
+
+
+def with_unposed(capture: Capture) -> Capture:
+    """The capture with those images beside its own, in the same folders, that its poses leave out: whoever finds poses anew can use them."""
+    if not capture.extra.get("unregistered"):
+        return capture
+    own = {frame.image for frame in capture.frames}
+    beside = [path for folder in sorted({path.parent for path in own}) for path in pictures_in(folder) if path not in own]
+    images = [*(frame.image for frame in capture.frames), *beside]
+    frames = [*capture.frames, *(Frame(name="", image=path, focal_prior=focal_from_exif(path)) for path in beside)]
+    named = [replace(frame, name=name) for frame, name in zip(frames, unique_names(images), strict=True)]
+    remarks = [text for text in capture.warnings if not text.endswith("are not in the model and are left out")]
+    whole = assemble(capture.kind, capture.root, named, remarks, alpha=capture.alpha)
+    return replace(capture, frames=whole.frames, warnings=whole.warnings, extra={**capture.extra, "unregistered": 0})
 
 
 def _once_each(pictures: list[Path]) -> tuple[list[Path], list[str]]:
