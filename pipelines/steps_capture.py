@@ -28,9 +28,8 @@ def find_capture(job: Job) -> Capture:
     from toolkit.capture import open_capture
     from toolkit.capture.checks import check_capture
     from toolkit.capture.convert import to_convert
-    from toolkit.capture.storage import capture_from_dict, capture_to_dict
-
     from toolkit.capture.photos import with_unposed
+    from toolkit.capture.storage import capture_from_dict, capture_to_dict
 
     path = job.folder / "capture.json"
 

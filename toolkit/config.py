@@ -33,8 +33,8 @@ class CaptureSettings:
 @dataclass
 class PosesSettings:
     source: str = "auto"  # auto | given | sfm: `sfm` ignores poses that the capture brings
-    # Of poses that the capture brings. auto: held against the images; what is read wrongly is corrected, what is wrong left out or refused |
-    # as_is: kept as they came, with a warning where they do not fit
+    # Of poses that the capture brings. auto: held against the images; what is read wrongly is corrected, what is wrong is left out or
+    # refused | as_is: kept as they came, with a warning where they do not fit
     convention: str = "auto"
     matching: str = "auto"  # auto | exhaustive | sequential
     image_size: int = 1600  # long side for feature extraction

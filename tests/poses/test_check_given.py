@@ -266,7 +266,7 @@ def test_the_images_looked_at_are_few_and_hold_the_odd_ones():
     assert len(chosen) <= 40 and {77, 78, 301} <= set(chosen)
 
 
-@pytest.mark.parametrize("name", ["fox_540x960", "llff_fern_8", "zoo/bart-toy", "zoo/kangaroo", "scannet_sample_11"])
+@pytest.mark.parametrize("name", ["llff_fern_8", "zoo/bart-toy", "scannet_sample_11"])
 def test_right_captures_raise_no_alarm(name):
     capture = open_capture(shared_data(name))
     result = check_given(capture, given_poses(capture))

@@ -203,11 +203,11 @@ def test_what_stands_against_what_moves_is_told_by_its_extent():
     assert standing(facts(21, [pair(n, n + 1) for n in range(20)], None)) == []
 
 
-def moved_features(world_turns: float, camera_turns: float, shift: tuple[float, float, float], far: float, seed: int = 0) -> tuple[Any, Any]:
-    """Pixels of an object's points, turned by some degrees or seen by a camera that moves, and of a background `far` away that stays."""
+def moved_features(world_turns: float, camera_turns: float, shift: tuple[float, ...], far: float, seed: int = 0) -> tuple[Any, Any]:
+    """Pixels of an object's points, turned by some degrees or seen by a camera that moves, and of a background `far` away."""
     random = np.random.default_rng(seed)
     k = np.array([[600, 0, 320], [0, 600, 240], [0, 0, 1.0]])
-    thing = random.uniform(-1, 1, (80, 3)) + [0, 0, 5]
+    thing = random.uniform([-1, -1, 4], [1, 1, 6], (80, 3))
     wall = np.concatenate([random.uniform(-0.5, 0.5, (60, 2)), np.ones((60, 1))], axis=1) * far
     turn = cv2.Rodrigues(np.array([0, np.radians(world_turns), 0]))[0]
     after = np.concatenate([(thing - [0, 0, 5]) @ turn.T + [0, 0, 5], wall])

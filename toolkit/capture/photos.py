@@ -58,7 +58,7 @@ def read_photos(path: Path | str) -> Capture:
 
 
 def with_unposed(capture: Capture) -> Capture:
-    """The capture with those images beside its own, in the same folders, that its poses leave out: whoever finds poses anew can use them."""
+    """The capture with those images beside its own, in the same folders, that have no poses: whoever finds poses anew can use them."""
     if not capture.extra.get("unregistered"):
         return capture
     own = {frame.image for frame in capture.frames}

@@ -1,9 +1,9 @@
 """Poses that come with a capture are held against its images.
 
 Measured is the share of matches that agree with the epipolar geometry of the given poses, of matches that were found and verified without
-these (`two_view`). Right poses reach 0.8 to 1 where wrong ones reach 0.5 at most. Where the share is low, other readings of the poses are tried
-(`mistakes`): one that clearly fits, on pairs that had no part in choosing it too, is used. Poses that no reading saves are refused, if the
-evidence is strong: many pairs with parallax, most of which contradict even the rough motion. Noisy poses pass, since they are refined later.
+these (`two_view`). Right poses reach 0.7 to 1 where wrong ones mostly stay below 0.5. Where the share is low, other readings of the poses
+are tried (`mistakes`): one that clearly fits, on pairs that had no part in choosing it too, is used. Poses that no reading saves are
+refused if the evidence is strong: many pairs with parallax, most of which contradict even the rough motion. Noisy poses pass.
 Single cameras that all of their matches contradict are left out.
 """
 
@@ -33,8 +33,7 @@ FITS = 0.6  # share of matches that agree from which poses are taken as right
 BETTER = 0.25  # by which another reading must beat the given one
 CLEARLY = 0.1  # by which it must beat the next best of another geometry; where nearly all agrees less is enough (`BARELY`)
 BARELY = 0.03
-LENS = 0.85  # share that agrees below which another focal length is tried, though the poses fit; it must beat the given one by `BETTER_LENS`
-BETTER_LENS = 0.1
+LENS, BETTER_LENS = 0.85, 0.1  # share below which another focal length is tried though the poses fit, and by how much it must be better
 PLATEAU = 0.01  # of the score within which focal lengths fit alike
 ROUGH = 0.4  # of the pairs with parallax: fewer that agree roughly with the poses contradict them (noise of 3° leaves 0.7)
 EXACT = 0.8  # median of the pairs' shares from which what is only nearly right stands out as wrong
@@ -102,8 +101,8 @@ def check_given(
         agreement = _agreement(reading.poses[chosen], matches)
         checked = _read_so(given, reading)
         checked.warnings.append(
-            f"the poses of {_what(capture)} do not fit its images as they came ({before.share:.0%} of {before.matches:,} matches agree); they "
-            f"fit {reading.text} ({agreement.share:.0%} agree), and are used so; --set poses.convention=as_is keeps them as they came"
+            f"the poses of {_what(capture)} do not fit its images as they came ({before.share:.0%} of {before.matches:,} matches agree); "
+            f"they fit {reading.text} ({agreement.share:.0%} agree), and are used so; --set poses.convention=as_is keeps them as they came"
         )
         poses = checked.world_from_camera
     wrong = [chosen[i] for i in _contradicted(poses[chosen], matches)]
@@ -113,7 +112,7 @@ def check_given(
         chosen, wrong = everyone, _contradicted(poses, matches)
     wrong = sorted({*wrong, *_twins_of(wrong, twins, chosen), *_outlying(poses, chosen, matches)})
     checked, out = _leave_out(checked, wrong, {int(i) for i in np.flatnonzero(twins >= 0)}, keep_all)
-    rest = matches.subset(~np.isin(np.array(chosen)[matches.pairs], out).any(axis=1))
+    rest = matches.subset(matches.without(np.isin(chosen, out)))
     return _told(checked, _agreement(poses[chosen], rest), reading)
 
 
@@ -274,12 +273,13 @@ def _doubt(
     if strong and not keep_all:
         raise PoseError(
             f"the poses that come with {capture.root} do not fit its images: {agreement.share:.0%} of {agreement.matches:,} matches in "
-            f"{agreement.pairs} pairs agree with them, {rough.mean():.0%} of {len(rough)} pairs with the motion{other}; correct them, or find "
-            f"own poses with --poses sfm"
+            f"{agreement.pairs} pairs agree with them, {rough.mean():.0%} of {len(rough)} pairs with the motion{other}; correct them, or "
+            f"find own poses with --poses sfm"
         )
     if agreement.share >= RIGHT and not strong:
         return given
-    inexact = "are inexact, and refined as far as the images allow" if len(rough) and rough.mean() > 1 - ROUGH else "may be inexact or wrong"
+    noisy = len(rough) >= FEW_PAIRS and rough.mean() > 1 - ROUGH
+    inexact = "are inexact, and refined as far as the images allow" if noisy else "may be inexact or wrong"
     what = "are kept as they came" if strong else inexact
     text = f"{_low(agreement)} of {_what(capture)}{other}: they {what}; --poses sfm finds own ones"
     return replace(given, warnings=[*given.warnings, text])
@@ -299,7 +299,7 @@ def _what(capture: Capture) -> str:
 def _few_wrong(poses: Array, matches: Matches, twins: Array) -> bool:
     """Whether the poses fit once a few wrong ones, or those that several images share (`twins` (N,) from 0), are left aside."""
     wrong = _contradicted(poses, matches)
-    rest = matches.subset(~np.isin(matches.pairs, wrong).any(axis=1))
+    rest = matches.subset(matches.without(np.isin(np.arange(len(poses)), wrong)))
     single = [i for i in wrong if twins[i] < 0]
     return len(single) <= MOST_WRONG * len(poses) and len(rest.pair) >= LEAST_MATCHES and _agreement(poses, rest).share >= FITS
 
@@ -340,8 +340,7 @@ def _outlying(poses: Array, chosen: list[int], matches: Matches) -> list[int]:
     """Cameras absurdly far from the others that no match confirms."""
     far = _distances(poses[:, :3, 3])
     off = deviation(poses[chosen], matches) if len(matches.pair) else np.zeros(0)
-    confirmed = np.unique(matches.pairs[matches.by_pair(off < 1) >= FITS]) if len(off) else []
-    held = {chosen[int(i)] for i in confirmed}
+    held = {chosen[int(i)] for i in matches.pairs[matches.by_pair(off < 1) >= FITS].ravel()} if len(off) else set()
     return [int(i) for i in np.flatnonzero(far > LOST) if int(i) not in held]
 
 
@@ -357,6 +356,7 @@ def _leave_out(given: PoseResult, wrong: list[int], twins: set[int], keep_all: b
     names = [given.names[i] for i in wrong]
     same = sum(i in twins for i in wrong)
     why = f" ({same} of them have one and the same pose for different images)" if same else ""
+    text = f"{len(wrong)} of {count} frames are left out because the images contradict their poses{why}: {listed(names)}"
     return replace(
         given,
         registered=len(keep),
@@ -365,5 +365,5 @@ def _leave_out(given: PoseResult, wrong: list[int], twins: set[int], keep_all: b
         world_from_camera=given.world_from_camera[keep],
         models=[len(keep)],
         missing=[*given.missing, *names],
-        warnings=[*given.warnings, f"{len(wrong)} of {count} frames are left out because the images contradict their poses{why}: {listed(names)}"],
+        warnings=[*given.warnings, text],
     ), wrong

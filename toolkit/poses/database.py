@@ -227,8 +227,8 @@ def _matched_places(keypoints: dict[int, Array], first: int, second: int, matche
 def stands(here: Array, there: Array) -> tuple[float, bool] | None:
     """Whether many features stay where they are in two pictures while others move together; None where nothing of the kind is seen.
 
-    What is very far away stands still, too, before a camera that moves and does not turn: then all that moves goes away from one point, near
-    or infinitely far.
+    What is very far away stands still, too, before a camera that moves and does not turn: then all that moves goes away from one point,
+    near or infinitely far.
 
     Returns:
         the share of the picture's area that the standing ones take up, and whether the moving ones go other ways than from one point: then

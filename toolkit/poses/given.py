@@ -27,8 +27,8 @@ def given_poses(capture: Capture) -> PoseResult:
     beside = int(capture.extra.get("unregistered") or 0)
     if len(posed) < FEW and len(posed) < SHARE * (len(posed) + beside):
         raise PoseError(
-            f"{capture.root}: the poses that come with it are of {len(posed)} of {len(posed) + beside} images only, so they hardly are of these "
-            f"images; find poses of all with --poses sfm"
+            f"{capture.root}: the poses that come with it are of {len(posed)} of {len(posed) + beside} images only, so they hardly are of "
+            f"these images; find poses of all with --poses sfm"
         )
     poses = np.array([frame.world_from_camera for frame in posed], dtype=np.float64)
     cameras = [frame.intrinsics.checked(f"{capture.root}, {frame.name}") for frame in posed if frame.intrinsics is not None]

@@ -281,7 +281,7 @@ def fold(facts: dict[str, Any], ordered: bool) -> list[str]:
 
 
 def standing(facts: dict[str, Any]) -> list[str]:
-    """A warning where something stands still in the images of many pairs while the rest moves, in some of them as no camera motion explains.
+    """A warning where something stands still in the images of many pairs while the rest moves, in some as no camera motion explains.
 
     In most pairs of a turntable's neighbouring images all moves sideways, as before a camera that does so.
     """
@@ -293,12 +293,12 @@ def standing(facts: dict[str, Any]) -> list[str]:
     found = f"what stands still in the images, in {len(extents)} of {len(pairs)} matched pairs, contradicts what moves"
     if float(np.median(extents)) < MARK:
         return [
-            f"{found}, and takes up a small part of them: a watermark, a clock or a part of the camera's mount is in view; give masks that leave "
-            f"it out"
+            f"{found}, and takes up a small part of them: a watermark, a clock or a part of the camera's mount is in view; give masks that "
+            f"leave it out"
         ]
     return [
-        f"{found}: the object was turned before a standing camera, or large things move along with the camera; poses are of a mixture of both. "
-        f"Give masks of the object, or film it before a plain background, or walk around it while nothing turns"
+        f"{found}: the object was turned before a standing camera, or large things move along with the camera, and poses mix both; "
+        f" give masks of the object, film it before a plain background, or walk around it while nothing turns"
     ]
 
 

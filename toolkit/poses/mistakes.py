@@ -68,7 +68,8 @@ def _other(raw: Array, inverse: Array, axes: Array) -> Iterator[Reading]:
     turned = np.swapaxes(rotation, 1, 2)
     text = "with rotations transposed (rows for columns) and positions kept"
     yield Reading(text, _axes(_joined(turned, centre), axes))
-    yield Reading("with rotations transposed (rows for columns) and translations kept", _axes(invert(_joined(rotation, inverse[:, :3, 3])), axes))
+    text = "with rotations transposed (rows for columns) and translations kept"
+    yield Reading(text, _axes(invert(_joined(rotation, inverse[:, :3, 3])), axes))
     for given in (raw, inverse):
         for order, name in (((3, 0, 1, 2), "qx qy qz qw, not qw qx qy qz"), ((1, 2, 3, 0), "qw qx qy qz, not qx qy qz qw")):
             read = _joined(from_quaternion(to_quaternion(given[:, :3, :3])[:, order]), given[:, :3, 3])

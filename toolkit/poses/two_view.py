@@ -63,6 +63,10 @@ class Matches:
             moved=self.moved[keep],
         )
 
+    def without(self, images: Array) -> Array:
+        """(P,) whether a pair holds none of the `images` (N,) bool."""
+        return ~(images[self.pairs[:, 0]] | images[self.pairs[:, 1]])
+
     def refocused(self, factor: float, shift: Array) -> Matches:
         """The same matches seen through cameras of `factor` times the focal length whose image-plane points lie `shift` (N, 2) further."""
         first, second = (shift[self.pairs[self.pair, side]] for side in (0, 1))
@@ -221,7 +225,7 @@ def own_motions(matches: Matches) -> tuple[Array, Array, Array]:
 
 
 def roughly_right(poses: Array, matches: Matches) -> Array:
-    """Of the pairs with parallax, whether `poses` turn and move the camera roughly as the pair's own essential matrix does: noisy poses do."""
+    """Of the pairs with parallax, whether `poses` turn and move the camera roughly as the pair's own essential matrix does."""
     rotations, directions, angles = own_motions(matches)
     relative = invert(poses[matches.pairs[:, 1]]) @ poses[matches.pairs[:, 0]]
     cosine = (np.einsum("pij,pij->p", rotations, relative[:, :3, :3]) - 1) / 2
