@@ -11,6 +11,7 @@ from pipelines.options import Json, Quiet
 
 if TYPE_CHECKING:
     from toolkit.capture.types import Capture
+    from toolkit.progress import Progress
 
 
 OUTDATED = (
@@ -59,12 +60,14 @@ def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
     from toolkit.capture.beside import unused
     from toolkit.capture.checks import check_capture
 
-    capture = open_capture(source)
+    capture, agreement = open_capture(source), None
     if not fast:
         progress = make_progress(quiet)
         with progress.listening():
             progress.begin("checking")
             capture = check_capture(capture, progress)
+            agreement, doubts = check_poses(capture, progress)
+            capture = capture.with_frames(capture.frames, *doubts)
     return {
         "source": str(source),
         **describe_capture(capture),
@@ -75,8 +78,25 @@ def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
         "ordered": capture.ordered,
         "depth_scale": capture.depth_scale if capture.has_depth else None,
         "unused": unused(capture),
+        "poses": agreement,
         "warnings": list(capture.warnings),
     }
+
+
+def check_poses(capture: Capture, progress: Progress) -> tuple[str | None, list[str]]:
+    """How well the poses that a capture brings fit its images, in a line, and what a run would warn of or refuse."""
+    from toolkit.errors import PoseError
+    from toolkit.poses.check_given import Agreement, check_given
+    from toolkit.poses.given import given_poses
+
+    if capture.filmed or not capture.posed:
+        return None, []
+    try:
+        result = check_given(capture, given_poses(capture), progress=progress)
+    except PoseError as error:
+        return None, [str(error)]
+    found = result.agreement
+    return None if found is None else str(Agreement(found["share"], found["matches"], found["pairs"])), result.warnings
 
 
 def lenses(capture: Capture) -> list[dict[str, Any]]:

@@ -6,7 +6,7 @@ import os
 import random
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pipelines.total_budget import TotalBudget
     from toolkit.effects.correct import Corrections
     from toolkit.keyframes import KeyFrames
+    from toolkit.poses.points import Features
 
 CAMERAS = "transforms.json"
 MOST_A_CORE, LEAST_MOST_THREADS = 4, 64  # threads that may be asked for: more of them only wait for each other
@@ -42,6 +43,7 @@ class Job:
     keys: KeyFrames | None = None  # the key frames, once chosen
     corrections: Corrections | None = None  # of effects, once found
     network: NetworkField | None = None  # the networks' field, once this command has made or loaded it
+    features: dict[str, Features] = field(default_factory=dict)  # of images by name, once this command has looked for them
     formats: list[str] | None = None  # to be exported this time, whatever the settings say
     alone: bool = False  # exports are all that was asked for
     plan: TotalBudget | None = None  # chooses settings as the run goes on, so that it takes as long as was asked for

@@ -28,6 +28,7 @@ def find_capture(job: Job) -> Capture:
     from toolkit.capture import open_capture
     from toolkit.capture.checks import check_capture
     from toolkit.capture.convert import to_convert
+    from toolkit.capture.photos import with_unposed
     from toolkit.capture.storage import capture_from_dict, capture_to_dict
 
     path = job.folder / "capture.json"
@@ -42,13 +43,14 @@ def find_capture(job: Job) -> Capture:
         write_json(path, capture_to_dict(capture))
         return [path]
 
-    return job.stages.run(
+    found = job.stages.run(
         "capture",
         make=make,
         save=save,
         load=lambda: capture_from_dict(read_json(path)),
         uses=state if masks == "auto" else [state, masks],
     )
+    return with_unposed(found) if job.settings.poses.source == "sfm" else found
 
 
 def choose_frames(job: Job, capture: Capture) -> Capture:
@@ -106,7 +108,9 @@ def last_of(job: Job, *names: str) -> list[str]:
 
 
 def find_camera_poses(job: Job, capture: Capture) -> PoseResult:
-    """Poses that the capture brings, or structure from motion."""
+    """Poses that the capture brings, as its images confirm them, or structure from motion."""
+    from toolkit.poses.check_given import VERSION as CHECKED
+    from toolkit.poses.check_given import check_given
     from toolkit.poses.given import given_poses
     from toolkit.poses.job import VERSION
     from toolkit.poses.result import PoseResult
@@ -118,7 +122,7 @@ def find_camera_poses(job: Job, capture: Capture) -> PoseResult:
 
     def make() -> PoseResult:
         if given:
-            return given_poses(capture)
+            return check_given(capture, given_poses(capture), settings.poses.convention, job.progress, job.features)
         set_seeds(settings.seed)
         return find_poses(capture, job.folder.path, settings.poses, settings.seed, settings.threads, job.progress)
 
@@ -127,8 +131,11 @@ def find_camera_poses(job: Job, capture: Capture) -> PoseResult:
         return [path]
 
     uses: list[Any] = [given]
-    if not given:
-        uses += [VERSION, asdict(settings.poses), settings.seed, pixel_state(capture)]
+    if given:
+        uses += [CHECKED, settings.poses.convention, pixel_state(capture)]
+    else:
+        found = {name: value for name, value in asdict(settings.poses).items() if name != "convention"}
+        uses += [VERSION, found, settings.seed, pixel_state(capture)]
     return job.stages.run(
         "poses",
         make=make,
@@ -153,11 +160,13 @@ def measure_scene(job: Job, posed: Capture) -> Scene:
 
     def make() -> Scene:
         set_seeds(job.settings.seed)
-        return describe_scene(posed, job.progress)
+        return describe_scene(posed, job.progress, job.features)
 
     uses = limit_of(job)
     after = last_of(job, "poses", "effects")
-    return job.stages.run("scene", make=make, save=save, load=lambda: Scene.from_dict(read_json(path)), uses=uses, after=after)
+    scene = job.stages.run("scene", make=make, save=save, load=lambda: Scene.from_dict(read_json(path)), uses=uses, after=after)
+    job.features.clear()
+    return scene
 
 
 def limit_of(job: Job) -> list[int] | None:

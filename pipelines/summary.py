@@ -84,6 +84,7 @@ def describe_poses(poses: PoseResult) -> dict[str, Any]:
         "models": poses.models,
         "missing": poses.missing,
         "seconds": poses.seconds,
+        "agreement": poses.agreement,
     }
 
 

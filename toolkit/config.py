@@ -34,6 +34,9 @@ class CaptureSettings:
 @dataclass
 class PosesSettings:
     source: str = "auto"  # auto | given | sfm: `sfm` ignores poses that the capture brings
+    # Of poses that the capture brings. auto: held against the images; what is read wrongly is corrected, what is wrong is left out or
+    # refused | as_is: kept as they came, with a warning where they do not fit
+    convention: str = "auto"
     matching: str = "auto"  # auto | exhaustive | sequential
     image_size: int = 1600  # long side for feature extraction
     max_features: int = 4096
@@ -187,6 +190,7 @@ CHOICES = {
     "device": ("auto", "cpu", "cuda"),
     "capture.masks": ("auto", "inverted", "off"),
     "poses.source": ("auto", "given", "sfm"),
+    "poses.convention": ("auto", "as_is"),
     "poses.matching": ("auto", "exhaustive", "sequential"),
     "poses.features": ("auto", "sift", "xfeat"),
     "field.decoder": ("deferred", "per_sample"),

@@ -17,6 +17,7 @@ from toolkit.poses.health import (
     rotation_residual,
     runs,
     shortfalls,
+    standing,
     turned_only,
     way,
 )
@@ -188,3 +189,54 @@ def test_missing_frames_are_grouped_by_cause():
 @pytest.mark.parametrize("count", [0, 1])
 def test_nothing_to_work_with(count):
     assert hopeless([picture(n) for n in range(count)]) is not None
+
+
+def test_what_stands_against_what_moves_is_told_by_its_extent():
+    def told(extent: float, standing_pairs: int, against: int) -> list[str]:
+        stands = [(extent, n < against) if n < standing_pairs else None for n in range(30)]
+        return standing(facts(31, [pair(n, n + 1) | {"stands": one} for n, one in enumerate(stands)], None))
+
+    assert "turned before a standing camera" in told(0.5, 12, 6)[0] and "12 of 30" in told(0.5, 12, 6)[0]
+    assert "watermark" in told(0.01, 30, 30)[0]
+    assert told(0.5, 12, 2) == []  # far mountains, and an estimate or two that failed
+    assert told(0.5, 2, 2) == []
+    assert standing(facts(21, [pair(n, n + 1) for n in range(20)], None)) == []
+
+
+def moved_features(world_turns: float, camera_turns: float, shift: tuple[float, ...], far: float, seed: int = 0) -> tuple[Any, Any]:
+    """Pixels of an object's points, turned by some degrees or seen by a camera that moves, and of a background `far` away."""
+    random = np.random.default_rng(seed)
+    k = np.array([[600, 0, 320], [0, 600, 240], [0, 0, 1.0]])
+    thing = random.uniform([-1, -1, 4], [1, 1, 6], (80, 3))
+    wall = np.concatenate([random.uniform(-0.5, 0.5, (60, 2)), np.ones((60, 1))], axis=1) * far
+    turn = cv2.Rodrigues(np.array([0, np.radians(world_turns), 0]))[0]
+    after = np.concatenate([(thing - [0, 0, 5]) @ turn.T + [0, 0, 5], wall])
+    after = after @ cv2.Rodrigues(np.array([0, np.radians(camera_turns), 0]))[0].T + shift
+    seen = [points @ k.T for points in (np.concatenate([thing, wall]), after)]
+    here, there = (points[:, :2] / points[:, 2:] for points in seen)
+    return here, there + random.normal(0, 0.3, there.shape)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_object_turned_before_a_standing_camera_contradicts_its_background(seed):
+    pytest.importorskip("pycolmap")
+    from toolkit.poses.database import stands
+
+    found = stands(*moved_features(20, 0, (0, 0, 0), 9, seed))
+    assert found is not None and found[0] > 0.2
+    sideways = stands(*moved_features(0, 0, (0.5, 0.1, 0), 1e5, seed))  # before far mountains
+    forward = stands(*moved_features(0, 0, (0, 0, -0.8), 1e5, seed))
+    assert all(one is None or not one[1] for one in (sideways, forward))
+    assert stands(*moved_features(0, 4, (0.4, 0, 0), 9, seed)) is None  # a camera that moves and turns: nothing stands still
+    assert stands(*moved_features(0, 0, (0, 0, 0), 9, seed)) is None  # nothing moves
+
+
+def test_an_object_turned_about_the_line_of_sight_leaves_no_point_to_go_away_from():
+    pytest.importorskip("pycolmap")
+    from toolkit.poses.database import stands
+
+    random = np.random.default_rng(3)
+    thing, rest = random.uniform(220, 420, (80, 2)), random.uniform(0, 640, (60, 2))
+    turn = cv2.Rodrigues(np.array([0, 0, np.radians(30)]))[0][:2, :2]
+    found = stands(np.concatenate([thing, rest]), np.concatenate([(thing - 320) @ turn.T * [1, 0.6] + 320, rest]))
+    assert found is not None and found[1] and found[0] > 0.3

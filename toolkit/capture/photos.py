@@ -11,6 +11,7 @@ import os
 import re
 import warnings
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +91,20 @@ def read_photos(path: Path | str) -> Capture:
     return assemble("photos", root, frames, remarks)
 
 
+def with_unposed(capture: Capture) -> Capture:
+    """The capture with those images beside its own, in the same folders, that have no poses: whoever finds poses anew can use them."""
+    if not capture.extra.get("unregistered"):
+        return capture
+    own = {frame.image for frame in capture.frames}
+    beside = [path for folder in sorted({path.parent for path in own}) for path in pictures_in(folder) if path not in own]
+    images = [*(frame.image for frame in capture.frames), *beside]
+    frames = [*capture.frames, *(Frame(name="", image=path, focal_prior=focal_from_exif(path)) for path in beside)]
+    named = [replace(frame, name=name) for frame, name in zip(frames, unique_names(images), strict=True)]
+    remarks = [text for text in capture.warnings if not text.endswith("are not in the model and are left out")]
+    whole = assemble(capture.kind, capture.root, named, remarks, alpha=capture.alpha)
+    return replace(capture, frames=whole.frames, warnings=whole.warnings, extra={**capture.extra, "unregistered": 0})
+
+
 def _may_hold_photos(name: str) -> bool:
     words = set(re.findall(r"[a-z]+", name.lower()))
     return not (name.startswith((".", "__")) or words & NO_PHOTOS or is_mask_folder(name) or SMALLER.fullmatch(name.lower()))
@@ -141,7 +156,6 @@ def _numbered(name: str) -> str:
     """What folders of one kind share: `cam` of `cam1` and `cam_2`; empty for a name without a number."""
     match = re.fullmatch(r"([a-z]+)[ _-]*[0-9]+", name.lower())
     return match[1] if match else ""
-
 
 def _once_each(pictures: list[Path]) -> tuple[list[Path], list[str]]:
     """The pictures without those `.heic` that lie beside another picture of their name, as phones and programs leave them that convert

@@ -25,6 +25,12 @@ GUESSED_FOCAL = 1.2  # of the long side, when nothing is known
 MIN_INLIERS = 15  # COLMAP's own bound for a verified pair
 ENLARGED = 2.0  # times at most that an image is enlarged for learned features, which are found to a pixel: SIFT does so by itself
 
+# Of the extent of the matched features: what moves less stands still, what moves more moves, and what is off a line by less lies on it.
+STANDING, MOVING, OFF = 0.0025, 0.01, 0.004
+LEAST_STANDING, STANDING_SHARE = 8, 0.15  # matches that stand still, and their share, that are worth looking at
+LEAST_MOVING = 12  # matches that move, and that one epipolar geometry must explain
+STRAIGHT = 0.75  # share of them that go away from one point where the camera did not turn
+
 Report = Callable[[float, float, str], None]
 
 
@@ -193,11 +199,13 @@ def sketches(job: Job, database: pycolmap.Database) -> list[Array]:
 
 
 def pair_facts(job: Job, database: pycolmap.Database) -> list[dict[str, Any]]:
-    """Each verified pair: indices, matches, inliers, whether a homography explains it (with it), how far features moved."""
+    """Each verified pair: indices, matches, inliers, whether a homography explains it (with it), how far features moved, and what stands
+    still beside what moves (`stands`)."""
     index = {image.image_id: int(image.name) for image in database.read_all_images()}
     keypoints = {image_id: np.asarray(database.read_keypoints(image_id)).reshape(-1, 4) for image_id in index}
     configurations = pycolmap.TwoViewGeometryConfiguration
     flat = (configurations.PLANAR, configurations.PANORAMIC, configurations.PLANAR_OR_PANORAMIC)
+    matched = dict(zip(*database.read_all_matches(), strict=True))
     facts = []
     ids, geometries = database.read_two_view_geometries()
     for pair_id, geometry in zip(ids, geometries, strict=True):
@@ -216,6 +224,62 @@ def pair_facts(job: Job, database: pycolmap.Database) -> list[dict[str, Any]]:
                 "flat": explained,
                 "homography": homography.tolist() if explained and homography is not None else None,
                 "moved": float(np.median(np.linalg.norm(moved, axis=1))),
+                "stands": stands(*_matched_places(keypoints, first, second, matched.get(pair_id))),
             }
         )
     return facts
+
+
+def _matched_places(keypoints: dict[int, Array], first: int, second: int, matches: Array | None) -> tuple[Array, Array]:
+    """(M, 2) pixels of each match in both pictures; of none where a database has none."""
+    rows = np.zeros((0, 2), np.int64) if matches is None else np.asarray(matches).reshape(-1, 2)
+    return keypoints[first][rows[:, 0], :2], keypoints[second][rows[:, 1], :2]
+
+
+def stands(here: Array, there: Array) -> tuple[float, bool] | None:
+    """Whether many features stay where they are in two pictures while others move together; None where nothing of the kind is seen.
+
+    What is very far away stands still, too, before a camera that moves and does not turn: then all that moves goes away from one point,
+    near or infinitely far.
+
+    Returns:
+        the share of the picture's area that the standing ones take up, and whether the moving ones go other ways than from one point: then
+        no motion of one camera explains both.
+
+    Args:
+        here, there: (M, 2) pixels of matched features in two pictures.
+    """
+    if len(here) < 2 * LEAST_MOVING:
+        return None
+    here, there = here.astype(np.float64), there.astype(np.float64)
+    low, high = here.min(axis=0), here.max(axis=0)
+    side = float((high - low).max())
+    way = np.linalg.norm(here - there, axis=1)
+    still, moving = way < STANDING * side, way > MOVING * side
+    if still.sum() < max(LEAST_STANDING, STANDING_SHARE * len(here)) or moving.sum() < LEAST_MOVING:
+        return None
+    cv2.setRNGSeed(0)
+    matrix, inlier = cv2.findFundamentalMat(here[moving], there[moving], cv2.FM_RANSAC, 0.5 * OFF * side, 0.999, 2000)
+    if matrix is None or matrix.shape != (3, 3) or inlier.sum() < LEAST_MOVING:
+        return None
+    one, other = (points[moving][inlier.ravel() > 0] for points in (here, there))
+    inner = np.quantile(here[still], [0.1, 0.9], axis=0)
+    extent = float(np.prod((inner[1] - inner[0]) / np.maximum(high - low, 1e-9)))
+    return extent, straight(one, other, OFF * side) < STRAIGHT
+
+
+def straight(here: Array, there: Array, tolerance: float) -> float:
+    """The largest share of features (M, 2) → (M, 2) found that move on lines through one point, near or infinitely far, within `tolerance`
+    pixels."""
+    one, other = (np.concatenate([points, np.ones((len(points), 1))], axis=1) for points in (here, there))
+    lines = np.cross(one, other)
+    lines /= np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), 1e-12)
+    random = np.random.default_rng(0)
+    best = 0.0
+    for _ in range(200):
+        i, j = random.choice(len(lines), 2, replace=False)
+        point = np.cross(lines[i], lines[j])
+        through = np.cross(point, one)  # (M, 3) lines from the point through where features were
+        off = np.abs((through * other).sum(axis=1)) / np.maximum(np.hypot(through[:, 0], through[:, 1]), 1e-12)
+        best = max(best, float(np.mean(off < tolerance)))
+    return best

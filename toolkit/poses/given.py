@@ -8,12 +8,14 @@ from toolkit.capture.types import Capture
 from toolkit.errors import PoseError
 from toolkit.poses.result import GIVEN, PoseResult, listed
 
+FEW, SHARE = 6, 0.1  # images with poses, and their share of all, below which the model is a failed one, or of other images
+
 
 def given_poses(capture: Capture) -> PoseResult:
     """The frames that come with pose and intrinsics, as they are.
 
     Raises:
-        PoseError: fewer than two frames have both, or all cameras stand on one spot.
+        PoseError: fewer than two frames have both, hardly any of many images do, or all cameras stand on one spot.
     """
     posed = [frame for frame in capture.frames if frame.world_from_camera is not None and frame.intrinsics is not None]
     missing = [frame.name for frame in capture.frames if frame.world_from_camera is None or frame.intrinsics is None]
@@ -21,6 +23,12 @@ def given_poses(capture: Capture) -> PoseResult:
         raise PoseError(
             f"{capture.root}: {len(posed)} of {len(capture.frames)} frames come with a pose and intrinsics, at least 2 "
             f"are needed; use --set poses.source=sfm to find them"
+        )
+    beside = int(capture.extra.get("unregistered") or 0)
+    if len(posed) < FEW and len(posed) < SHARE * (len(posed) + beside):
+        raise PoseError(
+            f"{capture.root}: the poses that come with it are of {len(posed)} of {len(posed) + beside} images only, so they hardly are of "
+            f"these images; find poses of all with --poses sfm"
         )
     poses = np.array([frame.world_from_camera for frame in posed], dtype=np.float64)
     cameras = [frame.intrinsics.checked(f"{capture.root}, {frame.name}") for frame in posed if frame.intrinsics is not None]

@@ -23,6 +23,9 @@ STILL = 0.004  # features moved by less than this share of the long side: the ca
 SMALL_ANGLE = 1.5  # degrees; the median triangulation angle below which depth is guesswork
 PRETENDED = 5.0  # times the way that the pairs tell of: a model that moves its cameras so far has a wrong lens (true ones: at most once)
 TOO_FEW = 3  # registered frames that make a model at all
+SHARE_STANDING = 0.1  # of the pairs, in which something stands still while the rest moves
+FEW_STANDING, SHARE_AGAINST = 5, 0.02  # pairs, and their share, in which no camera motion explains both
+MARK = 0.1  # of the image: what stands still on less is an overlay rather than a background
 AGREES = 0.7  # share of a frame's matches that agree with its place where that can be trusted (0.70 at least in right ones, but for one)
 
 
@@ -274,6 +277,28 @@ def fold(facts: dict[str, Any], ordered: bool) -> list[str]:
     return [
         f"{folded['contradicting']} pairs of neighbouring frames contradict the poses found: places that look alike may have been taken "
         f"for one; film with more of what differs in view, such as the floor and things around"
+    ]
+
+
+def standing(facts: dict[str, Any]) -> list[str]:
+    """A warning where something stands still in the images of many pairs while the rest moves, in some as no camera motion explains.
+
+    In most pairs of a turntable's neighbouring images all moves sideways, as before a camera that does so.
+    """
+    pairs = facts["pairs"]
+    extents = [pair["stands"][0] for pair in pairs if pair.get("stands")]
+    against = sum(pair["stands"][1] for pair in pairs if pair.get("stands"))
+    if len(extents) < SHARE_STANDING * len(pairs) or against < max(FEW_STANDING, SHARE_AGAINST * len(pairs)):
+        return []
+    found = f"what stands still in the images, in {len(extents)} of {len(pairs)} matched pairs, contradicts what moves"
+    if float(np.median(extents)) < MARK:
+        return [
+            f"{found}, and takes up a small part of them: a watermark, a clock or a part of the camera's mount is in view; give masks that "
+            f"leave it out"
+        ]
+    return [
+        f"{found}: the object was turned before a standing camera, or large things move along with the camera, and poses mix both; "
+        f" give masks of the object, film it before a plain background, or walk around it while nothing turns"
     ]
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
 from toolkit.camera import FISHEYE, Array, Intrinsics, distort, invert
 from toolkit.capture.images import load_image, turns_by_exif, usable_pixels
-from toolkit.capture.types import Capture
+from toolkit.capture.types import Capture, Frame
 from toolkit.poses.cloud import Cloud, every
 from toolkit.poses.overlap import best_neighbours, guessed_depth, overlap, parallax
 from toolkit.progress import SILENT, Progress
@@ -22,12 +24,26 @@ REPROJECTION = 2.0  # working pixels
 MIN_ANGLE = 1.0  # degrees between rays
 
 
-def triangulate(capture: Capture, progress: Progress = SILENT) -> Cloud:
+@dataclass(frozen=True)
+class Features:
+    """SIFT features of one image."""
+
+    pixel: Array  # (N, 2) in pixels of the camera, centres at +0.5
+    descriptor: Array  # (N, 128) float32 unit length: root-SIFT
+    size: Array  # (N,) working pixels
+    scale: float  # working pixels a pixel of the camera
+
+
+def triangulate(capture: Capture, progress: Progress = SILENT, known: dict[str, Features] | None = None) -> Cloud:
     """Sparse points of a posed capture from up to 100 of its pictures, each matched with up to 4 that overlap.
 
     A point is kept when all of its observations reproject within 2 pixels (of the picture at a long side of 640), and two
     of its rays meet at more than 1°. The result may be empty.
+
+    Args:
+        known: features of images by name, found before.
     """
+    known = known or {}
     chosen = every(len(capture.frames), MOST_FRAMES)
     frames = [capture.frames[i] for i in chosen]
     exif = turns_by_exif(capture)
@@ -37,11 +53,10 @@ def triangulate(capture: Capture, progress: Progress = SILENT) -> Cloud:
     for i, (frame, camera) in enumerate(zip(frames, cameras, strict=True)):
         progress.check()
         progress.update(i, 2 * len(frames), f"points, picture {i + 1} of {len(frames)}")
-        picture = load_image(frame, exif=exif)
-        ideal, described, scale = _features(picture, usable_pixels(frame, picture, exif=exif), camera)
-        flat.append(ideal)
-        descriptors.append(described)
-        focal[i] = 0.5 * (camera.fx + camera.fy) * scale
+        found = known.get(frame.name) or features_of(frame, camera, exif)
+        flat.append(undistorted(camera, found.pixel))
+        descriptors.append(found.descriptor)
+        focal[i] = 0.5 * (camera.fx + camera.fy) * found.scale
     depth = guessed_depth(poses)
     shares, angles = overlap(poses, cameras, depth), parallax(poses, depth)
     partners = best_neighbours(poses, shares, angles, NEIGHBOURS)
@@ -51,11 +66,11 @@ def triangulate(capture: Capture, progress: Progress = SILENT) -> Cloud:
     for n, (i, j) in enumerate(pairs):
         progress.check()
         progress.update(len(frames) + n * len(frames) / len(pairs), 2 * len(frames), f"points, pair {n + 1} of {len(pairs)}")
-        found = mutual_matches(descriptors[i], descriptors[j])
-        if len(found):
-            off = epipolar_distance(poses[i], poses[j], flat[i][found[:, 0]], flat[j][found[:, 1]]) * 0.5 * (focal[i] + focal[j])
-            found = found[off < EPIPOLAR]
-            links.append(np.stack([found[:, 0] + starts[i], found[:, 1] + starts[j]], axis=1))
+        matched = mutual_matches(descriptors[i], descriptors[j])
+        if len(matched):
+            off = epipolar_distance(poses[i], poses[j], flat[i][matched[:, 0]], flat[j][matched[:, 1]]) * 0.5 * (focal[i] + focal[j])
+            matched = matched[off < EPIPOLAR]
+            links.append(np.stack([matched[:, 0] + starts[i], matched[:, 1] + starts[j]], axis=1))
     owner = np.repeat(np.arange(len(frames)), [len(f) for f in flat])
     track, keypoint = tracks(np.concatenate(links) if links else np.zeros((0, 2), np.int64), owner)
     image_plane = np.concatenate(flat) if flat else np.zeros((0, 2))
@@ -63,23 +78,35 @@ def triangulate(capture: Capture, progress: Progress = SILENT) -> Cloud:
     return Cloud(points, point, chosen[owner[keypoint[kept]]], z, "triangulated")
 
 
-def _features(picture: Array, usable: Array | None, camera: Intrinsics) -> tuple[Array, Array, float]:
-    """(N, 2) keypoints on the ideal image plane (x/z, y/z), (N, 128) float32 descriptors, and the working scale."""
+def features_of(frame: Frame, camera: Intrinsics, exif: bool) -> Features:
+    """SIFT features of a frame's image, of what its mask and alpha leave.
+
+    Raises:
+        InputError: the image or its mask cannot be read.
+    """
+    picture = load_image(frame, exif=exif)
+    return find_features(picture, camera, usable_pixels(frame, picture, exif=exif))
+
+
+def find_features(picture: Array, camera: Intrinsics, usable: Array | None = None) -> Features:
+    """SIFT features of a picture (H, W, 3 or 4) uint8 at a long side of 640, where it is `usable` (H, W) bool; None: everywhere."""
     height, width = picture.shape[:2]
     scale = min(1.0, LONG_SIDE / max(width, height))
     grey = cv2.cvtColor(np.ascontiguousarray(picture[..., :3]), cv2.COLOR_RGB2GRAY)
     small = grey if scale == 1.0 else cv2.resize(grey, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
     keypoints, descriptors = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.02).detectAndCompute(small, None)
     if descriptors is None or len(keypoints) == 0:
-        return np.zeros((0, 2)), np.zeros((0, 128), np.float32), scale * width / camera.width
+        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros(0, np.float32), scale * width / camera.width)
+    sizes = np.array([k.size for k in keypoints], dtype=np.float32)
     pixels = (np.array([k.pt for k in keypoints]) + 0.5) * [camera.width / small.shape[1], camera.height / small.shape[0]]
     if usable is not None:
         column = np.clip((pixels[:, 0] * width / camera.width).astype(int), 0, width - 1)
         row = np.clip((pixels[:, 1] * height / camera.height).astype(int), 0, height - 1)
-        pixels, descriptors = pixels[usable[row, column]], descriptors[usable[row, column]]
+        kept = usable[row, column]
+        pixels, descriptors, sizes = pixels[kept], descriptors[kept], sizes[kept]
     # Root-SIFT: Euclidean distances of these compare histograms better than those of plain descriptors.
     rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)).astype(np.float32)
-    return undistorted(camera, pixels), rooted, scale * width / camera.width
+    return Features(pixels, rooted, sizes, scale * width / camera.width)
 
 
 def undistorted(camera: Intrinsics, pixels: Array) -> Array:

@@ -33,6 +33,7 @@ class PoseResult:
     warnings: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)  # by step
     metric: bool = False  # one unit is one metre
+    agreement: dict[str, Any] | None = None  # of given poses with the images: `share`, `matches`, `pairs`, `reading`; None: not measured
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON. Points are kept to float32's seven digits, poses in full."""
@@ -50,6 +51,7 @@ class PoseResult:
             "warnings": list(self.warnings),
             "seconds": {key: round(float(value), 3) for key, value in self.seconds.items()},
             "metric": self.metric,
+            "agreement": self.agreement,
         }
 
     @classmethod
@@ -83,6 +85,7 @@ class PoseResult:
                 warnings=[str(text) for text in data["warnings"]],
                 seconds={str(key): float(value) for key, value in data["seconds"].items()},
                 metric=bool(data.get("metric", False)),
+                agreement=data.get("agreement"),
             )
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             raise InputError(f"poses.json is not what the poses stage writes ({first_line(error)}); remove it and run again") from error

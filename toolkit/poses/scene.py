@@ -13,7 +13,7 @@ from toolkit.errors import InputError, PoseError, first_line
 from toolkit.poses.cloud import Cloud, cloud_of_depth, cloud_of_points
 from toolkit.poses.gravity import camera_frame, tight_turn, turn_about_z
 from toolkit.poses.hull import silhouette_cloud
-from toolkit.poses.points import triangulate
+from toolkit.poses.points import Features, triangulate
 from toolkit.poses.region import FORWARD, ROOM, Layout, box, layout, points_of_interest
 from toolkit.progress import SILENT, Progress
 
@@ -97,8 +97,11 @@ class Scene:
             raise InputError(f"scene.json is not what the poses stage writes ({first_line(error)}); remove it and run again") from error
 
 
-def describe_scene(capture: Capture, progress: Progress = SILENT) -> Scene:
+def describe_scene(capture: Capture, progress: Progress = SILENT, known: dict[str, Features] | None = None) -> Scene:
     """Working frame, region of interest and depth range of a posed capture.
+
+    Args:
+        known: features of images by name, found before.
 
     Raises:
         PoseError: the capture is not posed, or too few points can be found to tell where the scene is.
@@ -112,7 +115,7 @@ def describe_scene(capture: Capture, progress: Progress = SILENT) -> Scene:
     near_zero = Similarity(1.0, rotation, -(rotation @ given[0, :3, 3]))
     local = _moved(capture, near_zero)
     poses = np.array([frame.world_from_camera for frame in local.frames], dtype=np.float64)
-    cloud = find_cloud(local, progress)
+    cloud = find_cloud(local, progress, known)
     if len(cloud.points) < FEW_POINTS or len(cloud.point) == 0:
         raise PoseError(
             f"{capture.root}: only {len(cloud.points)} points could be triangulated with the given poses: they or their axis convention "
@@ -150,7 +153,7 @@ def describe_scene(capture: Capture, progress: Progress = SILENT) -> Scene:
     )
 
 
-def find_cloud(capture: Capture, progress: Progress = SILENT) -> Cloud:
+def find_cloud(capture: Capture, progress: Progress = SILENT, known: dict[str, Features] | None = None) -> Cloud:
     """Points of a posed capture in the input's frame, from the best there is: silhouettes, depth, the source's own points, or
     triangulated."""
     if capture.alpha:
@@ -165,7 +168,7 @@ def find_cloud(capture: Capture, progress: Progress = SILENT) -> Cloud:
         cloud = cloud_of_points(capture, np.asarray(capture.points, dtype=np.float64), "source")
         if len(cloud.point) >= FEW_POINTS:
             return cloud
-    return triangulate(capture, progress)
+    return triangulate(capture, progress, known)
 
 
 def _moved(capture: Capture, move: Similarity) -> Capture:

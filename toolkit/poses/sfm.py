@@ -19,7 +19,7 @@ from toolkit.config import PosesSettings
 from toolkit.errors import FieldfuseError, InputError, PoseError
 from toolkit.files import read_json, remove
 from toolkit.poses.child import run_child
-from toolkit.poses.health import doubts, failure, fold, shortfalls
+from toolkit.poses.health import doubts, failure, fold, shortfalls, standing
 from toolkit.poses.job import GONE_FAR, GONE_ON, SIFT, XFEAT, Job, plan
 from toolkit.poses.result import SFM, PoseResult
 from toolkit.poses.sensor import scale_to_depth
@@ -67,7 +67,7 @@ def find_poses(
     facts = _run(job, seconds, progress)
     reason = failure(facts)
     if reason is not None:
-        raise PoseError(f"{capture.root}: {reason}")
+        raise PoseError(f"{capture.root}: {'; '.join([reason, *standing(facts)])}")
     result = _result(capture, job, facts)
     result.warnings += notes
     if capture.has_depth:
@@ -151,7 +151,7 @@ def _result(capture: Capture, job: Job, facts: dict[str, Any]) -> PoseResult:
     placed = [names[i] for i in model["pictures"]]
     known = set(placed)
     sizes = next(attempt["models"] for attempt in facts["attempts"] if attempt["attempt"] == model["attempt"])
-    warnings = [*shortfalls(facts), *doubts(facts), *fold(facts, job.sequential)]
+    warnings = [*standing(facts), *shortfalls(facts), *doubts(facts), *fold(facts, job.sequential)]
     strict = max(facts["attempts"][0]["models"], default=0)
     if model["attempt"] in (GONE_ON, GONE_FAR):
         warnings.append(f"{len(placed) - strict} of {len(placed)} frames were placed by fewer matches and smaller angles than the others")
