@@ -22,6 +22,7 @@ from toolkit.config import settings_dict
 from toolkit.files import write_json
 
 if TYPE_CHECKING:
+    from toolkit.camera import Array
     from toolkit.capture.types import Capture, Views
     from toolkit.poses.result import PoseResult
     from toolkit.poses.scene import Scene
@@ -109,8 +110,15 @@ def summarise_poses(job: Job, capture: Capture, poses: PoseResult) -> dict[str, 
     return {**data, "warnings": unique([*capture.warnings, *poses.warnings]), "exports": [{"path": "exports/cameras/transforms.json"}]}
 
 
-def put_cameras(folder: Path, poses: PoseResult, posed: Capture) -> None:
-    """Cameras as transforms.json and COLMAP text, to be put into the capture's folder: for the pictures as they lie there."""
+def put_cameras(
+    folder: Path, poses: PoseResult, posed: Capture, points: Array | None = None, colours: Array | None = None
+) -> None:
+    """Cameras as transforms.json and COLMAP text, to be put into the capture's folder: for the pictures as they lie there.
+
+    Args:
+        points, colours: (P, 3) of a surface in the input's frame, for poses that came without points: programs that start from points
+            need some.
+    """
     from toolkit.capture.convert import all_converted
     from toolkit.capture.select import SELECTED
     from toolkit.capture.stored import stored_cameras
@@ -124,7 +132,9 @@ def put_cameras(folder: Path, poses: PoseResult, posed: Capture) -> None:
     files = [next((path.relative_to(base).as_posix() for base in bases if path.is_relative_to(base)), str(path)) for path in paths]
     # Those of the frames that take part, which may be fewer than have a pose.
     intrinsics, world_from_camera = stored_cameras(posed)
-    write_cameras(folder, files, intrinsics, world_from_camera, poses.points)
+    if poses.points is not None and len(poses.points):
+        points, colours = poses.points, None
+    write_cameras(folder, files, intrinsics, world_from_camera, points, colours)
 
 
 def unique(texts: list[str]) -> list[str]:

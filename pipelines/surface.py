@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 SMALL_PART = 0.002  # components of a mesh with less than this share of its area are specks
 MOST_TRIANGLES = 2_000_000
 RENDERED_SIDE = 400  # pixels; pictures tell what is finer (`export.mesh_size`), and rendering it takes long
+MOST_SPARSE = 20_000  # points that go with exported cameras
 VIDEO_SIDE = 640
 FPS = 30
 
@@ -144,7 +145,7 @@ def export_field(job: Job, folder: Path, field: Field, poses: PoseResult, posed:
             undone |= surfaces
             facts["notes"].append(f"points and meshes were left out: {error}")
     if "cameras" in formats:
-        put_cameras(folder / "cameras", poses, posed)
+        put_cameras(folder / "cameras", poses, posed, *sparse_points(folder / "points.ply"))
         written += [path for path in sorted((folder / "cameras").rglob("*")) if path.is_file()]
     if PAGE in formats:
         try:
@@ -161,6 +162,17 @@ def export_field(job: Job, folder: Path, field: Field, poses: PoseResult, posed:
         write_video(folder / "orbit.mp4", pictures(camera, lenses, around, job.progress), FPS)
         written.append(folder / "orbit.mp4")
     return Exported(facts, written, formats - undone, whole)
+
+
+def sparse_points(path: Path) -> tuple[Array, Array] | tuple[None, None]:
+    """At most `MOST_SPARSE` points (P, 3) of an exported cloud, evenly chosen, and their colours (P, 3) uint8; None where there is none."""
+    import trimesh
+
+    if not path.is_file():
+        return None, None
+    cloud = trimesh.load(path, process=False)
+    chosen = np.linspace(0, len(cloud.vertices) - 1, min(MOST_SPARSE, len(cloud.vertices))).astype(int)
+    return np.asarray(cloud.vertices)[chosen], np.asarray(cloud.colors)[chosen, :3]
 
 
 def export_surface(

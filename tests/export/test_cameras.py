@@ -9,9 +9,11 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipelines.surface import sparse_points
 from tests.export.samples import cameras, turned
 from toolkit.camera import Intrinsics, project
 from toolkit.capture import open_capture
@@ -128,3 +130,17 @@ def test_lists_of_different_length_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="7 names, 6 intrinsics, 7 poses"):
         write_cameras(tmp_path, names, intrinsics[:6], poses)
     assert not list(tmp_path.iterdir())
+
+
+def test_points_go_with_the_cameras_as_other_programs_look_for_them(tmp_path: Path) -> None:
+    colours = np.arange(3 * len(POINTS), dtype=np.uint8).reshape(-1, 3)
+    write_cameras(tmp_path, ["a.png"], [Intrinsics(8, 6, 7.0, 7.0, 4.0, 3.0)], np.eye(4)[None], POINTS, colours)
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    cloud = trimesh.load(tmp_path / data["ply_file_path"], process=False)
+    np.testing.assert_allclose(cloud.vertices, POINTS, atol=1e-5)
+    assert np.array_equal(np.asarray(cloud.colors)[:, :3], colours)
+    chosen, shades = sparse_points(tmp_path / data["ply_file_path"])
+    assert chosen is not None and shades is not None and len(chosen) == len(POINTS) and np.array_equal(shades, colours)
+    write_cameras(tmp_path, ["a.png"], [Intrinsics(8, 6, 7.0, 7.0, 4.0, 3.0)], np.eye(4)[None])
+    assert "ply_file_path" not in json.loads((tmp_path / "transforms.json").read_text())
+    assert not (tmp_path / "points3D.ply").exists() and sparse_points(tmp_path / "points3D.ply") == (None, None)

@@ -10,9 +10,11 @@ import numpy as np
 
 from toolkit.camera import FISHEYE, Array, Intrinsics, Similarity, invert, opengl_from_world
 from toolkit.errors import InputError
+from toolkit.export.points import write_points
 from toolkit.files import atomic_path, write_json
 from toolkit.tsdf.mesh import as_bytes
 
+POINTS = "points3D.ply"
 LENS_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # OpenCV's order
 FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
 
@@ -27,7 +29,8 @@ def write_cameras(
     working_from_input: Similarity | None = None,
     files: Sequence[str] | None = None,
 ) -> None:
-    """Write `folder/transforms.json` and `folder/colmap/{cameras,images,points3D}.txt`.
+    """Write `folder/transforms.json` and `folder/colmap/{cameras,images,points3D}.txt`; where there are points, `folder/points3D.ply` as
+    well, which the json names as other programs look for it.
 
     Args:
         names: of the pictures; COLMAP ends a name at a space, so spaces become underscores there.
@@ -51,7 +54,13 @@ def write_cameras(
         back = working_from_input.inverse()
         poses = back.poses(poses)
         points = None if points is None else back.points(points)
-    write_json(folder / "transforms.json", transforms(files, intrinsics, poses))
+    data = transforms(files, intrinsics, poses)
+    if points is not None and len(points):
+        write_points(folder / POINTS, points, colours)
+        data["ply_file_path"] = POINTS
+    else:
+        (folder / POINTS).unlink(missing_ok=True)
+    write_json(folder / "transforms.json", data)
     write_colmap(folder / "colmap", names, intrinsics, poses, points, colours)
 
 
