@@ -17,6 +17,7 @@ from toolkit.capture.duplicates import copies, suspects
 from toolkit.capture.headers import Header, read_bytes, read_header
 from toolkit.capture.images import turns_by_exif, upright
 from toolkit.capture.listing import counted, fitted, natural_key, unique_names
+from toolkit.capture.photos import size_from_exif
 from toolkit.capture.types import Capture
 from toolkit.errors import InputError
 from toolkit.progress import SILENT, Progress
@@ -28,6 +29,7 @@ FLAT = 2.0  # grey levels of standard deviation below which a picture shows noth
 DARK = 40  # grey level that 95% of a dark picture's pixels stay under
 BLOWN = 253  # grey level from which a pixel counts as saturated
 BLURRED = 0.25  # of the usual sharpness of the capture
+LOOKED_AT_SHAPES, SAME_SHAPE = 5, 0.05  # images whose EXIF is looked at; difference of width to height that rounding and lenses explain
 NOTICE = 0.1  # share of pictures from which a warning is worth reading
 
 
@@ -66,7 +68,7 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
     _refuse_same(capture, looks)
     capture, headers, looks, copy_warnings = _once_each(capture, headers, looks, exact)
     sizes = Counter(_upright_size(header, turns_by_exif(capture)) for header in headers)
-    warnings = [*_size_warnings(capture, sizes), *copy_warnings, *_picture_warnings(capture, looks), *check_depth(capture, progress)]
+    warnings = [*_size_warnings(capture, sizes), *_shape_warnings(capture, headers), *copy_warnings, *_picture_warnings(capture, looks), *check_depth(capture, progress)]
     extra = {**capture.extra, "sizes": {f"{width}x{height}": number for (width, height), number in sizes.most_common()}}
     return replace(
         capture, extra=extra, warnings=capture.warnings + tuple(warning for warning in warnings if warning not in capture.warnings)
@@ -206,6 +208,21 @@ def _size_warnings(capture: Capture, sizes: Counter[tuple[int, int]]) -> list[st
     if all(frame.intrinsics is not None for frame in capture.frames):
         return [f"the pictures have {len(sizes)} sizes: {listed}; each comes with its own camera, so this is fine"]
     return [f"the pictures have {len(sizes)} sizes: {listed}; each size gets its own camera, which is less certain than one camera for all"]
+
+
+def _shape_warnings(capture: Capture, headers: list[Header]) -> list[str]:
+    """Images that EXIF says were taken in another shape: squeezed into theirs, no camera with one focal length fits them."""
+    changed, example = 0, ""
+    chosen = [int(at) for at in np.unique(np.linspace(0, len(headers) - 1, LOOKED_AT_SHAPES).round())]
+    for index in chosen:
+        taken = size_from_exif(capture.frames[index].image)
+        stored = headers[index].width / headers[index].height
+        if taken and all(abs(stored / ratio - 1) > SAME_SHAPE for ratio in (taken[0] / taken[1], taken[1] / taken[0])):
+            changed += 1
+            example = f"{taken[0]}×{taken[1]}, as EXIF has it, and are {headers[index].width}×{headers[index].height}"
+    if 2 * changed <= len(chosen):
+        return []
+    return [f"the images were taken at {example}: cropped or squeezed; if squeezed, bring them back to their shape and find poses again"]
 
 
 def _picture_warnings(capture: Capture, looks: list[Look]) -> list[str]:
