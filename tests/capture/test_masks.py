@@ -78,7 +78,9 @@ def test_masks_follow_the_folders_of_a_split(tmp_path: Path) -> None:
     assert {(frame.split, share) for frame, share in zip(capture.frames, kept(capture), strict=True)} == {("train", 0.25), ("test", 0.75)}
 
 
-@pytest.mark.parametrize("name", ["{stem}_mask.png", "mask_{stem}.png", "{stem}.mask.png", "{stem}-mask.jpg", "{stem}.alpha.png", "{stem}.png"])
+@pytest.mark.parametrize(
+    "name", ["{stem}_mask.png", "mask_{stem}.png", "{stem}.mask.png", "{stem}-mask.jpg", "{stem}.alpha.png", "{stem}.png"]
+)
 def test_masks_among_photos_are_no_photos(tmp_path: Path, name: str) -> None:
     stems = ["1", "11", "2"]
     photos(tmp_path, [f"{stem}.jpg" for stem in stems])

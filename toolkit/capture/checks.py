@@ -68,7 +68,13 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
     _refuse_same(capture, looks)
     capture, headers, looks, copy_warnings = _once_each(capture, headers, looks, exact)
     sizes = Counter(_upright_size(header, turns_by_exif(capture)) for header in headers)
-    warnings = [*_size_warnings(capture, sizes), *_shape_warnings(capture, headers), *copy_warnings, *_picture_warnings(capture, looks), *check_depth(capture, progress)]
+    warnings = [
+        *_size_warnings(capture, sizes),
+        *_shape_warnings(capture, headers),
+        *copy_warnings,
+        *_picture_warnings(capture, looks),
+        *check_depth(capture, progress),
+    ]
     extra = {**capture.extra, "sizes": {f"{width}x{height}": number for (width, height), number in sizes.most_common()}}
     return replace(
         capture, extra=extra, warnings=capture.warnings + tuple(warning for warning in warnings if warning not in capture.warnings)
