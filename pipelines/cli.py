@@ -19,6 +19,7 @@ import typer
 from pipelines import (
     bake,
     bench,
+    bench_captures,
     bench_effects,
     bench_engines,
     bench_keyframes,
@@ -158,6 +159,7 @@ for _command in (
     simulate.simulate,
 ):
     app.command()(_command)
+bench.app.command("captures")(bench_captures.captures)
 bench.app.command("effects")(bench_effects.effects)
 bench.app.command("effects-by-hand")(bench_effects.by_hand)
 bench.app.command("few-views")(few_views.few_views)

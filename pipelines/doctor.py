@@ -68,7 +68,7 @@ class Check:
 def collect() -> list[Check]:
     """Look at everything (a few seconds). Never raises: what goes wrong in a check is its finding."""
     checks = [_python(), *_packages()]
-    extras: tuple[Callable[[], Check], ...] = (_lpips, _viewer, _heic, _record3d, _h264)
+    extras: tuple[Callable[[], Check], ...] = (_xfeat, _lpips, _viewer, _heic, _record3d, _h264)
     looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _video, *extras, _cores, _memory, _disk)
     for look in looks:
         try:
@@ -220,6 +220,19 @@ def _package(name: str, package: str, without: str, ask: str) -> Check:
         return Check(name, OK, f"{package} {version(package)}")
     except PackageNotFoundError:
         return Check(name, WARN, f"no {package}: {without}", ask)
+
+
+def _xfeat() -> Check:
+    from toolkit.errors import InputError
+    from toolkit.poses.xfeat import INSTALL, installed
+
+    try:
+        network = installed()
+    except InputError as error:
+        return Check("xfeat", WARN, str(error), INSTALL)
+    if network is not None:
+        return Check("xfeat", OK, "weights installed")
+    return Check("xfeat", WARN, "no weights: photos with little texture or overlap may find no place", INSTALL)
 
 
 def _lpips() -> Check:

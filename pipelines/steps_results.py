@@ -190,6 +190,7 @@ def fit_left_out(job: Job) -> LeftOut | None:
 
 def render_test_views(job: Job, field: Field, views: Views, scene: Scene) -> Pictures:
     """The field's pictures at the held-out views."""
+    from toolkit.evaluate.observed import training_psnr
     from toolkit.render.image import make_renderer, render_view
 
     kept = job.folder / "renders" / "field.safetensors"
@@ -205,13 +206,15 @@ def render_test_views(job: Job, field: Field, views: Views, scene: Scene) -> Pic
             start = time.monotonic()
             picture = to_picture(render_view(field, views.intrinsics[index], views.world_from_camera[index], view))
             pictures.add(views.names[index], picture, time.monotonic() - start)
+        if len(indices):
+            pictures.facts = {"training_psnr": training_psnr(lambda camera, pose: render_view(field, camera, pose, view).rgb, views)}
         return pictures
 
     def save(pictures: Pictures) -> list[Path]:
         save_pictures(kept, pictures)
         return [kept, *write_pngs(kept.parent, "field", pictures, views.exposure, depth_steps(scene))]
 
-    return job.stages.run("render", make=make, save=save, load=lambda: load_pictures(kept), after=["field", "views"], version=3)
+    return job.stages.run("render", make=make, save=save, load=lambda: load_pictures(kept), after=["field", "views"], version=4)
 
 
 def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, scene: Scene, views: Views) -> dict[str, Any]:
@@ -265,6 +268,7 @@ def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, sc
 def score_pictures(job: Job, views: Views, pictures: dict[str, Pictures]) -> dict[str, Any]:
     """The same metrics for field and TSDF, beside those of the nearest training picture."""
     from toolkit.evaluate.baseline import nearest_image_scores
+    from toolkit.evaluate.observed import seen_share
     from toolkit.evaluate.score import score_views
 
     path = job.folder / "evaluation.json"
@@ -276,6 +280,9 @@ def score_pictures(job: Job, views: Views, pictures: dict[str, Pictures]) -> dic
         for count, (what, shown) in enumerate(pictures.items()):
             job.progress.update(count, len(pictures), what)
             out[what] = {**score_views(shown.pictures, views, indices, shown.seconds), **shown.facts}
+        if "field" in pictures:
+            for view, picture in zip(out["field"]["per_view"], pictures["field"].pictures, strict=True):
+                view["seen"] = seen_share(picture.depth, views, view["index"])
         out["nearest_image"] = nearest_image_scores(views, indices)
         return out
 
@@ -289,5 +296,6 @@ def score_pictures(job: Job, views: Views, pictures: dict[str, Pictures]) -> dic
         save=save,
         load=lambda: read_kept(path, EVALUATION),
         uses=sorted(pictures),
+        version=2,
         after=["views", *last_of(job, "tsdf", "render", "direct")],
     )

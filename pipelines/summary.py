@@ -117,7 +117,10 @@ def put_cameras(folder: Path, poses: PoseResult, posed: Capture) -> None:
 
     made_here = SELECTED in posed.extra or all_converted(posed)  # then the pictures lie in the run's folder
     root = posed.frames[0].image.parent.parent if made_here else posed.root
-    files = [frame.image.relative_to(root).as_posix() if frame.image.is_relative_to(root) else str(frame.image) for frame in posed.frames]
+    # A capture that is reached through a link has its images where the link leads.
+    bases = (root, root.resolve())
+    paths = [frame.image for frame in posed.frames]
+    files = [next((path.relative_to(base).as_posix() for base in bases if path.is_relative_to(base)), str(path)) for path in paths]
     # Those of the frames that take part, which may be fewer than have a pose.
     intrinsics, world_from_camera = stored_cameras(posed)
     write_cameras(folder, files, intrinsics, world_from_camera, poses.points)
@@ -203,6 +206,7 @@ def put_report(
     seconds: float,
 ) -> dict[str, Any]:
     """Write report.json and report.html; `seconds` is what this command took so far, reused stages count as they took."""
+    from toolkit.evaluate.failure import failures
     from toolkit.evaluate.pictures import method_pictures, moving_pictures
     from toolkit.evaluate.report import report_data, write_report
 
@@ -234,6 +238,7 @@ def put_report(
         "export_facts": export_facts,
         "seconds_total": round(seconds + job.stages.fresh_seconds(), 3),
     }
+    data["warnings"] = unique([*failures(report_data(data)), *data["warnings"]])
     if job.plan is not None and told is not None:
         data |= {"budget": told, "notes": [job.plan.note(told), *data["notes"]]}
     shown = {name: [*found.pictures] for name, found in pictures.items()}

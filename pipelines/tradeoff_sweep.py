@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -18,10 +16,9 @@ from pipelines.tradeoff_plan import Wanted, point_id
 from toolkit.config import settings_dict
 from toolkit.errors import InputError
 from toolkit.files import fingerprint, read_json, remove, write_json
-from toolkit.poses.child import end, log_tail
+from toolkit.poses.child import log_tail, run_logged
 
 VERSION = 1  # raised when what a point measures changes
-TICK = 0.2  # seconds between looks at the user's wish to stop
 FIRST_GUESS = 15.0  # seconds that a point takes beside its fitting time, before one was measured
 FOLDER = "tradeoff"
 
@@ -144,23 +141,12 @@ def run_child(job: Job, ask: Path, log: Path, expected: float) -> int:
     Raises:
         Interrupted: the user asked to stop; the child is dead by then.
     """
-    with log.open("wb") as said:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "pipelines.tradeoff_child", str(ask)],
-            stdin=subprocess.PIPE,  # the child ends when it closes
-            stdout=said,
-            stderr=said,
-            start_new_session=True,  # so that Ctrl-C reaches us first
-        )
-    start = time.monotonic()
-    try:
-        while process.poll() is None:
-            job.progress.check()
-            job.progress.update(min(time.monotonic() - start, expected), expected)
-            time.sleep(TICK)
-    finally:
-        end(process)
-    return int(process.returncode)
+
+    def tick(seconds: float) -> None:
+        job.progress.check()
+        job.progress.update(min(seconds, expected), expected)
+
+    return run_logged(["-m", "pipelines.tradeoff_child", str(ask)], log, tick)
 
 
 def finish(one: Wanted, row: dict[str, Any]) -> dict[str, Any]:

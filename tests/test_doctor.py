@@ -23,7 +23,7 @@ def checks() -> dict[str, Check]:
 
 def test_a_machine_that_runs_the_tests_is_fit_for_use(checks: dict[str, Check]) -> None:
     assert [check for check in checks.values() if check.status == FAIL] == []
-    assert {"python", "open3d", "pycolmap", "torch device", "video", "cores", "memory", "disk", "lpips"} <= checks.keys()
+    assert {"python", "open3d", "pycolmap", "torch device", "video", "cores", "memory", "disk", "lpips", "xfeat"} <= checks.keys()
     assert checks["open3d"].found.startswith("0.")
     assert all(check.status == OK or check.advice for check in checks.values())
 

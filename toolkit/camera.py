@@ -6,7 +6,10 @@ depth along z. What other tools use is turned into this by the functions below, 
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -193,6 +196,18 @@ def undistort_maps(intrinsics: Intrinsics, width: int, height: int) -> tuple[Int
     return target, *resample_maps(intrinsics, target)
 
 
+def pinhole_share(intrinsics: Intrinsics, across: int = 64) -> float:
+    """Share of a distorted image's pixels that the pinhole image of the same size and focal length shows."""
+    height = max(2, round(across * intrinsics.height / intrinsics.width))
+    seen = np.zeros((height, across), dtype=bool)
+    fine = intrinsics.pinhole().scaled(4 * across, 4 * height)
+    map_x, map_y, valid = resample_maps(intrinsics, fine)
+    column = np.clip(map_x[valid] / intrinsics.width * across, 0, across - 1).astype(int)
+    row = np.clip(map_y[valid] / intrinsics.height * height, 0, height - 1).astype(int)
+    seen[row, column] = True
+    return float(seen.mean())
+
+
 # --------------------------------------------------------------------------------------------------- poses
 
 
@@ -213,6 +228,25 @@ def world_from_llff(pose: Array) -> Array:
     return out
 
 
+def _unusable(why: str, notes: PoseNotes | None) -> Array:
+    """NaN and a note, or a refusal."""
+    if notes is None:
+        raise InputError(why)
+    notes.unusable.append(why)
+    return np.full((4, 4), np.nan)
+
+
+def _unscaled(rotation: Array, off: float, notes: PoseNotes) -> tuple[Array, float]:
+    """The rotation without a uniform scale, if that is what makes it no rotation, and how far R'R is then from 1."""
+    scale = float(np.cbrt(np.linalg.det(rotation)))
+    plain = rotation / scale
+    left = float(np.abs(plain.T @ plain - np.eye(3)).max())
+    if left > ROUNDED or off <= ROUNDED:
+        return rotation, off
+    notes.scales.append(scale)
+    return plain, left
+
+
 def invert(pose: Array) -> Array:
     """Inverse of rigid (..., 4, 4) poses."""
     pose = np.asarray(pose, dtype=np.float64)
@@ -224,14 +258,40 @@ def invert(pose: Array) -> Array:
     return out
 
 
+ROUNDED = 0.04  # how far R'R may be from 1 where poses are read leniently: numbers of two digits
+_lenient: ContextVar[PoseNotes | None] = ContextVar("lenient poses", default=None)
+
+
+@dataclass
+class PoseNotes:
+    """What was wrong with poses that were read leniently."""
+
+    unusable: list[str] = field(default_factory=list)  # a sentence for each pose that came back as NaN
+    scales: list[float] = field(default_factory=list)  # of rotations that were scaled
+    rounding: list[float] = field(default_factory=list)  # how far R'R was from 1 where rotations were made rigid
+
+
+@contextmanager
+def lenient_poses() -> Iterator[PoseNotes]:
+    """Inside, `checked_pose` takes a uniform scale and rounding out of rotations, and answers NaN for a pose that holds nothing usable: one
+    bad pose does not refuse a whole capture. What was done is in the notes."""
+    notes = PoseNotes()
+    token = _lenient.set(notes)
+    try:
+        yield notes
+    finally:
+        _lenient.reset(token)
+
+
 def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     """A rigid float64 (4, 4) pose, re-orthonormalised where it is off, or a clear refusal.
 
-    What is rigid to the last digits stays as it is: a pose that was written and read back is the same pose.
+    What is rigid to the last digits stays as it is: a pose that was written and read back is the same pose. See `lenient_poses`.
 
     Raises:
         InputError: wrong shape, not finite, singular, mirrored, not rigid (beyond `tolerance`) or astronomically far away.
     """
+    notes = _lenient.get()
     try:
         pose = np.asarray(pose, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -241,18 +301,24 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     if pose.shape != (4, 4):
         raise InputError(f"{where}: the pose has shape {pose.shape}, it must be 4×4")
     if not np.all(np.isfinite(pose)):
-        raise InputError(f"{where}: the pose holds a value that is not finite; remove this frame or correct it")
+        return _unusable(f"{where}: the pose holds a value that is not finite; remove this frame or correct it", notes)
     rotation = pose[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):  # of damaged files: huge numbers are no rotation either
         size, off = np.linalg.det(rotation), np.abs(rotation.T @ rotation - np.eye(3)).max()
     if abs(size) < 1e-6:
-        raise InputError(f"{where}: the pose's rotation is singular; remove this frame or correct it")
+        return _unusable(f"{where}: the pose's rotation is singular; remove this frame or correct it", notes)
+    if notes is not None and size > 0 and not off <= tolerance:
+        rotation, off = _unscaled(rotation, off, notes)
     if size < 0:
         raise InputError(
             f"{where}: the pose mirrors space (its rotation has determinant < 0); its axis convention is not what this kind of capture uses"
         )
-    if not off <= tolerance:  # NaN, too
-        raise InputError(f"{where}: the pose is not rigid (its rotation is scaled or sheared by more than {tolerance:g}); correct it")
+    if notes is not None and tolerance < off <= ROUNDED:
+        notes.rounding.append(float(off))
+    elif not off <= tolerance:  # NaN, too
+        raise InputError(
+            f"{where}: the pose is not rigid (its rotation is sheared or its axes differ in length: R'R is {off:.2g} off 1); correct it"
+        )
     checked_place(pose[:3, 3], where)
     out = np.eye(4)
     if off > RIGID:

@@ -37,6 +37,7 @@ class PosesSettings:
     matching: str = "auto"  # auto | exhaustive | sequential
     image_size: int = 1600  # long side for feature extraction
     max_features: int = 4096
+    features: str = "auto"  # auto (SIFT, and XFeat where SIFT places too few) | sift | xfeat (learned; needs its weights)
 
 
 @dataclass
@@ -187,6 +188,7 @@ CHOICES = {
     "capture.masks": ("auto", "inverted", "off"),
     "poses.source": ("auto", "given", "sfm"),
     "poses.matching": ("auto", "exhaustive", "sequential"),
+    "poses.features": ("auto", "sift", "xfeat"),
     "field.decoder": ("deferred", "per_sample"),
     "network.depth_from": ("sensor", "off"),
     "network.precision": ("auto", "float32", "bfloat16"),

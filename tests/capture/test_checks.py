@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -74,6 +75,11 @@ def test_a_truncated_picture_is_named(tmp_path: Path, suffix: str, capfd: pytest
     capture = photos(tmp_path, scenery(), suffix)
     path = capture.frames[5].image
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    checked = check_capture(capture)
+    assert capture.frames[5].name not in {frame.name for frame in checked.frames} and len(checked.frames) == len(capture.frames) - 1
+    assert any(re.search(rf"left out.*05\{suffix}.*cut short", warning) for warning in checked.warnings)
+    for frame in capture.frames[6:]:
+        frame.image.write_bytes(path.read_bytes())
     refused(capture, rf"05\{suffix}.*cut short")
     assert capfd.readouterr().err == ""
 
@@ -81,6 +87,9 @@ def test_a_truncated_picture_is_named(tmp_path: Path, suffix: str, capfd: pytest
 def test_a_missing_picture_is_named(tmp_path: Path) -> None:
     capture = photos(tmp_path, scenery())
     capture.frames[3].image.unlink()
+    assert any("03.jpg" in warning for warning in check_capture(capture).warnings)
+    for frame in capture.frames[4:]:
+        frame.image.write_bytes(b"")
     refused(capture, r"03\.jpg")
 
 
@@ -205,14 +214,19 @@ def corner_of_a_room(pose: Array) -> Array:
 def rgbd(folder: Path, depth_factor: float = 1.0, kind: str = "7scenes", step: float = 0.25, count: int = 8) -> Capture:
     """A walk into the corner of a room, looking about; depth is stored in millimetres × depth_factor."""
     frames = []
-    for index, picture in enumerate(scenery(count, (60, 80))):
+    v, u = np.mgrid[0:60, 0:80]
+    rays = np.stack([(u + 0.5 - 40) / 70, (v + 0.5 - 30) / 70, np.ones((60, 80))], axis=-1)
+    for index in range(count):
         pose = np.eye(4)
         pose[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.08 * (index - 3), 0.0]))[0]
         pose[:3, 3] = step * index * np.array([0.7, 0.1, 1.0])
         path = folder / f"{index}.npy"
         folder.mkdir(parents=True, exist_ok=True)
-        np.save(path, (corner_of_a_room(pose) * 1000 * depth_factor).astype(np.float32))
-        image = save(folder / f"{index}.png", picture)
+        depth = corner_of_a_room(pose)
+        np.save(path, (depth * 1000 * depth_factor).astype(np.float32))
+        x, y, z = np.moveaxis((rays * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3], -1, 0)
+        waves = [np.sin(5 * x + 3 * y) * np.cos(4 * z - y), np.sin(7 * y - 2 * z), np.cos(6 * x + 5 * z)]
+        image = save(folder / f"{index}.png", np.clip(128 + 90 * np.stack(waves, axis=2), 0, 255).astype(np.uint8))
         frames.append(Frame(f"{index}", image, intrinsics=CAMERA, world_from_camera=pose, depth=path))
     return capture_of(folder, frames, kind=kind, metric=kind != "transforms", ordered=True)
 
@@ -221,12 +235,45 @@ def test_depth_in_the_right_unit_passes(tmp_path: Path) -> None:
     assert check_capture(rgbd(tmp_path)).warnings == ()
 
 
-@pytest.mark.parametrize("factor", [1000.0, 100.0, 10.0, 5.0, 0.2, 0.1, 0.01, 0.001])
+@pytest.mark.parametrize("factor", [1000.0, 100.0, 10.0, 5.0, 4.0, 2.0, 0.5, 0.25, 0.2, 0.1, 0.01, 0.001])
 @pytest.mark.parametrize("kind", ["7scenes", "transforms"])
 def test_depth_in_a_wrong_unit_is_noticed(tmp_path: Path, factor: float, kind: str) -> None:
     with pytest.raises(InputError, match=rf"{max(factor, 1 / factor):g} times {'smaller' if factor > 1 else 'larger'}") as caught:
         check_capture(rgbd(tmp_path, factor, kind))
     assert ("depth_unit_scale_factor" if kind == "transforms" else "millimetres") in str(caught.value)
+
+
+def corridor(pose: Array, seed: int) -> tuple[Array, Array]:
+    """(60, 80) depth along z and (60, 80) grey of a long corridor with doors at regular distances and posters that are not."""
+    v, u = np.mgrid[0:60, 0:80]
+    rays = np.stack([(u + 0.5 - 40) / 70, (v + 0.5 - 30) / 70, np.ones((60, 80))], axis=-1) @ pose[:3, :3].T
+    depth, grey = np.full((60, 80), 40.0), np.full((60, 80), 60.0)
+    posters = np.random.default_rng(seed).uniform(30, 220, 400)
+    for normal, distance, shade in (((1, 0, 0), 1.2, 150), ((-1, 0, 0), 1.2, 160), ((0, 1, 0), 1.4, 90), ((0, -1, 0), 1.1, 200)):
+        towards = rays @ np.array(normal, float)
+        along = (distance - pose[:3, 3] @ np.array(normal, float)) / np.maximum(towards, 1e-6)
+        nearer = (towards > 1e-6) & (along < depth)
+        place = pose[2, 3] + along * rays[..., 2]
+        door = (np.mod(place, 2.0) < 0.9) & (abs(normal[0]) == 1)
+        pattern = np.where(door, 40.0, 0.4 * shade + 0.6 * posters[np.clip(place / 0.7, 0, 399).astype(int)])
+        depth, grey = np.where(nearer, along, depth), np.where(nearer, pattern, grey)
+    return depth, grey
+
+
+@pytest.mark.parametrize("step", [0.3, 1.0, 2.0])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_corridor_filmed_in_long_steps_is_in_the_right_unit(step: float, seed: int, tmp_path: Path) -> None:
+    """Each step looks much as if the camera had stood still before something far away."""
+    rng, frames = np.random.default_rng(seed), []
+    for index in range(14):
+        pose = np.eye(4)
+        pose[:3, :3] = cv2.Rodrigues(rng.normal(0, 0.02, 3))[0]
+        pose[:3, 3] = [*rng.normal(0, 0.03, 2), step * index]
+        depth, grey = corridor(pose, seed)
+        np.save(tmp_path / f"{index}.npy", (1000 * depth * (1 + rng.normal(0, 0.005, depth.shape))).astype(np.float32))
+        image = save(tmp_path / f"{index}.png", np.repeat(grey[..., None], 3, axis=2).astype(np.uint8))
+        frames.append(Frame(f"{index:02d}", image, intrinsics=CAMERA, world_from_camera=pose, depth=tmp_path / f"{index}.npy"))
+    check_capture(capture_of(tmp_path, frames, kind="7scenes", metric=True, ordered=True))
 
 
 def test_impossible_metric_depth_is_noticed_without_motion(tmp_path: Path) -> None:

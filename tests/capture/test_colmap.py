@@ -14,7 +14,7 @@ from tests.capture.layouts import OFF_CENTRE, POINTS, half_size, write_colmap_bi
 from tests.capture.made import eyes, pixel_error, render, save_picture
 from toolkit.camera import Intrinsics, project
 from toolkit.capture import open_capture
-from toolkit.capture.colmap import read_colmap
+from toolkit.capture.colmap import candidate_captures, read_colmap
 from toolkit.capture.colmap_model import MODELS, intrinsics_of, read_model
 from toolkit.errors import InputError
 
@@ -114,7 +114,11 @@ def test_of_several_models_the_largest_is_taken(tmp_path: Path) -> None:
     (tmp_path / "sparse/0/images.txt").write_text("\n".join(lines[:5]) + "\n")
     capture = open_capture(tmp_path)
     assert len(capture.frames) == 5
-    assert capture.warnings == ("2 models were found; 1 has the most images (5) and is used",)
+    assert capture.warnings == (
+        "of several models that in sparse/1 is used, which 5 images fit; not used: sparse/0 (2 images, 2 of which fit)",
+    )
+    (tmp_path / "sparse/0/images.txt").write_text("a b c")
+    assert "the model in sparse/0 is not used" in open_capture(tmp_path).warnings[0]
 
 
 def test_missing_and_unregistered_pictures_are_counted(tmp_path: Path) -> None:
@@ -192,12 +196,67 @@ def test_a_principal_point_far_outside_is_refused(tmp_path: Path) -> None:
         open_capture(tmp_path)
 
 
-def test_a_name_that_leads_outside_is_refused(tmp_path: Path) -> None:
+def test_a_name_that_leads_outside_is_not_read(tmp_path: Path) -> None:
+    write_colmap_txt(tmp_path / "in")
+    shutil.copy(tmp_path / "in/images/view 0.png", tmp_path / "view 0.png")
+    (tmp_path / "in/images/view 0.png").unlink()
+    path = tmp_path / "in/sparse/0/images.txt"
+    path.write_text(path.read_text().replace("view 0.png", "../../view 0.png"))
+    capture = open_capture(tmp_path / "in")
+    assert [frame.name for frame in capture.frames] == ["view 1", "view 2", "view 3", "view 4"]
+    assert capture.warnings == ("1 of the 5 images of the model do not exist; the other 4 are used",)
+
+
+def move(root: Path, *moves: tuple[str, str]) -> None:
+    for old, new in moves:
+        (root / new).parent.mkdir(parents=True, exist_ok=True)
+        (root / old).rename(root / new)
+
+
+@pytest.mark.parametrize(
+    ("moves", "said"),
+    [
+        ([("images", "images_4")], "found in images_4"),
+        ([("images", "photos of day 1")], "found in photos of day 1"),
+        ([("images", "taken"), ("sparse", "workspace/sparse")], "found in taken"),
+        ([("images", "images/kitchen")], "found in images/kitchen"),
+        ([("sparse/0", "out/model")], "the COLMAP model was found in out/model"),
+        ([("images", "dense/0/images"), ("sparse/0", "dense/0/sparse")], None),
+        ([("images", "scene/images"), ("sparse", "scene/sparse")], "the capture was found in scene"),
+        ([("sparse/0", "distorted/sparse/1")], None),
+    ],
+)
+def test_where_models_and_images_are_found(tmp_path: Path, moves: list[tuple[str, str]], said: str | None) -> None:
     write_colmap_txt(tmp_path)
-    path = tmp_path / "sparse/0/images.txt"
-    path.write_text(path.read_text().replace("view 0.png", "../../../etc/passwd"))
-    with pytest.raises(InputError, match="outside the capture folder"):
+    if moves == [("images", "images/kitchen")]:
+        moves = [("images", "pictures"), ("pictures", "images/kitchen")]
+    move(tmp_path, *moves)
+    capture = open_capture(tmp_path)
+    assert pixel_error(capture, eyes(), OFF_CENTRE) < 1e-3
+    assert (said is None and capture.warnings == ()) or any(said in warning for warning in capture.warnings)
+
+
+def test_the_model_is_taken_whose_sizes_fit(tmp_path: Path) -> None:
+    """As undistorting leaves it: one model is of photos that are not there, whose names are the same."""
+    write_colmap_txt(tmp_path)
+    move(tmp_path, ("images", "dense/0/images"))
+    shutil.copytree(tmp_path / "sparse/0", tmp_path / "dense/0/sparse")
+    (tmp_path / "sparse/0/cameras.txt").write_text("7 PINHOLE 400 300 500 500 200 150\n")  # of the same shape
+    captures = list(candidate_captures(tmp_path))
+    assert pixel_error(captures[0], eyes(), OFF_CENTRE) < 1e-3
+    assert "dense/0/sparse is used" in captures[0].warnings[0]
+    assert "not used: sparse/0 (5 images, 5 of which fit)" in captures[0].warnings[0]
+    assert captures[1].frames[0].intrinsics.fx == pytest.approx(100)
+
+
+def test_images_of_one_name_in_two_folders_are_not_guessed(tmp_path: Path) -> None:
+    write_colmap_txt(tmp_path)
+    shutil.copytree(tmp_path / "images", tmp_path / "cam2")
+    move(tmp_path, ("images", "cam1"))
+    with pytest.raises(InputError, match=r"in cam1/ or in cam2/"):
         open_capture(tmp_path)
+    (tmp_path / "cam2/view 4.png").unlink()
+    assert open_capture(tmp_path).frames[0].image.parent.name == "cam1", "it alone has all"
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])

@@ -9,8 +9,18 @@ import numpy as np
 import pytest
 
 from tests.capture.films import film
-from tests.capture.layouts import EIGHTH_525, LAYOUTS, true_eyes, write_colmap_bin, write_llff, write_seven_scenes, write_transforms
+from tests.capture.layouts import (
+    EIGHTH_525,
+    LAYOUTS,
+    OFF_CENTRE,
+    true_eyes,
+    write_colmap_bin,
+    write_llff,
+    write_seven_scenes,
+    write_transforms,
+)
 from tests.capture.made import colour_difference, eyes, pixel_error, render, reprojection, save_picture
+from tests.conftest import shared_data
 from toolkit.camera import Intrinsics
 from toolkit.capture import open_capture
 from toolkit.capture.checks import check_capture
@@ -76,6 +86,45 @@ def test_what_is_written_on_purpose_goes_before_what_is_left_behind(tmp_path: Pa
     assert detect_kind(tmp_path) == "llff"
     write_transforms(tmp_path)
     assert detect_kind(tmp_path) == "transforms"
+
+
+def test_the_only_capture_further_down_is_read(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "unpacked/scene")
+    capture = open_capture(tmp_path)
+    assert capture.kind == "transforms"
+    assert pixel_error(capture, eyes(), OFF_CENTRE) < 1e-3
+    assert capture.warnings == ("the capture was found in unpacked/scene/",)
+    write_colmap_bin(tmp_path / "unpacked/scene")
+    assert open_capture(tmp_path).kind == "transforms", "the model beside it is its own"
+    write_llff(tmp_path / "other")
+    with pytest.raises(InputError, match=r"2 captures \(other/, unpacked/scene/\); give one of them"):
+        open_capture(tmp_path)
+
+
+def test_images_beside_the_folder_of_their_json(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    (tmp_path / "poses").mkdir()
+    text = (tmp_path / "transforms.json").read_text().replace('"images/', '"../images/').replace('"depth/', '"../depth/')
+    (tmp_path / "transforms.json").unlink()
+    (tmp_path / "poses/transforms.json").write_text(text)
+    capture = open_capture(tmp_path)
+    assert pixel_error(capture, eyes(), OFF_CENTRE) < 1e-3
+    assert capture.has_depth
+    with pytest.raises(InputError, match="lead outside the capture folder; give the folder that holds both"):
+        open_capture(tmp_path / "poses")
+
+
+def test_two_models_with_images_of_their_own_are_two_captures(tmp_path: Path) -> None:
+    write_colmap_bin(tmp_path / "a")
+    write_colmap_bin(tmp_path / "b")
+    with pytest.raises(InputError, match=r"2 captures \(a/, b/\)"):
+        open_capture(tmp_path)
+
+
+def test_photos_further_down(tmp_path: Path) -> None:
+    for index, eye in enumerate(eyes()):
+        save_picture(tmp_path / f"photos of day 1/{index}.png", render(eye, EIGHTH_525)[0])
+    assert len(open_capture(tmp_path).frames) == 5
 
 
 def test_each_kind_has_one_reader() -> None:
@@ -187,3 +236,23 @@ def test_a_camera_is_scaled_with_its_picture() -> None:
     assert fitted(camera, (4032, 3024), "here") is camera
     with pytest.raises(InputError, match="another shape"):
         fitted(camera, (3024, 4032), "here")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "count"),
+    [
+        ("bart-toy", "transforms", 15),
+        ("cairo-terrace", "transforms", 60),
+        ("cat-toy", "transforms", 47),
+        ("chess-king", "colmap", 23),
+        ("chickens", "transforms", 7),
+        ("computer-mouse", "colmap", 56),
+        ("kangaroo", "transforms", 29),
+        ("living-room-ten", "colmap", 10),
+        ("office-pc", "transforms", 16),
+        ("ultraman-figure", "transforms", 69),
+    ],
+)
+def test_captures_as_other_people_made_them(name: str, kind: str, count: int) -> None:
+    capture = open_capture(shared_data(f"zoo/{name}"))
+    assert (capture.kind, len(capture.frames), capture.posed) == (kind, count, True)

@@ -100,3 +100,16 @@ def test_fern() -> None:
     capture = open_capture(shared_data("llff_fern_8"))
     assert (capture.kind, len(capture.frames), capture.frames[0].intrinsics.width) == ("llff", 20, 504)
     assert capture.frames[0].intrinsics.fx == pytest.approx(3260.526 / 8, rel=1e-6)
+
+
+@pytest.mark.parametrize("place", [".", "photos", "photos/day 1"])
+def test_images_in_the_only_folder_that_fits(tmp_path: Path, place: str) -> None:
+    write_llff(tmp_path)
+    (tmp_path / "masks").mkdir()
+    (tmp_path / place).mkdir(parents=True, exist_ok=True)
+    for path in sorted((tmp_path / "images_4").iterdir()):
+        (tmp_path / "masks" / path.name).write_bytes(path.read_bytes())
+        path.rename(tmp_path / place / path.name)
+    capture = read_llff(tmp_path)
+    assert pixel_error(capture, eyes(), CENTRED) < 1e-3
+    assert "which holds one for each pose" in capture.warnings[0]

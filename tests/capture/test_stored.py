@@ -141,3 +141,16 @@ def test_orientation_is_told_from_the_header(tmp_path: Path, suffix: str) -> Non
     Image.fromarray(texture(HEIGHT, WIDTH)).save(tmp_path / "plain.png")
     (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe1nothing")
     assert [orientation_of(tmp_path / name) for name in ("plain.png", "broken.jpg", "missing.jpg")] == [1, 1, 1]
+
+
+def test_cameras_of_a_capture_behind_a_link_name_its_images_from_there(tmp_path: Path) -> None:
+    place = tmp_path / "photos"
+    photo(place / "images" / "1.jpg", 1, seed=1)
+    photo(place / "images" / "2.jpg", 1, seed=2)
+    result, posed = found(open_capture(place), [camera_for(1, PINHOLE), camera_for(1, PINHOLE)])
+    put_cameras(place, result, posed)
+    (tmp_path / "link").symlink_to(place)
+    again = open_capture(tmp_path / "link")
+    assert again.kind == "transforms"
+    put_cameras(tmp_path / "cameras", result, again)
+    assert '"file_path": "images/1.jpg"' in (tmp_path / "cameras" / "transforms.json").read_text()

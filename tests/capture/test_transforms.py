@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.capture.layouts import OFF_CENTRE, half_size, write_transforms
-from tests.capture.made import eyes, pixel_error, render, save_depth, save_picture
+from tests.capture.made import Pinhole, eyes, pixel_error, render, save_depth, save_picture
 from tests.conftest import shared_data
 from toolkit.camera import FISHEYE, OPENCV, PINHOLE
 from toolkit.capture import open_capture
@@ -115,7 +116,7 @@ def test_listed_files_that_do_not_exist_are_counted(root: Path) -> None:
     assert capture.warnings == ("2 of the 5 listed pictures do not exist; the other 3 are used", "1 listed depth picture not found")
     for path in (root / "images").iterdir():
         path.unlink()
-    with pytest.raises(InputError, match="none of the 5 pictures"):
+    with pytest.raises(InputError, match="none of the 5 images"):
         read_transforms(root)
 
 
@@ -224,24 +225,19 @@ def first(data: dict) -> dict:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: first(d).update(file_path="../../etc/passwd"), "outside the capture folder"),
-        (lambda d: first(d).update(file_path="/etc/passwd"), "outside the capture folder"),
-        (lambda d: first(d).update(depth_file_path="../x.png"), "outside the capture folder"),
-        (lambda d: d.update(ply_file_path="../x.ply"), "outside the capture folder"),
+        (lambda d: [frame.update(file_path=f"../../out/{i}.png") for i, frame in enumerate(d["frames"])], "outside the capture folder"),
         (lambda d: first(d).update(file_path="a\0b"), "not usable"),
         (lambda d: first(d).update(file_path=3), "frame 0 has no 'file_path'"),
         (lambda d: d.update(frames=[]), "lists no frames"),
         (lambda d: d.pop("frames"), "lists no frames"),
         (lambda d: d.update(frames={"a": 1}), "lists no frames"),
-        (lambda d: d["frames"].append(d["frames"][0]), "listed twice"),
+        (lambda d: d["frames"].append({**d["frames"][1], "file_path": d["frames"][0]["file_path"]}), "listed twice, with different poses"),
         (lambda d: first(d).pop("transform_matrix"), "no 'transform_matrix'"),
         (lambda d: first(d)["transform_matrix"][0].pop(), "not a 4×4 matrix"),
         (lambda d: first(d).update(transform_matrix=[[1, 0], [0, 1]]), "shape"),
         (lambda d: first(d)["transform_matrix"][0].__setitem__(3, 1e200), r"frame 0 .*translation is 1e\+200"),
         (lambda d: first(d).update(transform_matrix=[["a"] * 4] * 4), "not a 4×4 matrix"),
-        (lambda d: first(d).update(transform_matrix=[[float("nan")] * 4] * 4), r"frame 0 .*not finite"),
-        (lambda d: first(d).update(transform_matrix=[[0.0] * 4] * 4), r"frame 0 .*singular"),
-        (lambda d: first(d).update(transform_matrix=(2 * np.eye(4)).tolist()), r"frame 0 .*not rigid"),
+        (lambda d: first(d).update(transform_matrix=np.diag([2.0, 2, 1, 1]).tolist()), r"frame 0 .*not rigid"),
         (lambda d: first(d).update(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()), r"frame 0 .*mirrors"),
         (lambda d: d.update(fl_x=-500), "must be positive"),
         (lambda d: d.update(fl_x=0), "must be positive"),
@@ -258,7 +254,8 @@ def first(data: dict) -> dict:
         (lambda d: d.update(w=1e30), "picture size"),
         (lambda d: d.update(w=-80), "picture size"),
         (lambda d: d.update(w=60, h=80), "another shape"),
-        (lambda d: d.update(camera_model="EQUIRECTANGULAR"), "not known"),
+        (lambda d: d.update(camera_model="EQUIRECTANGULAR"), "panoramas"),
+        (lambda d: d.update(camera_model="MIRROR_BALL"), "not known"),
         (lambda d: d.update(camera_model="OPENCV", k4=0.1), "k4"),
         (lambda d: d.update(applied_scale=0), "'applied_scale'"),
         (lambda d: d.update(applied_transform=[1, 2]), "'applied_transform'"),
@@ -270,6 +267,78 @@ def test_what_is_refused(root: Path, change: Callable[[dict], Any], message: str
     with pytest.raises(InputError, match=message) as caught:
         open_capture(root)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["file_path", "depth_file_path", "mask_path", "ply_file_path"])
+def test_nothing_is_read_outside_the_folder(root: Path, tmp_path_factory: pytest.TempPathFactory, key: str) -> None:
+    outside = tmp_path_factory.mktemp("outside") / "other.png"
+    save_picture(outside, render(eyes()[0], OFF_CENTRE)[0])
+    for listed in (str(outside), f"../{outside.parent.name}/{outside.name}"):
+        edit(root, lambda data, to=listed: (data if key == "ply_file_path" else first(data)).update({key: to}))
+        capture = read_transforms(root)
+        assert all(path is None or path.is_relative_to(root) for f in capture.frames for path in (f.image, f.depth, f.mask))
+        assert capture.points is None
+        assert len(capture.warnings) == 1
+        assert re.search("do not exist|not found", capture.warnings[0])
+
+
+def test_an_image_listed_twice_with_one_pose_counts_once(root: Path) -> None:
+    edit(root, lambda data: data["frames"].append({**first(data), "file_path": "./" + first(data)["file_path"]}))
+    capture = read_transforms(root)
+    assert len(capture.frames) == 5
+    assert capture.warnings == ("1 picture listed once more with the same pose, used once",)
+
+
+def test_other_names_of_intrinsics(root: Path) -> None:
+    def change(data: dict) -> None:
+        camera = {new: data.pop(old) for new, old in (("f1_x", "fl_x"), ("f1_y", "fl_y"), ("c1_x", "cx"), ("c1_y", "cy"))}
+        for frame in data["frames"]:
+            frame.update(camera, camera_angle_x=1.0, camera_angle_y=0.8)
+
+    edit(root, change)
+    capture = read_transforms(root)
+    assert pixel_error(capture, eyes(), OFF_CENTRE) < 1e-3
+    assert capture.warnings == ("the intrinsics of 5 pictures were read from other keys than 'fl_x', 'fl_y', 'cx', 'cy'",)
+    edit(root, lambda data: [frame.update(f1_x=0.9, f1_y=0.9) for frame in data["frames"]])  # shares, or of something else
+    assert read_transforms(root).frames[0].intrinsics.fx == pytest.approx(40 / np.tan(0.5))
+
+
+def test_exchanged_camera_angles(root: Path) -> None:
+    def change(data: dict) -> None:
+        for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+            del data[key]
+        data.update(camera_angle_x=2 * np.arctan(30 / 73.0), camera_angle_y=2 * np.arctan(40 / 71.0), cx=0, cy=0)
+
+    edit(root, change)
+    capture = read_transforms(root)
+    assert (capture.frames[0].intrinsics.fx, capture.frames[0].intrinsics.fy) == pytest.approx((71.0, 73.0))
+    assert (capture.frames[0].intrinsics.cx, capture.frames[0].intrinsics.cy) == (40, 30)
+    assert [any(word in warning for warning in capture.warnings) for word in ("exchanged", "(0, 0)")] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("turn", "said"), [(np.diag([-1.0, -1, -1, 1]), "all camera axes"), (np.diag([1.0, -1, 1, 1]), "y axis"), (None, "world's z axis")]
+)
+def test_poses_that_all_mirror_space(tmp_path: Path, turn: np.ndarray | None, said: str) -> None:
+    """Which axes are wrong is seen on matches: of a scene with details, which the others here have none of."""
+    noise = np.random.default_rng(5).integers(0, 255, (120, 120, 3)).astype(np.uint8)
+    noise = cv2.resize(noise, (960, 960), interpolation=cv2.INTER_CUBIC)
+    camera = Pinhole(320, 240, 300.0, 300.0, 160.0, 120.0)
+    frames = []
+    for index, eye in enumerate(eyes()):
+        _, depth = render(eye, camera)
+        v, u = np.mgrid[0:240, 0:320] + 0.5
+        rays = eye.forward + ((u - 160) / 300)[..., None] * eye.right + ((v - 120) / 300)[..., None] * eye.down
+        points = (eye.centre + rays * depth[..., None]) * 240 + 480
+        maps = points[..., :2].astype(np.float32)
+        image = cv2.remap(noise, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        save_picture(tmp_path / f"images/{index}.png", image)
+        pose = np.diag([1.0, 1, -1, 1]) @ eye.opengl() if turn is None else eye.opengl() @ turn
+        frames.append({"file_path": f"images/{index}.png", "transform_matrix": pose.tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps({"w": 320, "h": 240, "fl_x": 300, "fl_y": 300, "frames": frames}))
+    capture = read_transforms(tmp_path)
+    assert said in capture.warnings[0]
+    assert pixel_error(capture, eyes(), camera) < 1e-3
 
 
 def test_links_out_of_the_folder_are_refused(root: Path, tmp_path_factory: pytest.TempPathFactory) -> None:

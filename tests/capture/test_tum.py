@@ -81,7 +81,6 @@ def test_without_depth(tmp_path: Path) -> None:
         ("rgb.txt", "1000.0\n", "line 1"),
         ("rgb.txt", "1000.0 ../../etc/passwd\n", "outside the capture folder"),
         ("rgb.txt", "5.0 rgb/1000.000000.png\n", "none of the 1 picture"),
-        ("depth.txt", "1000.0 /etc/passwd\n", "outside the capture folder"),
         ("groundtruth.txt", "1000.0 0 0 0 0 0 0 0\n", "not a rotation"),
         ("groundtruth.txt", "1000.0 0 0 0 nan 0 0 1\n", "not a rotation"),
         ("groundtruth.txt", "1000.0 inf 0 0 0 0 0 1\n", "not finite"),
@@ -94,3 +93,11 @@ def test_broken_lists_are_refused(tmp_path: Path, name: str, text: str, message:
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=message):
         read_tum(tmp_path)
+
+
+def test_depth_listed_outside_the_folder_is_not_read(tmp_path: Path) -> None:
+    write_tum(tmp_path)
+    (tmp_path / "depth.txt").write_text("1000.0 /etc/passwd\n")
+    capture = read_tum(tmp_path)
+    assert not capture.has_depth
+    assert "1 listed depth picture not found" in capture.warnings

@@ -95,11 +95,13 @@ def posed(change: Callable[[dict[str, Any]], None], depth: bool = False) -> Call
 
 
 def nan_pose(data: dict[str, Any]) -> None:
-    data["frames"][3]["transform_matrix"][0][3] = float("nan")
+    for entry in data["frames"][3:6]:  # a single one is left out
+        entry["transform_matrix"][0][3] = float("nan")
 
 
 def singular_pose(data: dict[str, Any]) -> None:
-    data["frames"][3]["transform_matrix"] = np.zeros((4, 4)).tolist()
+    for entry in data["frames"][3:6]:
+        entry["transform_matrix"] = np.zeros((4, 4)).tolist()
 
 
 def sheared_pose(data: dict[str, Any]) -> None:

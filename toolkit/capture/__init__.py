@@ -21,8 +21,12 @@ def open_capture(source: Path | str, masks: str = "auto") -> Capture:
         InputError: nothing there, nothing known, or the layout's own files are broken.
     """
     # Imported late: training and rendering need the types above on machines without Pillow.
+    from toolkit.camera import lenient_poses
     from toolkit.capture.beside import with_remark
     from toolkit.capture.detect import read_source
     from toolkit.capture.masks import with_masks
+    from toolkit.capture.usable import turned_by_exif, with_usable_poses
 
-    return with_remark(with_masks(read_source(Path(source)), masks))
+    with lenient_poses() as notes:
+        capture = read_source(Path(source))
+    return with_remark(with_masks(turned_by_exif(with_usable_poses(capture, notes)), masks))

@@ -33,9 +33,8 @@ def with_remark(capture: Capture) -> Capture:
     """The capture with a warning where it is photos and videos or other programs' poses lie beside them: these may have been meant."""
     lines = unused(capture) if capture.kind == "photos" else []
     meant = [line for line in lines if "video" in line or "with poses" in line]
-    return (
-        replace(capture, warnings=(*capture.warnings, f"beside the photos lie and are not used: {'; '.join(meant)}")) if meant else capture
-    )
+    remark = f"beside the photos lie and are not used: {'; '.join(meant)}"
+    return replace(capture, warnings=(*capture.warnings, remark)) if meant else capture
 
 
 def unused(capture: Capture) -> list[str]:

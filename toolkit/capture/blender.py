@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from toolkit.capture import nerf_json
-from toolkit.capture.listing import assemble, counted, fitted, picture_header, read_object, require_folder, unique_names
+from toolkit.capture.listing import assemble, picture_header, read_object, require_folder, unique_names
+from toolkit.capture.resolve import CaptureFiles
 from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
 
 
 def _json(root: Path, split: str) -> Path:
@@ -30,34 +31,36 @@ def read_blender(path: Path | str) -> Capture:
     """
     root = require_folder(path)
     test = "test" if _json(root, "test").is_file() or not _json(root, "val").is_file() else "val"
-    files: list[Path] = []
-    frames: list[Frame] = []
-    listed, scaled, bent, alpha = 0, 0, 0, False
-    for split, source in (("train", "train"), ("test", test)):
-        json_path = _json(root, source)
-        if split == "test" and not json_path.is_file():
-            continue
-        data = read_object(json_path)
-        for index, entry in enumerate(nerf_json.frame_list(data, json_path)):
-            listed += 1
-            where = f"frame {index} of {json_path.name}"
-            image = nerf_json.listed_file(root, entry["file_path"], where)
-            if image is None:
-                continue
-            header = picture_header(image)
-            described = nerf_json.picture_camera(data, entry, header.size, where)
-            intrinsics = fitted(described, header.size, where)
-            scaled += intrinsics is not described
-            bent += described.distorted and nerf_json.says_pinhole(data, entry)
-            alpha |= header.alpha
-            files.append(image)
-            frames.append(Frame(name="", image=image, intrinsics=intrinsics, world_from_camera=nerf_json.pose(entry, where), split=split))
-    if not frames:
-        raise InputError(f"none of the {counted(listed, 'picture')} listed in {root}/transforms_*.json exists; put them beside the files")
-    missing = listed - len(frames)
-    warnings = [f"{missing} of the {listed} listed pictures do not exist; the other {len(frames)} are used"] if missing else []
-    if scaled:
-        warnings.append(f"{counted(scaled, 'picture')} of another size than the json tells; intrinsics were scaled to fit")
-    warnings += nerf_json.bent_remarks(bent)
-    named = [replace(frame, name=name) for frame, name in zip(frames, unique_names(files), strict=True)]
-    return assemble("blender", root, named, warnings, alpha=alpha, up=(0.0, 0.0, 1.0), extra={"listed": listed, "missing": missing})
+    listed: list[tuple[dict[str, Any], dict[str, Any], str]] = []
+    splits: list[str] = []
+    for split, json_path in (("train", _json(root, "train")), ("test", _json(root, test))):
+        if split == "train" or json_path.is_file():
+            data = read_object(json_path)
+            entries = nerf_json.frame_list(data, json_path)
+            listed += [(data, entry, f"frame {index} of {json_path.name}") for index, entry in enumerate(entries)]
+            splits += [split] * len(entries)
+    folder = CaptureFiles(root)
+    found = folder.find([entry["file_path"] for _, entry, _ in listed], source="transforms_*.json")
+    if not found.count:
+        raise folder.none_exists("transforms_*.json", len(listed), found)
+    there = [index for index, image in enumerate(found.files) if image is not None]
+    images = [image for image in found.files if image is not None]
+    read, remarks = nerf_json.read_frames([listed[index] for index in there], images)
+    frames, copies = nerf_json.once_each(_held_out([replace(frame, split=splits[i]) for frame, i in zip(read, there, strict=True)]))
+    named = [replace(frame, name=name) for frame, name in zip(frames, unique_names([frame.image for frame in frames]), strict=True)]
+    return assemble(
+        "blender",
+        root,
+        named,
+        [*found.remarks, *nerf_json.missing_remarks(len(listed), found), *remarks, *copies],
+        alpha=any(picture_header(image).alpha for image in images),
+        up=(0.0, 0.0, 1.0),
+        extra={"listed": len(listed), "missing": len(listed) - found.count},
+    )
+
+
+def _held_out(frames: list[Frame]) -> list[Frame]:
+    """Frames in the one split that each image has: of the test where it is in both, of none where the two list the same images."""
+    test = {frame.image for frame in frames if frame.split == "test"}
+    both = {frame.image for frame in frames if frame.split == "train"} <= test
+    return [replace(frame, split=None if both else "test") if frame.image in test else frame for frame in frames]

@@ -10,15 +10,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
+from toolkit.camera import Array, pinhole_share
 from toolkit.capture import heif
 from toolkit.capture.depth_checks import check_depth
 from toolkit.capture.duplicates import copies, suspects
-from toolkit.capture.headers import Header, read_bytes, read_header
-from toolkit.capture.images import turns_by_exif, upright
-from toolkit.capture.listing import counted, fitted, natural_key, unique_names
+from toolkit.capture.headers import PANORAMA, Header, is_panorama, read_bytes, read_header
+from toolkit.capture.images import largest, read_picture, turns_by_exif, upright
+from toolkit.capture.listing import TIFFS, counted, fitted, natural_key, unique_names
 from toolkit.capture.photos import size_from_exif
-from toolkit.capture.types import Capture
+from toolkit.capture.tiff import unturned
+from toolkit.capture.types import Capture, Frame
+from toolkit.capture.usable import without
 from toolkit.errors import InputError
 from toolkit.progress import SILENT, Progress
 
@@ -29,6 +31,8 @@ FLAT = 2.0  # grey levels of standard deviation below which a picture shows noth
 DARK = 40  # grey level that 95% of a dark picture's pixels stay under
 BLOWN = 253  # grey level from which a pixel counts as saturated
 BLURRED = 0.25  # of the usual sharpness of the capture
+CUT_OFF = 0.1  # share of an image that is not used, from which on that is said
+FEWER_BITS = (1023, 4095, 16383)  # largest values of sensors that store 10, 12 and 14 bits in 16
 LOOKED_AT_SHAPES, SAME_SHAPE = 5, 0.05  # images whose EXIF is looked at; difference of width to height that rounding and lenses explain
 NOTICE = 0.1  # share of pictures from which a warning is worth reading
 
@@ -63,52 +67,85 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
         return capture
     if len(frames) == 1:
         raise InputError(f"{capture.root} holds only one picture; take at least 20 from different places")
-    headers, looks, exact = _look_at_all(capture, progress)
+    capture = scaled_to_white(capture, progress)
+    capture, headers, looks, exact = _look_at_all(capture, progress)
     _refuse_blank(capture, looks)
     _refuse_same(capture, looks)
     capture, headers, looks, copy_warnings = _once_each(capture, headers, looks, exact)
     sizes = Counter(_upright_size(header, turns_by_exif(capture)) for header in headers)
-    warnings = [
-        *_size_warnings(capture, sizes),
-        *_shape_warnings(capture, headers),
-        *copy_warnings,
-        *_picture_warnings(capture, looks),
-        *check_depth(capture, progress),
-    ]
+    warnings = [*_size_warnings(capture, sizes), *_shape_warnings(capture, headers), *_lens_warnings(capture), *copy_warnings]
+    warnings += _picture_warnings(capture, looks)
+    warnings += check_depth(capture, progress)
     extra = {**capture.extra, "sizes": {f"{width}x{height}": number for (width, height), number in sizes.most_common()}}
     return replace(
         capture, extra=extra, warnings=capture.warnings + tuple(warning for warning in warnings if warning not in capture.warnings)
     )
 
 
-def _look_at_all(capture: Capture, progress: Progress) -> tuple[list[Header], list[Look], dict[int, int]]:
-    """Headers of all pictures, thumbnail measures of as many as `PIXEL_BUDGET` allows and of all that may be copies by their names, and
-    the indices of exact copies with those that they are copies of."""
+def scaled_to_white(capture: Capture, progress: Progress = SILENT) -> Capture:
+    """The capture with `Frame.white` where its images use 10, 12 or 14 of 16 bits, by the files' own word or their largest value."""
+    deep = [frame for frame in capture.frames if frame.image.suffix.lower() in (*TIFFS, ".png") and frame.video_index is None]
+    most, said = 0, True
+    for number, frame in enumerate(deep):
+        progress.check()
+        try:
+            header = read_header(read_bytes(frame.image), frame.image)
+            value = 0 if not header.deep else header.white if header.white is not None else largest(frame.image)
+        except InputError:
+            continue  # said where images are looked at
+        if not header.deep:
+            return capture
+        said, most = said and header.white is not None, max(most, value)
+        if most > FEWER_BITS[-1]:
+            return capture
+        progress.update(number, len(deep), frame.name)
+    if not deep or len(deep) < len(capture.frames) or most <= 255:
+        return capture
+    white = next(bits for bits in FEWER_BITS if most <= bits)
+    why = "as the files say" if said else f"as no value exceeds {most}"
+    remark = f"the images use {white.bit_length()} of 16 bits, {why}; {white} is taken for white"
+    return replace(capture, frames=tuple(replace(frame, white=white) for frame in capture.frames), warnings=(*capture.warnings, remark))
+
+
+def _look_at_all(capture: Capture, progress: Progress) -> tuple[Capture, list[Header], list[Look], dict[int, int]]:
+    """The capture without images that cannot be used, headers of all others, thumbnail measures of as many as `PIXEL_BUDGET` allows and of
+    all that may be copies by their names, and the indices of exact copies with those that they are copies of.
+
+    Raises:
+        InputError: more than a few images cannot be used.
+    """
     headers: list[Header] = []
     looks: list[Look] = []
     first: dict[bytes, int] = {}
     exact: dict[int, int] = {}
+    bad: dict[str, str] = {}
     named = suspects(capture.frames)
     every = 1
     exif = turns_by_exif(capture)
     for index, frame in enumerate(capture.frames):
         progress.check()
         progress.update(index, len(capture.frames), frame.name)
-        data = read_bytes(frame.image)
-        header = read_header(data, frame.image)
+        try:
+            data = read_bytes(frame.image)
+            header = read_header(data, frame.image)
+            if is_panorama(data):
+                raise InputError(f"{frame.image}: {PANORAMA}")
+            if not headers:
+                # Entropy decoding of a JPEG costs about a third of a PNG's, whatever size it is reduced to.
+                cost = header.width * header.height * len(capture.frames) * (0.35 if header.format in ("JPEG", "MPO") else 1.0)
+                every = max(1, min(int(np.ceil(cost / PIXEL_BUDGET)), len(capture.frames) // 20))
+            if frame.intrinsics is not None:
+                fitted(frame.intrinsics, _upright_size(header, exif), str(frame.image))
+            if index % every == 0 or index in named:
+                looks.append(_look(frame, data, header, exif))
+        except InputError as error:
+            bad[frame.name] = str(error)
+            continue
         headers.append(header)
-        same = first.setdefault(hashlib.blake2b(data, digest_size=16).digest(), index)
-        if same != index:
-            exact[index] = same
-        if index == 0:
-            # Entropy decoding of a JPEG costs about a third of a PNG's, whatever size it is reduced to.
-            cost = header.width * header.height * len(capture.frames) * (0.35 if header.format in ("JPEG", "MPO") else 1.0)
-            every = max(1, min(int(np.ceil(cost / PIXEL_BUDGET)), len(capture.frames) // 20))
-        if frame.intrinsics is not None:
-            fitted(frame.intrinsics, _upright_size(header, exif), str(frame.image))
-        if index % every == 0 or index in named:
-            looks.append(_look(frame.name, frame.image, data, header, exif))
-    return headers, looks, exact
+        same = first.setdefault(hashlib.blake2b(data, digest_size=16).digest(), len(headers) - 1)
+        if same != len(headers) - 1:
+            exact[len(headers) - 1] = same
+    return without(capture, bad), headers, looks, exact
 
 
 def _once_each(
@@ -137,8 +174,8 @@ def _once_each(
     return left, [headers[index] for index in stays], looks, [warning]
 
 
-def _look(name: str, path: Path, data: bytes, header: Header, exif: bool) -> Look:
-    thumb = thumbnail(data, header, path)
+def _look(frame: Frame, data: bytes, header: Header, exif: bool) -> Look:
+    name, thumb = frame.name, thumbnail(data, header, frame.image, frame.white)
     grey = upright(thumb, header.orientation if exif and header.format != heif.FORMAT else 1).astype(np.float32)
     deviation = float(grey.std())
     # Divided by the contrast, so that a dim picture does not pass for a blurred one.
@@ -147,7 +184,7 @@ def _look(name: str, path: Path, data: bytes, header: Header, exif: bool) -> Loo
     return Look(name, tiny, deviation, sharpness, float(np.quantile(grey, 0.95)), float((thumb >= BLOWN).mean()))
 
 
-def thumbnail(data: bytes, header: Header, path: Path) -> Array:
+def thumbnail(data: bytes, header: Header, path: Path, white: int | None = None) -> Array:
     """A small grey picture (h, w) uint8, long side about `THUMB_SIDE`; JPEG is decoded at an eighth, a quarter or half its size.
 
     Raises:
@@ -163,8 +200,10 @@ def thumbnail(data: bytes, header: Header, path: Path) -> Array:
     try:
         if header.format == heif.FORMAT:
             grey = heif.small(data, THUMB_SIDE, path)
+        elif header.deep or header.format == "AVIF":
+            grey = np.asarray(cv2.cvtColor(read_picture(path, white)[0][..., :3], cv2.COLOR_RGB2GRAY))
         else:
-            grey = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+            grey = cv2.imdecode(np.frombuffer(unturned(data), np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         grey = None
     if grey is None:
@@ -229,6 +268,18 @@ def _shape_warnings(capture: Capture, headers: list[Header]) -> list[str]:
     if 2 * changed <= len(chosen):
         return []
     return [f"the images were taken at {example}: cropped or squeezed; if squeezed, bring them back to their shape and find poses again"]
+
+
+def _lens_warnings(capture: Capture) -> list[str]:
+    """That much of a wide lens's image lies outside of the pinhole image that is made of it."""
+    cameras = {frame.intrinsics for frame in capture.frames if frame.intrinsics is not None and frame.intrinsics.distorted}
+    shares = [pinhole_share(camera) for camera in cameras]
+    if not shares or min(shares) > 1 - CUT_OFF:
+        return []
+    return [
+        f"{100 * (1 - float(np.mean(shares))):.0f}% of the images' pixels lie outside of the pinhole view that is made of them (a wide "
+        "lens) and are not used; cut the images into several perspective views to use all"
+    ]
 
 
 def _picture_warnings(capture: Capture, looks: list[Look]) -> list[str]:

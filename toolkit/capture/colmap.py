@@ -1,17 +1,25 @@
-"""A COLMAP model with its images: `sparse/0`, `sparse`, `colmap/sparse/0`, `colmap/sparse` or the folder itself.
+"""A COLMAP model with its images. Both may lie anywhere below the folder: `sparse/0` and `images/`, `dense/0/sparse` and `dense/0/images`,
+the model in one folder and the images in its sibling.
 
-Of several models below `sparse/`, the one with the most images is taken. Images are looked for in `images/`, else beside.
+A folder may hold several models, of the photos as they were taken and of undistorted ones, or parts that were not joined. Taken is the one
+that most images fit by name and by size.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
+from toolkit.camera import Intrinsics
 from toolkit.capture.colmap_model import Model, holds_model, read_model
-from toolkit.capture.colmap_names import locate
 from toolkit.capture.listing import (
     assemble,
     counted,
+    fits_shape,
     fitted,
     natural_key,
     picture_header,
@@ -20,65 +28,118 @@ from toolkit.capture.listing import (
     unique_names,
 )
 from toolkit.capture.masks import masks_among
+from toolkit.capture.resolve import CaptureFiles, Found
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 
-PLACES = ("sparse", "colmap/sparse", ".")
+USUAL = re.compile(r"((colmap|dense|distorted|undistorted)/(\d+/)?)*sparse(/\d+)?|\.")
+MOST_MODELS = 20
+SAMPLED = 24  # images of a model whose sizes are compared with its cameras
+
+
+@dataclass(frozen=True)
+class CandidateModel:
+    """A model below a capture's folder, with those of its images that are there."""
+
+    name: str  # of its folder, relative to the capture's
+    model: Model
+    images: dict[int, Path]  # index of an image of the model → its file
+    fit: int  # images whose shape is their camera's, by those looked at
+    exact: float  # share of those looked at whose size is their camera's to the pixel
+    outside: int  # paths of images that lead outside the capture's folder
+    remarks: tuple[str, ...] = ()
 
 
 def model_folders(root: Path) -> list[Path]:
-    """Folders that hold a model: the numbered ones of the first place that has any, else that place itself."""
-    for place in PLACES:
-        folder = root / place
-        if not folder.is_dir():
-            continue
-        numbered = [child for child in folder.iterdir() if child.name.isdecimal() and child.is_dir() and holds_model(child)]
-        if numbered:
-            return sorted(numbered, key=lambda child: natural_key(child.name))
-        if holds_model(folder):
-            return [folder]
-    return []
+    """Folders at and below `root` that hold a model, those of fewest parts first."""
+    found = [name for name in CaptureFiles(root).folders() if holds_model(root / name)]
+    return [root / name for name in sorted(found, key=lambda name: (name.count("/") + bool(name), natural_key(name)))][:MOST_MODELS]
 
 
 def looks_like_colmap(path: Path) -> bool:
-    return bool(model_folders(path))
+    """Whether a model is where COLMAP and what is made for it put one."""
+    return path in owners(path)
 
 
-def image_folders(root: Path) -> list[Path]:
-    """Where the images of a model may lie; also above, when `root` is `…/sparse/0` itself."""
-    bases = [root]
-    while len(bases) < 4 and (bases[-1].name in ("sparse", "colmap") or bases[-1].name.isdecimal()):
-        bases.append(bases[-1].parent)
-    return [folder for base in bases for folder in (base / "images", base) if folder.is_dir()]
+def owners(root: Path) -> list[Path]:
+    """Folders at and below `root` whose models they are: `scene` of `scene/sparse/0`."""
+    out = []
+    for folder in model_folders(root):
+        if root.name == "sparse" and folder.parent == root and folder.name.isdecimal():
+            out.append(root)
+            continue
+        above = [root, *(root / parent for parent in reversed(folder.relative_to(root).parents)), folder]
+        out.append(next(owner for owner in above if USUAL.fullmatch(folder.relative_to(owner).as_posix())))
+    return list(dict.fromkeys(out))
+
+
+def has_images(root: Path) -> bool:
+    """Whether images lie where those of a model mostly do."""
+    return any(pictures_in(folder) for folder in (root / "images", root))
+
+
+def candidate_models(root: Path) -> list[CandidateModel]:
+    """The models that can be read, best first: the one that most images fit, by name and size.
+
+    Raises:
+        InputError: none is there, none can be read, or images of the same names lie in two places.
+    """
+    folders = model_folders(root)
+    if not folders:
+        raise InputError(f"{root} holds no COLMAP model (cameras and images as .bin or .txt in sparse/0); export one there")
+    top = _above_model(root)
+    files = CaptureFiles(top)
+    candidates, errors = [], []
+    for folder in folders:
+        try:
+            candidates.append(_candidate(root, folder, files))
+        except InputError as error:
+            errors.append((folder, error))
+    if not candidates:
+        raise errors[0][1]
+    remarks = tuple(f"the model in {_name(root, folder)} is not used: {error}" for folder, error in errors)
+    ranked = sorted(candidates, key=lambda one: (-one.fit, -one.exact, -len(one.images)))
+    if not ranked[0].images and errors:
+        raise errors[0][1]
+    return [_among(one, ranked, remarks) for one in ranked]
+
+
+def candidate_captures(path: Path | str) -> Iterator[Capture]:
+    """The captures that the models in a folder make, best first; each is made when it is asked for.
+
+    Raises:
+        InputError: no model, a broken model, none of its images on disk, or an image of another shape than its camera.
+    """
+    root = require_folder(path)
+    for candidate in candidate_models(root):
+        yield _capture(root, candidate)
 
 
 def read_colmap(path: Path | str) -> Capture:
     """The registered images that exist, with cameras, poses and sparse points in the model's frame.
 
     Raises:
-        InputError: no model, a broken model, none of its images on disk, or an image of another shape than its camera.
+        InputError: as `candidate_captures`.
     """
-    root = require_folder(path)
-    folders = model_folders(root)
-    if not folders:
-        raise InputError(f"{root} holds no COLMAP model (cameras and images as .bin or .txt in sparse/0); export one there")
-    models = [read_model(folder) for folder in folders]
-    best = max(range(len(models)), key=lambda index: len(models[index].images))
-    model = models[best]
-    warnings = []
-    if len(models) > 1:
-        warnings.append(f"{len(models)} models were found; {folders[best].name} has the most images ({len(model.images)}) and is used")
-    images, located = _locate(root, model)
+    return next(candidate_captures(path))
+
+
+def _capture(root: Path, candidate: CandidateModel) -> Capture:
+    model, images = candidate.model, candidate.images
+    listed = len(model.images)
+    if not images:
+        raise CaptureFiles(_above_model(root)).none_exists(f"the model {candidate.name}", listed, Found([], outside=candidate.outside))
+    located, warnings = sorted(images), list(candidate.remarks)
     frames, scaled = [], 0
     for index, name in zip(located, unique_names([images[index] for index in located]), strict=True):
         entry = model.images[index]
         described = model.cameras[entry.camera]
-        intrinsics = fitted(described, picture_header(images[index]).size, f"{entry.name} in {folders[best]}")
+        intrinsics = fitted(described, picture_header(images[index]).size, f"{entry.name} in {root / candidate.name}", images[index])
         scaled += intrinsics is not described
         frames.append(Frame(name=name, image=images[index], intrinsics=intrinsics, world_from_camera=entry.world_from_camera))
-    missing = len(model.images) - len(frames)
+    missing = listed - len(frames)
     if missing:
-        warnings.append(f"{missing} of the {len(model.images)} images of the model do not exist; the other {len(frames)} are used")
+        warnings.append(f"{missing} of the {listed} images of the model do not exist; the other {len(frames)} are used")
     if scaled:
         warnings.append(f"{counted(scaled, 'picture')} of another size than the model tells; intrinsics were scaled to fit")
     used = set(images.values())
@@ -88,17 +149,87 @@ def read_colmap(path: Path | str) -> Capture:
         unregistered += len(set(pictures) - used - masks_among(pictures))
     if unregistered:
         warnings.append(f"{counted(unregistered, 'picture')} beside these are not in the model and are left out")
-    extra = {"listed": len(model.images), "missing": missing, "unregistered": unregistered}
+    extra = {"listed": listed, "missing": missing, "unregistered": unregistered}
     return assemble("colmap", root, frames, warnings, points=model.points if len(model.points) else None, extra=extra)
 
 
-def _locate(root: Path, model: Model) -> tuple[dict[int, Path], list[int]]:
-    """Image index → its file, from the folder that holds most of them; and the indices that were found."""
-    best: dict[int, Path] = {}
-    for folder in image_folders(root):
-        found = locate(folder, [entry.name for entry in model.images])
-        if len(found) > len(best):
-            best = found
-    if not best:
-        raise InputError(f"none of the {counted(len(model.images), 'image')} of the model in {root} exists; put them in {root / 'images'}")
-    return best, sorted(best)
+def _candidate(root: Path, folder: Path, files: CaptureFiles) -> CandidateModel:
+    """The model in `folder` with the images that fit it best: of the folders around it, nearest first, else of any other."""
+    model = read_model(folder)
+    names = [image.name for image in model.images]
+    name = _name(root, folder)
+    found: Found | None = None
+    best = (0, 0.0)
+    for base in _bases(folder.resolve(), files):
+        here = files.find(names, source=name, base=base, anywhere=False)
+        fit = _fit(model, here)
+        if here.count and (found is None or fit > best):
+            found, best = here, fit
+        if best[1] == 1 and found is not None and found.count == len(names):
+            break
+    remarks: list[str] = []
+    if found is None:
+        found = files.find(names, source=name, base="images", anywhere=files.root == root.resolve())
+        best = _fit(model, found)
+        places = sorted({path.parent.relative_to(files.root).as_posix() for path in found.files if path is not None})
+        if places:
+            remarks.append(f"the images of the model in {name} were found in {', '.join(places[:3])}{', …' if len(places) > 3 else ''}")
+    else:
+        remarks += found.remarks
+    if not USUAL.fullmatch(name):
+        remarks.append(f"the COLMAP model was found in {name}")
+    there = {index: path for index, path in enumerate(found.files) if path is not None}
+    return CandidateModel(name, model, there, *best, found.outside, tuple(remarks))
+
+
+def _bases(folder: Path, files: CaptureFiles) -> list[str]:
+    """Where the images of the model in `folder` may lie: in `images/` beside it, then beside it, then further up to the top."""
+    out = []
+    for above in (folder, *folder.parents):
+        out += [place.relative_to(files.root).as_posix() for place in (above / "images", above) if place.is_dir()]
+        if above == files.root:
+            return out
+    return out
+
+
+def _fit(model: Model, found: Found) -> tuple[int, float]:
+    """How many images have their camera's shape, and the share of those looked at that have its very size."""
+    there = [index for index, path in enumerate(found.files) if path is not None]
+    if not there:
+        return 0, 0.0
+    chosen = [there[int(place)] for place in np.unique(np.linspace(0, len(there) - 1, SAMPLED).round())]
+    shapes = [_shape(model.cameras[model.images[index].camera], found.files[index]) for index in chosen]
+    return round(len(there) * sum(shape > 0 for shape in shapes) / len(shapes)), sum(shape == 2 for shape in shapes) / len(shapes)
+
+
+def _shape(camera: Intrinsics, path: Path | None) -> int:
+    """2: an image of the camera's size, 1: of its shape, 0: of neither, or no image."""
+    try:
+        size = picture_header(path).size if path is not None else (0, 0)
+    except InputError:
+        return 0
+    return 2 if size == (camera.width, camera.height) else int(fits_shape(camera, size))
+
+
+def _above_model(root: Path) -> Path:
+    """The folder that holds a model's images: above `root` when this is the model's own folder (`sparse/0`, `colmap/sparse`)."""
+    top = root.resolve()
+    if top.name.isdecimal() and top.parent.name == "sparse":
+        top = top.parent
+    for name in ("sparse", "colmap"):
+        top = top.parent if top.name == name else top
+    return top
+
+
+def _name(root: Path, folder: Path) -> str:
+    return folder.relative_to(root).as_posix()
+
+
+def _among(one: CandidateModel, ranked: list[CandidateModel], remarks: tuple[str, ...]) -> CandidateModel:
+    """The candidate with a remark on those that it was chosen from."""
+    rest = [other for other in ranked if other is not one]
+    others = [f"{other.name} ({counted(len(other.model.images), 'image')}, {other.fit} of which fit)" for other in rest]
+    if others:
+        more = ", …" if len(others) > 3 else ""
+        remarks += (f"of several models that in {one.name} is used, which {one.fit} images fit; not used: {', '.join(others[:3])}{more}",)
+    return replace(one, remarks=remarks + one.remarks)

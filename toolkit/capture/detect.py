@@ -9,7 +9,8 @@ The order is deliberate: what somebody wrote for this very purpose goes before w
 5. a COLMAP model before LLFF's `poses_bounds.npy`: sets that have both keep lens and points only in the model, but only
    when its pictures are there (sets at 1/8 size often come without them);
 6. colour and depth in folders of any name, with a list of poses;
-7. photos; 8. one video (or recording in one file) in a folder, alone or with one picture (its cover).
+7. photos; 8. one video (or recording in one file) in a folder, alone or with one picture (its cover);
+9. the only capture in a folder further down, as unpacking leaves it.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from pathlib import Path
 
 from toolkit.capture.archive import SUFFIXES as ARCHIVES
 from toolkit.capture.blender import looks_like_blender, read_blender
-from toolkit.capture.colmap import image_folders, looks_like_colmap, read_colmap
+from toolkit.capture.colmap import candidate_models, has_images, looks_like_colmap, owners, read_colmap
 from toolkit.capture.dtu import looks_like_dtu, read_dtu
-from toolkit.capture.listing import PICTURES, counted, pictures_in, require_folder
+from toolkit.capture.listing import PICTURES, counted, natural_key, pictures_in, require_folder
 from toolkit.capture.llff import looks_like_llff, read_llff
 from toolkit.capture.photos import looks_like_photos, photo_files, read_photos
 from toolkit.capture.polycam import looks_like_polycam, read_polycam
@@ -30,6 +31,7 @@ from toolkit.capture.record3d import SUFFIX as RECORD3D
 from toolkit.capture.record3d import holds_record3d, looks_like_record3d, read_record3d
 from toolkit.capture.redwood import looks_like_redwood, read_redwood
 from toolkit.capture.replica import looks_like_replica, read_replica
+from toolkit.capture.resolve import CaptureFiles
 from toolkit.capture.rgbd_folder import looks_like_rgbd, read_rgbd
 from toolkit.capture.scanner3d import looks_like_scanner3d, read_scanner3d
 from toolkit.capture.scannet import looks_like_scannet, read_scannet, read_sens
@@ -44,13 +46,79 @@ from toolkit.errors import InputError
 from toolkit.files import require_utf8
 
 FILMS = (*VIDEO_SUFFIXES, RECORD3D)
+DEEPEST, MOST_FOLDERS = 3, 200  # where captures are looked for that are not where they were said to be
 CAMERA_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 
 
 def _colmap_without_llff(path: Path) -> bool:
     if not looks_like_colmap(path):
+        return _model_further_down(path)
+    return not looks_like_llff(path) or has_images(path)
+
+
+def _model_further_down(path: Path) -> bool:
+    """Whether a model below is this folder's: its images lie here or in a sibling, and no capture of its own is around it."""
+    models = owners(path)
+    if not models or looks_like_llff(path) or sum(map(has_images, models)) > 0 or captures_below(path) != models:
         return False
-    return not looks_like_llff(path) or any(pictures_in(folder) for folder in image_folders(path))
+    try:
+        return bool(candidate_models(path)[0].images)
+    except InputError:
+        return not looks_like_photos(path)  # the reader says what is wrong
+
+
+def captures_below(folder: Path) -> list[Path]:
+    """Folders below that hold a capture with poses, none of them within another; those of fewest parts first."""
+    found = owners(folder)
+    kinds = [looks_like for kind, looks_like, _ in READERS if kind not in ("colmap", "photos")]
+    for below in _folders_below(folder):
+        if not any(below.is_relative_to(other) for other in found) and any(looks_like(below) for looks_like in kinds):
+            found.append(below)
+    found = [one for one in found if not any(one != other and one.is_relative_to(other) for other in found)]
+    return sorted(found, key=lambda one: (len(one.parts), natural_key(str(one))))
+
+
+def _folders_below(folder: Path) -> list[Path]:
+    listing = CaptureFiles(folder).folders()
+    return [folder / name for name in listing if name and name.count("/") < DEEPEST][:MOST_FOLDERS]
+
+
+def _read_below(folder: Path) -> Capture | None:
+    """The only capture in the folders below: of those with poses, else of photos, or a video; None where there is none.
+
+    Several folders of images may be one capture's colour and depth, which only a layout says.
+
+    Raises:
+        InputError: there are several.
+    """
+    found = captures_below(folder)
+    if len(found) > 1:
+        names = ", ".join(f"{one.relative_to(folder).as_posix()}/" for one in found[:4])
+        raise InputError(f"{folder} holds {len(found)} captures ({names}{', …' if len(found) > 4 else ''}); give one of them")
+    if not found:
+        found = [below for below in _folders_below(folder) if len(pictures_in(below)) > 1 or len(pictures_in(below, FILMS)) == 1]
+    if len(found) != 1:
+        return None
+    return _descended(folder, found[0])
+
+
+def _posed_below(folder: Path) -> Capture | None:
+    """The capture whose images are photos of this folder and whose json lies further down; None where there is none."""
+    found = captures_below(folder)
+    if len(found) != 1 or not looks_like_transforms(found[0]):
+        return None
+    try:
+        capture = _descended(folder, found[0])
+    except InputError:
+        return None  # another's
+    photos = {photo.resolve() for photo in photo_files(folder)}
+    return capture if all(frame.image in photos for frame in capture.frames) else None
+
+
+def _descended(folder: Path, below: Path) -> Capture:
+    # What its json lists may lie beside its folder.
+    capture = read_transforms(below, within=folder) if detect_kind(below) == "transforms" else read_source(below)
+    return replace(capture, warnings=(f"the capture was found in {below.relative_to(folder).as_posix()}/", *capture.warnings))
 
 
 def _photos_without_film(path: Path) -> bool:
@@ -102,9 +170,9 @@ def read_source(path: Path) -> Capture:
         return read_sens(path) if is_sens(path) else read_video(path)
     folder = require_folder(path)
     try:
-        for _, looks_like, read in READERS:
+        for kind, looks_like, read in READERS:
             if looks_like(folder):
-                return read(folder)
+                return (_posed_below(folder) if kind == "photos" else None) or read(folder)
         videos = pictures_in(folder, FILMS)
     except OSError as error:
         raise InputError(f"cannot read {error.filename or folder}: {error.strerror or error}") from error
@@ -121,6 +189,9 @@ def read_source(path: Path) -> Capture:
             f"{folder} holds {counted(len(raw), 'camera raw file')} ({raw[0].name}{', …' if len(raw) > 1 else ''}), which cannot be read; "
             "develop them to JPEG, all in the same way"
         )
+    below = _read_below(folder)
+    if below is not None:
+        return below
     held = ", ".join(sorted(child.name for child in folder.iterdir())[:4])
     raise InputError(
         f"{folder} holds no capture of a known kind (it holds {held}); "

@@ -13,9 +13,15 @@ from PIL import Image, UnidentifiedImageError
 from toolkit.capture import heif
 from toolkit.capture.archive import read_member
 from toolkit.capture.primaries import heif_colours, png_colours
+from toolkit.capture.tiff import Tiff, is_tiff, read_tiff, unturned
 from toolkit.errors import InputError
 
 MAX_PIXELS = 200_000_000
+PANORAMA = "360° panoramas (equirectangular) are not read; cut each into perspective views first, and give these"
+XMP_WITHIN = 2**18  # bytes of a file's beginning in which its XMP stands
+PNG_BITS = 24  # where a PNG's bit depth stands
+EXR = b"\x76\x2f\x31\x01"
+NOT_EXR = "is OpenEXR, which is not read; write depth as 16-bit PNG in millimetres or as float .npy, and images as PNG or TIFF"
 _ORIENTATION = 0x0112  # EXIF tag, 1 to 8
 _pillow_limit = threading.Lock()
 
@@ -30,6 +36,8 @@ class Header:
     format: str
     orientation: int
     profile: bytes | None = None
+    deep: bool = False  # more than 8 bits a channel
+    white: int | None = None  # the largest value that a channel has, where the file says so
 
 
 def read_bytes(path: Path) -> bytes:
@@ -57,34 +65,61 @@ def read_header(data: bytes, path: Path) -> Header:
     """
     if heif.is_heif(data):
         heif.register(path)
-        if not heif.complete(data):
-            raise _cut_short(path)
+    if (heif.is_heif(data) or is_avif(data)) and not heif.complete(data):
+        raise _cut_short(path)
+    if data[:4] == EXR:
+        raise InputError(f"{path} {NOT_EXR}")
+    tiff = read_tiff(data) if is_tiff(data) else None
     try:
         # Pillow's own limit is lower than ours and global; it is lifted for the header only, and ours is applied below.
         with _pillow_limit, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
             try:
-                with Image.open(io.BytesIO(data)) as picture:
+                with Image.open(io.BytesIO(unturned(data))) as picture:
                     width, height = picture.size
                     kind = picture.format or ""
-                    orientation = _orientation(picture)
+                    orientation = _orientation(picture) if tiff is None else tiff.orientation
                     profile = _profile(picture, data)
+                    deep = picture.mode.startswith("I") or (tiff is not None and tiff.bits > 8)
             finally:
                 Image.MAX_IMAGE_PIXELS = limit
     except UnidentifiedImageError as error:
+        if tiff is not None:
+            return _of_tiff(tiff, path)
         raise InputError(f"{path} is not a picture that can be read; convert it to JPEG or PNG, or remove it") from error
     except Exception as error:  # Pillow's parsers raise many families on damaged headers
         raise InputError(f"the header of the picture {path} is damaged; copy it again or remove it") from error
+    _check_size(width, height, path)
+    if not _complete(data, kind):
+        raise _cut_short(path)
+    deep = deep or (kind == "PNG" and len(data) > PNG_BITS and data[PNG_BITS] == 16)
+    return Header(width, height, kind, orientation, profile, deep, None if tiff is None else tiff.maximum)
+
+
+def is_panorama(data: bytes) -> bool:
+    """Whether the file says that its image is equirectangular (Google's photo sphere XMP)."""
+    head = data[:XMP_WITHIN]
+    return b"GPano:" in head and b"equirectangular" in head
+
+
+def is_avif(data: bytes) -> bool:
+    return data[4:8] == b"ftyp" and data[8:12] in (b"avif", b"avis")
+
+
+def _of_tiff(tiff: Tiff, path: Path) -> Header:
+    """Of a TIFF that Pillow does not know, as those with 32-bit floating-point colours."""
+    _check_size(tiff.width, tiff.height, path)
+    return Header(tiff.width, tiff.height, "TIFF", tiff.orientation, tiff.profile, tiff.bits > 8, tiff.maximum)
+
+
+def _check_size(width: int, height: int, path: Path) -> None:
     if width * height > MAX_PIXELS:
         raise InputError(
             f"the picture {path} has {width}×{height} pixels, more than the {MAX_PIXELS // 10**6} megapixels that are read; make it smaller"
         )
     if width < 1 or height < 1:
         raise InputError(f"the picture {path} has no pixels ({width}×{height}); remove it")
-    if not _complete(data, kind):
-        raise _cut_short(path)
-    return Header(width, height, kind, orientation, profile)
 
 
 def orientation_of(path: Path) -> int:
@@ -93,6 +128,8 @@ def orientation_of(path: Path) -> int:
     if heif.file_is_heif(path):
         return 1
     try:
+        if path.suffix.lower() in (".tif", ".tiff") and (tiff := read_tiff(path.read_bytes())) is not None:
+            return tiff.orientation
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with Image.open(path) as picture:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from toolkit.camera import Array
 from toolkit.capture import heif, lzfse
@@ -15,10 +17,12 @@ from toolkit.capture.headers import MAX_PIXELS, Header, orientation_of, read_byt
 from toolkit.capture.listing import picture_header
 from toolkit.capture.sens import is_sens
 from toolkit.capture.sens_frames import sens_depth
+from toolkit.capture.tiff import unturned
 from toolkit.capture.types import Capture, Frame
 from toolkit.capture.video import iterate_video
 from toolkit.errors import InputError
 
+EXIF_TURNS = "exif_turns"  # in `Capture.extra`: the cameras are those of images that are turned by EXIF
 LOSSY = ("JPEG", "MPO", "WEBP", heif.FORMAT)  # formats whose black and white come out as greys
 WHITE = 255
 FEW_LEVELS = 32  # grey levels of a mask up to which they are labels, not soft edges
@@ -27,9 +31,10 @@ FEW_LEVELS = 32  # grey levels of a mask up to which they are labels, not soft e
 def turns_by_exif(capture: Capture) -> bool:
     """Whether this capture's pictures are turned upright by their EXIF orientation.
 
-    Only plain photo folders are: every other source brings cameras that were made for the pixels as they are stored.
+    Plain photo folders are. Other sources bring cameras that were made for the pixels as they are stored, unless only the turned images
+    have the cameras' shape (`usable.turned_by_exif`).
     """
-    return capture.kind == "photos"
+    return capture.kind == "photos" or capture.extra.get(EXIF_TURNS) is True
 
 
 def load_image(frame: Frame, *, exif: bool = False) -> Array:
@@ -46,7 +51,7 @@ def load_image(frame: Frame, *, exif: bool = False) -> Array:
         for _, picture in iterate_video(frame.image, {frame.video_index}, as_stored=frame.as_stored):
             return picture
         raise InputError(f"frame {frame.video_index} of the video {frame.image} cannot be decoded; the file may be damaged")
-    stored, orientation = read_picture(frame.image)
+    stored, orientation = read_picture(frame.image, frame.white)
     picture = upright(stored, orientation if exif else 1)
     mask = load_mask(frame, exif=exif) if frame.mask_is_alpha else None
     if mask is None or picture.shape[2] == 4:
@@ -54,14 +59,27 @@ def load_image(frame: Frame, *, exif: bool = False) -> Array:
     return np.dstack([picture, cv2.resize(mask.astype(np.uint8) * 255, picture.shape[1::-1], interpolation=cv2.INTER_LINEAR)])
 
 
-def read_picture(path: Path) -> tuple[Array, int]:
+def read_picture(path: Path, white: int | None = None) -> tuple[Array, int]:
     """The picture in the file `path` as `load_image` has it, pixels as stored, and the EXIF orientation.
+
+    Args:
+        white: the largest value of its channels, as `Frame.white`.
 
     Raises:
         InputError: naming the file.
     """
     picture, header = decode(path)
-    return to_srgb(to_rgba(picture), header.profile), 1 if header.format == heif.FORMAT else header.orientation
+    return to_srgb(to_rgba(picture, white), header.profile), 1 if header.format == heif.FORMAT else header.orientation
+
+
+def largest(path: Path) -> int:
+    """The largest value of a 16-bit image's channels, alpha aside; 0 for other images.
+
+    Raises:
+        InputError: naming the file.
+    """
+    image = decode(path)[0]
+    return int(image[..., :3].max() if image.ndim == 3 else image.max()) if image.dtype == np.uint16 else 0
 
 
 def see_through(path: Path) -> bool:
@@ -172,10 +190,17 @@ def _white(mask: Array, lossy: bool) -> Array:
     return np.asarray(grey > grey.max() / 2 if soft else grey > 0)
 
 
-def to_rgba(picture: Array) -> Array:
-    """A decoded picture of any depth and number of channels (BGR order) → (H, W, 3) or (H, W, 4) uint8 RGB(A)."""
+def to_rgba(picture: Array, white: int | None = None) -> Array:
+    """A decoded picture of any depth and number of channels (BGR order) → (H, W, 3) or (H, W, 4) uint8 RGB(A).
+
+    Args:
+        white: the value of 16-bit channels that becomes 255; None: 65535. Alpha always uses all bits.
+    """
     if picture.dtype == np.uint16:
-        picture = cv2.convertScaleAbs(picture, alpha=1 / 257)
+        alpha = picture[..., 3:] if white is not None and picture.ndim == 3 and picture.shape[2] == 4 else None
+        picture = cv2.convertScaleAbs(picture, alpha=255 / (white or 65535))
+        if alpha is not None:
+            picture[..., 3:] = alpha >> 8
     elif picture.dtype != np.uint8:
         finite = np.nan_to_num(picture.astype(np.float32), nan=0.0, posinf=1.0, neginf=0.0)
         picture = np.round(np.clip(finite, 0, 1) * 255).astype(np.uint8)
@@ -211,9 +236,11 @@ def decode(path: Path) -> tuple[Array, Header]:
     header = read_header(data, path)
     if header.format == heif.FORMAT:
         return heif.decode(data, path), header
+    if header.format == "AVIF":
+        return _decode_avif(data, path), header
     try:
-        # UNCHANGED keeps alpha and 16 bits, and leaves the orientation to us.
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        # UNCHANGED keeps alpha and 16 bits, and leaves the orientation to us; TIFFs would be turned all the same.
+        picture = cv2.imdecode(np.frombuffer(unturned(data), np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         picture = None
     if picture is None:
@@ -221,6 +248,17 @@ def decode(path: Path) -> tuple[Array, Header]:
             f"the picture {path} ({header.format}) is damaged or of a kind that cannot be decoded; copy it again or convert it to PNG"
         )
     return np.asarray(picture), header
+
+
+def _decode_avif(data: bytes, path: Path) -> Array:
+    """(H, W, 3 or 4) uint8 in OpenCV's order: OpenCV itself reads more than 8 bits in a range of their own."""
+    try:
+        with Image.open(io.BytesIO(data)) as picture:
+            picture.load()
+            rgb = np.asarray(picture.convert("RGBA" if picture.mode in ("RGBA", "LA") else "RGB"))
+    except Exception as error:  # Pillow's decoders raise many families on damaged files
+        raise InputError(f"the picture {path} (AVIF) is damaged or cannot be decoded; copy it again or convert it to PNG") from error
+    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGBA2BGRA if rgb.shape[2] == 4 else cv2.COLOR_RGB2BGR))
 
 
 def _load_npy(path: Path) -> Array:

@@ -15,10 +15,14 @@ from PIL import Image
 from toolkit import files
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture import heif
+from toolkit.capture.headers import NOT_EXR, orientation_of
+from toolkit.capture.tiff import read_tiff
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError, first_line
 
-PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", *heif.SUFFIXES)
+PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".avif", *heif.SUFFIXES)
+LYING = 5  # EXIF orientations from here on turn by 90°
+TIFFS = (".tif", ".tiff")
 MAX_TEXT_BYTES = 64 * 2**20
 
 
@@ -115,10 +119,14 @@ def picture_header(path: Path) -> Header:
     """
     if heif.file_is_heif(path):
         heif.register(path)
+    if path.suffix.lower() == ".exr":
+        raise InputError(f"{path} {NOT_EXR}")
     try:
         if path.suffix.lower() == ".npy":
             height, width = np.load(path, mmap_mode="r", allow_pickle=False).shape[:2]
             return Header(int(width), int(height), False)
+        if path.suffix.lower() in TIFFS and (tiff := read_tiff(path.read_bytes())) is not None:
+            return Header(tiff.width, tiff.height, tiff.alpha)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # only the header is read; large photos are welcome
             picture = Image.open(path)
@@ -129,8 +137,17 @@ def picture_header(path: Path) -> Header:
         raise InputError(f"{path} cannot be read as a picture; remove it or replace it") from error
 
 
-def fitted(intrinsics: Intrinsics, size: tuple[int, int], where: str) -> Intrinsics:
+def fits_shape(intrinsics: Intrinsics, size: tuple[int, int]) -> bool:
+    """Whether a picture of `size` (width, height) may be the camera's, made smaller or larger."""
+    width, height = size
+    return abs(intrinsics.height * width / intrinsics.width - height) <= max(2.0, 0.005 * height)
+
+
+def fitted(intrinsics: Intrinsics, size: tuple[int, int], where: str, image: Path | None = None) -> Intrinsics:
     """The camera for a picture of `size` (width, height): itself, or scaled when the aspect ratio agrees.
+
+    Args:
+        image: a file whose EXIF orientation may turn it by 90° into the camera's shape; then the camera is that of the upright image.
 
     Raises:
         InputError: the picture has another shape (cropped, or turned).
@@ -138,8 +155,9 @@ def fitted(intrinsics: Intrinsics, size: tuple[int, int], where: str) -> Intrins
     width, height = size
     if (width, height) == (intrinsics.width, intrinsics.height):
         return intrinsics
-    expected = intrinsics.height * width / intrinsics.width
-    if abs(expected - height) > max(2.0, 0.005 * height):
+    if not fits_shape(intrinsics, size):
+        if image is not None and fits_shape(intrinsics, (height, width)) and orientation_of(image) >= LYING:
+            return fitted(intrinsics, (height, width), where)
         raise InputError(
             f"{where}: the picture is {width}×{height} but its intrinsics are for "
             f"{intrinsics.width}×{intrinsics.height}, which is another shape; "
@@ -167,6 +185,15 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 
 
+def number(word: str) -> float:
+    """A number as text, NaN also as Microsoft's C library writes it (`-1.#IND`, `nan(ind)`).
+
+    Raises:
+        ValueError: the text is no number.
+    """
+    return float("nan") if word.lower().lstrip("+-").startswith(("1.#", "nan")) else float(word)
+
+
 def read_numbers(path: Path) -> Array:
     """All numbers of a text file, float64; values may be infinite or NaN.
 
@@ -174,7 +201,7 @@ def read_numbers(path: Path) -> Array:
         InputError: missing, not text, or a word that is not a number.
     """
     try:
-        return np.array([float(word) for word in read_text(path).split()], dtype=np.float64)
+        return np.array([number(word) for word in read_text(path).split()], dtype=np.float64)
     except ValueError as error:
         raise InputError(f"{path} must hold numbers only ({first_line(error)}); check how it was written") from error
 

@@ -13,6 +13,7 @@ import numpy as np
 from toolkit.camera import Array, Intrinsics, checked_pose, world_from_llff
 from toolkit.capture.listing import assemble, counted, fitted, picture_header, pictures_in, require_folder, unique_names
 from toolkit.capture.masks import is_mask_folder, masks_among
+from toolkit.capture.resolve import BESIDE, CaptureFiles
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError, first_line
 
@@ -31,7 +32,7 @@ def read_llff(path: Path | str) -> Capture:
     """
     root = require_folder(path)
     rows = _read_rows(root / NAME)
-    pictures = _pictures(root, len(rows))
+    pictures, remarks = _pictures(root, len(rows))
     frames = []
     for index, (picture, name) in enumerate(zip(pictures, unique_names(pictures), strict=True)):
         where = f"{root / NAME}, row {index} ({picture.name})"
@@ -42,11 +43,11 @@ def read_llff(path: Path | str) -> Capture:
             raise InputError(f"{where}: the picture size {width:g}×{height:g} is not usable; correct it")
         camera = Intrinsics(round(width), round(height), float(focal), float(focal), float(width) / 2, float(height) / 2).checked(where)
         frames.append(
-            Frame(name=name, image=picture, intrinsics=fitted(camera, picture_header(picture).size, where), world_from_camera=pose)
+            Frame(name=name, image=picture, intrinsics=fitted(camera, picture_header(picture).size, where, picture), world_from_camera=pose)
         )
     bounds = rows[:, 15:]
     extra = {"near": float(bounds[:, 0].min()), "far": float(bounds[:, 1].max())} if np.isfinite(bounds).all() else {}
-    return assemble("llff", root, frames, extra=extra)
+    return assemble("llff", root, frames, remarks, extra=extra)
 
 
 def _read_rows(path: Path) -> Array:
@@ -59,8 +60,8 @@ def _read_rows(path: Path) -> Array:
     return rows.astype(np.float64)
 
 
-def _pictures(root: Path, rows: int) -> list[Path]:
-    """One picture a row, in alphabetical order: `images/` first, else the folder with the largest pictures."""
+def _pictures(root: Path, rows: int) -> tuple[list[Path], list[str]]:
+    """One picture a row, in alphabetical order: `images/` first, else the folder with the largest pictures, else the only one that fits."""
     counts: dict[str, int] = {}
     candidates: list[tuple[bool, int, list[Path]]] = []
     for folder in sorted(path for path in root.iterdir() if path.is_dir() and (path.name == "images" or path.name.startswith("images_"))):
@@ -71,7 +72,11 @@ def _pictures(root: Path, rows: int) -> list[Path]:
         counts[folder.name] = len(found)
         if found and len(found) == rows:
             candidates.append((folder.name == "images", picture_header(found[0]).width, found))
-    if not candidates:
-        held = ", ".join(f"{name}/ holds {counted(count, 'picture')}" for name, count in counts.items()) or "there is no images/ folder"
-        raise InputError(f"{root / NAME} has {counted(rows, 'pose')} but {held}; each pose needs exactly one picture")
-    return max(candidates, key=lambda candidate: candidate[:2])[2]
+    if candidates:
+        return max(candidates, key=lambda candidate: candidate[:2])[2], []
+    others = {name: sorted(pictures_in(root / name), key=lambda path: path.name) for name in CaptureFiles(root).folders()}
+    fitting = [name for name, found in others.items() if len(found) == rows and not BESIDE.search(name.lower())]
+    if len(fitting) == 1:
+        return others[fitting[0]], [f"the images were found in {fitting[0] or '.'}/, which holds one for each pose"]
+    held = ", ".join(f"{name}/ holds {counted(count, 'picture')}" for name, count in counts.items()) or "there is no images/ folder"
+    raise InputError(f"{root / NAME} has {counted(rows, 'pose')} but {held}; each pose needs exactly one picture")

@@ -96,7 +96,7 @@ def read_sens(path: Path) -> Capture:
     seen = np.flatnonzero(found.places[:, 1])
     if not len(seen):
         raise InputError(f"{path} holds no picture; copy it again from where it was published")
-    tracked = [int(index) for index in seen if not np.isinf(found.poses[index]).any()]
+    tracked = [int(index) for index in seen if np.isfinite(found.poses[index]).all()]
     remarks = [*lost_frames(len(seen), len(tracked), path), *_unused(found)]
     colour = fitted(colour, sens_size(found, tracked[0]), f"{path}, frame {tracked[0]}")
     frames = [

@@ -77,7 +77,7 @@ def frame_names(found: list[FrameFiles]) -> list[str]:
 def posed_frames(
     found: list[FrameFiles], names: list[str], colour: Intrinsics, depth: Intrinsics, root: Path
 ) -> tuple[list[Frame], list[str]]:
-    """The frames that have a pose, and a remark on those that were lost (-inf). The cameras are scaled to the pictures' sizes.
+    """The frames that have a pose, and a remark on those that were lost (-inf or NaN). The cameras are scaled to the pictures' sizes.
 
     Raises:
         InputError: all are lost, a pose is not rigid, or a picture has another shape than its camera.
@@ -85,7 +85,7 @@ def posed_frames(
     frames = []
     for entry, name in zip(found, names, strict=True):
         pose = read_matrix(entry.pose, (4, 4))
-        if np.isinf(pose).any():
+        if not np.isfinite(pose).all():
             continue
         frames.append(
             Frame(
@@ -108,8 +108,8 @@ def lost_frames(listed: int, tracked: int, where: Path) -> list[str]:
     """
     lost = listed - tracked
     if not tracked:
-        raise InputError(f"all {counted(lost, 'pose')} in {where} are -inf (tracking lost); no frame is left to use")
-    return [f"{counted(lost, 'frame')} left out because tracking was lost there (pose -inf)"] if lost else []
+        raise InputError(f"all {counted(lost, 'pose')} in {where} are -inf or NaN (tracking lost); no frame is left to use")
+    return [f"{counted(lost, 'frame')} left out because tracking was lost there (pose -inf or NaN)"] if lost else []
 
 
 def first_sizes(found: list[FrameFiles]) -> tuple[tuple[int, int], tuple[int, int] | None]:

@@ -79,6 +79,7 @@ def _frame_to_dict(frame: Frame) -> dict[str, Any]:
         "video_index": frame.video_index,
         "focal_prior": frame.focal_prior,
         "as_stored": frame.as_stored,
+        "white": frame.white,
         "confidence": None if frame.confidence is None else str(frame.confidence),
         "depth_pose": None if frame.depth_pose is None else np.asarray(frame.depth_pose, dtype=np.float64).tolist(),
     }
@@ -100,6 +101,7 @@ def _frame_from_dict(data: dict[str, Any]) -> Frame:
         focal_prior=data["focal_prior"],
         as_stored=bool(data.get("as_stored", False)),
         confidence=None if data.get("confidence") is None else Path(data["confidence"]),
+        white=None if data.get("white") is None else int(data["white"]),
         depth_pose=_pose(data.get("depth_pose")),
     )
 

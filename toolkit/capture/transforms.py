@@ -9,13 +9,15 @@ Stored depth is in the earlier frame's unit: `applied_scale` is part of `depth_s
 from __future__ import annotations
 
 import posixpath
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from toolkit.camera import Intrinsics
 from toolkit.capture import nerf_json
 from toolkit.capture.listing import assemble, counted, fitted, picture_header, read_object, require_folder, unique_names
 from toolkit.capture.ply_points import read_ply_points
+from toolkit.capture.resolve import DEPTH, MASK, POINTS, CaptureFiles
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 
@@ -23,104 +25,86 @@ NAME = "transforms.json"
 DEPTH_KEYS = ("depth_file_path", "depth_path")
 
 
-@dataclass
-class _Tally:
-    missing: int = 0
-    depth_missing: int = 0
-    mask_missing: int = 0
-    scaled: int = 0
-    bent: int = 0
-    files: list[Path] = field(default_factory=list)
-
-    def warnings(self, listed: int) -> list[str]:
-        out = []
-        if self.missing:
-            out.append(f"{self.missing} of the {listed} listed pictures do not exist; the other {listed - self.missing} are used")
-        if self.depth_missing:
-            out.append(f"{counted(self.depth_missing, 'listed depth picture')} not found")
-        if self.mask_missing:
-            out.append(f"{counted(self.mask_missing, 'listed mask')} not found")
-        if self.scaled:
-            out.append(f"{counted(self.scaled, 'picture')} of another size than the json tells; intrinsics were scaled to fit")
-        return out + nerf_json.bent_remarks(self.bent)
-
-
 def looks_like_transforms(path: Path) -> bool:
     return (path / NAME).is_file()
 
 
-def read_transforms(path: Path | str) -> Capture:
+def read_transforms(path: Path | str, within: Path | None = None) -> Capture:
     """The capture that `path/transforms.json` (or the JSON file `path` itself) describes.
 
+    Listed files are read below `within`, by default the json's own folder.
+
     Raises:
-        InputError: not readable, no picture exists, a pose or camera is not usable, or a path leads outside the folder.
+        InputError: not readable, no picture exists, a pose or camera is not usable, or a link leads outside the folder.
     """
     source = Path(path).absolute()
     json_path = source if source.is_file() else require_folder(source) / NAME
     data = read_object(json_path)
-    root = json_path.parent
+    root = within or json_path.parent
+    base = json_path.parent.relative_to(root).as_posix()
     entries = nerf_json.frame_list(data, json_path)
     splits, remarks = _splits(data, entries, json_path)
-    tally = _Tally()
-    frames = [frame for index, entry in enumerate(entries) if (frame := _frame(root, data, entry, index, splits, tally)) is not None]
-    if not frames and tally.missing:
-        raise InputError(
-            f"none of the {counted(len(entries), 'picture')} listed in {json_path} exists; put them beside it or correct the paths"
+    folder = CaptureFiles(root)
+    found = folder.find([entry["file_path"] for entry in entries], source=json_path.name, base=base)
+    if not found.count:
+        raise folder.none_exists(json_path.name, len(entries), found)
+    there = [(index, entry, image) for index, (entry, image) in enumerate(zip(entries, found.files, strict=True)) if image is not None]
+    taken = [image for _, _, image in there]
+    beside: dict[str, list[Path | None]] = {}
+    absent = []
+    for what, keys, kind in (("depth picture", DEPTH_KEYS, DEPTH), ("mask", ("mask_path",), MASK)):
+        listed = nerf_json.listed_names([entry for _, entry, _ in there], keys, json_path)
+        beside[what], found_remarks = folder.find_beside(listed, kind, taken, json_path.name, base)
+        gone = beside[what].count(None) - listed.count(None)
+        absent += [f"{counted(gone, f'listed {what}')} not found"] if gone else []
+        remarks += found_remarks
+    where = [(data, entry, f"frame {index} ({entry['file_path'][:80]}) of {root.name}") for index, entry, _ in there]
+    read, camera_remarks = nerf_json.read_frames(where, taken)
+    frames = [
+        replace(
+            frame,
+            depth=depth,
+            depth_intrinsics=_depth_camera(frame, depth),
+            mask=mask,
+            split=splits.get(_plain(entry["file_path"])),
         )
-    named = [replace(frame, name=name) for frame, name in zip(frames, unique_names(tally.files), strict=True)]
-    extra: dict[str, Any] = {"listed": len(entries), "missing": tally.missing}
+        for frame, (_, entry, _), depth, mask in zip(read, there, beside["depth picture"], beside["mask"], strict=True)
+    ]
+    frames, copies = nerf_json.once_each(frames)
+    named = [replace(frame, name=name) for frame, name in zip(frames, unique_names([frame.image for frame in frames]), strict=True)]
+    extra: dict[str, Any] = {"listed": len(entries), "missing": len(entries) - found.count}
     if data.get("applied_transform") is not None:
         extra["applied_transform"] = nerf_json.matrix(data["applied_transform"], f"{json_path}: 'applied_transform'").tolist()
     applied_scale = _positive(data, "applied_scale", json_path)
     if applied_scale is not None:
         extra["applied_scale"] = applied_scale
+    points, point_remarks = _points(folder, data, json_path, base)
     return assemble(
         "transforms",
         root,
         _kept(named),
-        [*tally.warnings(len(entries)), *remarks],
+        [
+            *found.remarks,
+            *nerf_json.missing_remarks(len(entries), found),
+            *absent,
+            *camera_remarks,
+            *copies,
+            *remarks,
+            *point_remarks,
+        ],
         depth_scale=_depth_scale(data, applied_scale or 1.0, json_path),
-        points=_points(root, data, json_path),
+        points=points,
         extra=extra,
     )
 
 
-def _frame(root: Path, data: dict[str, Any], entry: dict[str, Any], index: int, splits: dict[str, str], tally: _Tally) -> Frame | None:
-    listed = entry["file_path"]
-    where = f"frame {index} ({listed[:80]}) of {root.name}"
-    image = nerf_json.listed_file(root, listed, where)
-    if image is None:
-        tally.missing += 1
+def _depth_camera(frame: Frame, depth: Path | None) -> Intrinsics | None:
+    """Depth is of the same camera, often at a lower resolution: the lens is the picture's too."""
+    if depth is None or frame.intrinsics is None:
         return None
-    header = picture_header(image)
-    described = nerf_json.picture_camera(data, entry, header.size, where)
-    intrinsics = fitted(described, header.size, where)
-    tally.scaled += intrinsics is not described
-    tally.bent += described.distorted and nerf_json.says_pinhole(data, entry)
-    tally.files.append(image)
-    depth, depth_intrinsics = None, None
-    depth_listed = next((entry[key] for key in DEPTH_KEYS if entry.get(key) is not None), None)
-    if depth_listed is not None:
-        depth = nerf_json.listed_file(root, depth_listed, where)
-        tally.depth_missing += depth is None
-    if depth is not None:
-        depth_size = picture_header(depth).size
-        # Depth of the same camera, often at a lower resolution: the lens is the picture's too.
-        depth_intrinsics = None if depth_size == header.size else fitted(intrinsics, depth_size, f"{where}, depth")
-    mask = None
-    if entry.get("mask_path") is not None:
-        mask = nerf_json.listed_file(root, entry["mask_path"], where)
-        tally.mask_missing += mask is None
-    return Frame(
-        name=listed,
-        image=image,
-        intrinsics=intrinsics,
-        world_from_camera=nerf_json.pose(entry, where),
-        depth=depth,
-        depth_intrinsics=depth_intrinsics,
-        mask=mask,
-        split=splits.get(_plain(listed)),
-    )
+    size = picture_header(depth).size
+    same = size == (frame.intrinsics.width, frame.intrinsics.height)
+    return None if same else fitted(frame.intrinsics, size, str(depth))
 
 
 def _splits(data: dict[str, Any], entries: list[dict[str, Any]], json_path: Path) -> tuple[dict[str, str], list[str]]:
@@ -167,8 +151,10 @@ def _depth_scale(data: dict[str, Any], applied_scale: float, json_path: Path) ->
     return 1.0 / (factor * applied_scale)
 
 
-def _points(root: Path, data: dict[str, Any], json_path: Path) -> Any:
-    if data.get("ply_file_path") is None:
-        return None
-    path = nerf_json.listed_file(root, data["ply_file_path"], str(json_path))
-    return None if path is None else read_ply_points(path)
+def _points(folder: CaptureFiles, data: dict[str, Any], json_path: Path, base: str) -> tuple[Any, list[str]]:
+    """The listed points, and remarks on where they are."""
+    listed = nerf_json.listed_names([data], ("ply_file_path",), json_path)
+    if listed == [None]:
+        return None, []
+    (path,), remarks = folder.find_beside(listed, POINTS, (), json_path.name, base)
+    return (None, ["the points listed in 'ply_file_path' were not found"]) if path is None else (read_ply_points(path), remarks)

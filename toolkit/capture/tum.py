@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit import files
 from toolkit.camera import OPENCV, Array, Intrinsics, checked_pose
 from toolkit.capture.calibration import PRIMESENSE, find_json
-from toolkit.capture.listing import assemble, counted, fitted, is_file, picture_header, read_text, require_folder, unique_names
+from toolkit.capture.listing import assemble, counted, fitted, picture_header, read_text, require_folder, unique_names
 from toolkit.capture.quaternion import rigid
+from toolkit.capture.resolve import DEPTH, CaptureFiles
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 
@@ -57,25 +57,20 @@ def read_tum(path: Path | str) -> Capture:
     poses = _read_list(root / "groundtruth.txt", 7)
     depths = _read_list(root / "depth.txt", 1) if (root / "depth.txt").is_file() else _Listing(np.zeros(0), [])
     camera, warnings = _camera(root)
-    images: list[Path] = []
+    folder = CaptureFiles(root)
+    found = folder.find([listed for listed, *_ in colours.values], source="rgb.txt")
+    if not found.count:
+        raise folder.none_exists("rgb.txt", len(colours.values), found)
+    there = [(time, image) for time, image in zip(colours.times, found.files, strict=True) if image is not None]
+    posed = [(time, image, pose) for time, image in there if (pose := poses.nearest(time)) is not None]
+    images = [image for _, image, _ in posed]
+    listed_depth = [None if (entry := depths.nearest(time)) is None else entry[0] for time, *_ in posed]
+    maps, remarks = folder.find_beside(listed_depth, DEPTH, images, "depth.txt")
     frames: list[Frame] = []
-    missing, unposed = 0, 0
-    for time, (listed, *_) in zip(colours.times, colours.values, strict=True):
-        image = files.inside(root, listed)
-        if not is_file(image):
-            missing += 1
-            continue
-        pose = poses.nearest(time)
-        if pose is None:
-            unposed += 1
-            continue
+    for (time, image, pose), depth in zip(posed, maps, strict=True):
         size = picture_header(image).size
         intrinsics = fitted(camera, size, str(image))
-        depth_entry = depths.nearest(time)
-        depth = files.inside(root, depth_entry[0]) if depth_entry is not None else None
-        depth = depth if depth is not None and is_file(depth) else None
         depth_size = picture_header(depth).size if depth is not None else size
-        images.append(image)
         frames.append(
             Frame(
                 name="",
@@ -92,6 +87,11 @@ def read_tum(path: Path | str) -> Capture:
             f"none of the {counted(total, 'picture')} in {root / 'rgb.txt'} has both a file and "
             f"a pose within {MAX_GAP * 1000:.0f} ms; check the three lists"
         )
+    warnings += [*found.remarks, *remarks]
+    gone = maps.count(None) - listed_depth.count(None)
+    if gone:
+        warnings.append(f"{counted(gone, 'listed depth picture')} not found")
+    missing, unposed = total - found.count, found.count - len(posed)
     if missing:
         warnings.append(f"{missing} of the {total} listed pictures do not exist; the others are used")
     if unposed:

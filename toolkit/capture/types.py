@@ -30,6 +30,7 @@ class Frame:
     focal_prior: float | None = None  # pixels, from EXIF, when intrinsics are unknown
     as_stored: bool = False  # of a video: its frames are not turned, and those count too that its edit list hides
     confidence: Path | None = None  # picture of the depth map's size; 0 = the sensor does not believe this depth itself
+    white: int | None = None  # largest value of the image's channels, where they use fewer bits than they are stored in; None: all bits
     depth_pose: Array | None = None  # (4, 4) picture's camera from the depth camera, units of the poses; None: both at the same place
     mask_excludes: bool = False  # the mask is the other way round: what is not 0 is not used
     mask_is_alpha: bool = False  # nothing is there where the mask is 0, as the image shows: it is cut out

@@ -14,6 +14,8 @@ from toolkit.evaluate.images import psnr
 from toolkit.evaluate.pixels import as_float
 from toolkit.evaluate.score import entry, mean
 
+SCORES = ("psnr", "psnr_uncorrected")
+
 
 def nearest_training(views: Views, index: int) -> int | None:
     """The training view whose camera is closest to that of view `index`; None without training views.
@@ -37,17 +39,25 @@ def nearest_image_scores(views: Views, indices: Sequence[int] | Array) -> dict[s
     """PSNR of the nearest training picture at each of `indices`, resized where sizes differ.
 
     Returns:
-        `views`, the mean `psnr` (dB), and `per_view` with `index`, `name`, `nearest` (a name) and `psnr`; None without training views.
+        `views`, the mean `psnr` (dB), `psnr_uncorrected` (the same of images as they were taken, where colours were corrected; else None),
+        and `per_view` with `index`, `name`, `nearest` (a name) and both; None without training views.
     """
     per_view: list[dict[str, Any]] = []
     for index in (int(i) for i in indices):
         nearest = nearest_training(views, index)
-        value = None
+        value = uncorrected = None
         if nearest is not None:
-            truth, picture = views.photo(index), views.images[nearest]
-            if picture.shape != truth.shape:
-                picture = cv2.resize(picture, (truth.shape[1], truth.shape[0]), interpolation=cv2.INTER_AREA)
-            value = psnr(views.as_taken(index, as_float(picture)), truth, entry(views.valid, index))
+            truth, picture, tone = views.photo(index), as_float(views.images[nearest]), entry(views.tones, nearest)
+            taken = None if tone is None else tone.applied(picture, views.intrinsics[nearest])
+            value = psnr(views.as_taken(index, _resized(picture, truth)), truth, entry(views.valid, index))
+            uncorrected = None if taken is None else psnr(_resized(taken, truth), truth, entry(views.valid, index))
         shown = None if nearest is None else views.names[nearest]
-        per_view.append({"index": index, "name": views.names[index], "nearest": shown, "psnr": value})
-    return {"views": len(per_view), "psnr": mean(view["psnr"] for view in per_view), "per_view": per_view}
+        per_view.append({"index": index, "name": views.names[index], "nearest": shown, "psnr": value, "psnr_uncorrected": uncorrected})
+    return {"views": len(per_view), **{key: mean(view[key] for view in per_view) for key in SCORES}, "per_view": per_view}
+
+
+def _resized(picture: Array, like: Array) -> Array:
+    """`picture` in the size of `like`."""
+    if picture.shape == like.shape:
+        return picture
+    return np.asarray(cv2.resize(picture, (like.shape[1], like.shape[0]), interpolation=cv2.INTER_AREA))

@@ -15,11 +15,10 @@ from toolkit.poses.database import MIN_INLIERS
 from toolkit.poses.job import Job
 from toolkit.poses.mapping import SMALLEST, Model
 
-NEAR = 4.0  # pixels from a match to the epipolar line, COLMAP's own bound for a pair's inliers
 
-
-def agreement(job: Job, model: Model) -> dict[int, float]:
-    """For each placed picture (its index in the job) the share of its matches with other placed ones that agree with their cameras."""
+def agreement(job: Job, model: Model, apart: int = 0) -> dict[int, float]:
+    """For each placed picture (its index in the job) the share of its matches with other placed ones that agree with their cameras, of
+    those more than `apart` away in order; 0 without any."""
     database = pycolmap.Database.open(job.database)
     try:
         index = {image.image_id: int(image.name) for image in database.read_all_images()}
@@ -33,7 +32,7 @@ def agreement(job: Job, model: Model) -> dict[int, float]:
         first, second = pycolmap.pair_id_to_image_pair(pair_id)
         matches = np.asarray(geometry.inlier_matches).reshape(-1, 2)
         here, there = index[first], index[second]
-        if len(matches) < MIN_INLIERS or here not in placed or there not in placed:
+        if len(matches) < MIN_INLIERS or here not in placed or there not in placed or abs(here - there) <= apart:
             continue
         cameras = [model.reconstruction.camera(placed[i].camera_id) for i in (here, there)]
         rays = [
@@ -42,7 +41,7 @@ def agreement(job: Job, model: Model) -> dict[int, float]:
         ]
         moved = placed[there].cam_from_world() * placed[here].cam_from_world().inverse()
         off = epipolar_distance(rays[0], rays[1], moved.rotation.matrix(), np.asarray(moved.translation))
-        near = int(np.count_nonzero(off * cameras[0].mean_focal_length() < NEAR))
+        near = int(np.count_nonzero(off * cameras[0].mean_focal_length() < job.tolerance))
         for i in (here, there):
             agree[i] += near
             total[i] += len(matches)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import queue
 import signal
@@ -49,7 +50,7 @@ def run_child(
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log_file,
-            env={**os.environ, **_import_path(), **(environment or {})},
+            env={**os.environ, **import_path(), **(environment or {})},
             start_new_session=True,  # so that Ctrl-C reaches us first and we decide what the child does
         )
     try:
@@ -57,7 +58,43 @@ def run_child(
     finally:
         end(process)
     if process.returncode != 0:
-        raise PoseError(f"the process that finds poses {_ending(process.returncode)}; the last line of {log} is: {log_tail(log)}")
+        raise PoseError(f"the process that finds poses {end_reason(process.returncode)}; the last line of {log} is: {log_tail(log)}")
+
+
+def run_logged(
+    arguments: list[str], log: Path, tick: Callable[[float], None], longest: float = math.inf, environment: dict[str, str] | None = None
+) -> int:
+    """Run `python arguments` to its end; all that it writes goes to `log`.
+
+    Args:
+        tick: called again and again with the seconds that have passed; what it raises ends the child.
+
+    Returns:
+        the exit code, negative for a signal.
+
+    Raises:
+        TimeoutError: it was ended after `longest` seconds.
+    """
+    with log.open("wb") as said:
+        process = subprocess.Popen(
+            [sys.executable, *arguments],
+            stdin=subprocess.PIPE,  # the child ends when it closes
+            stdout=said,
+            stderr=said,
+            env={**os.environ, **(environment or {})},
+            start_new_session=True,  # so that Ctrl-C reaches us first
+        )
+    start = time.monotonic()
+    try:
+        while process.poll() is None:
+            seconds = time.monotonic() - start
+            if seconds > longest:
+                raise TimeoutError(f"it took longer than {longest:g} s and was ended")
+            tick(seconds)
+            time.sleep(TICK)
+    finally:
+        end(process)
+    return int(process.returncode)
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
@@ -82,14 +119,15 @@ def log_tail(log: Path) -> str:
     return telling[-1][-300:] if telling else "(empty)"
 
 
-def _import_path() -> dict[str, str]:
+def import_path() -> dict[str, str]:
     """So that the child finds this package wherever it was started from."""
     here = str(Path(__file__).resolve().parents[2])
     known = os.environ.get("PYTHONPATH")
     return {"PYTHONPATH": here if not known else os.pathsep.join([here, known])}
 
 
-def _ending(code: int) -> str:
+def end_reason(code: int) -> str:
+    """How a process ended, from its exit code."""
     if code >= 0:
         return f"failed with exit code {code}"
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,14 @@ from toolkit.camera import Array
 from toolkit.capture.images import load_image, usable_pixels
 from toolkit.errors import InputError
 from toolkit.files import read_json, remove, write_json
-from toolkit.poses.features import TILTED_SIZE, sift, tilted
-from toolkit.poses.job import Job, Picture
+from toolkit.poses.features import floats, learned, sift
+from toolkit.poses.job import SIFT, TOLERANCE, Job, Picture
 from toolkit.poses.pairs import coarse
 
 THUMBNAIL = 32  # pixels a side of the picture kept to tell identical ones
 GUESSED_FOCAL = 1.2  # of the long side, when nothing is known
 MIN_INLIERS = 15  # COLMAP's own bound for a verified pair
-OBLIQUE = 2  # times as many features are kept where they are of oblique views, too
+ENLARGED = 2.0  # times at most that an image is enlarged for learned features, which are found to a pixel: SIFT does so by itself
 
 Report = Callable[[float, float, str], None]
 
@@ -55,7 +56,7 @@ def _discard(job: Job) -> None:
 
 
 def extract(job: Job, database: pycolmap.Database, report: Report) -> list[dict[str, Any]]:
-    """SIFT features of every picture into the database; what is there already is kept.
+    """Features of every picture into the database; what is there already is kept.
 
     Returns:
         a record a picture: name, width, height, keypoints, deviation (of grey values), thumbnail.
@@ -96,16 +97,17 @@ def _features(job: Job, indices: list[int]) -> Iterator[tuple[int, tuple[dict[st
 
 
 def _describe(picture: Picture, job: Job) -> tuple[dict[str, Any], Array, Array]:
-    """One picture as every later stage loads it, its keypoints (N, 4) in its own pixels and descriptors (N, 128)."""
+    """One picture as every later stage loads it, its keypoints (N, 4) in its own pixels and descriptors (N, 128) for the database."""
     frame = picture.frame()
     pixels = load_image(frame, exif=job.exif)
     height, width = pixels.shape[:2]
     grey = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
     usable = usable_pixels(frame, pixels, exif=job.exif)
-    factor = min(1.0, (min(job.image_size, TILTED_SIZE) if job.oblique else job.image_size) / max(width, height))
-    small = grey if factor == 1.0 else cv2.resize(grey, (round(width * factor), round(height * factor)), interpolation=cv2.INTER_AREA)
-    keypoints, descriptors = tilted(small, OBLIQUE * job.max_features) if job.oblique else sift(small, job.max_features)
-    keypoints = keypoints * np.array([width / small.shape[1], height / small.shape[0], width / small.shape[1], 1.0], dtype=np.float32)
+    factor = _factor(job, width, height)
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    seen = grey if factor == 1.0 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA if factor < 1.0 else cv2.INTER_CUBIC)
+    keypoints, descriptors = sift(seen, job.max_features) if job.features == SIFT else learned(seen, job.max_features)
+    keypoints = keypoints * np.array([width / size[0], height / size[1], width / size[0], 1.0], dtype=np.float32)
     if usable is not None and len(keypoints):
         column = np.clip(keypoints[:, 0].astype(int), 0, width - 1)
         row = np.clip(keypoints[:, 1].astype(int), 0, height - 1)
@@ -123,6 +125,18 @@ def _describe(picture: Picture, job: Job) -> tuple[dict[str, Any], Array, Array]
     return record, keypoints, descriptors
 
 
+def _factor(job: Job, width: int, height: int) -> float:
+    """Size of an image in which features are looked for, in sizes of its own."""
+    return min(1.0 if job.features == SIFT else ENLARGED, job.image_size / max(width, height))
+
+
+def tolerant(job: Job, records: list[dict[str, Any]]) -> Job:
+    """The job with the tolerance that suits its features: learned ones lie within COLMAP's pixels of the image in which they were found."""
+    if job.features == SIFT:
+        return job
+    return replace(job, tolerance=TOLERANCE / float(np.median([_factor(job, record["width"], record["height"]) for record in records])))
+
+
 def label(index: int) -> str:
     """The name of a picture inside the database: COLMAP's lists of pairs cannot hold names with spaces."""
     return f"{index:06d}"
@@ -138,7 +152,8 @@ def _write_picture(job: Job, database: pycolmap.Database, index: int, record: di
     frame.add_data_id(image.data_id)
     database.write_frame(frame)
     database.write_keypoints(image_id, keypoints)
-    data = pycolmap.FeatureDescriptors(type=pycolmap.FeatureExtractorType.SIFT, data=np.ascontiguousarray(descriptors))
+    kind = pycolmap.FeatureExtractorType.SIFT if job.features == SIFT else pycolmap.FeatureExtractorType.UNDEFINED
+    data = pycolmap.FeatureDescriptors(type=kind, data=np.ascontiguousarray(descriptors))
     database.write_descriptors(image_id, data)
 
 
@@ -173,7 +188,7 @@ def sketches(job: Job, database: pycolmap.Database) -> list[Array]:
     for index in range(len(job.pictures)):
         image_id = database.read_image_with_name(label(index)).image_id
         keypoints = np.asarray(database.read_keypoints(image_id)).reshape(-1, 4)
-        out.append(coarse(np.asarray(database.read_descriptors(image_id).data).reshape(-1, 128), keypoints[:, 2]))
+        out.append(coarse(floats(database.read_descriptors(image_id).data, job.features), keypoints[:, 2]))
     return out
 
 

@@ -1,8 +1,4 @@
-"""SIFT features of one picture, as COLMAP's database takes them. OpenCV finds them in a third of COLMAP's own time.
-
-Where photos stand far apart, what is seen from the front in one is seen obliquely in the other, and looks different to SIFT. `tilted` looks
-at pictures as if they were seen obliquely (ASIFT; Morel and Yu, "A New Framework for Fully Affine Invariant Image Comparison", 2009).
-"""
+"""Features of one image, as COLMAP's database takes them: SIFT, which OpenCV finds in a third of COLMAP's own time, or learned ones."""
 
 from __future__ import annotations
 
@@ -10,10 +6,9 @@ import cv2
 import numpy as np
 
 from toolkit.camera import Array
+from toolkit.poses.job import SIFT
 
 CONTRAST = 0.014  # finds as many as COLMAP's own detector does with its threshold
-TILTS = 3  # steps of the square root of two by which a picture is made narrower, in several directions each
-TILTED_SIZE = 1000  # pixels of the long side: some forty pictures are looked at instead of one
 
 
 def sift(grey: Array, most: int) -> tuple[Array, Array]:
@@ -23,20 +18,8 @@ def sift(grey: Array, most: int) -> tuple[Array, Array]:
         (N, 4) float32 keypoints: x and y in pixels, pixel centres at +0.5, scale in pixels, angle in radians; (N, 128) uint8 descriptors,
         512 times the root of their shares (root-SIFT; Arandjelović and Zisserman, CVPR 2012).
     """
-    return _largest(_finder(), grey, most)
-
-
-def tilted(grey: Array, most: int) -> tuple[Array, Array]:
-    """As `sift`, of the picture and of oblique views of it: ten times as many features, of which many describe the same place."""
-    return _largest(cv2.AffineFeature.create(_finder(), TILTS), grey, most)
-
-
-def _finder() -> cv2.SIFT:
     # Without `enable_precise_upscale` all keypoints lie a quarter of a pixel off, right and below.
-    return cv2.SIFT.create(contrastThreshold=CONTRAST, enable_precise_upscale=True)
-
-
-def _largest(finder: cv2.Feature2D, grey: Array, most: int) -> tuple[Array, Array]:
+    finder = cv2.SIFT.create(contrastThreshold=CONTRAST, enable_precise_upscale=True)
     found, described = finder.detectAndCompute(np.ascontiguousarray(grey), None)
     if described is None or len(found) == 0:
         return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8)
@@ -46,3 +29,19 @@ def _largest(finder: cv2.Feature2D, grey: Array, most: int) -> tuple[Array, Arra
     keypoints[:, :2] += 0.5
     shares = described / np.maximum(described.sum(axis=1, keepdims=True), 1e-9)
     return keypoints, np.minimum(np.round(512 * np.sqrt(shares)), 255).astype(np.uint8)
+
+
+def learned(grey: Array, most: int) -> tuple[Array, Array]:
+    """As `sift`, by XFeat: the surest first; (N, 128) uint8 are the bytes of (N, 64) float16."""
+    from toolkit.poses import xfeat  # torch takes a second and 200 MB, and is not always needed
+
+    network = xfeat.installed()
+    assert network is not None  # whoever made the job has looked
+    keypoints, descriptors = xfeat.detect(network, grey, most)
+    return keypoints, descriptors.astype(np.float16).view(np.uint8)
+
+
+def floats(descriptors: Array, features: str) -> Array:
+    """(N, 128) uint8 from the database → (N, 128) or (N, 64) float32."""
+    rows = np.ascontiguousarray(descriptors, dtype=np.uint8).reshape(-1, 128)
+    return (rows if features == SIFT else rows.view(np.float16)).astype(np.float32)

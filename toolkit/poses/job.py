@@ -13,13 +13,14 @@ from toolkit.config import PosesSettings
 from toolkit.files import fingerprint, read_json, write_json
 
 MAX_EXHAUSTIVE = 40  # photos; beyond it pairs are chosen
-MAX_OBLIQUE = 12  # photos; up to it those that find no place so are looked at obliquely
+SIFT, XFEAT = "sift", "xfeat"  # features that images are matched by
+TOLERANCE = 4.0  # pixels, COLMAP's own
 MAX_ASKED_AGAIN = 120  # photos; up to it those that find no place so are matched with all others
 GONE_ON = "incremental, gone on with small angles"  # the attempt that adds to the strict one's model what that had no place for
 GONE_FAR = "incremental, gone on with tiny angles"  # the same from there, where cameras turn before a wall and hardly move
 LOOSE = "incremental, small angles"  # from scratch, by looser rules
 GLOBAL = "global"  # the last attempt, which takes what no other can begin with
-VERSION = 4  # of what is found and how; a change discards what earlier versions left in out/sparse
+VERSION = 5  # of what is found and how; a change discards what earlier versions left in out/sparse
 REPEATABLE = 300  # pictures up to which poses repeat: one thread maps (docs/measured/performance.md)
 
 
@@ -66,7 +67,9 @@ class Job:
     max_features: int
     seed: int
     threads: int
-    oblique: bool = False  # features are looked for in oblique views of the pictures, too
+    features: str = SIFT
+    tolerance: float = TOLERANCE  # pixels that a match may be off its epipolar line, and a point off where it is seen
+    second: str | None = None  # features that are tried where the first place too few
 
     @property
     def database(self) -> Path:
@@ -98,7 +101,7 @@ class Job:
         """Of what features and matches depend on: not on threads, not on what the mapper is told."""
         pictures = [[picture.key(), Path(picture.image)] for picture in self.pictures]
         flat = [part for pair in pictures for part in pair]
-        how = [self.sequential, self.one_camera, self.exif, self.image_size, self.max_features, self.seed, self.oblique]
+        how = [self.sequential, self.one_camera, self.exif, self.image_size, self.max_features, self.seed, self.features]
         return fingerprint(VERSION, *how, *flat)
 
     def save(self, path: Path) -> None:
@@ -110,7 +113,9 @@ class Job:
         return cls(**{**data, "pictures": tuple(Picture(**picture) for picture in data["pictures"])})
 
 
-def plan(capture: Capture, folder: Path, settings: PosesSettings, seed: int, threads: int) -> Job:
+def plan(
+    capture: Capture, folder: Path, settings: PosesSettings, seed: int, threads: int, features: str = SIFT, second: str | None = None
+) -> Job:
     """The job for `capture`. Intrinsics and poses that the capture brings are not used; focal lengths from EXIF are."""
     pictures = tuple(
         Picture(
@@ -136,4 +141,6 @@ def plan(capture: Capture, folder: Path, settings: PosesSettings, seed: int, thr
         max_features=settings.max_features,
         seed=seed,
         threads=threads,
+        features=features,
+        second=second,
     )

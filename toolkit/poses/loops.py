@@ -22,9 +22,10 @@ import pycolmap
 
 from toolkit.camera import Array, Intrinsics
 from toolkit.files import remove
+from toolkit.poses.agreement import agreement
 from toolkit.poses.database import MIN_INLIERS
 from toolkit.poses.job import Job
-from toolkit.poses.mapping import Model, Report, calibrate, map_pictures, plain
+from toolkit.poses.mapping import Model, Report, calibrate, joined, map_pictures, plain
 from toolkit.poses.match import match
 from toolkit.poses.overlap import guessed_depth, overlap, parallax
 
@@ -40,6 +41,7 @@ SUSPECT, TOLD = 0.8, 0.5
 BORNE_OUT = 0.5  # … and that contradict the model of near neighbours, too
 MEETINGS = 4  # pairs far apart that are matched for each picture, where the near model says that cameras meet
 WIDEST = 25.0  # degrees of parallax between two such cameras
+CLOSED = 0.7  # share of a frame's far matches that agree with a closed loop: of nine frames in ten
 COMMON = 0.4  # of both pictures, that they have to share
 KEPT = 0.5  # share of the folded model's frames that another one has to hold …
 KEPT_PHOTOS = 0.9  # … and of photos', whose neighbours by name may be of other things, or where none was mapped
@@ -131,9 +133,19 @@ def _held_against(job: Job, near: Model, reach: int, report: Report) -> tuple[Mo
         far = every.apart > reach
         false = far & ~(disagreement(every, axes(near)) < AGREES)  # where the near model has no answer a pair is not believed
         _drop(copy, every, false)
-        found, tried = map_pictures(copy, report)
+        # The near model has drifted along its way. Where that is too much for what meets again to be joined, all is mapped from the start.
+        found = joined(copy, near, report)
+        tried = [] if found is None else [{"attempt": found.attempt, "models": [len(found.registered)]}]
+        if found is None or len(found.registered) < len(near.registered) or not _closed(copy, found, reach):
+            found, tried = map_pictures(copy, report)
     left = 0 if found is None else contradictions(every, axes(found))
     return found, tried, {"left": left, "far": int(far.sum()), "dropped": int(false.sum())}
+
+
+def _closed(job: Job, model: Model, reach: int) -> bool:
+    """Whether what frames far apart share agrees with their cameras, too."""
+    shares = [share for share in agreement(job, model, reach).values() if share > 0]
+    return bool(shares) and float(np.percentile(shares, 10)) >= CLOSED
 
 
 def _by_neighbours(job: Job, seen: Turns, reach: int, report: Report) -> Model | None:

@@ -14,7 +14,7 @@ import pycolmap
 from toolkit.camera import OPENCV, Intrinsics
 from toolkit.errors import PoseError
 from toolkit.files import remove
-from toolkit.poses.job import GLOBAL, GONE_FAR, GONE_ON, LOOSE, Job
+from toolkit.poses.job import GLOBAL, GONE_FAR, GONE_ON, LOOSE, TOLERANCE, Job
 
 Report = Callable[[float, float, str], None]
 STRICT = "incremental"  # the attempt by COLMAP's own rules
@@ -68,11 +68,21 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
         models = [model for model in models if len(model.registered) >= SMALLEST]
         history.append({"attempt": name, "models": [len(model.registered) for model in models]})
         for model in models:
-            if model.error <= MAX_ERROR and (best is None or _better(model, best)):
+            if model.error <= MAX_ERROR * max(1.0, job.tolerance / TOLERANCE) and (best is None or _better(model, best)):
                 best = model
     if best is not None:
         settle(best)
     return best, history
+
+
+def joined(job: Job, model: Model, report: Report) -> Model | None:
+    """The model, gone on from by COLMAP's own rules with what the job's pictures match besides; None where nothing sound comes of it."""
+    found = [Model(one, STRICT, _registered(one)) for one in _incremental(job, report, None, model.reconstruction)]
+    best = max(found, key=lambda one: one.size, default=None)
+    if best is None or len(best.registered) < SMALLEST or best.error > MAX_ERROR:
+        return None
+    settle(best)
+    return best
 
 
 def _enough(attempt: str, pictures: int) -> float:
@@ -109,6 +119,10 @@ def _options(job: Job, angle: float | None = None) -> pycolmap.IncrementalPipeli
     options.triangulation.random_seed = job.seed
     # COLMAP would go on to the last bit after every few pictures, and find the same in twice the time (docs/measured/performance.md).
     options.ba_global_frames_ratio = options.ba_global_points_ratio = ADJUSTED_AFTER
+    if job.tolerance > TOLERANCE:
+        options.mapper.filter_max_reproj_error = options.triangulation.complete_max_reproj_error = job.tolerance
+        options.triangulation.merge_max_reproj_error = job.tolerance
+        options.mapper.abs_pose_max_error *= job.tolerance / TOLERANCE
     options.ba_local_function_tolerance = options.ba_global_function_tolerance = STEP_TOLERANCE
     if angle is not None:
         options.mapper.init_min_tri_angle = 4.0
@@ -127,7 +141,10 @@ def _incremental(
     options = _options(job, angle)
     total = len(job.pictures)
     how = "small" if angle == SMALL_ANGLE else "tiny"
-    what = "mapping" if angle is None else f"mapping again with {how} angles" if start is None else f"going on with {how} angles"
+    if angle is None:
+        what = "mapping" if start is None else "closing loops"
+    else:
+        what = f"{'mapping again' if start is None else 'going on'} with {how} angles"
     count = 0 if start is None else start.num_reg_images()
 
     def started() -> None:
@@ -146,8 +163,8 @@ def _incremental(
     given: Path | str = ""  # nothing
     if start is not None:
         options.multiple_models = False
-        # What it begins with was adjusted, and `finish` adjusts all that it adds.
-        options.ba_local_max_refinements = options.ba_global_max_refinements = 1
+        if angle is not None:  # what it begins with was adjusted, and `finish` adjusts all that it adds
+            options.ba_local_max_refinements = options.ba_global_max_refinements = 1
         given = _empty(Path(job.folder) / "start")
         start.write_binary(given)
     try:

@@ -8,18 +8,25 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from queue import SimpleQueue
 
 import pycolmap
 
+from toolkit.camera import Array
 from toolkit.files import atomic_path, remove
 from toolkit.poses.database import Report, label
-from toolkit.poses.job import Job
+from toolkit.poses.features import floats
+from toolkit.poses.job import XFEAT, Job
 
+# Learned features nearly always match something, and of hundreds of false matches some dozens agree with some geometry or other.
+LEAST_RATIO = 0.2  # share of such a pair's matches that have to
+MOST_TRIALS = 3000  # which so many trials find
 PAIRS_A_STEP = 40  # matched between two progress reports
 MOST_MATCHERS = 8  # processes, each of a hundred megabytes and more
+MOST_DESCRIBED = 128  # images whose learned descriptors are held in memory, of a megabyte each
 MOST_COPIED = 2**30  # bytes of all copies of the database, of which each process that matches has one
 
 
@@ -34,8 +41,11 @@ def match(job: Job, pairs: list[tuple[int, int]], report: Report) -> None:
     total = len(left)
 
     def tell(done: int) -> None:
-        report(done, total, f"matching, pair {done} of {total}")
+        before = 0.5 if job.features == XFEAT else 0.0
+        report(before * total + (1 - before) * done, total, f"matching, pair {done} of {total}")
 
+    if job.features == XFEAT:
+        _compare(job, left, lambda done: report(done / 2, total, f"matching, pair {done} of {total}"))
     tell(0)
     with suppress(RuntimeError):  # no room for what copies grow to, or a process ended for its memory: what is left is matched here
         _together(job, left, tell)
@@ -44,6 +54,30 @@ def match(job: Job, pairs: list[tuple[int, int]], report: Report) -> None:
     for step in _steps(left):
         _match(job, Path(job.folder), step)
         tell(done := done + len(step))
+
+
+def _compare(job: Job, pairs: list[tuple[int, int]], tell: Callable[[int], None]) -> None:
+    """Put the matches of learned features into the job's database, which COLMAP's matcher then only verifies."""
+    from toolkit.poses.xfeat import mutual
+
+    database = pycolmap.Database.open(job.database)
+    try:
+        ids = {int(image.name): image.image_id for image in database.read_all_images()}
+
+        @lru_cache(maxsize=MOST_DESCRIBED)
+        def described(index: int) -> Array:
+            return floats(database.read_descriptors(ids[index]).data, job.features)
+
+        new = [(i, j) for i, j in pairs if not database.exists_matches(ids[i], ids[j])]
+        with ThreadPoolExecutor(job.threads) as pool:
+            for done, step in enumerate(_steps(new)):
+                tell(len(pairs) - len(new) + done * PAIRS_A_STEP)
+                found = pool.map(mutual, [described(i) for i, _ in step], [described(j) for _, j in step])
+                with pycolmap.DatabaseTransaction(database):
+                    for (i, j), matches in zip(step, found, strict=True):
+                        database.write_matches(ids[i], ids[j], matches)
+    finally:
+        database.close()
 
 
 def _steps(pairs: list[tuple[int, int]]) -> list[list[tuple[int, int]]]:
@@ -138,6 +172,10 @@ def _match(job: Job, folder: Path, pairs: list[tuple[int, int]]) -> None:
     matching.guided_matching = False
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job.seed
+    verification.ransac.max_error = job.tolerance
+    if job.features == XFEAT:
+        verification.min_inlier_ratio = LEAST_RATIO
+        verification.ransac.max_num_trials = MOST_TRIALS
     pairing = pycolmap.ImportedPairingOptions()
     with atomic_path(folder / "pairs.txt") as listing:
         listing.write_text("".join(f"{label(i)} {label(j)}\n" for i, j in pairs), encoding="utf-8")

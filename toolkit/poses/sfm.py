@@ -20,7 +20,7 @@ from toolkit.errors import FieldfuseError, InputError, PoseError
 from toolkit.files import read_json, remove
 from toolkit.poses.child import run_child
 from toolkit.poses.health import doubts, failure, fold, shortfalls
-from toolkit.poses.job import GONE_FAR, GONE_ON, Job, plan
+from toolkit.poses.job import GONE_FAR, GONE_ON, SIFT, XFEAT, Job, plan
 from toolkit.poses.result import SFM, PoseResult
 from toolkit.poses.sensor import scale_to_depth
 from toolkit.progress import SILENT, Progress
@@ -60,7 +60,8 @@ def find_poses(
     workers = memory.workers(
         wanted, SIFT_BYTES * pixels, f"finding features in {pixels / 1e6:.1f} million pixels", "lower poses.image_size"
     )
-    job = plan(capture, Path(out).resolve() / "sparse", settings, seed, workers)
+    first, second, notes = _features(settings.features)
+    job = plan(capture, Path(out).resolve() / "sparse", settings, seed, workers, first, second)
     seconds: dict[str, float] = {}
     began = time.monotonic()
     facts = _run(job, seconds, progress)
@@ -68,10 +69,34 @@ def find_poses(
     if reason is not None:
         raise PoseError(f"{capture.root}: {reason}")
     result = _result(capture, job, facts)
+    result.warnings += notes
     if capture.has_depth:
         result = scale_to_depth(result, capture)
     result.seconds = {**seconds, "total": time.monotonic() - began}
     return result
+
+
+def _features(wanted: str) -> tuple[str, str | None, list[str]]:
+    """The features to begin with, those to try where these are not enough, and warnings.
+
+    Raises:
+        InputError: learned ones are wanted, and their weights are not there or damaged.
+    """
+    if wanted == SIFT:
+        return SIFT, None, []
+    from toolkit.poses import xfeat
+
+    try:
+        network = xfeat.installed()
+    except InputError as error:
+        if wanted == XFEAT:
+            raise
+        return SIFT, None, [f"learned features were not tried: {error}"]
+    if wanted == XFEAT:
+        if network is None:
+            raise InputError(f"poses.features=xfeat needs weights that are not installed; {xfeat.INSTALL}, or choose poses.features=auto")
+        return XFEAT, None, []
+    return SIFT, None if network is None else XFEAT, []
 
 
 def _pixels(capture: Capture, long_side: int) -> int:

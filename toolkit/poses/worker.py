@@ -80,9 +80,10 @@ def work(job_file: Path, mouth: Mouth) -> None:
     records = store.extract(job, database, lambda done, total, note: mouth.progress("features", done, total, note))
     facts: dict[str, Any] = {"pictures": records, "pairs": [], "attempts": [], "folded": None, "model": None}
     step("features")
-    if hopeless(records) is None:
-        pairs = choose_pairs(job, database, lambda done, total, note: mouth.progress("matching", 0, total, note))
-        database.close()
+    job, reason = store.tolerant(job, records), hopeless(records)
+    pairs = [] if reason else choose_pairs(job, database, lambda done, total, note: mouth.progress("matching", 0, total, note))
+    database.close()
+    if reason is None or job.second is not None:
         match(job, pairs, lambda done, total, note: mouth.progress("matching", done, total, note))
         step("matching")
 

@@ -35,22 +35,22 @@ def suite_table(suite: Suite, data: dict[str, Any]) -> str:
 
 def table(rows: Sequence[dict[str, Any]], reported: dict[str, float], scenes: int) -> list[str]:
     """Lines of a table: a row a scene, their mean when there are several, and what the paper reports."""
-    lines = [_line(COLUMNS), _line(["---"] * len(COLUMNS))]
+    lines = [row_line(COLUMNS), row_line(["---"] * len(COLUMNS))]
     for row in rows:
         if row.get("error"):
-            lines.append(_line([row["scene"], f"not made: {row['error']}", *[""] * (len(COLUMNS) - 2)]))
+            lines.append(row_line([row["scene"], f"not made: {row['error']}", *[""] * (len(COLUMNS) - 2)]))
             continue
         size = f"{row['width']}×{row['height']}"
         facts = [f"{row['train']} / {row['test']}", size, *(words.duration(row[key]) for key in ("fit_seconds", "seconds"))]
-        lines.append(_line([row["scene"], *_scores(row), *facts, words.whole(row["voxels"])]))
+        lines.append(row_line([row["scene"], *_scores(row), *facts, words.whole(row["voxels"])]))
     made = [row for row in rows if not row.get("error")]
     empty = [""] * (len(COLUMNS) - 1 - len(MEASURES))
     if len(made) > 1:
-        lines.append(_line([f"mean of {len(made)}", *_scores(summary(made, MEASURES)), *empty]))
+        lines.append(row_line([f"mean of {len(made)}", *_scores(summary(made, MEASURES)), *empty]))
     if reported:
         whose = f"{PAPER}, mean of all its scenes" if scenes == 0 else f"{PAPER}, mean of {scenes}"
         lines.append(
-            _line([f"*{whose}: {REPORTED}*", *(f"*{text}*" if text != words.NONE else text for text in _scores(reported)), *empty])
+            row_line([f"*{whose}: {REPORTED}*", *(f"*{text}*" if text != words.NONE else text for text in _scores(reported)), *empty])
         )
     return lines
 
@@ -59,7 +59,8 @@ def _scores(row: dict[str, Any]) -> list[str]:
     return [words.decimal(row.get(key), DIGITS[key]) for key in MEASURES]
 
 
-def _line(cells: Sequence[str]) -> str:
+def row_line(cells: Sequence[str]) -> str:
+    """A row of a Markdown table."""
     return "| " + " | ".join(str(cell).replace("|", "/") for cell in cells) + " |"
 
 

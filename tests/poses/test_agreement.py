@@ -1,11 +1,9 @@
-"""Few photos that stand far apart: whether matches agree with the places found, and what oblique views add; with the real mapper."""
+"""Few photos that stand far apart: whether matches agree with the places found; with the real mapper."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -13,16 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tests.conftest import shared_data
 from tests.poses.textured import aligned_error, arc, render, turning, write_capture
-from toolkit.capture import open_capture
 from toolkit.config import PosesSettings
 from toolkit.poses import database as store
 from toolkit.poses import placing
 from toolkit.poses.agreement import agreement, epipolar_distance, leave_out
-from toolkit.poses.features import sift, tilted
 from toolkit.poses.health import doubts
-from toolkit.poses.job import MAX_OBLIQUE, Job, plan
+from toolkit.poses.job import Job, plan
 from toolkit.poses.mapping import Model, plain
 from toolkit.poses.match import match
 from toolkit.poses.pairs import exhaustive_pairs
@@ -73,7 +68,6 @@ def test_a_picture_put_elsewhere_is_told(tmp_path):
     assert model is not None and error(model, poses) < 0.01
     assert facts["agreement"] == agreement(job, model) and set(facts["agreement"]) == set(range(5))
     assert min(facts["agreement"].values()) > 0.95
-    assert not (Path(job.folder) / placing.OBLIQUE).exists()  # there is no reason to
     image = model.reconstruction.image(model.registered[3])
     pose = image.cam_from_world()
     shifted = pycolmap.Rigid3d(pose.rotation, np.asarray(pose.translation) + np.array([0.0, 0.4, 0.0]))
@@ -91,61 +85,8 @@ def test_places_that_may_be_wrong_are_named():
     assert doubts({"agreement": {"0": 0.9}, "pictures": pictures}) == doubts({"agreement": {}}) == doubts({}) == []
 
 
-# --------------------------------------------------------------------------------------------- oblique views
-
-
-def test_oblique_views_find_what_is_seen_from_the_side():
-    front = render(arc(1, 0)[0])[0][..., 0]
-    wide = np.array([[0.4, 0, 40], [0.1, 1, 0]], np.float32)  # as a wall is seen from 66° to its side
-    side = cv2.warpAffine(front, wide, (front.shape[1], front.shape[0]), flags=cv2.INTER_AREA, borderValue=90)
-
-    def right(find) -> int:
-        """Matches by the ratio test that are where the warp puts them."""
-        (first, one), (second, other) = find(front, 2048), find(side, 2048)
-        pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(one.astype(np.float32), other.astype(np.float32), k=2)
-        good = np.array([(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < 0.8 * b.distance]).reshape(-1, 2)
-        expected = (first[good[:, 0], :2] - 0.5) @ wide[:, :2].T + wide[:, 2] + 0.5
-        return int(np.count_nonzero(np.linalg.norm(expected - second[good[:, 1], :2], axis=1) < 2))
-
-    assert right(tilted) > 3 * right(sift)
-    keypoints, descriptors = tilted(front, 300)
-    assert keypoints.shape == (300, 4) and descriptors.shape == (300, 128) and descriptors.dtype == np.uint8
-    np.testing.assert_array_equal(keypoints, tilted(front, 300)[0])
-    assert len(tilted(np.full((64, 64), 90, np.uint8), 300)[0]) == 0
-
-
-def test_photos_without_a_place_are_looked_at_obliquely(tmp_path, monkeypatch):
-    poses = arc(4, 135)
-    job = matched(tmp_path, poses)
-    before, _ = placing._mapped(job, silent)
-    assert before is not None and len(before.registered) < 4  # the reason to look again
-    notes: list[str] = []
-    model, facts = placing.place(job, lambda done, total, note: notes.append(note))
-    assert model is not None and len(model.registered) >= len(before.registered) and error(model, poses) < 0.01
-    assert min(facts["agreement"].values()) > 0.9 and any("seen obliquely" in note for note in notes)
-    again = plain(placing.place(job, silent)[0])  # from the features that are there
-    assert again == plain(model)
-    monkeypatch.setattr(placing, "_obliquely", lambda *_: pytest.fail("was looked at obliquely"))
-    assert "agreement" not in placing.place(replace(job, sequential=True), silent)[1]
-    many = replace(job, pictures=job.pictures * 4)
-    assert len(many.pictures) > MAX_OBLIQUE and "agreement" not in placing.place(many, silent)[1]
-
-
 def test_a_camera_that_turns_on_the_spot_stays_refused(tmp_path):
     from toolkit.errors import PoseError
 
     with pytest.raises(PoseError, match="turned on the spot"):
         find_poses(write_capture(tmp_path / "photos", turning(6)), tmp_path, PosesSettings(max_features=400), seed=3, threads=1)
-
-
-def test_six_photos_of_a_real_capture(tmp_path):
-    """Without oblique views one of them gets a place that is off by two thirds of the cameras' spread, and nothing tells."""
-    given_poses = open_capture(shared_data("fox_540x960"))
-    names = ["0006", "0021", "0033", "0052", "0081", "0105"]
-    (tmp_path / "photos").mkdir()
-    for name in names:
-        (tmp_path / "photos" / f"{name}.jpg").symlink_to(shared_data(f"fox_540x960/images/{name}.jpg"))
-    result = find_poses(open_capture(tmp_path / "photos"), tmp_path, PosesSettings(max_features=2048), seed=0, threads=1)
-    true = {frame.name: frame.world_from_camera for frame in given_poses.frames}
-    assert result.registered == 6 and not any("contradict" in warning for warning in result.warnings)
-    assert aligned_error(result.world_from_camera[:, :3, 3], np.array([true[name] for name in result.names])[:, :3, 3]) < 0.01

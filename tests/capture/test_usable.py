@@ -1,0 +1,109 @@
+"""One bad part does not stop a good whole: what is wrong with single frames costs these alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.pipelines.made import circle, make_room
+from toolkit.camera import checked_pose, lenient_poses
+from toolkit.capture import open_capture
+from toolkit.capture.types import Capture, Frame
+from toolkit.capture.usable import without
+from toolkit.effects.adjust import rotation
+from toolkit.errors import InputError
+
+COUNT = 10
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    make_room(tmp_path / "room", COUNT)
+    return tmp_path / "room"
+
+
+def changed(room: Path, *which: int, by: object) -> Path:
+    """The capture with other matrices at some frames of its transforms.json: `by` makes them of what is there."""
+    path = room / "transforms.json"
+    data = json.loads(path.read_text())
+    for number in which:
+        entry = data["frames"][number]
+        entry["transform_matrix"] = by(np.array(entry["transform_matrix"])).tolist()  # type: ignore[operator]
+    path.write_text(json.dumps(data))
+    return room
+
+
+def scaled(factor: float):  # type: ignore[no-untyped-def]
+    def change(pose: np.ndarray) -> np.ndarray:
+        pose[:3, :3] *= factor
+        return pose
+
+    return change
+
+
+@pytest.mark.parametrize("fill", [np.nan, 0.0])
+def test_a_few_poses_that_hold_nothing_cost_their_frames(room: Path, fill: float) -> None:
+    whole = open_capture(room)
+    capture = open_capture(changed(room, 2, 7, by=lambda pose: np.full((4, 4), fill)))
+    assert len(capture.frames) == COUNT - 2 and len(whole.frames) == COUNT
+    assert any(f"2 frames of {COUNT} are left out" in warning for warning in capture.warnings)
+
+
+def test_too_many_of_them_refuse_the_capture(room: Path) -> None:
+    with pytest.raises(InputError, match=rf"not finite.*3 of {COUNT} poses hold nothing usable"):
+        open_capture(changed(room, 2, 5, 7, by=lambda pose: np.full((4, 4), np.nan)))
+
+
+def test_a_uniform_scale_is_taken_out_of_rotations(room: Path) -> None:
+    whole = open_capture(room)
+    capture = open_capture(changed(room, *range(COUNT), by=scaled(0.4)))
+    assert any("scaled by 0.4" in warning for warning in capture.warnings)
+    for one, other in zip(capture.frames, whole.frames, strict=True):
+        np.testing.assert_allclose(one.world_from_camera, other.world_from_camera, atol=1e-9)
+
+
+def test_rounded_rotations_are_made_rigid(room: Path) -> None:
+    capture = open_capture(changed(room, *range(COUNT), by=lambda pose: pose.round(2)))
+    assert any("rounded?" in warning for warning in capture.warnings)
+    for frame in capture.frames:
+        turn = np.asarray(frame.world_from_camera)[:3, :3]
+        np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-12)
+
+
+def test_a_sheared_rotation_is_refused(room: Path) -> None:
+    def sheared(pose: np.ndarray) -> np.ndarray:
+        pose[:3, :3] = pose[:3, :3] @ np.array([[1, 0.3, 0], [0, 1, 0], [0, 0, 1]])
+        return pose
+
+    with pytest.raises(InputError, match="sheared"):
+        open_capture(changed(room, 3, by=sheared))
+
+
+def test_outside_of_readers_poses_are_checked_as_strictly_as_before() -> None:
+    turn = np.eye(4)
+    turn[:3, :3] = 0.4 * rotation(np.array([[0.1, 0.2, 0.3]]))[0]
+    with pytest.raises(InputError, match="not rigid"):
+        checked_pose(turn, "here")
+    with lenient_poses() as notes:
+        assert np.isnan(checked_pose(np.full((4, 4), np.nan), "here")).all()
+        np.testing.assert_allclose(checked_pose(turn, "here")[:3, :3] * 0.4, turn[:3, :3], atol=1e-12)
+    assert notes.scales == pytest.approx([0.4]) and notes.unusable == ["here: the pose holds a value that is not finite; "
+                                                                       "remove this frame or correct it"]
+    with pytest.raises(InputError, match="not finite"):
+        checked_pose(np.full((4, 4), np.nan), "here")
+
+
+def test_what_is_left_out_is_named() -> None:
+    frames = tuple(Frame(f"{number}", Path(f"{number}.png"), world_from_camera=pose) for number, pose in enumerate(circle(10)))
+    capture = Capture("photos", Path("/here"), frames)
+    assert without(capture, {}) is capture
+    less = without(capture, {"3": "3.png is empty; copy it again"})
+    assert [frame.name for frame in less.frames] == [str(number) for number in range(10) if number != 3]
+    assert less.warnings == ("1 frame of 10 is left out (3): 3.png is empty",)
+    with pytest.raises(InputError, match=r"empty; copy it again \(3 frames of 10|3 of 10"):
+        without(capture, dict.fromkeys("345", "3.png is empty; copy it again"))
+    with pytest.raises(InputError, match="empty"):
+        without(Capture("photos", Path("/here"), frames[:3]), {"1": "1.png is empty"})

@@ -1,0 +1,90 @@
+"""One bad part does not stop a good whole: frames that cannot be used are left out where nearly all others can."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from toolkit.camera import PoseNotes
+from toolkit.capture.headers import orientation_of
+from toolkit.capture.images import EXIF_TURNS
+from toolkit.capture.listing import LYING, counted, picture_header
+from toolkit.capture.types import Capture
+from toolkit.errors import InputError
+
+MOST_BAD = 0.2  # share of the frames that may be left out; with more of them something is wrong with the capture
+LEAST = 3  # frames that have to stay
+BESIDE = ("transforms", "blender", "colmap", "llff")  # kinds whose images may be photos as a camera wrote them
+NAMED = 3  # frames that a remark names
+
+
+def without(capture: Capture, bad: Mapping[str, str], refusal: str | None = None) -> Capture:
+    """The capture without its `bad` frames (name → a sentence that says why), with a remark; itself where there are none.
+
+    Args:
+        refusal: what is said where too many are bad; None: the first one's sentence.
+
+    Raises:
+        InputError: too many are bad.
+    """
+    if not bad:
+        return capture
+    kept = [frame for frame in capture.frames if frame.name not in bad]
+    total, lost = len(capture.frames), len(capture.frames) - len(kept)
+    first = next(iter(bad.values()))
+    if lost > MOST_BAD * total or len(kept) < LEAST:
+        raise InputError(refusal or (f"{first} ({lost} of {total} frames are like this)" if lost > 1 else first))
+    names = ", ".join(list(bad)[:NAMED]) + (", …" if lost > NAMED else "")
+    cause = first.rsplit("; ", 1)[0]
+    remark = f"{counted(lost, 'frame')} of {total} {'is' if lost == 1 else 'are'} left out ({names}): {cause}"
+    return capture.with_frames(kept, remark)
+
+
+def turned_by_exif(capture: Capture) -> Capture:
+    """The capture with the switch that has its images turned by EXIF, where its cameras have the shape of the upright images only; and with
+    a remark on images that EXIF turns by 180° or mirrors, where the shape says nothing."""
+    if capture.kind not in BESIDE or not capture.posed or any(frame.video_index is not None for frame in capture.frames):
+        return capture
+    turns = [orientation_of(frame.image) for frame in capture.frames]
+    lying = sum(
+        turn >= LYING and (frame.intrinsics.width, frame.intrinsics.height) == picture_header(frame.image).size[::-1]
+        for frame, turn in zip(capture.frames, turns, strict=True)
+        if frame.intrinsics is not None and frame.intrinsics.width != frame.intrinsics.height
+    )
+    if lying:
+        remark = f"{counted(lying, 'image fits its camera', 'images fit their cameras')} only when turned by EXIF, so all are turned by it"
+        return replace(capture.with_frames(capture.frames, remark), extra={**capture.extra, EXIF_TURNS: True})
+    over = sum(1 < turn < LYING for turn in turns)
+    if not over:
+        return capture
+    remark = (
+        f"EXIF turns {over} of {len(turns)} images (by 180°, or mirrored), and poses are taken to be for the images as they are stored; "
+        "if renders come out wrong, write the images anew without that tag"
+    )
+    return capture.with_frames(capture.frames, remark)
+
+
+def with_usable_poses(capture: Capture, notes: PoseNotes) -> Capture:
+    """The capture without frames whose pose holds nothing usable, and with remarks on poses that were made rigid.
+
+    Raises:
+        InputError: too many poses are unusable.
+    """
+    lost = [frame for frame in capture.frames if frame.world_from_camera is not None and not np.isfinite(frame.world_from_camera).all()]
+    sentences = [*notes.unusable[: len(lost)], *[""] * (len(lost) - len(notes.unusable))]
+    refusal = None
+    if notes.unusable and len(lost) > 1:
+        refusal = f"{notes.unusable[0]} ({len(lost)} of {len(capture.frames)} poses hold nothing usable)"
+    capture = without(capture, {frame.name: why for frame, why in zip(lost, sentences, strict=True)}, refusal)
+    remarks = []
+    if notes.scales:
+        low, high = min(notes.scales), max(notes.scales)
+        by = f"{low:.4g}" if high - low < 0.01 * high else f"{low:.4g} to {high:.4g}"
+        remarks.append(f"the rotations of {counted(len(notes.scales), 'pose')} were scaled by {by}, which was taken out")
+    if notes.rounding:
+        most = max(notes.rounding)
+        many = counted(len(notes.rounding), "pose")
+        remarks.append(f"the rotations of {many} were off by up to {most:.2g} (rounded?) and were made rigid")
+    return capture.with_frames(capture.frames, *remarks) if remarks else capture
