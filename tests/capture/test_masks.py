@@ -240,6 +240,12 @@ def test_a_linked_folder_of_masks_outside_is_not_read(tmp_path: Path) -> None:
         save(tmp_path / f"elsewhere/{index}.png", half())
     (tmp_path / "capture/masks").symlink_to(tmp_path / "elsewhere")
     assert kept(open_capture(tmp_path / "capture")) == [1.0] * 3
+    (tmp_path / "capture/masks").unlink()
+    save(tmp_path / "capture/masks/1.png", half())
+    (tmp_path / "capture/masks/2.png").symlink_to(tmp_path / "elsewhere/2.png")
+    assert kept(open_capture(tmp_path / "capture")) == [1.0, 0.5, 1.0]
+    save(tmp_path / "capture/masks/1.png", half(left=0))
+    assert [frame.name for frame in open_capture(tmp_path / "capture").frames] == ["0", "2"], "nothing of it is to be used"
 
 
 def test_masks_of_images_that_are_cut_out_are_their_alpha(tmp_path: Path) -> None:

@@ -267,7 +267,7 @@ def _shape_warnings(capture: Capture, headers: list[Header]) -> list[str]:
             example = f"{taken[0]}×{taken[1]}, as EXIF has it, and are {headers[index].width}×{headers[index].height}"
     if 2 * changed <= len(chosen):
         return []
-    return [f"the images were taken at {example}: cropped or squeezed; if squeezed, bring them back to their shape and find poses again"]
+    return [f"the images were taken at {example}: cropped, or squeezed, and no camera with one focal length fits squeezed images"]
 
 
 def _lens_warnings(capture: Capture) -> list[str]:

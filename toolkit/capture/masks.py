@@ -17,7 +17,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit import files
 from toolkit.capture import heif
 from toolkit.capture.images import LOSSY, decode, load_image, load_mask, turns_by_exif, usable_pixels
 from toolkit.capture.listing import counted, natural_key, picture_header, pictures_in
@@ -91,7 +90,7 @@ def with_masks(capture: Capture, use: str = "auto") -> Capture:
         return capture.with_frames(frames, *remarks)
     if len(shares) + len(unreadable) == len(masked) and min(shares.values()) > WHOLE:
         return capture.with_frames([replace(frame, mask=None, mask_excludes=False) for frame in frames], *remarks)
-    if max(shares.values()) < NOTHING:
+    if max(shares.values()) < NOTHING and len(masked) == len(frames):
         raise InputError(f"the masks{place} of {capture.root} leave nothing of any image (black is left out); {INSTEAD}")
     if len(masked) == len(frames) and not unreadable and (colour := _cut_out_on([frames[at] for at in shares], exif)):
         frames = [replace(frame, mask_is_alpha=True) for frame in frames]
@@ -101,15 +100,16 @@ def with_masks(capture: Capture, use: str = "auto") -> Capture:
     empty = {masked[at] for at, share in shares.items() if share == 0}
     frames = [frame for index, frame in enumerate(frames) if index not in empty]
     count = sum(frame.mask is not None for frame in frames)
-    share = float(np.mean([share for share in shares.values() if share > 0]))
-    remarks.append(
-        f"{count} of {counted(len(frames), 'image')} {'has' if count == 1 else 'have'} a mask{place}, which leaves "
-        f"{100 * share:.0f}% of the pixels: {'white' if excluding else 'black'} is left out of the fit and of scores"
-        + ("" if count == len(frames) else "; images without one are used whole")
-    )
+    if count:
+        share = float(np.mean([share for share in shares.values() if share > 0]))
+        remarks.append(
+            f"{count} of {counted(len(frames), 'image')} {'has' if count == 1 else 'have'} a mask{place}, which leaves "
+            f"{100 * share:.0f}% of the pixels: {'white' if excluding else 'black'} is left out of the fit and of scores"
+            + ("" if count == len(frames) else "; images without one are used whole")
+        )
     if empty:
         remarks.append(f"{counted(len(empty), 'image')} of which the masks leave nothing {'is' if len(empty) == 1 else 'are'} not used")
-    if max(shares.values()) < LITTLE:
+    if count and max(shares.values()) < LITTLE:
         remarks.append(f"the masks leave less than {100 * LITTLE:.0f}% of every image; {INSTEAD}")
     return capture.with_frames(frames, *remarks)
 
@@ -160,7 +160,8 @@ def _find(capture: Capture, remarks: list[str]) -> _Found | None:
         if place not in among and not found and len(beside) == 1:
             found = dict.fromkeys(range(len(images)), beside[0])
         for at, path in found.items():
-            places.setdefault(place, {})[indices[at]] = _inside(capture.root, path)
+            if path.resolve().is_relative_to(capture.root.resolve()):
+                places.setdefault(place, {})[indices[at]] = path.resolve()
         places.setdefault(place, {})
     names = {place: _name(capture.root, place) for place in places}
     usual = _factor(Counter(frame.image.parent.name for frame in capture.frames).most_common(1)[0][0])
@@ -185,7 +186,7 @@ def _shared(capture: Capture) -> _Found | None:
     for folder in sorted({root, *(frame.image.resolve().parent for frame in capture.frames)}):
         masks = [path for path in pictures_in(folder) if SHARED.fullmatch(path.stem.lower())] if folder.is_relative_to(root) else []
         if len(masks) == 1 and len(capture.frames) > 1 and _show_masks(masks):
-            mask = _inside(root, masks[0])
+            mask = masks[0].resolve()
             if all(frame.image.resolve() != mask for frame in capture.frames):
                 return _Found(dict.fromkeys(range(len(capture.frames)), mask), mask.relative_to(root).as_posix(), False)
     return None
@@ -272,10 +273,6 @@ def _factor(name: str) -> str:
 def _name(root: Path, place: Path) -> str:
     name = place.relative_to(root.resolve()).as_posix()
     return "the folder of the images" if name == "." else f"{name}/"
-
-
-def _inside(root: Path, path: Path) -> Path:
-    return files.inside(root, str(path))
 
 
 # ------------------------------------------------------------------------------------------------ looked at
