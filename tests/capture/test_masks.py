@@ -78,7 +78,9 @@ def test_masks_follow_the_folders_of_a_split(tmp_path: Path) -> None:
     assert {(frame.split, share) for frame, share in zip(capture.frames, kept(capture), strict=True)} == {("train", 0.25), ("test", 0.75)}
 
 
-@pytest.mark.parametrize("name", ["{stem}_mask.png", "mask_{stem}.png", "{stem}.mask.png", "{stem}-mask.jpg", "{stem}.alpha.png"])
+@pytest.mark.parametrize(
+    "name", ["{stem}_mask.png", "mask_{stem}.png", "{stem}.mask.png", "{stem}-mask.jpg", "{stem}.alpha.png", "{stem}.png"]
+)
 def test_masks_among_photos_are_no_photos(tmp_path: Path, name: str) -> None:
     stems = ["1", "11", "2"]
     photos(tmp_path, [f"{stem}.jpg" for stem in stems])
@@ -89,9 +91,25 @@ def test_masks_among_photos_are_no_photos(tmp_path: Path, name: str) -> None:
     assert kept(capture) == [0.5] * 3
 
 
+@pytest.mark.parametrize("name", ["mask.png", "images/camera_mask.png", "mask/all.png"])
+def test_one_mask_for_all_images(tmp_path: Path, name: str) -> None:
+    photos(tmp_path, [f"images/{index}.jpg" for index in range(3)])
+    save(tmp_path / name, half())
+    capture = open_capture(tmp_path)
+    assert [frame.name for frame in capture.frames] == ["0", "1", "2"] and kept(capture) == [0.5] * 3
+
+
+def test_cut_outs_among_photos_are_their_masks(tmp_path: Path) -> None:
+    photos(tmp_path, [f"{index}.jpg" for index in range(3)])
+    for index in range(3):
+        picture = np.array(Image.open(tmp_path / f"{index}.jpg"))
+        save(tmp_path / f"{index}-removebg-preview.png", np.dstack([picture, half()]))
+    assert kept(open_capture(tmp_path)) == [0.5] * 3
+
+
 def test_photos_of_masks_are_photos(tmp_path: Path) -> None:
-    photos(tmp_path, ["venetian.jpg", "venetian_mask.jpg", "mask_2.jpg"])
-    assert len(read_photos(tmp_path).frames) == 3
+    photos(tmp_path, ["venetian.jpg", "venetian_mask.jpg", "mask_2.jpg", "mask.jpg", "venetian.png"])
+    assert len(read_photos(tmp_path).frames) == 5
     assert not any(is_mask_folder(name) for name in ("unmasked_photos", "depth_masks", "damask"))
 
 
@@ -222,6 +240,12 @@ def test_a_linked_folder_of_masks_outside_is_not_read(tmp_path: Path) -> None:
         save(tmp_path / f"elsewhere/{index}.png", half())
     (tmp_path / "capture/masks").symlink_to(tmp_path / "elsewhere")
     assert kept(open_capture(tmp_path / "capture")) == [1.0] * 3
+    (tmp_path / "capture/masks").unlink()
+    save(tmp_path / "capture/masks/1.png", half())
+    (tmp_path / "capture/masks/2.png").symlink_to(tmp_path / "elsewhere/2.png")
+    assert kept(open_capture(tmp_path / "capture")) == [1.0, 0.5, 1.0]
+    save(tmp_path / "capture/masks/1.png", half(left=0))
+    assert [frame.name for frame in open_capture(tmp_path / "capture").frames] == ["0", "2"], "nothing of it is to be used"
 
 
 def test_masks_of_images_that_are_cut_out_are_their_alpha(tmp_path: Path) -> None:

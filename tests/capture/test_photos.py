@@ -12,6 +12,7 @@ from PIL import Image
 
 from tests.capture.films import film, quarters
 from toolkit.capture import open_capture
+from toolkit.capture.checks import check_capture
 from toolkit.capture.photos import focal_from_exif, read_photos
 from toolkit.errors import InputError
 
@@ -110,3 +111,17 @@ def test_a_name_that_is_not_utf8_is_refused_in_a_sentence(tmp_path: Path) -> Non
     for source in (tmp_path / strange, tmp_path / "photos", tmp_path / "film", tmp_path / "link.mp4"):
         with pytest.raises(InputError, match=r"K\?che.* is not UTF-8.*rename it"):
             open_capture(source)
+
+
+def test_photos_squeezed_into_another_shape_are_said(tmp_path: Path) -> None:
+    for size, said in (((64, 64), True), ((96, 64), False), ((64, 96), False)):
+        root = tmp_path / str(size)
+        for index in range(4):
+            path = root / f"{index}.jpg"
+            path.parent.mkdir(exist_ok=True)
+            tags = Image.Exif()
+            tags.get_ifd(0x8769).update({0xA002: 5472, 0xA003: 3648})
+            noise = np.random.default_rng(index).integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
+            Image.fromarray(noise).save(path, exif=tags)
+        warnings = check_capture(open_capture(root)).warnings
+        assert any("taken at 5472×3648, as EXIF has it, and are 64×64" in warning for warning in warnings) == said, size

@@ -17,6 +17,7 @@ from toolkit.capture.duplicates import copies, suspects
 from toolkit.capture.headers import PANORAMA, Header, is_panorama, read_bytes, read_header
 from toolkit.capture.images import largest, read_picture, turns_by_exif, upright
 from toolkit.capture.listing import TIFFS, counted, fitted, natural_key, unique_names
+from toolkit.capture.photos import size_from_exif
 from toolkit.capture.tiff import unturned
 from toolkit.capture.types import Capture, Frame
 from toolkit.capture.usable import without
@@ -32,6 +33,7 @@ BLOWN = 253  # grey level from which a pixel counts as saturated
 BLURRED = 0.25  # of the usual sharpness of the capture
 CUT_OFF = 0.1  # share of an image that is not used, from which on that is said
 FEWER_BITS = (1023, 4095, 16383)  # largest values of sensors that store 10, 12 and 14 bits in 16
+LOOKED_AT_SHAPES, SAME_SHAPE = 5, 0.05  # images whose EXIF is looked at; difference of width to height that rounding and lenses explain
 NOTICE = 0.1  # share of pictures from which a warning is worth reading
 
 
@@ -71,7 +73,8 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
     _refuse_same(capture, looks)
     capture, headers, looks, copy_warnings = _once_each(capture, headers, looks, exact)
     sizes = Counter(_upright_size(header, turns_by_exif(capture)) for header in headers)
-    warnings = [*_size_warnings(capture, sizes), *_lens_warnings(capture), *copy_warnings, *_picture_warnings(capture, looks)]
+    warnings = [*_size_warnings(capture, sizes), *_shape_warnings(capture, headers), *_lens_warnings(capture), *copy_warnings]
+    warnings += _picture_warnings(capture, looks)
     warnings += check_depth(capture, progress)
     extra = {**capture.extra, "sizes": {f"{width}x{height}": number for (width, height), number in sizes.most_common()}}
     return replace(
@@ -250,6 +253,21 @@ def _size_warnings(capture: Capture, sizes: Counter[tuple[int, int]]) -> list[st
     if all(frame.intrinsics is not None for frame in capture.frames):
         return [f"the pictures have {len(sizes)} sizes: {listed}; each comes with its own camera, so this is fine"]
     return [f"the pictures have {len(sizes)} sizes: {listed}; each size gets its own camera, which is less certain than one camera for all"]
+
+
+def _shape_warnings(capture: Capture, headers: list[Header]) -> list[str]:
+    """Images that EXIF says were taken in another shape: squeezed into theirs, no camera with one focal length fits them."""
+    changed, example = 0, ""
+    chosen = [int(at) for at in np.unique(np.linspace(0, len(headers) - 1, LOOKED_AT_SHAPES).round())]
+    for index in chosen:
+        taken = size_from_exif(capture.frames[index].image)
+        stored = headers[index].width / headers[index].height
+        if taken and all(abs(stored / ratio - 1) > SAME_SHAPE for ratio in (taken[0] / taken[1], taken[1] / taken[0])):
+            changed += 1
+            example = f"{taken[0]}×{taken[1]}, as EXIF has it, and are {headers[index].width}×{headers[index].height}"
+    if 2 * changed <= len(chosen):
+        return []
+    return [f"the images were taken at {example}: cropped, or squeezed, and no camera with one focal length fits squeezed images"]
 
 
 def _lens_warnings(capture: Capture) -> list[str]:

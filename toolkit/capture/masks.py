@@ -17,14 +17,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit import files
+from toolkit.capture import heif
 from toolkit.capture.images import LOSSY, decode, load_image, load_mask, turns_by_exif, usable_pixels
 from toolkit.capture.listing import counted, natural_key, picture_header, pictures_in
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 
 FOLDER_WORDS = {"mask", "masks", "matte", "mattes", "silhouette", "silhouettes"}
-FILE_WORDS = {*FOLDER_WORDS, "alpha"}
+FILE_WORDS = {*FOLDER_WORDS, "alpha", "removebg", "nobg", "cutout"}
+PHOTOS = (".jpg", ".jpeg", *heif.SUFFIXES)  # a mask is none of these where it has its image's name
+SHARED = re.compile(r"(camera[_-]?)?mask")  # the name of one mask for all images
 OTHER_WORDS = {"depth", "depths", "normal", "normals", "confidence", "overlay", "overlays"}  # `depth_masks/` is of something else
 OTHER_WAY_ROUND = "dynamic"  # what such a mask marks is left out
 SAMPLED = 16  # images whose names are compared with all masks' to find how these are called
@@ -63,7 +65,10 @@ def with_masks(capture: Capture, use: str = "auto") -> Capture:
     frames = list(capture.frames)
     place = ""
     if all(frame.mask is None for frame in frames):
-        found = _find(capture, remarks)
+        try:
+            found = _find(capture, remarks)
+        except OSError as error:
+            raise InputError(f"cannot read {error.filename or capture.root}: {error.strerror or error}") from error
         if found is not None:
             place = f" in {found.place}"
             for index, path in found.masks.items():
@@ -85,7 +90,7 @@ def with_masks(capture: Capture, use: str = "auto") -> Capture:
         return capture.with_frames(frames, *remarks)
     if len(shares) + len(unreadable) == len(masked) and min(shares.values()) > WHOLE:
         return capture.with_frames([replace(frame, mask=None, mask_excludes=False) for frame in frames], *remarks)
-    if max(shares.values()) < NOTHING:
+    if max(shares.values()) < NOTHING and len(masked) == len(frames):
         raise InputError(f"the masks{place} of {capture.root} leave nothing of any image (black is left out); {INSTEAD}")
     if len(masked) == len(frames) and not unreadable and (colour := _cut_out_on([frames[at] for at in shares], exif)):
         frames = [replace(frame, mask_is_alpha=True) for frame in frames]
@@ -95,27 +100,40 @@ def with_masks(capture: Capture, use: str = "auto") -> Capture:
     empty = {masked[at] for at, share in shares.items() if share == 0}
     frames = [frame for index, frame in enumerate(frames) if index not in empty]
     count = sum(frame.mask is not None for frame in frames)
-    share = float(np.mean([share for share in shares.values() if share > 0]))
-    remarks.append(
-        f"{count} of {counted(len(frames), 'image')} {'has' if count == 1 else 'have'} a mask{place}, which leaves "
-        f"{100 * share:.0f}% of the pixels: {'white' if excluding else 'black'} is left out of the fit and of scores"
-        + ("" if count == len(frames) else "; images without one are used whole")
-    )
+    if count:
+        share = float(np.mean([share for share in shares.values() if share > 0]))
+        remarks.append(
+            f"{count} of {counted(len(frames), 'image')} {'has' if count == 1 else 'have'} a mask{place}, which leaves "
+            f"{100 * share:.0f}% of the pixels: {'white' if excluding else 'black'} is left out of the fit and of scores"
+            + ("" if count == len(frames) else "; images without one are used whole")
+        )
     if empty:
         remarks.append(f"{counted(len(empty), 'image')} of which the masks leave nothing {'is' if len(empty) == 1 else 'are'} not used")
-    if max(shares.values()) < LITTLE:
+    if count and max(shares.values()) < LITTLE:
         remarks.append(f"the masks leave less than {100 * LITTLE:.0f}% of every image; {INSTEAD}")
     return capture.with_frames(frames, *remarks)
 
 
 def masks_among(pictures: Sequence[Path]) -> set[Path]:
     """Those of a folder's pictures that are masks of others, by their names (`NAME_mask.png`) and by what a few of them show."""
-    named = [path for path in pictures if _words(path.stem) & FILE_WORDS]
-    if not named:
-        return set()
-    images = [path for path in pictures if path not in set(named)]
-    found = set(_match(images, named, among=True).values())
-    return found if _show_masks(sorted(found)) else set()
+    out: set[Path] = set()
+    named, twins = _named(pictures), _twins(pictures)
+    images = [path for path in pictures if path not in {*named, *twins}]
+    shared = [path for path in named if SHARED.fullmatch(path.stem.lower())]
+    for found in (*(sorted(_match(images, some, among=True).values()) for some in (named, twins)), shared if len(shared) == 1 else []):
+        if len(images) > 1 and found and _show_masks(found):
+            out |= set(found)
+    return out
+
+
+def _named(pictures: Sequence[Path]) -> list[Path]:
+    return [path for path in pictures if _words(path.stem) & FILE_WORDS]
+
+
+def _twins(pictures: Sequence[Path]) -> list[Path]:
+    """Of `NAME.jpg` and `NAME.png` the latter, which may be the mask of the former."""
+    photos = {path.stem.lower() for path in pictures if path.suffix.lower() in PHOTOS}
+    return [path for path in pictures if path.suffix.lower() not in PHOTOS and path.stem.lower() in photos]
 
 
 def is_mask_folder(name: str) -> bool:
@@ -136,10 +154,14 @@ def _find(capture: Capture, remarks: list[str]) -> _Found | None:
         beside = pictures_in(directory)
         if place == directory == images[0].resolve().parent:
             used = {image.name for image in images}
-            beside = [path for path in beside if path.name not in used and _words(path.stem) & FILE_WORDS]
+            beside = [path for path in (*_named(beside), *_twins(beside)) if path.name not in used]
             among.add(place)
-        for at, path in _match(images, beside, among=place in among).items():
-            places.setdefault(place, {})[indices[at]] = _inside(capture.root, path)
+        found = _match(images, beside, among=place in among)
+        if place not in among and not found and len(beside) == 1:
+            found = dict.fromkeys(range(len(images)), beside[0])
+        for at, path in found.items():
+            if path.resolve().is_relative_to(capture.root.resolve()):
+                places.setdefault(place, {})[indices[at]] = path.resolve()
         places.setdefault(place, {})
     names = {place: _name(capture.root, place) for place in places}
     usual = _factor(Counter(frame.image.parent.name for frame in capture.frames).most_common(1)[0][0])
@@ -155,7 +177,19 @@ def _find(capture: Capture, remarks: list[str]) -> _Found | None:
         elif place not in among or masks:
             why = "other masks are" if masks else "their names fit no image"
             remarks.append(f"the masks in {names[place]} are not used: {why}")
-    return best
+    return best or _shared(capture)
+
+
+def _shared(capture: Capture) -> _Found | None:
+    """One mask for all images: `mask.png` among them or above."""
+    root = capture.root.resolve()
+    for folder in sorted({root, *(frame.image.resolve().parent for frame in capture.frames)}):
+        masks = [path for path in pictures_in(folder) if SHARED.fullmatch(path.stem.lower())] if folder.is_relative_to(root) else []
+        if len(masks) == 1 and len(capture.frames) > 1 and _show_masks(masks):
+            mask = masks[0].resolve()
+            if all(frame.image.resolve() != mask for frame in capture.frames):
+                return _Found(dict.fromkeys(range(len(capture.frames)), mask), mask.relative_to(root).as_posix(), False)
+    return None
 
 
 def _places(capture: Capture) -> Iterator[tuple[Path, Path, list[int]]]:
@@ -180,11 +214,10 @@ def _places(capture: Capture) -> Iterator[tuple[Path, Path, list[int]]]:
                 if place in above:
                     continue
                 parts = folder.relative_to(base).parts
-                for rest in dict.fromkeys((parts, parts[1:])):
-                    directory = place.joinpath(*rest)
-                    if directory.resolve().is_relative_to(root) and pictures_in(directory):
-                        yield place, directory, indices
-                        break
+                folders = [place.joinpath(*rest) for rest in dict.fromkeys((parts, parts[1:]))]
+                inside = [directory for directory in folders if directory.resolve().is_relative_to(root) and pictures_in(directory)]
+                if inside or (place.resolve().is_relative_to(root) and any(place.iterdir())):
+                    yield place, (inside or [place])[0], indices
 
 
 def _match(images: Sequence[Path], masks: Sequence[Path], *, among: bool) -> dict[int, Path]:
@@ -198,7 +231,7 @@ def _match(images: Sequence[Path], masks: Sequence[Path], *, among: bool) -> dic
             start = name.find(stem)
             if start >= 0 and _apart(name[:start], stem[0]) and _apart(name[start + len(stem) :][::-1], stem[-1]):
                 before, after = name[:start], name[start + len(stem) :]
-                if after.startswith(suffix) or not among or _words(before + " " + after) & FILE_WORDS:
+                if after.startswith(suffix) or not among or not before + after or _words(before + " " + after) & FILE_WORDS:
                     votes[before, after.replace(suffix, "{}", 1) if after.startswith(suffix) else after] += 1
     out: dict[int, Path] = {}
     for before, after in sorted(votes, key=lambda affix: (-votes[affix], len(affix[0] + affix[1]), affix)):
@@ -240,10 +273,6 @@ def _factor(name: str) -> str:
 def _name(root: Path, place: Path) -> str:
     name = place.relative_to(root.resolve()).as_posix()
     return "the folder of the images" if name == "." else f"{name}/"
-
-
-def _inside(root: Path, path: Path) -> Path:
-    return files.inside(root, str(path))
 
 
 # ------------------------------------------------------------------------------------------------ looked at

@@ -168,6 +168,24 @@ def _once_each(pictures: list[Path]) -> tuple[list[Path], list[str]]:
     return kept, [f"{counted(double, 'picture is', 'pictures are')} there as HEIC and in another format; the latter is used"]
 
 
+def size_from_exif(path: Path) -> tuple[int, int] | None:
+    """Width and height in pixels that the camera wrote, as EXIF has them, or None."""
+    exif = _exif(path)
+    width, height = _positive(exif.get(STORED_WIDTH)), _positive(exif.get(STORED_HEIGHT))
+    return (round(width), round(height)) if width and height and min(width, height) >= 1 else None
+
+
+def _exif(path: Path) -> dict[int, Any]:
+    """The camera's part of EXIF; empty where there is none, or it is broken in a good picture."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow remarks on size and on every oddity of EXIF
+            with Image.open(path) as picture:
+                return dict(picture.getexif().get_ifd(EXIF_FOLDER))
+    except Exception:  # Pillow raises many families
+        return {}
+
+
 def focal_from_exif(path: Path) -> float | None:
     """The focal length in pixels of the stored picture, or None when EXIF does not tell a believable one.
 
@@ -177,13 +195,7 @@ def focal_from_exif(path: Path) -> float | None:
         InputError: the file is not a picture.
     """
     width, height = picture_header(path).size
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow remarks on size and on every oddity of EXIF
-            with Image.open(path) as picture:
-                exif = dict(picture.getexif().get_ifd(EXIF_FOLDER))
-    except Exception:  # broken metadata in a good picture; Pillow raises many families
-        return None
+    exif = _exif(path)
     equivalent = _positive(exif.get(FOCAL_LENGTH_35))
     focal: float | None = None
     if equivalent:

@@ -100,7 +100,7 @@ class Job:
     def key(self) -> str:
         """Of what features and matches depend on: not on threads, not on what the mapper is told."""
         pictures = [[picture.key(), Path(picture.image)] for picture in self.pictures]
-        flat = [part for pair in pictures for part in pair]
+        flat = [part for pair in pictures for part in pair] + [Path(picture.mask) for picture in self.pictures if picture.mask]
         how = [self.sequential, self.one_camera, self.exif, self.image_size, self.max_features, self.seed, self.features]
         return fingerprint(VERSION, *how, *flat)
 
