@@ -170,7 +170,7 @@ def sparse_points(path: Path) -> tuple[Array, Array] | tuple[None, None]:
 
     if not path.is_file():
         return None, None
-    cloud = trimesh.load(path, process=False)
+    cloud: Any = trimesh.load(path, process=False)
     chosen = np.linspace(0, len(cloud.vertices) - 1, min(MOST_SPARSE, len(cloud.vertices))).astype(int)
     return np.asarray(cloud.vertices)[chosen], np.asarray(cloud.colors)[chosen, :3]
 

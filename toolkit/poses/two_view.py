@@ -161,7 +161,10 @@ def _verified(here: Array, there: Array, focal: float) -> tuple[Array, Array]:
     if len(here) < MIN_INLIERS:
         return here[:0], there[:0]
     cv2.setRNGSeed(0)
-    _, inlier = cv2.findFundamentalMat(here * focal, there * focal, cv2.USAC_MAGSAC, INLIER, 0.999, 1000)
+    try:
+        _, inlier = cv2.findFundamentalMat(here * focal, there * focal, cv2.USAC_MAGSAC, INLIER, 0.999, 1000)
+    except cv2.error:  # OpenCV fails an assertion of its own where no sample gives a model that it can refine
+        _, inlier = cv2.findFundamentalMat(here * focal, there * focal, cv2.FM_RANSAC, INLIER, 0.999, 1000)
     keep = np.zeros(len(here), bool) if inlier is None else inlier.ravel() > 0
     return here[keep], there[keep]
 
