@@ -132,7 +132,7 @@ def find_camera_poses(job: Job, capture: Capture) -> PoseResult:
 
     uses: list[Any] = [given]
     if given:
-        uses += [CHECKED, settings.poses.convention, pixel_state(capture)]
+        uses += [CHECKED, settings.poses.convention]  # the stages before know the files
     else:
         found = {name: value for name, value in asdict(settings.poses).items() if name != "convention"}
         uses += [VERSION, found, settings.seed, pixel_state(capture)]

@@ -25,7 +25,7 @@ def test_posed_captures_are_measured_and_their_table_written(tmp_path: Path, cap
     assert answer.code == 0, answer.err
     rows = {row["scene"]: row for row in json.loads(answer.out)["rows"]}
     fitted = rows["room"]
-    assert fitted["psnr"] > 10 and fitted["train"] == 8 and fitted["test"] == 2 and fitted["fit_seconds"] > 0.8 and fitted["voxels"] > 0
+    assert fitted["psnr"] > 10 and fitted["train"] == 8 and fitted["test"] == 2 and fitted["fit_seconds"] > 0.05 and fitted["voxels"] > 0
     assert rows["broken"]["error"] and rows["broken"].get("psnr") is None
     assert read_json(out / "results.json")["rows"] == list(rows.values())
 

@@ -62,7 +62,7 @@ def test_fewer_workers_look_for_features(tmp_path: Path, monkeypatch: pytest.Mon
     class Enough(Exception):
         pass
 
-    def plan(capture: object, folder: object, settings: object, seed: int, threads: int) -> None:
+    def plan(capture: object, folder: object, settings: object, seed: int, threads: int, *_: object) -> None:
         asked.append(threads)
         raise Enough
 

@@ -64,14 +64,12 @@ class Suite:
         """
         if not root.is_dir():
             raise InputError(f"{root} is not a folder; give the one that holds the scenes of {self.title}")
-        if is_scene(root):
+        below = sorted((path for path in root.iterdir() if path.is_dir()), key=lambda path: natural_key(path.name))
+        # Folders of any name, with colour, depth and poses, may as well belong to several scenes.
+        if is_scene(root) and not (detect_kind(root) == "rgbd" and any(map(is_scene, below))):
             found = {root.name: root}
         else:
-            found = {
-                path.name: path
-                for path in sorted(root.iterdir(), key=lambda path: natural_key(path.name))
-                if path.is_dir() and is_scene(path)
-            }
+            found = {path.name: path for path in below if is_scene(path)}
             if self.scenes:
                 found = {name: found[name] for name in self.scenes if name in found}
         if wanted is not None:
