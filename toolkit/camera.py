@@ -283,6 +283,11 @@ def lenient_poses() -> Iterator[PoseNotes]:
         _lenient.reset(token)
 
 
+def reads_leniently() -> bool:
+    """Whether a capture is being read in which single bad parts are left out (`lenient_poses`)."""
+    return _lenient.get() is not None
+
+
 def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     """A rigid float64 (4, 4) pose, re-orthonormalised where it is off, or a clear refusal.
 

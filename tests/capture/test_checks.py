@@ -308,6 +308,10 @@ def test_missing_depth_is_told(tmp_path: Path) -> None:
     assert "50% of the depth is missing" in text and "1 of 7 depth maps" in text and "1 of 8 frames have no depth" in text
     assert capture.frames[1].depth is not None
     capture.frames[1].depth.unlink()
+    assert "without depth (1): " in warnings_of(capture)
+    for frame in capture.frames[2:5]:
+        assert frame.depth is not None
+        frame.depth.unlink()
     refused(capture, r"1\.npy")
 
 

@@ -185,8 +185,11 @@ def test_a_file_that_is_no_picture_is_named(tmp_path: Path, layout: str) -> None
     LAYOUTS[layout][1](tmp_path)
     victim = open_capture(tmp_path).frames[-1].image
     victim.write_bytes(b"not a picture")
-    with pytest.raises(InputError, match=victim.name):
-        open_capture(tmp_path)
+    try:
+        said = " ".join(check_capture(open_capture(tmp_path)).warnings)  # one of many is left out
+    except InputError as error:
+        said = str(error)
+    assert victim.name in said
 
 
 @pytest.mark.parametrize("layout", [name for name in LAYOUTS if name not in ("blender", "stray", "sens")])  # these tell no size, or hold it

@@ -125,8 +125,7 @@ def test_a_truncated_picture_is_refused_by_name(tmp_path: Path, share: float) ->
     path.write_bytes(data[: int(len(data) * share)])
     with pytest.raises(InputError, match=r"photo\.heic.*(cut short|damaged|cannot be read)"):
         load_image(Frame("a", path))
-    with pytest.raises(InputError, match=r"photo\.heic"):
-        check_capture(open_capture(folder(tmp_path)))
+    assert any("left out" in text and "photo.heic" in text for text in check_capture(open_capture(folder(tmp_path))).warnings)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -8,15 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.capture.layouts import LAYOUTS
 from tests.pipelines.made import circle, make_room
 from toolkit.camera import checked_pose, lenient_poses
 from toolkit.capture import open_capture
+from toolkit.capture.checks import check_capture
 from toolkit.capture.types import Capture, Frame
 from toolkit.capture.usable import without
 from toolkit.effects.adjust import rotation
 from toolkit.errors import InputError
 
 COUNT = 10
+EVERY = [name for name in LAYOUTS if name not in ("sens", "stray", "record3d")]  # those hold their images in one file
 
 
 @pytest.fixture
@@ -107,3 +110,33 @@ def test_what_is_left_out_is_named() -> None:
         without(capture, dict.fromkeys("345", "3.png is empty; copy it again"))
     with pytest.raises(InputError, match="empty"):
         without(Capture("photos", Path("/here"), frames[:3]), {"1": "1.png is empty"})
+
+
+@pytest.mark.parametrize("layout", EVERY)
+@pytest.mark.parametrize("which", [0, 2])
+def test_an_empty_or_damaged_image_costs_its_frame_in_every_layout(layout: str, which: int, tmp_path: Path) -> None:
+    folder = tmp_path / layout
+    LAYOUTS[layout][1](folder)
+    frames = open_capture(folder).frames
+    image, whole = frames[which].image, frames[which].image.read_bytes()
+    for data in (b"", whole[: len(whole) // 3]):
+        image.write_bytes(data)
+        capture = check_capture(open_capture(folder))
+        assert {frame.name for frame in capture.frames} == {frame.name for frame in frames} - {frames[which].name}
+        assert any("left out" in warning and image.name in warning for warning in capture.warnings)
+    for frame in frames:
+        frame.image.write_bytes(b"")
+    with pytest.raises(InputError):
+        check_capture(open_capture(folder))
+
+
+@pytest.mark.parametrize("data", [None, b"", b"no image"])
+def test_a_lost_depth_map_costs_no_frame(data: bytes | None, tmp_path: Path) -> None:
+    make_room(tmp_path / "room", COUNT, depth=True)
+    frames = open_capture(tmp_path / "room").frames
+    path = frames[4].depth
+    assert path is not None
+    path.unlink() if data is None else path.write_bytes(data)
+    capture = check_capture(open_capture(tmp_path / "room"))
+    assert len(capture.frames) == COUNT and sum(frame.depth is None for frame in capture.frames) == 1
+    assert any("without depth" in warning or "do not exist" in warning or "not found" in warning for warning in capture.warnings)

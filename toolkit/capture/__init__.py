@@ -28,5 +28,5 @@ def open_capture(source: Path | str, masks: str = "auto") -> Capture:
     from toolkit.capture.usable import turned_by_exif, with_usable_poses
 
     with lenient_poses() as notes:
-        capture = read_source(Path(source))
-    return with_remark(with_masks(turned_by_exif(with_usable_poses(capture, notes)), masks))
+        capture = with_usable_poses(read_source(Path(source)), notes)
+        return with_remark(with_masks(turned_by_exif(capture), masks))

@@ -20,7 +20,7 @@ from toolkit.capture.listing import TIFFS, counted, fitted, natural_key, unique_
 from toolkit.capture.photos import size_from_exif
 from toolkit.capture.tiff import unturned
 from toolkit.capture.types import Capture, Frame
-from toolkit.capture.usable import without
+from toolkit.capture.usable import with_usable_depth, without
 from toolkit.errors import InputError
 from toolkit.progress import SILENT, Progress
 
@@ -69,6 +69,7 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
         raise InputError(f"{capture.root} holds only one picture; take at least 20 from different places")
     capture = scaled_to_white(capture, progress)
     capture, headers, looks, exact = _look_at_all(capture, progress)
+    capture = with_usable_depth(capture)
     _refuse_blank(capture, looks)
     _refuse_same(capture, looks)
     capture, headers, looks, copy_warnings = _once_each(capture, headers, looks, exact)

@@ -18,7 +18,7 @@ import numpy as np
 
 from toolkit.camera import Array, Intrinsics, checked_pose
 from toolkit.capture.calibration import from_matrix
-from toolkit.capture.listing import assemble, counted, picture_header, pictures_in, require_folder, same_count, unique_names
+from toolkit.capture.listing import assemble, counted, pictures_in, require_folder, same_count, size_of, unique_names
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError, first_line
 
@@ -54,7 +54,7 @@ def read_dtu(path: Path | str) -> Capture:
     for position, (index, picture, name) in enumerate(zip(indices, pictures, unique_names(pictures), strict=True)):
         where = f"world_mat_{index} of {source}"
         matrix, pose = decompose(matrices[f"world_mat_{index}"], where)
-        intrinsics, warning = camera_for(matrix, picture_header(picture).size, where)
+        intrinsics, warning = camera_for(matrix, size_of(picture, pictures), where)
         if warning:
             warnings[warning] = None
         frames.append(

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from toolkit import files
-from toolkit.camera import Array, Intrinsics
+from toolkit.camera import Array, Intrinsics, reads_leniently
 from toolkit.capture import heif
 from toolkit.capture.headers import NOT_EXR, orientation_of
 from toolkit.capture.tiff import read_tiff
@@ -111,8 +111,12 @@ class Header:
         return self.width, self.height
 
 
+UNREADABLE = Header(0, 0, False)  # of a file that cannot be read, while a capture is: the first look at all images leaves it out
+
+
 def picture_header(path: Path) -> Header:
-    """Size and alpha of a picture (or the shape of a 2-D `.npy`); nothing is decoded.
+    """Size and alpha of a picture (or the shape of a 2-D `.npy`); nothing is decoded. While a capture is read, a file that cannot be read
+    is `UNREADABLE`: whether that refuses the capture is decided when all are known.
 
     Raises:
         InputError: not a picture that can be read.
@@ -134,7 +138,31 @@ def picture_header(path: Path) -> Header:
             width, height = picture.size
             return Header(width, height, picture.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in picture.info)
     except Exception as error:  # Pillow's and NumPy's parsers raise many families on broken files
+        if reads_leniently():
+            return UNREADABLE
         raise InputError(f"{path} cannot be read as a picture; remove it or replace it") from error
+
+
+def first_size(paths: Sequence[Path]) -> tuple[int, int]:
+    """Size (width, height) of the first picture that can be read.
+
+    Raises:
+        InputError: none of them can.
+    """
+    size = next((size for path in paths if (size := picture_header(path).size) != UNREADABLE.size), None)
+    if size is None:
+        raise InputError(f"{paths[0]} cannot be read as a picture, and neither can the others beside it; check how they were written")
+    return size
+
+
+def size_of(path: Path, others: Sequence[Path]) -> tuple[int, int]:
+    """Size (width, height) of a picture; where it cannot be read, that of the first of the `others` that can.
+
+    Raises:
+        InputError: none of them can.
+    """
+    size = picture_header(path).size
+    return first_size(others) if size == UNREADABLE.size else size
 
 
 def fits_shape(intrinsics: Intrinsics, size: tuple[int, int]) -> bool:
@@ -153,7 +181,7 @@ def fitted(intrinsics: Intrinsics, size: tuple[int, int], where: str, image: Pat
         InputError: the picture has another shape (cropped, or turned).
     """
     width, height = size
-    if (width, height) == (intrinsics.width, intrinsics.height):
+    if (width, height) in ((intrinsics.width, intrinsics.height), UNREADABLE.size):
         return intrinsics
     if not fits_shape(intrinsics, size):
         if image is not None and fits_shape(intrinsics, (height, width)) and orientation_of(image) >= LYING:

@@ -326,11 +326,13 @@ def _without_bad(frames: list[Frame], exif: bool, remarks: list[str]) -> list[Fr
         if frame.mask is not None:
             try:
                 width, height = picture_header(frame.mask).size
+                wide, high = picture_header(frame.image).size
+                if not (width and wide):
+                    raise InputError(f"{frame.mask} or its image cannot be read")
             except InputError:
                 broken.append(frame.name)
                 frame = replace(frame, mask=None, mask_excludes=False)
             else:
-                wide, high = picture_header(frame.image).size
                 fits = [abs(width * high / (height * wide) - 1) < SHAPE, exif and abs(width * wide / (height * high) - 1) < SHAPE]
                 if not any(fits):
                     shapes.append(frame.name)

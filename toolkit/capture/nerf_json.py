@@ -11,7 +11,7 @@ import numpy as np
 
 from toolkit.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, checked_pose, world_from_opengl
 from toolkit.capture.headers import PANORAMA
-from toolkit.capture.listing import counted, fitted, picture_header
+from toolkit.capture.listing import UNREADABLE, counted, fitted, picture_header
 from toolkit.capture.mirrored import mirrors, unmirrored
 from toolkit.capture.resolve import Found
 from toolkit.capture.types import Frame
@@ -225,6 +225,8 @@ def read_frames(listed: Sequence[Listed], images: Sequence[Path]) -> tuple[list[
     """
     scaled = bent = 0
     sizes = [picture_header(image).size for image in images]
+    usual = next((size for size in sizes if size != UNREADABLE.size), UNREADABLE.size)
+    sizes = [usual if size == UNREADABLE.size else size for size in sizes]
     cameras = []
     for (shared, entry, where), size, image in zip(listed, sizes, images, strict=True):
         described = picture_camera(shared, entry, size, where)

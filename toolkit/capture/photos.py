@@ -195,6 +195,8 @@ def focal_from_exif(path: Path) -> float | None:
         InputError: the file is not a picture.
     """
     width, height = picture_header(path).size
+    if not width:  # it cannot be read, which is said elsewhere
+        return None
     exif = _exif(path)
     equivalent = _positive(exif.get(FOCAL_LENGTH_35))
     focal: float | None = None

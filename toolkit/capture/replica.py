@@ -12,7 +12,17 @@ from pathlib import Path
 
 from toolkit.camera import Array, Intrinsics, checked_pose
 from toolkit.capture.calibration import sensor
-from toolkit.capture.listing import assemble, fitted, picture_header, pictures_in, read_numbers, read_object, require_folder, same_count
+from toolkit.capture.listing import (
+    assemble,
+    first_size,
+    fitted,
+    picture_header,
+    pictures_in,
+    read_numbers,
+    read_object,
+    require_folder,
+    same_count,
+)
 from toolkit.capture.nerf_json import MAX_SIDE, number
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
@@ -44,7 +54,7 @@ def read_replica(path: Path | str) -> Capture:
     depths = {path.stem.removeprefix("depth"): path for path in found if path.name.startswith("depth")}
     if not pictures:
         raise InputError(f"{root / PICTURES} holds no pictures frame000000.jpg, frame000001.jpg, …; put them there")
-    camera, scale, warnings = _camera(root, picture_header(pictures[0]).size)
+    camera, scale, warnings = _camera(root, first_size(pictures))
     frames = []
     for picture, (line, pose) in zip(pictures, _poses(root, pictures), strict=True):
         size = picture_header(picture).size

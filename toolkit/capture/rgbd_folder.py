@@ -25,6 +25,7 @@ from toolkit.capture.listing import (
     assemble,
     counted,
     files_in,
+    first_size,
     fitted,
     natural_key,
     picture_header,
@@ -90,7 +91,7 @@ def read_rgbd(path: Path | str) -> Capture:
     images = pictures_in(layout.colour)
     depths = _depths_of(images, pictures_in(layout.depth, DEPTH_FILES), root)
     poses = _poses_of(images, layout.poses, root)
-    camera, scale, source = _camera(root, layout, picture_header(images[0]).size)
+    camera, scale, source = _camera(root, layout, first_size(images))
     frames = []
     for index, (image, name) in enumerate(zip(images, unique_names(images), strict=True)):
         if index not in poses or not np.isfinite(poses[index]).all():

@@ -16,7 +16,7 @@ import numpy as np
 
 from toolkit.camera import Array, Intrinsics, checked_pose, world_from_opengl
 from toolkit.capture.calibration import from_matrix
-from toolkit.capture.listing import assemble, fitted, is_file, picture_header, pictures_in, read_object, require_folder
+from toolkit.capture.listing import assemble, fitted, is_file, picture_header, pictures_in, read_object, require_folder, size_of
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import InputError
 
@@ -47,13 +47,13 @@ def read_scanner3d(path: Path | str) -> Capture:
         raise InputError(f'{root} holds no frame_*.jpg with its frame_*.json; export "All Data" of the scan')
     lost = len(pictures) - len(used)
     remarks = [f"{lost} of the {len(pictures)} pictures have no .json beside them and are left out"] if lost else []
-    return assemble("scanner3d", root, [_frame(picture) for picture in used], remarks, ordered=True, metric=True, up=(0.0, 1.0, 0.0))
+    return assemble("scanner3d", root, [_frame(picture, used) for picture in used], remarks, ordered=True, metric=True, up=(0.0, 1.0, 0.0))
 
 
-def _frame(picture: Path) -> Frame:
+def _frame(picture: Path, others: list[Path]) -> Frame:
     where = picture.with_suffix(".json")
     data = read_object(where)
-    camera = _camera(_numbers(data, LENS, 9, where).reshape(3, 3), picture_header(picture).size, str(where))
+    camera = _camera(_numbers(data, LENS, 9, where).reshape(3, 3), size_of(picture, others), str(where))
     number = PICTURE.fullmatch(picture.name)
     assert number is not None
     depth, confidence = (picture.with_name(f"{kind}_{number[1]}.png") for kind in ("depth", "conf"))

@@ -16,6 +16,7 @@ from toolkit.camera import Intrinsics, checked_pose
 from toolkit.capture.listing import (
     assemble,
     counted,
+    first_size,
     fitted,
     picture_header,
     pictures_in,
@@ -113,9 +114,9 @@ def lost_frames(listed: int, tracked: int, where: Path) -> list[str]:
 
 
 def first_sizes(found: list[FrameFiles]) -> tuple[tuple[int, int], tuple[int, int] | None]:
-    """Size (width, height) of the first picture, and of the first depth picture, if there is one."""
-    depth = next((entry.depth for entry in found if entry.depth is not None), None)
-    return picture_header(found[0].colour).size, None if depth is None else picture_header(depth).size
+    """Size (width, height) of the first picture that can be read, and of the first depth picture, if there is one."""
+    depths = [entry.depth for entry in found if entry.depth is not None]
+    return first_size([entry.colour for entry in found]), first_size(depths) if depths else None
 
 
 def looks_like_seven_scenes(path: Path) -> bool:

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.camera import PoseNotes
-from toolkit.capture.headers import orientation_of
+from toolkit.capture.headers import orientation_of, read_bytes, read_header
 from toolkit.capture.images import EXIF_TURNS
-from toolkit.capture.listing import LYING, counted, picture_header
+from toolkit.capture.listing import LYING, PICTURES, counted, picture_header
 from toolkit.capture.types import Capture
 from toolkit.errors import InputError
 
@@ -40,6 +40,36 @@ def without(capture: Capture, bad: Mapping[str, str], refusal: str | None = None
     cause = first.rsplit("; ", 1)[0]
     remark = f"{counted(lost, 'frame')} of {total} {'is' if lost == 1 else 'are'} left out ({names}): {cause}"
     return capture.with_frames(kept, remark)
+
+
+def with_usable_depth(capture: Capture) -> Capture:
+    """The capture without those few depth maps that are missing, empty or damaged; their frames stay.
+
+    Raises:
+        InputError: too many depth maps are.
+    """
+    deep = [frame for frame in capture.frames if frame.depth is not None and frame.video_index is None]
+    bad: dict[str, str] = {}
+    for frame in deep:
+        assert frame.depth is not None
+        try:
+            if frame.depth.suffix.lower() in PICTURES:
+                read_header(read_bytes(frame.depth), frame.depth)
+            elif not frame.depth.stat().st_size:
+                raise InputError(f"{frame.depth} is empty; copy it again")
+        except (InputError, OSError) as error:
+            bad[frame.name] = str(error) if isinstance(error, InputError) else f"{frame.depth} is not there; add it or remove the frame"
+    if not bad:
+        return capture
+    first = next(iter(bad.values()))
+    if len(bad) > MOST_BAD * len(deep):
+        raise InputError(f"{first} ({len(bad)} of {len(deep)} depth maps are like this)" if len(bad) > 1 else first)
+    frames = [
+        replace(frame, depth=None, depth_intrinsics=None, confidence=None, depth_pose=None) if frame.name in bad else frame
+        for frame in capture.frames
+    ]
+    names = ", ".join(list(bad)[:NAMED]) + (", …" if len(bad) > NAMED else "")
+    return capture.with_frames(frames, f"{counted(len(bad), 'frame is', 'frames are')} used without depth ({names}): {first}")
 
 
 def turned_by_exif(capture: Capture) -> Capture:
