@@ -54,8 +54,8 @@ def black_photos(path: Path) -> Path:
 
 def truncated_jpeg(path: Path) -> Path:
     photos(path, 6)
-    victim = path / "03.jpg"
-    victim.write_bytes(victim.read_bytes()[:600])
+    for victim in (path / "03.jpg", path / "04.jpg"):  # a single one is left out
+        victim.write_bytes(victim.read_bytes()[:600])
     return path
 
 
