@@ -310,7 +310,8 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     rotation = pose[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):  # of damaged files: huge numbers are no rotation either
         size, off = np.linalg.det(rotation), np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if abs(size) < 1e-6:
+    least = 1e-6 if notes is None else 1e-6 * np.abs(rotation).max() ** 3  # where scale is taken out, a small one is no fault
+    if not abs(size) > least:
         return _unusable(f"{where}: the pose's rotation is singular; remove this frame or correct it", notes)
     if notes is not None and size > 0 and not off <= tolerance:
         rotation, off = _unscaled(rotation, off, notes)
@@ -321,9 +322,8 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     if notes is not None and tolerance < off <= ROUNDED:
         notes.rounding.append(float(off))
     elif not off <= tolerance:  # NaN, too
-        raise InputError(
-            f"{where}: the pose is not rigid (its rotation is sheared or its axes differ in length: R'R is {off:.2g} off 1); correct it"
-        )
+        why = f"its rotation is sheared or its axes differ in length: R'R is {off:.2g} off 1"
+        return _unusable(f"{where}: the pose is not rigid ({why}); correct it", notes)
     checked_place(pose[:3, 3], where)
     out = np.eye(4)
     if off > RIGID:
