@@ -264,11 +264,12 @@ _lenient: ContextVar[PoseNotes | None] = ContextVar("lenient poses", default=Non
 
 @dataclass
 class PoseNotes:
-    """What was wrong with poses that were read leniently."""
+    """What was wrong with poses, and other parts of single frames, that were read leniently."""
 
     unusable: list[str] = field(default_factory=list)  # a sentence for each pose that came back as NaN
     scales: list[float] = field(default_factory=list)  # of rotations that were scaled
     rounding: list[float] = field(default_factory=list)  # how far R'R was from 1 where rotations were made rigid
+    unread: dict[str, str] = field(default_factory=dict)  # frames that could not be read, and why
 
 
 @contextmanager
@@ -281,6 +282,24 @@ def lenient_poses() -> Iterator[PoseNotes]:
         yield notes
     finally:
         _lenient.reset(token)
+
+
+@contextmanager
+def single_frame(name: str) -> Iterator[None]:
+    """What is read inside belongs to one frame: while a capture is read leniently, a failure leaves out this frame and is noted."""
+    notes = _lenient.get()
+    try:
+        yield
+    except InputError as error:
+        if notes is None:
+            raise
+        notes.unread[name] = str(error)
+
+
+def unread_frames() -> dict[str, str]:
+    """Frames of the capture that is being read that could not be, and why."""
+    notes = _lenient.get()
+    return {} if notes is None else notes.unread
 
 
 def reads_leniently() -> bool:
