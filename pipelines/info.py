@@ -59,8 +59,9 @@ def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
     from toolkit.capture import open_capture
     from toolkit.capture.beside import unused
     from toolkit.capture.checks import check_capture
+    from toolkit.poses.check_given import best_fitting
 
-    capture, agreement = open_capture(source), None
+    capture, agreement = open_capture(source, choose=None if fast else best_fitting), None
     if not fast:
         progress = make_progress(quiet)
         with progress.listening():

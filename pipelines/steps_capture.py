@@ -30,13 +30,14 @@ def find_capture(job: Job) -> Capture:
     from toolkit.capture.convert import to_convert
     from toolkit.capture.photos import with_unposed
     from toolkit.capture.storage import capture_from_dict, capture_to_dict
+    from toolkit.poses.check_given import best_fitting
 
     path = job.folder / "capture.json"
     masks = job.settings.capture.masks
     state = source_state(job.source, job.folder.path)
 
     def make() -> Capture:
-        capture = open_capture(job.source, masks)
+        capture = open_capture(job.source, masks, best_fitting)
         return capture if to_convert(capture) else check_capture(capture, job.progress)
 
     def save(capture: Capture) -> list[Path]:

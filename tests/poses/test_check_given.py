@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from toolkit.capture import open_capture
 from toolkit.capture.photos import with_unposed
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import PoseError
+from toolkit.export.cameras import write_colmap
 from toolkit.poses import check_given as module
 from toolkit.poses.check_given import LEAST_MATCHES, best_fitting, check_given, choose_images, same_poses
 from toolkit.poses.given import given_poses
@@ -235,6 +237,17 @@ def test_wrong_cameras_among_many_are_searched_for_when_one_is_met(check, monkey
 def test_of_several_pose_sources_the_one_that_fits_is_chosen(folder):
     candidates = [capture_of(poses, folder) for poses in (RIGHT[::-1].copy(), shaken(RIGHT, 2.0), RIGHT)]
     assert best_fitting(candidates) == 2
+
+
+def test_of_several_colmap_models_the_one_that_fits_the_images_is_read(folder, tmp_path):
+    root = tmp_path / "scene"
+    shutil.copytree(folder, root / "images")
+    names = [f"{n:02d}.png" for n in range(len(RIGHT))]
+    for number, poses in enumerate((RIGHT[::-1], RIGHT)):
+        write_colmap(root / "sparse" / str(number), names, [CAMERA] * len(RIGHT), poses)
+    first, best = open_capture(root), open_capture(root, choose=best_fitting)
+    assert np.allclose([frame.world_from_camera for frame in first.frames], RIGHT[::-1], atol=1e-6)
+    assert np.allclose([frame.world_from_camera for frame in best.frames], RIGHT, atol=1e-6)
 
 
 def test_matches_are_found_without_poses_and_mirrored_ones_count_as_behind(folder, known):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from toolkit.capture.types import Capture, Frame, Views
@@ -9,11 +10,12 @@ from toolkit.capture.types import Capture, Frame, Views
 __all__ = ["Capture", "Frame", "Views", "open_capture"]
 
 
-def open_capture(source: Path | str, masks: str = "auto") -> Capture:
+def open_capture(source: Path | str, masks: str = "auto", choose: Callable[[Sequence[Capture]], int] | None = None) -> Capture:
     """The capture at `source`: a video, a folder of a known layout, a `.sens` file, or one of a layout's JSON files. Found by looking.
 
     Args:
         masks: what masks beside the images mean: auto (black is left out) | inverted | off.
+        choose: which of the captures that several COLMAP models make is the right one; None: the one that most images fit by name and size.
 
     Only listings, metadata and picture headers are read; pixels are decoded of a video's first frame, and of a few pictures with alpha.
 
@@ -23,10 +25,15 @@ def open_capture(source: Path | str, masks: str = "auto") -> Capture:
     # Imported late: training and rendering need the types above on machines without Pillow.
     from toolkit.camera import lenient_poses
     from toolkit.capture.beside import with_remark
+    from toolkit.capture.colmap import model_captures
     from toolkit.capture.detect import read_source
     from toolkit.capture.masks import with_masks
     from toolkit.capture.usable import turned_by_exif, with_usable_poses
 
     with lenient_poses() as notes:
-        capture = with_usable_poses(read_source(Path(source)), notes)
+        capture = read_source(Path(source))
+        if choose is not None and len(others := model_captures(capture)) > 1 and (best := choose(others)) > 0:
+            remark = "of several COLMAP models the one is used whose poses fit the images best"
+            capture = others[best].with_frames(others[best].frames, remark)
+        capture = with_usable_poses(capture, notes)
         return with_remark(with_masks(turned_by_exif(capture), masks))

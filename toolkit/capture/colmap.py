@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -34,6 +35,7 @@ from toolkit.errors import InputError
 
 USUAL = re.compile(r"((colmap|dense|distorted|undistorted)/(\d+/)?)*sparse(/\d+)?|\.")
 MOST_MODELS = 20
+LEAST_IMAGES = 6  # of a model that is held against another
 SAMPLED = 24  # images of a model whose sizes are compared with its cameras
 
 
@@ -113,6 +115,18 @@ def candidate_captures(path: Path | str) -> Iterator[Capture]:
     root = require_folder(path)
     for candidate in candidate_models(root):
         yield _capture(root, candidate)
+
+
+def model_captures(capture: Capture) -> list[Capture]:
+    """The captures that the models in a COLMAP capture's folder make and that have about as many images, itself first; of others alone."""
+    if capture.kind != "colmap":
+        return [capture]
+    out = [capture]
+    for candidate in candidate_models(capture.root)[1:MOST_MODELS]:
+        with suppress(InputError):
+            if len(candidate.images) >= max(LEAST_IMAGES, len(capture.frames) // 2):
+                out.append(_capture(capture.root, candidate))
+    return out
 
 
 def read_colmap(path: Path | str) -> Capture:
