@@ -264,11 +264,12 @@ _lenient: ContextVar[PoseNotes | None] = ContextVar("lenient poses", default=Non
 
 @dataclass
 class PoseNotes:
-    """What was wrong with poses that were read leniently."""
+    """What was wrong with poses, and other parts of single frames, that were read leniently."""
 
     unusable: list[str] = field(default_factory=list)  # a sentence for each pose that came back as NaN
     scales: list[float] = field(default_factory=list)  # of rotations that were scaled
     rounding: list[float] = field(default_factory=list)  # how far R'R was from 1 where rotations were made rigid
+    unread: dict[str, str] = field(default_factory=dict)  # frames that could not be read, and why
 
 
 @contextmanager
@@ -281,6 +282,24 @@ def lenient_poses() -> Iterator[PoseNotes]:
         yield notes
     finally:
         _lenient.reset(token)
+
+
+@contextmanager
+def single_frame(name: str) -> Iterator[None]:
+    """What is read inside belongs to one frame: while a capture is read leniently, a failure leaves out this frame and is noted."""
+    notes = _lenient.get()
+    try:
+        yield
+    except InputError as error:
+        if notes is None:
+            raise
+        notes.unread[name] = str(error)
+
+
+def unread_frames() -> dict[str, str]:
+    """Frames of the capture that is being read that could not be, and why."""
+    notes = _lenient.get()
+    return {} if notes is None else notes.unread
 
 
 def reads_leniently() -> bool:
@@ -310,7 +329,8 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     rotation = pose[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):  # of damaged files: huge numbers are no rotation either
         size, off = np.linalg.det(rotation), np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if abs(size) < 1e-6:
+    least = 1e-6 if notes is None else 1e-6 * np.abs(rotation).max() ** 3  # where scale is taken out, a small one is no fault
+    if not abs(size) > least:
         return _unusable(f"{where}: the pose's rotation is singular; remove this frame or correct it", notes)
     if notes is not None and size > 0 and not off <= tolerance:
         rotation, off = _unscaled(rotation, off, notes)
@@ -321,9 +341,8 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     if notes is not None and tolerance < off <= ROUNDED:
         notes.rounding.append(float(off))
     elif not off <= tolerance:  # NaN, too
-        raise InputError(
-            f"{where}: the pose is not rigid (its rotation is sheared or its axes differ in length: R'R is {off:.2g} off 1); correct it"
-        )
+        why = f"its rotation is sheared or its axes differ in length: R'R is {off:.2g} off 1"
+        return _unusable(f"{where}: the pose is not rigid ({why}); correct it", notes)
     checked_place(pose[:3, 3], where)
     out = np.eye(4)
     if off > RIGID:

@@ -17,9 +17,12 @@ from tests.conftest import shared_data
 from toolkit.camera import Array, Intrinsics
 from toolkit.capture import open_capture
 from toolkit.capture.checks import check_capture
+from toolkit.capture.depth_checks import Sample, check_depth, unit_factor
 from toolkit.capture.types import Capture, Frame
 from toolkit.errors import FieldfuseError, InputError, Interrupted
 from toolkit.progress import Progress
+from toolkit.simulate.paths import PathSettings, plan
+from toolkit.simulate.procedural import random_scene
 
 SIZE = (120, 160)
 
@@ -276,6 +279,72 @@ def test_a_corridor_filmed_in_long_steps_is_in_the_right_unit(step: float, seed:
     check_capture(capture_of(tmp_path, frames, kind="7scenes", metric=True, ordered=True))
 
 
+def plain_corridor(seed: int) -> list[Sample]:
+    """Depth maps (45, 60) along a corridor, filmed in steps of half a metre to three: doors at equal distances, or none; an end wall far
+    off; a sensor that reaches 4 m, 8 m or all the way."""
+    rng = np.random.default_rng(seed)
+    half, height, length = rng.uniform(0.7, 1.6), rng.uniform(1.1, 1.7), rng.choice([30.0, 60.0, 200.0])
+    period, recess, step = rng.choice([0.0, 2.0, 3.0]), rng.choice([0.1, 0.6]), rng.choice([0.5, 1.0, 2.0, 3.0])
+    reach, turn, sway = rng.choice([4.0, 8.0, np.inf]), rng.choice([0.01, 0.1]), rng.choice([0.01, 0.15])
+    camera = Intrinsics(60, 45, 45.0, 45.0, 30.0, 22.5)
+    v, u = np.mgrid[0:45, 0:60] + 0.5
+    found = []
+    for index in range(8):
+        pose = np.eye(4)
+        pose[:3, :3] = cv2.Rodrigues(np.array([0.3 * rng.normal(0, turn), rng.normal(0, turn), 0.0]))[0]
+        pose[:3, 3] = [*rng.normal(0, sway, 2), step * index]
+        rays = np.stack([(u - 30) / 45, (v - 22.5) / 45, np.ones((45, 60))], axis=-1) @ pose[:3, :3].T
+        with np.errstate(divide="ignore", invalid="ignore"):
+
+            def plane(axis: int, at: float, rays: Array = rays, pose: Array = pose) -> Array:
+                depth = (at - pose[axis, 3]) / rays[..., axis]
+                return np.where(depth > 1e-6, depth, np.inf)
+
+            depths = [plane(1, -height), plane(1, height), plane(2, length)]
+            for side in (-half, half):
+                wall = plane(0, side)
+                along = pose[2, 3] + wall * rays[..., 2]
+                door = (along % period < 0.9) if period else np.zeros((45, 60), bool)
+                depths += [np.where(door, np.inf, wall), plane(0, side + np.sign(side) * recess)]
+        depth = np.min(depths, axis=0)
+        depth *= 1 + rng.normal(0, 0.003, depth.shape)
+        found.append(Sample.of(np.where(depth < reach, depth, 0).astype(np.float32), camera, pose))
+    return found
+
+
+def test_no_unit_is_invented_along_corridors() -> None:
+    """There, large depth always agrees: the camera then seems to stand still, and the corridor looks the same from everywhere."""
+    factors = [unit_factor(plain_corridor(seed)) for seed in range(40)]
+    assert factors == [1.0] * 40
+
+
+def of_scene(kind: str, seed: int, step: float) -> list[Sample]:
+    """Exact depth (45, 60) of a simulated scene, walked through in such steps."""
+    rng = np.random.default_rng(seed)
+    scene = random_scene(kind, rng)
+    camera = Intrinsics(60, 45, 45.0, 45.0, 30.0, 22.5)
+    path = PathSettings("walk", 8, 1.0, step)
+    poses = plan(scene, path, rng).poses(path.times())
+    return [Sample.of(scene.render(camera, pose, side=1).depth.numpy(), camera, pose) for pose in poses]
+
+
+@pytest.mark.parametrize(("kind", "step"), [("corridor", 1.0), ("corridor", 0.5), ("room", 0.5), ("street", 1.0), ("wall", 0.5)])
+def test_units_of_simulated_scenes(kind: str, step: float) -> None:
+    samples = of_scene(kind, 3, step)
+    assert unit_factor(samples) == 1.0
+    if kind == "room":
+        for factor in (1000.0, 4.0, 0.5, 0.01):
+            wrong = [replace(sample, depth=sample.depth * factor, values=sample.values * factor) for sample in samples]
+            assert unit_factor(wrong) == pytest.approx(1 / factor)
+
+
+def test_the_look_at_units_takes_less_than_a_second() -> None:
+    samples = [sample for seed in (1, 2) for sample in plain_corridor(seed)]
+    started = time.process_time()
+    unit_factor(samples)
+    assert time.process_time() - started < 3  # where it was measured 0.5
+
+
 def test_impossible_metric_depth_is_noticed_without_motion(tmp_path: Path) -> None:
     still = rgbd(tmp_path / "far", 1000.0, step=1e-3)
     refused(still, "e[+]03 m, which no depth camera measures")
@@ -322,6 +391,16 @@ REAL = ["fox_540x960", "lego_400", "dtu_scan24_384", "redkitchen", "scannet_samp
 def test_real_captures_pass(name: str) -> None:
     capture = open_capture(shared_data(name))
     assert len(check_capture(capture).frames) == len(capture.frames)
+
+
+@pytest.mark.parametrize("factor", [1e4, 1000.0, 100.0, 10.0, 5.0, 4.0, 2.0, 0.5, 0.25, 0.2, 0.1, 0.01, 0.001])
+def test_wrong_units_of_thirty_real_frames_are_named(factor: float) -> None:
+    """As a sensor of quarter millimetres, tenths or fifths would store them."""
+    capture = open_capture(shared_data("redkitchen"))
+    capture = replace(capture, frames=capture.frames[:180:6], depth_scale=capture.depth_scale / factor)
+    times = f"{factor:g} times smaller" if factor > 1 else f"{1 / factor:g} times larger"
+    with pytest.raises(InputError, match=f"would if it were {times}".replace("+", "[+]")):
+        check_depth(capture)
 
 
 @pytest.mark.parametrize("name", ["redkitchen", "redwood_livingroom1"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -19,7 +20,7 @@ from tests.capture.layouts import (
     write_seven_scenes,
     write_transforms,
 )
-from tests.capture.made import colour_difference, eyes, pixel_error, render, reprojection, save_picture
+from tests.capture.made import colour_difference, eyes, left_out, pixel_error, render, reprojection, save_picture
 from tests.conftest import shared_data
 from toolkit.camera import Intrinsics
 from toolkit.capture import open_capture
@@ -195,10 +196,20 @@ def test_a_file_that_is_no_picture_is_named(tmp_path: Path, layout: str) -> None
 @pytest.mark.parametrize("layout", [name for name in LAYOUTS if name not in ("blender", "stray", "sens")])  # these tell no size, or hold it
 def test_a_cropped_picture_does_not_pass_as_a_resized_one(tmp_path: Path, layout: str) -> None:
     LAYOUTS[layout][1](tmp_path)
-    victim = open_capture(tmp_path).frames[0].image
-    save_picture(victim, np.zeros((60, 50, 3), np.uint8))
+    for frame in open_capture(tmp_path).frames[:2]:  # two of five: of one, the frame is left out
+        save_picture(frame.image, np.zeros((60, 50, 3), np.uint8))
     with pytest.raises(InputError):
         open_capture(tmp_path)
+
+
+@pytest.mark.parametrize("layout", ["7scenes", "scannet", "llff", "dtu", "redwood", "replica", "polycam", "scanner3d"])
+def test_one_cropped_picture_costs_its_frame(tmp_path: Path, layout: str) -> None:
+    LAYOUTS[layout][1](tmp_path)
+    victim = open_capture(tmp_path).frames[-1]
+    save_picture(victim.image, np.zeros((60, 50, 3), np.uint8))
+    capture = open_capture(tmp_path)
+    left_out(capture, re.escape(victim.name))
+    assert victim.name not in {frame.name for frame in capture.frames}
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -63,6 +63,28 @@ def test_floating_point_tiff_is_taken_as_0_to_1(tmp_path: Path) -> None:
     assert np.array_equal(load_image(capture.frames[0]), scene())
 
 
+@pytest.mark.parametrize("white", [255, 1023, 65535])
+def test_floating_point_tiff_of_whole_numbers_is_scaled(white: int, tmp_path: Path) -> None:
+    for number, path in enumerate(photos(tmp_path / "f", ".tif")):
+        cv2.imwrite(str(path), np.maximum(scene(3 * number), 255 * (number == 0))[..., ::-1].astype(np.float32) * np.float32(white / 255))
+    capture = check_capture(open_capture(tmp_path / "f"))
+    assert [frame.white for frame in capture.frames] == [white] * 4 and f"{white} is taken for white" in capture.warnings[0]
+    assert np.array_equal(load_image(capture.frames[1]), scene(3))
+
+
+def test_floating_point_values_beyond_white_are_cut_off_with_a_remark(tmp_path: Path) -> None:
+    for number, path in enumerate(photos(tmp_path / "f", ".tif")):
+        values = scene(3 * number)[..., ::-1].astype(np.float32) / 255
+        values[:4, :4] = 9.0
+        values[4, 0] = np.nan, np.inf, -1.0
+        cv2.imwrite(str(path), values)
+    capture = check_capture(open_capture(tmp_path / "f"))
+    assert capture.frames[0].white is None
+    assert capture.warnings == ("4 floating-point images have values up to 9; 1 is taken for white, and what is above it is cut off",)
+    shown = load_image(capture.frames[0])
+    assert (shown[:4, :4] == 255).all() and shown[4, 0].tolist() == [0, 255, 0] and np.array_equal(shown[8:], scene()[8:])
+
+
 @pytest.mark.parametrize("suffix", [".tif", ".png"])
 def test_twelve_bits_in_sixteen_are_scaled_to_white(suffix: str, tmp_path: Path) -> None:
     for number, path in enumerate(photos(tmp_path / "t", suffix)):
@@ -181,6 +203,19 @@ def test_panoramas_are_refused_for_what_they_are(room: Path, tmp_path: Path) -> 
     path.write_text(json.dumps({**json.loads(path.read_text()), "camera_model": "EQUIRECTANGULAR"}))
     with pytest.raises(InputError, match=r"panoramas .* are not read"):
         open_capture(room)
+
+
+def test_views_that_were_cut_out_of_panoramas_pass(room: Path) -> None:
+    """They may have kept its metadata, and come with cameras."""
+    xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:ProjectionType>equirectangular</GPano:ProjectionType></x:xmpmeta>'
+    path = room / "transforms.json"
+    data = json.loads(path.read_text())
+    for entry in data["frames"]:
+        image = Image.open(room / entry["file_path"])
+        entry["file_path"] = str(Path(entry["file_path"]).with_suffix(".jpg"))
+        image.save(room / entry["file_path"], xmp=xmp)
+    path.write_text(json.dumps(data))
+    assert len(check_capture(open_capture(room)).frames) == 8
 
 
 def test_openexr_is_named(room: Path) -> None:

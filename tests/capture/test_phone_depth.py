@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.capture.layouts import PHONE, quarter_size, write_polycam, write_scanner3d, write_stray
-from tests.capture.made import eyes, pixel_error, render
+from tests.capture.made import eyes, left_out, pixel_error, render
 from toolkit.capture import open_capture
 from toolkit.capture.images import load_depth, load_image
 from toolkit.capture.select import select_frames
@@ -66,8 +66,7 @@ def test_a_camera_that_cannot_be(tmp_path: Path, key: str, value: object) -> Non
     path = tmp_path / "keyframes" / "corrected_cameras" / "100333.json"
     data = json.loads(path.read_text()) | {key: value}
     path.write_text(json.dumps({name: entry for name, entry in data.items() if entry is not None}))
-    with pytest.raises(InputError, match=r"100333\.json"):
-        open_capture(tmp_path)
+    left_out(open_capture(tmp_path), r"100333\.json")
 
 
 def test_recordings_without_a_header(tmp_path: Path) -> None:
@@ -182,5 +181,4 @@ def test_pictures_smaller_than_what_the_intrinsics_are_for(tmp_path: Path) -> No
 def test_frames_of_3d_scanner_app_that_cannot_be(tmp_path: Path, changes: dict) -> None:
     write_scanner3d(tmp_path)
     retold(tmp_path / "frame_00002.json", **changes)
-    with pytest.raises(InputError, match=r"frame_00002\.json"):
-        open_capture(tmp_path)
+    left_out(open_capture(tmp_path), r"frame_00002\.json")

@@ -12,7 +12,7 @@ import pytest
 
 from tests.capture.films import film, hide_first, names, quarters, turn
 from tests.capture.layouts import PHONE, write_stray
-from tests.capture.made import eyes, pixel_error, render
+from tests.capture.made import eyes, left_out, pixel_error, render
 from toolkit.capture import Capture, open_capture
 from toolkit.capture.images import load_image
 from toolkit.capture.select import select_frames
@@ -84,7 +84,6 @@ def test_columns_are_found_by_their_names(tmp_path: Path) -> None:
     [
         (lambda number, line: line + (NOW if number == 0 else ", 1, nan, 3, 4"), r"odometry\.csv, row 1 holds numbers that are not finite"),
         (lambda number, line: line + (NOW if number == 0 else ", 0, 1, 3, 4"), r"odometry\.csv, row 1: the focal length is 0"),
-        (lambda number, line: line if number != 3 else line.rsplit(",", 1)[0] + ", ", r"odometry\.csv, row 3 must hold numbers"),
         (lambda number, line: line if number != 3 else line.rsplit(",", 1)[0], "rows of different length"),
         (lambda number, line: line.replace("qw", "q"), "number"),
     ],
@@ -97,6 +96,14 @@ def test_rows_that_cannot_be(tmp_path: Path, change, said: str) -> None:
             open_capture(tmp_path)
     else:  # a header that says nothing known: by position, as ever
         assert pixel_error(open_capture(tmp_path), eyes(), PHONE) < 1e-3
+
+
+def test_a_row_that_cannot_be_costs_its_frame(tmp_path: Path) -> None:
+    write_stray(tmp_path)
+    rewritten(tmp_path, lambda number, line: line if number != 3 else line.rsplit(",", 1)[0] + ", ")
+    capture = open_capture(tmp_path)
+    left_out(capture, r"frame_000002.*odometry\.csv, row 3 must hold numbers")
+    assert [frame.video_index for frame in capture.frames] == [0, 1, 3, 4]
 
 
 # ------------------------------------------------------------------------------------------------ the video

@@ -76,13 +76,25 @@ def test_rounded_rotations_are_made_rigid(room: Path) -> None:
         np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-12)
 
 
-def test_a_sheared_rotation_is_refused(room: Path) -> None:
+def test_a_sheared_rotation_costs_its_frame_and_several_the_capture(room: Path) -> None:
     def sheared(pose: np.ndarray) -> np.ndarray:
         pose[:3, :3] = pose[:3, :3] @ np.array([[1, 0.3, 0], [0, 1, 0], [0, 0, 1]])
         return pose
 
-    with pytest.raises(InputError, match="sheared"):
-        open_capture(changed(room, 3, by=sheared))
+    capture = open_capture(changed(room, 3, by=sheared))
+    assert len(capture.frames) == COUNT - 1 and "sheared" in capture.warnings[0]
+    with pytest.raises(InputError, match=r"sheared.*\(3 of 10 poses"):
+        open_capture(changed(room, 5, 6, by=sheared))
+
+
+@pytest.mark.parametrize("scale", [1e-4, 25.0])
+def test_no_uniform_scale_is_too_small(scale: float, room: Path) -> None:
+    def scaled(pose: np.ndarray) -> np.ndarray:
+        pose[:3, :3] *= scale
+        return pose
+
+    capture = open_capture(changed(room, *range(COUNT), by=scaled))
+    assert capture.warnings == (f"the rotations of 10 poses were scaled by {scale:.4g}, which was taken out",)
 
 
 def test_outside_of_readers_poses_are_checked_as_strictly_as_before() -> None:

@@ -105,7 +105,8 @@ def singular_pose(data: dict[str, Any]) -> None:
 
 
 def sheared_pose(data: dict[str, Any]) -> None:
-    data["frames"][3]["transform_matrix"] = (np.array(data["frames"][3]["transform_matrix"]) @ np.diag([1.0, 1.3, 1.0, 1.0])).tolist()
+    for frame in data["frames"][3:6]:  # more than are left out
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1.0, 1.3, 1.0, 1.0])).tolist()
 
 
 def negative_focal(data: dict[str, Any]) -> None:

@@ -15,7 +15,7 @@ from toolkit.capture import heif
 from toolkit.capture.depth_checks import check_depth
 from toolkit.capture.duplicates import copies, suspects
 from toolkit.capture.headers import PANORAMA, Header, is_panorama, read_bytes, read_header
-from toolkit.capture.images import largest, read_picture, turns_by_exif, upright
+from toolkit.capture.images import decode, largest, read_picture, turns_by_exif, upright
 from toolkit.capture.listing import TIFFS, counted, fitted, natural_key, unique_names
 from toolkit.capture.photos import size_from_exif
 from toolkit.capture.tiff import unturned
@@ -32,6 +32,9 @@ DARK = 40  # grey level that 95% of a dark picture's pixels stay under
 BLOWN = 253  # grey level from which a pixel counts as saturated
 BLURRED = 0.25  # of the usual sharpness of the capture
 CUT_OFF = 0.1  # share of an image that is not used, from which on that is said
+FLOAT_WHITES = (255, 1023, 4095, 16383, 65535)  # that floating-point values may be meant for
+WHOLE, BRIGHT, EVERY = 4.0, 90, 7  # they are where their 90th percentile, of every 7th that is not black, is as large as this
+CUT_OFF = 1e-3  # by which values may exceed 1 before that is worth a word
 FEWER_BITS = (1023, 4095, 16383)  # largest values of sensors that store 10, 12 and 14 bits in 16
 LOOKED_AT_SHAPES, SAME_SHAPE = 5, 0.05  # images whose EXIF is looked at; difference of width to height that rounding and lenses explain
 NOTICE = 0.1  # share of pictures from which a warning is worth reading
@@ -67,7 +70,7 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
         return capture
     if len(frames) == 1:
         raise InputError(f"{capture.root} holds only one picture; take at least 20 from different places")
-    capture = scaled_to_white(capture, progress)
+    capture = floats_to_white(scaled_to_white(capture, progress), progress)
     capture, headers, looks, exact = _look_at_all(capture, progress)
     capture = with_usable_depth(capture)
     _refuse_blank(capture, looks)
@@ -108,6 +111,37 @@ def scaled_to_white(capture: Capture, progress: Progress = SILENT) -> Capture:
     return replace(capture, frames=tuple(replace(frame, white=white) for frame in capture.frames), warnings=(*capture.warnings, remark))
 
 
+def floats_to_white(capture: Capture, progress: Progress = SILENT) -> Capture:
+    """The capture with `Frame.white` where its floating-point images hold whole numbers (up to 255 or 65535) instead of 0 to 1, and with a
+    remark on these, or on values beyond 1 that are cut off."""
+    found: dict[str, tuple[float, float]] = {}  # the largest value, and a high percentile of what is not black
+    for frame in capture.frames:
+        if frame.image.suffix.lower() not in TIFFS or frame.video_index is not None:
+            continue
+        progress.check()
+        try:
+            if not read_header(read_bytes(frame.image), frame.image).floating:
+                break  # of a capture, all are of one kind
+            image = decode(frame.image)[0]
+        except InputError:
+            continue  # said where images are looked at
+        values = image[..., :3][np.isfinite(image[..., :3])] if image.ndim == 3 else image[np.isfinite(image)]
+        some = values[values > 0][::EVERY]
+        found[frame.name] = (float(values.max()), float(np.percentile(some, BRIGHT))) if some.size else (0.0, 0.0)
+    most = max((largest for largest, _ in found.values()), default=0.0)
+    beyond = sum(largest > 1 + CUT_OFF for largest, _ in found.values())
+    if not beyond:
+        return capture
+    if np.median([bright for _, bright in found.values()]) < WHOLE or most > FLOAT_WHITES[-1]:
+        many = counted(beyond, "floating-point image has", "floating-point images have")
+        remark = f"{many} values up to {most:.4g}; 1 is taken for white, and what is above it is cut off"
+        return replace(capture, warnings=(*capture.warnings, remark))
+    white = next(value for value in FLOAT_WHITES if most <= value)
+    remark = f"the floating-point images have values up to {most:.4g}; {white} is taken for white"
+    frames = tuple(replace(frame, white=white) if frame.name in found else frame for frame in capture.frames)
+    return replace(capture, frames=frames, warnings=(*capture.warnings, remark))
+
+
 def _look_at_all(capture: Capture, progress: Progress) -> tuple[Capture, list[Header], list[Look], dict[int, int]]:
     """The capture without images that cannot be used, headers of all others, thumbnail measures of as many as `PIXEL_BUDGET` allows and of
     all that may be copies by their names, and the indices of exact copies with those that they are copies of.
@@ -129,7 +163,7 @@ def _look_at_all(capture: Capture, progress: Progress) -> tuple[Capture, list[He
         try:
             data = read_bytes(frame.image)
             header = read_header(data, frame.image)
-            if is_panorama(data):
+            if is_panorama(data, header, frame.intrinsics is not None):
                 raise InputError(f"{frame.image}: {PANORAMA}")
             if not headers:
                 # Entropy decoding of a JPEG costs about a third of a PNG's, whatever size it is reduced to.

@@ -5,31 +5,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import combinations
 
-import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, project, unproject
-from toolkit.capture.images import load_depth, load_image
+from toolkit.camera import Array, Intrinsics, invert
+from toolkit.capture.images import load_depth
 from toolkit.capture.listing import fitted
-from toolkit.capture.types import Capture, Frame
+from toolkit.capture.types import Capture
 from toolkit.errors import InputError
 from toolkit.progress import SILENT, Progress
 
 LOOKED_AT = 16  # depth maps read, evenly spread
-POINTS = 300  # compared for each pair of them
-SEEN = 0.3  # share of points that must agree, in some unit, before a pair of frames says anything
-AGREE = 0.05  # relative difference of depth up to which two maps agree
+POINTS = 200  # compared for each pair of them
+PAIRS = 60  # compared at most, evenly spread
 MISSING = 0.3  # share of pixels without depth from which a warning is worth reading
 NEAREST, FARTHEST = 0.05, 100.0  # metres: no depth sensor's median lies outside
-# Units that get confused: mm, cm, m, tenths and quarters of a millimetre, the 5000 steps a metre of TUM, inverse and doubled factors.
-FACTORS = (1000.0, 100.0, 10.0, 5.0, 4.0, 2.0, 0.5, 0.25, 0.2, 0.1, 0.01, 0.001)
-BEYOND = 3.0  # times a factor: where depths agree there as well, it is since the camera hardly moves against them, which says nothing
-PEAK = 0.9  # of the agreement at a factor, that is less there
-BETTER = 1.7  # times the agreement as it stands that another unit needs
-PLAINLY = 0.1  # by which colours agree better under one unit than under another
-ALIKE, FEWEST_PAIRS = 0.5, 3  # correlation of colours that fit, and pairs that say so
-FEWEST = 40  # points whose colours are compared
-GREY_SIDE = 160  # pixels of the images that are
+RANGE, STEP = 20_000.0, 1.07  # factors that depth is multiplied by to see where it agrees with the poses: 1/RANGE to RANGE in such steps
+FACTORS = np.exp(np.log(STEP) * np.arange(-round(np.log(RANGE) / np.log(STEP)), round(np.log(RANGE) / np.log(STEP)) + 1))
+AGREE = 0.1  # relative difference of depth at which two maps agree no more
+SEEN = 0.25  # share of points that must agree at a pair's best factor,
+CONTRAST = 0.15  # and how much larger than at all factors smaller or larger than that by `APART` it must be, before the pair has a vote
+APART = 1.5
+SAME = 1.15  # factors that differ by less are one: votes of pairs that see the same
+VOTES, MAJORITY = 4, 0.6  # a unit is refused by at least so many votes for another one, and such a share of all
+UNITS = (2.0, 2.54, 3.28, 4.0, 5.0, 10.0, 25.4, 39.4, 100.0, 1000.0, 5000.0, 10_000.0)  # that get confused: named where they are meant
 WHAT_TO_SET = {
     "transforms": "set `depth_unit_scale_factor` (units of length for each stored value) in transforms.json",
     "redwood": "set `depth_scale` (stored values for each unit of the trajectory) in the camera's json",
@@ -48,21 +46,13 @@ class Sample:
     pose: Array  # (4, 4)
     pixels: Array  # (N, 2)
     values: Array  # (N,) depth at them
-    grey: Array | None = None  # (h, w) float32 the image, blurred
 
     @classmethod
-    def of(cls, depth: Array, camera: Intrinsics, pose: Array, grey: Array | None = None) -> Sample:
+    def of(cls, depth: Array, camera: Intrinsics, pose: Array) -> Sample:
         row, column = np.nonzero(depth > 0)
-        row, column = row[:: max(1, len(row) // POINTS)], column[:: max(1, len(column) // POINTS)]
-        return cls(depth, camera.pinhole(), pose, np.stack([column + 0.5, row + 0.5], axis=1), depth[row, column].astype(np.float64), grey)
-
-    def shade(self, pixels: Array) -> Array:
-        """(N,) grey at places in the depth map's pixels."""
-        assert self.grey is not None
-        height, width = self.grey.shape
-        column = np.clip(pixels[:, 0] / self.camera.width * width, 0, width - 1).astype(int)
-        row = np.clip(pixels[:, 1] / self.camera.height * height, 0, height - 1).astype(int)
-        return np.asarray(self.grey[row, column], dtype=np.float64)
+        some = np.random.default_rng(0).permutation(len(row))[:POINTS]  # not every n-th, which may all lie in a few columns
+        row, column = row[some], column[some]
+        return cls(depth, camera.pinhole(), pose, np.stack([column + 0.5, row + 0.5], axis=1), depth[row, column].astype(np.float64))
 
 
 def check_depth(capture: Capture, progress: Progress = SILENT) -> list[str]:
@@ -92,7 +82,7 @@ def check_depth(capture: Capture, progress: Progress = SILENT) -> list[str]:
         if there.size:
             medians.append(float(np.median(there)))
             if camera is not None and frame.world_from_camera is not None:
-                samples.append(Sample.of(depth, camera, frame.world_from_camera, _grey(frame)))
+                samples.append(Sample.of(depth, camera, frame.world_from_camera))
     if not medians:
         raise InputError(
             f"no depth map in {capture.root} holds a value (all are 0, NaN or 65535); check how depth was written, or remove it"
@@ -127,87 +117,58 @@ def _refuse_wrong_unit(capture: Capture, median: float, samples: list[Sample]) -
 
 
 def unit_factor(samples: list[Sample]) -> float:
-    """What depth must be multiplied by to agree with the poses: 1, or one of `FACTORS` when that is far better.
+    """What depth must be multiplied by to agree with the poses: 1, or another factor of which the evidence is strong.
 
-    Points of one depth map are carried into other frames by the poses and compared with the depth there. A wrong unit moves
-    them to wrong places as soon as the camera moves by a good part of the depth. Each pair of frames that can tell (one unit
-    makes it agree much better than others) has a vote for or against the unit as it is, so pairs that see different things, or hardly
-    moved, do no harm; those against it choose together. A long step along a corridor looks as if the camera had not moved before
-    something far away: there the agreement does not fall with still larger depths, and colours agree better as it stands.
+    Points of one depth map are carried into another frame by the poses and compared with the depth there, under many factors. The right
+    one shows as a peak: with smaller depth the camera seems to move further, with larger depth less, and either way points come to lie
+    beside their surfaces. Where there is no such peak the pair has no vote: frames hardly moved, they see different things, or the scene
+    looks the same from everywhere (along a corridor, large depth always agrees, since the camera then seems to stand still).
     """
-    own, against = 0, []
-    for a, b in _pairs(samples):
-        here = agreement(a, b, 1.0)
-        scores = {factor: agreement(a, b, factor) for factor in FACTORS}
-        factor = max(FACTORS, key=lambda f: scores[f])
-        best = scores[factor]
-        if max(here, best) < SEEN:
-            continue
-        if here * PEAK > best:
-            own += 1
-        elif best > BETTER * here:
-            if agreement(a, b, factor * (BEYOND if factor > 1 else 1 / BEYOND)) > PEAK * best:
-                continue
-            colours, other_colours = colours_agree(a, b, 1.0), colours_agree(a, b, factor)
-            if colours is None or other_colours is None or other_colours > colours + PLAINLY:
-                against.append(scores)
-            elif colours > other_colours + PLAINLY:
-                own += 1
-    if len(against) < 2 or len(against) <= 2 * own:
+    found = [np.log(factor) for a, b in _pairs(samples) if (factor := _peak(a, b)) is not None]
+    others = np.array([value for value in found if abs(value) > np.log(APART)])
+    if not len(others):
         return 1.0
-    together = {factor: sum(scores[factor] for scores in against) for factor in FACTORS}
-    # Of units that fit about as well (a flat wall, little motion), the one that changes least.
-    most = max(together.values())
-    factor = min((f for f in FACTORS if together[f] > 0.95 * most), key=lambda f: abs(np.log(f)))
-    return 1.0 if _colours_fit(samples, factor) else factor
+    agree = np.abs(others[:, None] - others) < np.log(SAME)
+    mode = int(agree.sum(axis=1).argmax())
+    votes = int(agree[mode].sum())
+    if votes < VOTES or votes < MAJORITY * len(found):
+        return 1.0
+    return _named(float(np.exp(np.median(others[agree[mode]]))))
 
 
-def _colours_fit(samples: list[Sample], factor: float) -> bool:
-    """Whether the colours of all pairs that have points in common as depth stands say that it is right, and not `factor` times as large."""
-    both = [(colours_agree(a, b, 1.0), colours_agree(a, b, factor)) for a, b in _pairs(samples)]
-    known = np.array([(here, there) for here, there in both if here and there is not None])
-    if len(known) < FEWEST_PAIRS:
-        return False
-    here, there = np.median(known, axis=0)
-    return bool(here > ALIKE and here > there + PLAINLY)
+def _named(factor: float) -> float:
+    """The factor of a unit that is confused with another, where it is near to one; else itself with two digits."""
+    near = min((unit for known in UNITS for unit in (known, 1 / known)), key=lambda unit: abs(np.log(unit / factor)))
+    return near if abs(np.log(near / factor)) < np.log(SAME) else float(f"{factor:.2g}")
 
 
 def _pairs(samples: list[Sample]) -> list[tuple[Sample, Sample]]:
     """Pairs of frames from different places that look much the same way."""
-    return [(a, b) for a, b in combinations(samples, 2) if a.pose[:3, 2] @ b.pose[:3, 2] > 0.5 and np.any(a.pose[:3, 3] != b.pose[:3, 3])]
+    found = [(a, b) for a, b in combinations(samples, 2) if a.pose[:3, 2] @ b.pose[:3, 2] > 0.5 and np.any(a.pose[:3, 3] != b.pose[:3, 3])]
+    return [found[int(place)] for place in np.unique(np.linspace(0, len(found) - 1, PAIRS).round())] if found else []
 
 
-def _grey(frame: Frame) -> Array | None:
-    """The frame's image, small and blurred; None where it cannot be read, which is said elsewhere."""
-    try:
-        image = load_image(frame)
-    except InputError:
+def _peak(a: Sample, b: Sample) -> float | None:
+    """The factor under which two maps agree best, both ways; None where it does not stand out."""
+    shares = (agreement(a, b) + agreement(b, a)) / 2
+    best = int(shares.argmax())
+    apart = round(np.log(APART) / np.log(STEP))
+    smaller, larger = shares[: max(best - apart, 0)], shares[best + apart :]
+    if not len(smaller) or not len(larger) or shares[best] < SEEN:
         return None
-    scale = GREY_SIDE / max(image.shape[:2])
-    small = cv2.resize(image[..., :3], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.GaussianBlur(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.5))
+    return float(FACTORS[best]) if shares[best] - max(smaller.max(), larger.max()) >= CONTRAST else None
 
 
-def colours_agree(a: Sample, b: Sample, factor: float) -> float | None:
-    """Correlation of the images' grey where a's points, with depth times `factor`, lie in b; 0 where too few do; None without images."""
-    if a.grey is None or b.grey is None:
-        return None
-    place, depth = project(b.camera, b.pose, unproject(a.camera, a.pose, a.pixels, a.values * factor))
-    inside = (depth > 0) & (place >= 0).all(axis=1) & (place[:, 0] < b.camera.width) & (place[:, 1] < b.camera.height)
-    if inside.sum() < FEWEST:
-        return 0.0
-    one, other = a.shade(a.pixels[inside]), b.shade(place[inside])
-    spread = float(one.std() * other.std())
-    return float(((one - one.mean()) * (other - other.mean())).mean() / spread) if spread > 0 else 0.0
-
-
-def agreement(a: Sample, b: Sample, factor: float) -> float:
-    """Share of a's points, with depth times `factor`, that lie on b's surface where b sees them."""
-    points = unproject(a.camera, a.pose, a.pixels, a.values * factor)
-    place, depth = project(b.camera, b.pose, points)
-    inside = (depth > 0) & (place >= 0).all(axis=1) & (place[:, 0] < b.camera.width) & (place[:, 1] < b.camera.height)
-    if not inside.any():
-        return 0.0
-    column, row = np.floor(place[inside]).astype(int).T
-    seen = b.depth[row, column].astype(np.float64) * factor
-    return float(((seen > 0) & (np.abs(depth[inside] - seen) < AGREE * seen)).sum() / len(a.values))
+def agreement(a: Sample, b: Sample) -> Array:
+    """(F,) for each of `FACTORS`, by which both depths are multiplied: the share of a's points that lie on b's surface, those that are off
+    by a part of `AGREE` counted by the rest."""
+    b_from_a = invert(b.pose) @ a.pose
+    rays = np.stack([(a.pixels[:, 0] - a.camera.cx) / a.camera.fx, (a.pixels[:, 1] - a.camera.cy) / a.camera.fy, np.ones(len(a.pixels))])
+    points = FACTORS[:, None, None] * (b_from_a[:3, :3] @ (rays * a.values)) + b_from_a[:3, 3:]
+    depth = points[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        across, down = b.camera.fx * points[:, 0] / depth + b.camera.cx, b.camera.fy * points[:, 1] / depth + b.camera.cy
+        inside = (depth > 0) & (across >= 0) & (across < b.camera.width) & (down >= 0) & (down < b.camera.height)
+        seen = b.depth[np.where(inside, down, 0).astype(np.intp), np.where(inside, across, 0).astype(np.intp)] * FACTORS[:, None]
+        off = np.where(inside & (seen > 0), np.abs(depth - seen) / seen, np.inf)
+    return np.asarray(np.maximum(1 - off / AGREE, 0).sum(axis=1) / len(a.values))

@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, checked_pose
+from toolkit.camera import Array, Intrinsics, checked_pose, single_frame
 from toolkit.capture.calibration import from_matrix
 from toolkit.capture.listing import assemble, counted, pictures_in, require_folder, same_count, size_of, unique_names
 from toolkit.capture.types import Capture, Frame
@@ -53,13 +53,13 @@ def read_dtu(path: Path | str) -> Capture:
     frames = []
     for position, (index, picture, name) in enumerate(zip(indices, pictures, unique_names(pictures), strict=True)):
         where = f"world_mat_{index} of {source}"
-        matrix, pose = decompose(matrices[f"world_mat_{index}"], where)
-        intrinsics, warning = camera_for(matrix, size_of(picture, pictures), where)
-        if warning:
-            warnings[warning] = None
-        frames.append(
-            Frame(name=name, image=picture, intrinsics=intrinsics, world_from_camera=pose, mask=masks[position] if masks else None)
-        )
+        with single_frame(name):
+            matrix, pose = decompose(matrices[f"world_mat_{index}"], where)
+            intrinsics, warning = camera_for(matrix, size_of(picture, pictures), where)
+            if warning:
+                warnings[warning] = None
+            mask = masks[position] if masks else None
+            frames.append(Frame(name=name, image=picture, intrinsics=intrinsics, world_from_camera=pose, mask=mask))
     return assemble("dtu", root, frames, list(warnings), extra=_region(matrices, indices))
 
 

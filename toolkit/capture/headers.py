@@ -38,6 +38,7 @@ class Header:
     profile: bytes | None = None
     deep: bool = False  # more than 8 bits a channel
     white: int | None = None  # the largest value that a channel has, where the file says so
+    floating: bool = False  # channels are floating-point numbers
 
 
 def read_bytes(path: Path) -> bytes:
@@ -94,13 +95,15 @@ def read_header(data: bytes, path: Path) -> Header:
     if not _complete(data, kind):
         raise _cut_short(path)
     deep = deep or (kind == "PNG" and len(data) > PNG_BITS and data[PNG_BITS] == 16)
-    return Header(width, height, kind, orientation, profile, deep, None if tiff is None else tiff.maximum)
+    white, floating = (None, False) if tiff is None else (tiff.maximum, tiff.floating)
+    return Header(width, height, kind, orientation, profile, deep, white, floating)
 
 
-def is_panorama(data: bytes) -> bool:
-    """Whether the file says that its image is equirectangular (Google's photo sphere XMP)."""
+def is_panorama(data: bytes, header: Header, posed: bool) -> bool:
+    """Whether the file says that its image is equirectangular (Google's photo sphere XMP). Of `posed` images those alone are such that are
+    twice as wide as high: views that were cut out of a panorama may have kept its XMP."""
     head = data[:XMP_WITHIN]
-    return b"GPano:" in head and b"equirectangular" in head
+    return b"GPano:" in head and b"equirectangular" in head and (not posed or header.width == 2 * header.height)
 
 
 def is_avif(data: bytes) -> bool:
@@ -110,7 +113,7 @@ def is_avif(data: bytes) -> bool:
 def _of_tiff(tiff: Tiff, path: Path) -> Header:
     """Of a TIFF that Pillow does not know, as those with 32-bit floating-point colours."""
     _check_size(tiff.width, tiff.height, path)
-    return Header(tiff.width, tiff.height, "TIFF", tiff.orientation, tiff.profile, tiff.bits > 8, tiff.maximum)
+    return Header(tiff.width, tiff.height, "TIFF", tiff.orientation, tiff.profile, tiff.bits > 8, tiff.maximum, tiff.floating)
 
 
 def _check_size(width: int, height: int, path: Path) -> None:

@@ -194,7 +194,7 @@ def to_rgba(picture: Array, white: int | None = None) -> Array:
     """A decoded picture of any depth and number of channels (BGR order) → (H, W, 3) or (H, W, 4) uint8 RGB(A).
 
     Args:
-        white: the value of 16-bit channels that becomes 255; None: 65535. Alpha always uses all bits.
+        white: the value of 16-bit or floating-point channels that becomes 255; None: 65535, or 1. Alpha of 16 bits always uses all.
     """
     if picture.dtype == np.uint16:
         alpha = picture[..., 3:] if white is not None and picture.ndim == 3 and picture.shape[2] == 4 else None
@@ -202,8 +202,9 @@ def to_rgba(picture: Array, white: int | None = None) -> Array:
         if alpha is not None:
             picture[..., 3:] = alpha >> 8
     elif picture.dtype != np.uint8:
-        finite = np.nan_to_num(picture.astype(np.float32), nan=0.0, posinf=1.0, neginf=0.0)
-        picture = np.round(np.clip(finite, 0, 1) * 255).astype(np.uint8)
+        top = white or 1
+        finite = np.nan_to_num(picture.astype(np.float32), nan=0.0, posinf=top, neginf=0.0)
+        picture = np.round(np.clip(finite / np.float32(top), 0, 1) * 255).astype(np.uint8)
     if picture.ndim == 3 and picture.shape[2] == 1:
         picture = picture[:, :, 0]
     if picture.ndim == 2:

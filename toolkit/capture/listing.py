@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from toolkit import files
-from toolkit.camera import Array, Intrinsics, reads_leniently
+from toolkit.camera import Array, Intrinsics, reads_leniently, unread_frames
 from toolkit.capture import heif
 from toolkit.capture.headers import NOT_EXR, orientation_of
 from toolkit.capture.tiff import read_tiff
@@ -281,6 +281,8 @@ def assemble(kind: str, root: Path, frames: list[Frame], remarks: Sequence[str] 
     Raises:
         InputError: no frame is left, or two frames have one name.
     """
+    if not frames and unread_frames():
+        raise InputError(next(iter(unread_frames().values())))
     if not frames:
         raise InputError(f"no usable picture was found in {root}; check the folder's layout")
     names = [frame.name for frame in frames]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, checked_pose, world_from_llff
+from toolkit.camera import Array, Intrinsics, checked_pose, single_frame, world_from_llff
 from toolkit.capture.listing import assemble, counted, fitted, picture_header, pictures_in, require_folder, unique_names
 from toolkit.capture.masks import is_mask_folder, masks_among
 from toolkit.capture.resolve import BESIDE, CaptureFiles
@@ -36,15 +36,15 @@ def read_llff(path: Path | str) -> Capture:
     frames = []
     for index, (picture, name) in enumerate(zip(pictures, unique_names(pictures), strict=True)):
         where = f"{root / NAME}, row {index} ({picture.name})"
-        matrix = rows[index, :15].reshape(3, 5)
-        pose = checked_pose(world_from_llff(matrix[:, :4]), where)
-        height, width, focal = matrix[:, 4]
-        if not (1 <= width < 1e6 and 1 <= height < 1e6):
-            raise InputError(f"{where}: the picture size {width:g}×{height:g} is not usable; correct it")
-        camera = Intrinsics(round(width), round(height), float(focal), float(focal), float(width) / 2, float(height) / 2).checked(where)
-        frames.append(
-            Frame(name=name, image=picture, intrinsics=fitted(camera, picture_header(picture).size, where, picture), world_from_camera=pose)
-        )
+        with single_frame(name):
+            matrix = rows[index, :15].reshape(3, 5)
+            pose = checked_pose(world_from_llff(matrix[:, :4]), where)
+            height, width, focal = matrix[:, 4]
+            if not (1 <= width < 1e6 and 1 <= height < 1e6):
+                raise InputError(f"{where}: the picture size {width:g}×{height:g} is not usable; correct it")
+            camera = Intrinsics(round(width), round(height), float(focal), float(focal), float(width) / 2, float(height) / 2).checked(where)
+            intrinsics = fitted(camera, picture_header(picture).size, where, picture)
+            frames.append(Frame(name=name, image=picture, intrinsics=intrinsics, world_from_camera=pose))
     bounds = rows[:, 15:]
     extra = {"near": float(bounds[:, 0].min()), "far": float(bounds[:, 1].max())} if np.isfinite(bounds).all() else {}
     return assemble("llff", root, frames, remarks, extra=extra)

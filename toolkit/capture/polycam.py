@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, checked_pose, world_from_opengl
+from toolkit.camera import Array, Intrinsics, checked_pose, single_frame, world_from_opengl
 from toolkit.capture.listing import (
     assemble,
     files_in,
@@ -57,7 +57,10 @@ def read_polycam(path: Path | str) -> Capture:
     images, cameras = folders
     pictures = pictures_in(images)
     used = [picture for picture in pictures if is_file(cameras / f"{picture.stem}.json")]
-    frames = [_frame(picture, cameras / f"{picture.stem}.json", name) for picture, name in zip(used, unique_names(used), strict=True)]
+    frames = []
+    for picture, name in zip(used, unique_names(used), strict=True):
+        with single_frame(name):
+            frames.append(_frame(picture, cameras / f"{picture.stem}.json", name))
     lost = len(pictures) - len(used)
     remarks = [f"{lost} of the {len(pictures)} pictures in {images.name}/ have no file in {cameras.name}/ and are left out"] if lost else []
     return assemble("polycam", root, frames, remarks, ordered=True, metric=True, up=(0.0, 1.0, 0.0))

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Array, checked_pose
+from toolkit.camera import Array, checked_pose, single_frame
 from toolkit.capture.calibration import PRIMESENSE, find_json
 from toolkit.capture.listing import (
     assemble,
@@ -100,20 +100,21 @@ def read_redwood(path: Path | str) -> Capture:
         raise InputError(f"{root}: the camera's 'depth_scale' is {scale:g}, it must be positive; correct it")
     frames = []
     for index, (picture, name) in enumerate(zip(pictures, unique_names(pictures), strict=True)):
-        size = picture_header(picture).size
-        intrinsics = fitted(camera, size, str(picture))
-        depth = depths[index] if depths else None
-        depth_size = picture_header(depth).size if depth is not None else size
-        frames.append(
-            Frame(
-                name=name,
-                image=picture,
-                intrinsics=intrinsics,
-                world_from_camera=checked_pose(poses[index], f"{log}, entry {index}"),
-                depth=depth,
-                depth_intrinsics=None if depth_size == size else fitted(intrinsics, depth_size, str(depth)),
+        with single_frame(name):
+            size = picture_header(picture).size
+            intrinsics = fitted(camera, size, str(picture))
+            depth = depths[index] if depths else None
+            depth_size = picture_header(depth).size if depth is not None else size
+            frames.append(
+                Frame(
+                    name=name,
+                    image=picture,
+                    intrinsics=intrinsics,
+                    world_from_camera=checked_pose(poses[index], f"{log}, entry {index}"),
+                    depth=depth,
+                    depth_intrinsics=None if depth_size == size else fitted(intrinsics, depth_size, str(depth)),
+                )
             )
-        )
     return assemble("redwood", root, frames, warnings, ordered=True, metric=True, depth_scale=scale or 1000.0)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from toolkit.camera import Array, Intrinsics, checked_pose
+from toolkit.camera import Array, Intrinsics, checked_pose, single_frame
 from toolkit.capture.calibration import sensor
 from toolkit.capture.listing import (
     assemble,
@@ -57,19 +57,20 @@ def read_replica(path: Path | str) -> Capture:
     camera, scale, warnings = _camera(root, first_size(pictures))
     frames = []
     for picture, (line, pose) in zip(pictures, _poses(root, pictures), strict=True):
-        size = picture_header(picture).size
-        depth = depths.get(picture.stem.removeprefix("frame"))
-        depth_size = size if depth is None else picture_header(depth).size
-        frames.append(
-            Frame(
-                name=picture.stem,
-                image=picture,
-                intrinsics=fitted(camera, size, str(picture)),
-                world_from_camera=checked_pose(pose, f"{root / POSES}, pose {line + 1}"),
-                depth=depth,
-                depth_intrinsics=None if depth_size == size else fitted(camera, depth_size, str(depth)),
+        with single_frame(picture.stem):
+            size = picture_header(picture).size
+            depth = depths.get(picture.stem.removeprefix("frame"))
+            depth_size = size if depth is None else picture_header(depth).size
+            frames.append(
+                Frame(
+                    name=picture.stem,
+                    image=picture,
+                    intrinsics=fitted(camera, size, str(picture)),
+                    world_from_camera=checked_pose(pose, f"{root / POSES}, pose {line + 1}"),
+                    depth=depth,
+                    depth_intrinsics=None if depth_size == size else fitted(camera, depth_size, str(depth)),
+                )
             )
-        )
     return assemble("replica", root, frames, warnings, ordered=True, metric=True, depth_scale=scale, up=(0.0, 0.0, 1.0))
 
 

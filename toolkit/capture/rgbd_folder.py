@@ -11,14 +11,13 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
 from toolkit.camera import OPENCV, Array, Intrinsics, checked_pose
 from toolkit.capture.calibration import from_matrix, sensor
-from toolkit.capture.depth_checks import FACTORS, Sample, agreement
+from toolkit.capture.depth_checks import Sample, unit_factor
 from toolkit.capture.images import load_depth
 from toolkit.capture.listing import (
     PICTURES,
@@ -50,7 +49,6 @@ WORD = re.compile(rf"{NUMBER.pattern}|[-+]?(?:nan|inf|infinity)", re.IGNORECASE)
 MOST_CAMERA = 2**18  # bytes of a file that holds a camera
 NEAR = 0.03  # seconds between an image and its pose or depth
 MILLIMETRES = 1000.0
-BETTER = 1.1  # how much better another unit than the usual one must fit the poses
 LOOKED_AT = 12  # depth maps that the unit is found by
 MOST_FOLDERS = 200
 DEPTH_FACTORS = ("depthmapfactor", "depth_scale", "depth_factor", "png_depth_scale")
@@ -393,7 +391,7 @@ def _in_own_unit(capture: Capture) -> Capture:
         if camera is not None and frame.world_from_camera is not None and depth.any():
             camera = fitted(camera, (depth.shape[1], depth.shape[0]), str(frame.depth))
             samples.append(Sample.of(depth / np.float32(scaled.depth_scale), camera, frame.world_from_camera))
-    factor = _best_factor(samples)
+    factor = unit_factor(samples)
     scale = scaled.depth_scale / factor
     how = "which fits the poses" if factor != 1 else "as is usual"
     return replace(
@@ -401,11 +399,3 @@ def _in_own_unit(capture: Capture) -> Capture:
         depth_scale=scale,
         warnings=(*capture.warnings, f"no file gives the unit of depth; {scale:g} for each unit of the poses is taken, {how}"),
     )
-
-
-def _best_factor(samples: Sequence[Sample]) -> float:
-    """What depth must be multiplied by to agree best with the poses; 1 where no factor is better than the usual unit."""
-    pairs = [(a, b) for a, b in combinations(samples, 2) if a.pose[:3, 2] @ b.pose[:3, 2] > 0.5]
-    scores = {factor: sum(agreement(a, b, factor) for a, b in pairs) for factor in (1.0, *FACTORS)}
-    best = max(scores, key=lambda factor: scores[factor])
-    return best if scores[best] > BETTER * scores[1.0] else 1.0

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, checked_pose, world_from_opengl
+from toolkit.camera import Array, Intrinsics, checked_pose, single_frame, world_from_opengl
 from toolkit.capture.calibration import from_matrix
 from toolkit.capture.listing import assemble, fitted, is_file, picture_header, pictures_in, read_object, require_folder, size_of
 from toolkit.capture.types import Capture, Frame
@@ -47,7 +47,11 @@ def read_scanner3d(path: Path | str) -> Capture:
         raise InputError(f'{root} holds no frame_*.jpg with its frame_*.json; export "All Data" of the scan')
     lost = len(pictures) - len(used)
     remarks = [f"{lost} of the {len(pictures)} pictures have no .json beside them and are left out"] if lost else []
-    return assemble("scanner3d", root, [_frame(picture, used) for picture in used], remarks, ordered=True, metric=True, up=(0.0, 1.0, 0.0))
+    frames = []
+    for picture in used:
+        with single_frame(picture.stem):
+            frames.append(_frame(picture, used))
+    return assemble("scanner3d", root, frames, remarks, ordered=True, metric=True, up=(0.0, 1.0, 0.0))
 
 
 def _frame(picture: Path, others: list[Path]) -> Frame:

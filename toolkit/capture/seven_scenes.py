@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Intrinsics, checked_pose
+from toolkit.camera import Intrinsics, checked_pose, single_frame
 from toolkit.capture.listing import (
     assemble,
     counted,
@@ -84,21 +84,24 @@ def posed_frames(
         InputError: all are lost, a pose is not rigid, or a picture has another shape than its camera.
     """
     frames = []
+    lost = 0
     for entry, name in zip(found, names, strict=True):
-        pose = read_matrix(entry.pose, (4, 4))
-        if not np.isfinite(pose).all():
-            continue
-        frames.append(
-            Frame(
-                name=name,
-                image=entry.colour,
-                intrinsics=fitted(colour, picture_header(entry.colour).size, str(entry.colour)),
-                world_from_camera=checked_pose(pose, str(entry.pose)),
-                depth=entry.depth,
-                depth_intrinsics=None if entry.depth is None else fitted(depth, picture_header(entry.depth).size, str(entry.depth)),
+        with single_frame(name):
+            pose = read_matrix(entry.pose, (4, 4))
+            if not np.isfinite(pose).all():
+                lost += 1
+                continue
+            frames.append(
+                Frame(
+                    name=name,
+                    image=entry.colour,
+                    intrinsics=fitted(colour, picture_header(entry.colour).size, str(entry.colour)),
+                    world_from_camera=checked_pose(pose, str(entry.pose)),
+                    depth=entry.depth,
+                    depth_intrinsics=None if entry.depth is None else fitted(depth, picture_header(entry.depth).size, str(entry.depth)),
+                )
             )
-        )
-    return frames, lost_frames(len(found), len(frames), root)
+    return frames, lost_frames(len(found), len(found) - lost, root)
 
 
 def lost_frames(listed: int, tracked: int, where: Path) -> list[str]:

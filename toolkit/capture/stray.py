@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, checked_pose
+from toolkit.camera import Array, Intrinsics, checked_pose, single_frame
 from toolkit.capture.calibration import from_matrix
 from toolkit.capture.listing import assemble, fitted, is_file, picture_header, read_text, require_folder
 from toolkit.capture.quaternion import rigid
@@ -56,6 +56,8 @@ def read_stray(path: Path | str) -> Capture:
     rows = _rows(root / POSES)
     frames = []
     for index, row in enumerate(rows[: len(video.frames)]):
+        if row is None:
+            continue
         camera = shared if row.camera is None else Intrinsics(width, height, *row.camera).checked(_where(root / POSES, index))
         depth = next((found for suffix in ("png", "npy") if is_file(found := root / "depth" / f"{row.number:06d}.{suffix}")), None)
         confidence = root / "confidence" / f"{row.number:06d}.png"
@@ -75,14 +77,14 @@ def read_stray(path: Path | str) -> Capture:
     remarks = []
     if len(rows) != len(video.frames):
         remarks.append(
-            f"the video has {len(video.frames)} frames and {POSES} {len(rows)} rows; the first {len(frames)} are used, and if others are "
-            "missing than the last, pictures and poses do not belong together, and --poses sfm finds others"
+            f"the video has {len(video.frames)} frames and {POSES} {len(rows)} rows; the first {min(len(rows), len(video.frames))} are "
+            "used, and if others are missing than the last, pictures and poses do not belong together, and --poses sfm finds others"
         )
     return assemble("stray", root, frames, remarks, ordered=True, metric=True, up=(0.0, 1.0, 0.0), extra=dict(video.extra))
 
 
-def _rows(path: Path) -> list[Row]:
-    """The rows of `odometry.csv`, at least one.
+def _rows(path: Path) -> list[Row | None]:
+    """The rows of `odometry.csv`, at least one; None where one cannot be read.
 
     Raises:
         InputError: missing, not text, a word that is not a finite number, rows of different length, or too few numbers a row.
@@ -98,7 +100,11 @@ def _rows(path: Path) -> list[Row]:
     needed = 1 + max(columns[name] for name in (*POSE, NUMBER) if name in columns)
     if any(len(line) < needed if named else len(line) != len(lines[0]) for line in lines):
         raise InputError(f"{path} has rows of different length; check how it was written")
-    return [_row(line, columns, index, _where(path, index)) for index, line in enumerate(lines)]
+    rows: list[Row | None] = [None] * len(lines)
+    for index, line in enumerate(lines):
+        with single_frame(f"frame_{index:06d}"):
+            rows[index] = _row(line, columns, index, _where(path, index))
+    return rows
 
 
 def _columns(header: list[str], count: int) -> dict[str, int] | None:

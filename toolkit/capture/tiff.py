@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-WIDTH, HEIGHT, BITS, ORIENTATION, SAMPLES, MAXIMUM, EXTRA, PROFILE = 256, 257, 258, 274, 277, 281, 338, 34675
+WIDTH, HEIGHT, BITS, ORIENTATION, SAMPLES, MAXIMUM, EXTRA, FORMAT, PROFILE = 256, 257, 258, 274, 277, 281, 338, 339, 34675
 SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 6: 1, 7: 1, 8: 2, 9: 4, 13: 4, 16: 8, 17: 8, 18: 8}  # bytes of a value, by type
 NUMBERS = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q"}
 MOST_ENTRIES = 4096
@@ -23,6 +23,7 @@ class Tiff:
     width: int
     height: int
     bits: int  # of a sample
+    floating: bool  # whether samples are floating-point numbers
     samples: int  # a pixel
     orientation: int  # 1 to 8
     alpha: bool
@@ -44,7 +45,8 @@ def read_tiff(data: bytes) -> Tiff | None:
     try:
         entries = _entries(data, order, big)
         width, height = (_numbers(data, order, entries[tag])[0] for tag in (WIDTH, HEIGHT))
-        values = {tag: _numbers(data, order, entries[tag]) for tag in (BITS, ORIENTATION, SAMPLES, MAXIMUM, EXTRA) if tag in entries}
+        tags = (BITS, ORIENTATION, SAMPLES, MAXIMUM, EXTRA, FORMAT)
+        values = {tag: _numbers(data, order, entries[tag]) for tag in tags if tag in entries}
         profile = _bytes(data, entries[PROFILE]) if PROFILE in entries else None
     except (struct.error, KeyError, IndexError, ValueError):
         return None
@@ -53,6 +55,7 @@ def read_tiff(data: bytes) -> Tiff | None:
         width=width,
         height=height,
         bits=max(values.get(BITS, (1,))),
+        floating=3 in values.get(FORMAT, ()),
         samples=values.get(SAMPLES, (1,))[0],
         orientation=orientation if 1 <= orientation <= 8 else 1,
         alpha=any(kind in (1, 2) for kind in values.get(EXTRA, ())),

@@ -21,7 +21,8 @@ NAMED = 3  # frames that a remark names
 
 
 def without(capture: Capture, bad: Mapping[str, str], refusal: str | None = None) -> Capture:
-    """The capture without its `bad` frames (name → a sentence that says why), with a remark; itself where there are none.
+    """The capture without its `bad` frames (name → a sentence that says why), with a remark; itself where there are none. Frames that were
+    not read at all may be among the bad ones.
 
     Args:
         refusal: what is said where too many are bad; None: the first one's sentence.
@@ -32,7 +33,8 @@ def without(capture: Capture, bad: Mapping[str, str], refusal: str | None = None
     if not bad:
         return capture
     kept = [frame for frame in capture.frames if frame.name not in bad]
-    total, lost = len(capture.frames), len(capture.frames) - len(kept)
+    lost = len(bad)
+    total = len(kept) + lost
     first = next(iter(bad.values()))
     if lost > MOST_BAD * total or len(kept) < LEAST:
         raise InputError(refusal or (f"{first} ({lost} of {total} frames are like this)" if lost > 1 else first))
@@ -108,6 +110,7 @@ def with_usable_poses(capture: Capture, notes: PoseNotes) -> Capture:
     if notes.unusable and len(lost) > 1:
         refusal = f"{notes.unusable[0]} ({len(lost)} of {len(capture.frames)} poses hold nothing usable)"
     capture = without(capture, {frame.name: why for frame, why in zip(lost, sentences, strict=True)}, refusal)
+    capture = without(capture, notes.unread)
     remarks = []
     if notes.scales:
         low, high = min(notes.scales), max(notes.scales)
