@@ -47,8 +47,8 @@ OF_FIELD = {  # no correction of pictures, but what the field is made of
 }
 PLAIN_VIEW = "full"  # what the decoder sees of the direction where nothing speaks for view dependence
 GROUPS = ((POSES, LENS), (EXPOSURE, VIGNETTING), (BLUR,))  # what a trial switches at once, in this order
-# Decibels by which a trial has to be better with a group. Small images do not show blur: what little they gain by weights against it, a whole
-# fit may lose again.
+# Decibels by which a trial has to be better with a group. Small images do not show blur: what little they gain by weights against it, a
+# whole fit may lose again.
 WINS = {POSES: 0.0, LENS: 0.0, EXPOSURE: 0.1, VIGNETTING: 0.1, BLUR: 0.3}
 TRIED, VALIDATED = 56, 8  # training frames that take part in a trial, and those of them that it scores, at most
 FEWEST_TRIED = 6  # training frames without which there is no trial
