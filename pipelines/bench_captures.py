@@ -217,7 +217,7 @@ def shown(source: Path) -> str:
 
 
 def facts(report: dict[str, Any]) -> dict[str, Any]:
-    """What the table tells of a finished run; PSNR counts the pixels within the masks of a capture that has them."""
+    """A finished run's entries in the table; PSNR counts the pixels within the masks of a capture that has them."""
     scores, poses, effects = report["evaluation"], report["poses"], (report.get("effects") or {}).get("effects", [])
     field, nearest = scores["field"] or {}, scores["nearest_image"] or {}
     return {

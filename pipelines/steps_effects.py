@@ -109,14 +109,13 @@ def moved_cameras(job: Job, capture: Capture) -> list[str]:
     """How far cameras that came with the capture were moved by what pictures and depth show: what is exported lies with the moved ones."""
     import numpy as np
 
+    from toolkit.effects.bounds import apart
+
     given = {frame.name: frame.world_from_camera for frame in capture.frames if frame.world_from_camera is not None}
     names = [name for name in (job.corrections.poses if job.corrections else {}) if name in given]
     if job.corrections is None or not names:
         return []
-    before, after = np.stack([given[name] for name in names]), np.stack([job.corrections.poses[name] for name in names])
-    way = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
-    cosine = (np.einsum("nij,nij->n", before[:, :3, :3], after[:, :3, :3]) - 1) / 2
-    turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    way, turn = apart(np.stack([given[name] for name in names]), np.stack([job.corrections.poses[name] for name in names]))
     length = f"{100 * np.median(way):.1f} cm" if capture.metric else f"{np.median(way):.3g} of the capture's units"
     held = job.corrections.by_depth
     unregistered = capture.has_depth and job.corrections.depth is None and not held
@@ -132,11 +131,12 @@ def moved_depth(job: Job, capture: Capture) -> list[str]:
     """How far the depth camera stands from the pictures', where depth is carried from the one to the other."""
     import numpy as np
 
+    from toolkit.effects.bounds import apart
+
     found = job.corrections.depth if job.corrections else None
     if found is None:
         return []
-    way = np.linalg.norm(found[:3, 3])
-    turn = np.degrees(np.arccos(np.clip((np.trace(found[:3, :3]) - 1) / 2, -1, 1)))
+    way, turn = (float(value[0]) for value in apart(np.eye(4)[None], found[None]))
     length = f"{100 * way:.1f} cm" if capture.metric else f"{way:.3g} of the capture's units"
     return [
         f"the depth camera was found to stand {length} beside the pictures' and to be turned by {turn:.2f}°, and its depth is carried over;"

@@ -142,6 +142,14 @@ def test_what_is_no_whole_file_is_refused_in_a_sentence(tmp_path: Path, case: st
     assert str(tmp_path / NAME) in str(caught.value) and len(str(caught.value).splitlines()) == 1
 
 
+def test_a_pose_that_is_not_a_number_costs_its_frame(tmp_path: Path) -> None:
+    whole = made(tmp_path / NAME)
+    frames = len(open_capture(tmp_path / NAME).frames)
+    (tmp_path / NAME).write_bytes(packed(whole, BODY + 12, "<f", float("nan")))
+    capture = open_capture(tmp_path / NAME)
+    assert len(capture.frames) == frames - 1 and any("tracking was lost" in warning for warning in capture.warnings)
+
+
 @pytest.mark.parametrize("bytes_of", ["picture", "depth"])
 def test_what_is_damaged_inside_is_told_by_its_frame(tmp_path: Path, bytes_of: str) -> None:
     data = made(tmp_path / NAME)

@@ -307,7 +307,7 @@ def _turned_back(across: Any, down: Any, width: int, height: int) -> tuple[Any, 
         if abs(math.log(exchanged)) < square and abs(apart) > 3 * square:
             return down, across
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
-        pass  # absent, or refused by whoever reads them
+        pass  # absent, or refused where they are read
     return across, down
 
 

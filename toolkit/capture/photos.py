@@ -92,7 +92,7 @@ def read_photos(path: Path | str) -> Capture:
 
 
 def with_unposed(capture: Capture) -> Capture:
-    """The capture with those images beside its own, in the same folders, that have no poses: whoever finds poses anew can use them."""
+    """The capture with those images beside its own, in the same folders, that have no poses, for finding poses anew."""
     if not capture.extra.get("unregistered"):
         return capture
     own = {frame.image for frame in capture.frames}
@@ -143,7 +143,7 @@ def _of_one_capture(root: Path, folders: dict[Path, list[Path]]) -> tuple[list[P
 
 
 def _sizes(pictures: list[Path]) -> set[tuple[int, int]]:
-    """Long and short side of a few of the pictures; what cannot be read is left to whoever reads it all."""
+    """Long and short side of a few of the pictures; files that cannot be read are passed over."""
     out = set()
     for picture in pictures[:: max(1, len(pictures) // 5)]:
         with suppress(InputError):

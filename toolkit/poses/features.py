@@ -36,7 +36,7 @@ def learned(grey: Array, most: int) -> tuple[Array, Array]:
     from toolkit.poses import xfeat  # torch takes a second and 200 MB, and is not always needed
 
     network = xfeat.installed()
-    assert network is not None  # whoever made the job has looked
+    assert network is not None  # a job with these features is made only where the weights are
     keypoints, descriptors = xfeat.detect(network, grey, most)
     return keypoints, descriptors.astype(np.float16).view(np.uint8)
 
