@@ -25,10 +25,12 @@ COMPILE := $(BIN)/python -m compileall -q -j 0 -x '/(tests|testing|plotly|dash|s
 # ruff does not read setup.cfg, so its options stand here.
 RUFF_RULES := E,F,W,I,B,UP,PTH,RUF,PERF,SIM,C4,PIE,RET,T20,S102,S301,S307,S506,S602,S605
 # RUF001-003: × and – are meant. PERF203: a try inside a loop is how one bad frame is told from a bad capture.
-RUFF := $(BIN)/ruff check --isolated --line-length 140 --target-version py311 --select $(RUFF_RULES) --ignore RUF001,RUF002,RUF003,PERF203
+RUFF := $(BIN)/ruff check --isolated --line-length 140 --target-version py311 --config 'lint.isort.known-first-party=["fieldfuse"]' --select $(RUFF_RULES) --ignore RUF001,RUF002,RUF003,PERF203
 SOURCES := toolkit pipelines configs tests
+# Static tools find packages by their folders' names: a folder of links that is laid out as the wheel is.
+LINKS := build/links
 
-.PHONY: help demo test lint stability fuzz venv system lpips xfeat
+.PHONY: help demo test lint links stability fuzz venv system lpips xfeat
 
 help:
 	@echo "make demo    film a small made-up scene, reconstruct it, and print where the results are (in demo/)"
@@ -40,7 +42,7 @@ help:
 	@echo "make xfeat   add the weights of learned features for structure from motion"
 
 demo: $(VENV)/.installed
-	@$(BIN)/python -m pipelines.demo
+	@$(BIN)/python -m fieldfuse.pipelines.demo
 
 # Tests run in two processes where there are two cores; those of a file stay together, since they share what takes long to make.
 # `make test WORKERS=0` runs them in one.
@@ -48,9 +50,9 @@ WORKERS ?= $(if $(filter-out 0 1,$(shell nproc 2>/dev/null)),2,0)
 
 # Types take one core most of a minute, so they are checked beside the tests; their errors count all the same.
 # Bytecode is kept, also where the environment says otherwise: tests start many processes, and each would compile what it imports.
-test: $(VENV)/.installed-test
+test: $(VENV)/.installed-test links
 	$(RUFF) $(SOURCES)
-	$(BIN)/lint-imports
+	PYTHONPATH=$(LINKS) $(BIN)/lint-imports
 	$(BIN)/mypy & types=$$!; tests=0; \
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile || tests=$$?; wait $$types; exit $$tests
 
@@ -62,10 +64,13 @@ stability: $(VENV)/.installed-test
 fuzz: $(VENV)/.installed-test
 	$(BIN)/python -m tests.stability.fuzz --inputs 100000 --state .fuzz-state.json --page docs/stability.md
 
-lint: $(VENV)/.installed-test
+lint: $(VENV)/.installed-test links
 	$(RUFF) $(SOURCES)
 	$(BIN)/mypy
-	$(BIN)/lint-imports
+	PYTHONPATH=$(LINKS) $(BIN)/lint-imports
+
+links:
+	@rm -rf $(LINKS) && mkdir -p $(LINKS)/fieldfuse && ln -s $(CURDIR)/toolkit/* $(CURDIR)/pipelines $(CURDIR)/configs $(LINKS)/fieldfuse/
 
 venv: $(VENV)/.installed $(VENV)/.installed-xfeat
 

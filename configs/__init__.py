@@ -1,1 +1,1 @@
-"""Presets as YAML: only what differs from the defaults in `toolkit.config`."""
+"""Presets as YAML: only what differs from the defaults in `fieldfuse.config`."""

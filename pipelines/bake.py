@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from pipelines.baking import SEEN
-from pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
+from fieldfuse.pipelines.baking import SEEN
+from fieldfuse.pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
 
 
 def bake(
@@ -26,7 +26,7 @@ def bake(
     json: Json = False,
 ) -> None:
     """Quantise the field of a run to bytes and say what that costs at the held-out views."""
-    from pipelines.thread_limits import bound_threads
+    from fieldfuse.pipelines.thread_limits import bound_threads
 
     options = gather(None, config, pairs, threads=threads)
     bound_threads(options)
@@ -55,16 +55,16 @@ def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: floa
     import numpy as np
     import torch
 
-    from pipelines.baking import default_place, write
-    from pipelines.console import make_progress
-    from pipelines.job import open_job
-    from pipelines.reconstruct import BEFORE, stand
-    from pipelines.rendered import to_picture
-    from pipelines.steps_results import fit_radiance_field
-    from toolkit.evaluate.images import psnr
-    from toolkit.evaluate.score import as_photo
-    from toolkit.render.bake_image import BakedRenderer
-    from toolkit.render.image import make_renderer, render_view
+    from fieldfuse.evaluate.images import psnr
+    from fieldfuse.evaluate.score import as_photo
+    from fieldfuse.pipelines.baking import default_place, write
+    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.job import open_job
+    from fieldfuse.pipelines.reconstruct import BEFORE, stand
+    from fieldfuse.pipelines.rendered import to_picture
+    from fieldfuse.pipelines.steps_results import fit_radiance_field
+    from fieldfuse.render.bake_image import BakedRenderer
+    from fieldfuse.render.image import make_renderer, render_view
 
     with open_job(target, out, options, make_progress(quiet), (*BEFORE, "field")) as job:
         _, _, _, scene, views = stand(job)

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pipelines.job import Job
-    from toolkit.capture.types import Views
-    from toolkit.poses.scene import Scene
-    from toolkit.render.bake import BakedField
-    from toolkit.render.field import Field
+    from fieldfuse.capture.types import Views
+    from fieldfuse.pipelines.job import Job
+    from fieldfuse.poses.scene import Scene
+    from fieldfuse.render.bake import BakedField
+    from fieldfuse.render.field import Field
 
 SEEN = 0.01  # see `fieldfuse bake --seen`
 
@@ -27,7 +27,7 @@ def write(job: Job, field: Field, views: Views, scene: Scene, seen: float, place
         InputError: a decoder that cannot be baked.
         OutputError: the file cannot be written.
     """
-    from toolkit.render.bake_file import read_baked, write_baked
+    from fieldfuse.render.bake_file import read_baked, write_baked
 
     write_baked(place, baked(job, field, views, seen), scene.working_from_input)
     return read_baked(place)
@@ -42,9 +42,9 @@ def baked(job: Job, field: Field, views: Views, seen: float = SEEN) -> BakedFiel
     import numpy as np
     import torch
 
-    from pipelines.room import require_baking
-    from toolkit.render.bake import bake as quantise
-    from toolkit.render.bake_views import seen_voxels
+    from fieldfuse.pipelines.room import require_baking
+    from fieldfuse.render.bake import bake as quantise
+    from fieldfuse.render.bake_views import seen_voxels
 
     require_baking(field)
     keep, train = None, np.flatnonzero(~views.test)
@@ -56,7 +56,7 @@ def baked(job: Job, field: Field, views: Views, seen: float = SEEN) -> BakedFiel
 
 def baked_of(job: Job, field: Field, views: Views, scene: Scene) -> BakedField:
     """The run's baked field; made first where there is none, or one of an earlier fit."""
-    from toolkit.render.bake_file import read_baked
+    from fieldfuse.render.bake_file import read_baked
 
     place, source = default_place(job), job.folder / "field.safetensors"
     if place.is_file() and source.is_file() and place.stat().st_mtime_ns >= source.stat().st_mtime_ns:

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.bench_suite import add_suites
-from pipelines.options import Quiet, Threads
+from fieldfuse.pipelines.bench_suite import add_suites
+from fieldfuse.pipelines.options import Quiet, Threads
 
 if TYPE_CHECKING:
-    from toolkit.evaluate.speed import Case
+    from fieldfuse.evaluate.speed import Case
 
 app = typer.Typer(help="Benchmarks on this machine.", no_args_is_help=True, add_completion=False, rich_markup_mode=None)
 PARTS = ("step", "growth", "render", "threads", "order", "lookup", "convolution", "keyframe", "tsdf", "jobs")
@@ -32,12 +32,12 @@ def speed(
     quiet: Quiet = False,
 ) -> None:
     """Time each part beside a reference loop in the same run, and say how many times faster it is."""
-    from pipelines.thread_limits import bound_threads
+    from fieldfuse.pipelines.thread_limits import bound_threads
 
     bound_threads({"flags": {"threads": threads}})
     data = measure(chosen(parts), threads, repetitions, budget, quiet)
     if to is not None:
-        from toolkit.files import write_json
+        from fieldfuse.files import write_json
 
         write_json(to, data)
     if not quiet:
@@ -50,7 +50,7 @@ def chosen(parts: str | None) -> tuple[str, ...]:
     Raises:
         InputError: an unknown one.
     """
-    from toolkit.errors import InputError
+    from fieldfuse.errors import InputError
 
     wanted = PARTS if parts is None else tuple(name.strip() for name in parts.split(",") if name.strip())
     for name in wanted:
@@ -68,10 +68,10 @@ def measure(parts: tuple[str, ...], threads: int | None, repetitions: int, budge
     import os
     import time
 
-    from pipelines.console import make_progress
-    from pipelines.job import set_threads
-    from toolkit.evaluate import speed_cases, speed_growth, speed_jobs
-    from toolkit.evaluate.speed import machine
+    from fieldfuse.evaluate import speed_cases, speed_growth, speed_jobs
+    from fieldfuse.evaluate.speed import machine
+    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.job import set_threads
 
     threads = threads or os.cpu_count() or 1
     set_threads(threads)
@@ -110,7 +110,7 @@ def measure(parts: tuple[str, ...], threads: int | None, repetitions: int, budge
 def growth(cases: list[Case]) -> dict[str, float]:
     """Exponent of the processor time a unit over the size (the lattice's side, or what the case names), for each kind of case that was
     measured at several sizes."""
-    from toolkit.evaluate.speed import exponent
+    from fieldfuse.evaluate.speed import exponent
 
     out = {}
     for name in dict.fromkeys(case.name for case in cases):
@@ -126,7 +126,7 @@ def show(data: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from toolkit.evaluate.words import counted
+    from fieldfuse.evaluate.words import counted
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("what", "size", "a unit, processor", "wall", "times faster", "than"):

@@ -14,9 +14,9 @@ from typing import Annotated, Any
 
 import typer
 
-from pipelines.console import ConsoleProgress
-from pipelines.options import Budget, Config, Device, ImageSize, Json, Out, Pairs, Preset, Quiet, Threads, gather
-from toolkit.errors import Interrupted
+from fieldfuse.errors import Interrupted
+from fieldfuse.pipelines.console import ConsoleProgress
+from fieldfuse.pipelines.options import Budget, Config, Device, ImageSize, Json, Out, Pairs, Preset, Quiet, Threads, gather
 
 FILE = "captures"
 RUNS = "runs"  # OUT/runs/CAPTURE/VARIANT-SEED are ordinary run folders
@@ -65,10 +65,10 @@ def captures(
     Each run is a process of its own, so that none of them ends the table. Repeat the command after an interruption: finished runs are
     reused.
     """
-    from pipelines.console import make_progress
-    from pipelines.job import read_settings
-    from toolkit.errors import InputError
-    from toolkit.evaluate.captures_table import captures_table
+    from fieldfuse.errors import InputError
+    from fieldfuse.evaluate.captures_table import captures_table
+    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.job import read_settings
 
     numbers = tuple(dict.fromkeys(part.strip() for part in seeds.split(",") if part.strip()))
     if not numbers or not all(number.isdecimal() for number in numbers):
@@ -94,10 +94,10 @@ def sources(data: Path, out: Path, only: str | None = None) -> list[Path]:
     Raises:
         InputError: there are none, or not those of `only`.
     """
-    from toolkit.capture.detect import FILMS
-    from toolkit.capture.listing import natural_key
-    from toolkit.capture.sens import is_sens
-    from toolkit.errors import InputError
+    from fieldfuse.capture.detect import FILMS
+    from fieldfuse.capture.listing import natural_key
+    from fieldfuse.capture.sens import is_sens
+    from fieldfuse.errors import InputError
 
     try:
         held = sorted(data.absolute().iterdir(), key=lambda path: natural_key(path.name))
@@ -175,14 +175,14 @@ def worth(variant: str, first: dict[str, Any]) -> bool:
 
 def run_one(source: Path, plan: Plan, options: list[str], name: str, progress: ConsoleProgress) -> dict[str, Any]:
     """One run in a process of its own, as far as it came: `state` is "read", "refused" (bad input, with its sentence) or "failed"."""
-    from toolkit.errors import FieldfuseError, first_line
-    from toolkit.files import read_json, remove
-    from toolkit.poses.child import end_reason, import_path, log_tail, run_logged
+    from fieldfuse.errors import FieldfuseError, first_line
+    from fieldfuse.files import read_json, remove
+    from fieldfuse.poses.child import end_reason, import_path, log_tail, run_logged
 
     folder = plan.out / RUNS / source.name / name.replace(" ", "-")
     log = folder.with_name(f"{folder.name}.log")
     log.parent.mkdir(parents=True, exist_ok=True)
-    command = ["-m", "pipelines.bench_captures", "run", str(source), "--out", str(folder), *plan.options, *options, "--quiet"]
+    command = ["-m", "fieldfuse.pipelines.bench_captures", "run", str(source), "--out", str(folder), *plan.options, *options, "--quiet"]
     try:
         code = run_logged(command, log, lambda _: progress.check(), plan.timeout, import_path())
         if code == 0:
@@ -202,8 +202,8 @@ def run_one(source: Path, plan: Plan, options: list[str], name: str, progress: C
 
 def kind_of(folder: Path) -> str | None:
     """What a run that was refused later had found its source to be; None: it did not come so far."""
-    from toolkit.errors import FieldfuseError
-    from toolkit.files import read_json
+    from fieldfuse.errors import FieldfuseError
+    from fieldfuse.files import read_json
 
     try:
         return str(read_json(folder / "capture.json")["kind"])
@@ -237,11 +237,11 @@ def facts(report: dict[str, Any]) -> dict[str, Any]:
 
 def put(found: Sequence[Path], rows: dict[str, list[dict[str, Any]]], plan: Plan) -> dict[str, Any]:
     """Write what there is so far, in the order of the folder."""
-    from pipelines.folder import command_line
-    from toolkit import __version__
-    from toolkit.evaluate.captures_table import captures_table
-    from toolkit.evaluate.speed import machine
-    from toolkit.files import atomic_path, write_json
+    from fieldfuse import __version__
+    from fieldfuse.evaluate.captures_table import captures_table
+    from fieldfuse.evaluate.speed import machine
+    from fieldfuse.files import atomic_path, write_json
+    from fieldfuse.pipelines.folder import command_line
 
     threads = plan.options[plan.options.index("--threads") + 1] if "--threads" in plan.options else os.cpu_count() or 1
     data = {
@@ -258,14 +258,14 @@ def put(found: Sequence[Path], rows: dict[str, list[dict[str, Any]]], plan: Plan
 
 def said(row: dict[str, Any]) -> str:
     """A run in a few words."""
-    from toolkit.evaluate.words import decimal
+    from fieldfuse.evaluate.words import decimal
 
     return f"{row['state']}: {row['error']}" if row["error"] else f"{decimal(row['psnr'])} dB, {row['registered']} of {row['total']} frames"
 
 
 if __name__ == "__main__":  # the process of one run
-    from pipelines.cli import program
-    from toolkit.poses.worker import die_with_parent
+    from fieldfuse.pipelines.cli import program
+    from fieldfuse.poses.worker import die_with_parent
 
     die_with_parent()
     program()

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pipelines.options import Quiet
+from fieldfuse.pipelines.options import Quiet
 
 WHAT = ("effect", "weak", "medium", "strong", "captures without it")
 
@@ -35,11 +35,11 @@ def effects(
     """Film sixty small captures with known effects, look for effects in each, and count what was found."""
     import time
 
-    from pipelines.console import make_progress
-    from toolkit.evaluate.effects_bench import confusion, look_at
-    from toolkit.evaluate.effects_plan import FIRST_DRIFTING, FIRST_SEED, plan
-    from toolkit.evaluate.effects_plan import drifting as plan_drifting
-    from toolkit.files import write_json
+    from fieldfuse.evaluate.effects_bench import confusion, look_at
+    from fieldfuse.evaluate.effects_plan import FIRST_DRIFTING, FIRST_SEED, plan
+    from fieldfuse.evaluate.effects_plan import drifting as plan_drifting
+    from fieldfuse.files import write_json
+    from fieldfuse.pipelines.console import make_progress
 
     folder.mkdir(parents=True, exist_ok=True)
     progress = make_progress(quiet)
@@ -52,7 +52,7 @@ def effects(
     with progress.listening():
         progress.begin("effects")
         if against:
-            from toolkit.evaluate.effects_fits import compared
+            from fieldfuse.evaluate.effects_fits import compared
 
             data = compared(planned[::every], folder, seconds, against, progress)
         else:
@@ -107,10 +107,10 @@ def by_hand(
     """Fit captures with all effects off, with what is found, and with each effect switched on by hand."""
     import time
 
-    from pipelines.console import make_progress
-    from toolkit.errors import InputError
-    from toolkit.evaluate.effects_switch import SWITCHES, switched
-    from toolkit.files import write_json
+    from fieldfuse.errors import InputError
+    from fieldfuse.evaluate.effects_switch import SWITCHES, switched
+    from fieldfuse.files import write_json
+    from fieldfuse.pipelines.console import make_progress
 
     progress = make_progress(quiet)
     began = time.monotonic()

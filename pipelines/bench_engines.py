@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from pipelines.few_views import ground_of, keep_rows, numbers, opened, tell
-from pipelines.options import Config, Device, ImageSize, Out, Pairs, Quiet, Seed, Source, Threads, gather
+from fieldfuse.pipelines.few_views import ground_of, keep_rows, numbers, opened, tell
+from fieldfuse.pipelines.options import Config, Device, ImageSize, Out, Pairs, Quiet, Seed, Source, Threads, gather
 
 FILE = "engines"
 
@@ -26,8 +26,8 @@ def engines(
     quiet: Quiet = False,
 ) -> None:
     """Held-out quality of fits by each engine, and the time of a picture of 640×480 pixels."""
-    from pipelines.job import check_engine
-    from toolkit.evaluate.engines import engine_rows, engine_table
+    from fieldfuse.evaluate.engines import engine_rows, engine_table
+    from fieldfuse.pipelines.job import check_engine
 
     seconds, names = numbers(budgets, "budgets"), named(engines)
     options = gather(None, config, pairs, image_size=image_size, seed=seed, threads=threads, device=device)
@@ -50,8 +50,8 @@ def named(text: str) -> list[str]:
     Raises:
         InputError: something is no engine.
     """
-    from toolkit.config import CHOICES
-    from toolkit.errors import InputError
+    from fieldfuse.config import CHOICES
+    from fieldfuse.errors import InputError
 
     parts = [part.strip() for part in text.split(",") if part.strip()]
     for part in parts or [""]:

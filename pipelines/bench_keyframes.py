@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pipelines.options import Device, Quiet, Seed, Threads
+from fieldfuse.pipelines.options import Device, Quiet, Seed, Threads
 
 FAR = 3.0  # metres, as in the paper
 TITLES = {
@@ -28,7 +28,7 @@ def keyframes(
     quiet: Quiet = False,
 ) -> None:
     """Fuse key frames of a walk through a made-up room, and say how many a second: pictures encoded, swept, held against each other."""
-    from pipelines.thread_limits import bound_threads
+    from fieldfuse.pipelines.thread_limits import bound_threads
 
     bound_threads({"flags": {"threads": threads}})
     import os
@@ -36,12 +36,12 @@ def keyframes(
 
     import torch
 
-    from pipelines.console import make_progress
-    from pipelines.job import choose_device, set_threads
-    from toolkit.evaluate.key_frames import NEAR, key_frame_rates, walk
-    from toolkit.evaluate.speed import machine
-    from toolkit.files import write_json
-    from toolkit.fusion import FusionOptions
+    from fieldfuse.evaluate.key_frames import NEAR, key_frame_rates, walk
+    from fieldfuse.evaluate.speed import machine
+    from fieldfuse.files import write_json
+    from fieldfuse.fusion import FusionOptions
+    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.job import choose_device, set_threads
 
     threads = threads or os.cpu_count() or 1
     set_threads(threads)
@@ -68,7 +68,7 @@ def show(rows: list[dict[str, Any]], about: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from toolkit.evaluate.words import counted
+    from fieldfuse.evaluate.words import counted
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     columns = [name for name in TITLES if name in rows[0]]

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.options import Device, ImageSize, Json, Out, Pairs, Preset, Quiet, Seed, Threads, gather
+from fieldfuse.pipelines.options import Device, ImageSize, Json, Out, Pairs, Preset, Quiet, Seed, Threads, gather
 
 if TYPE_CHECKING:
-    from pipelines.job import Job
-    from pipelines.rendered import Pictures
-    from toolkit.capture.types import Views
-    from toolkit.evaluate.suites.base import Suite, Variant
-    from toolkit.poses.scene import Scene
+    from fieldfuse.capture.types import Views
+    from fieldfuse.evaluate.suites.base import Suite, Variant
+    from fieldfuse.pipelines.job import Job
+    from fieldfuse.pipelines.rendered import Pictures
+    from fieldfuse.poses.scene import Scene
 
 HELP = {
     "nerf-synthetic": "NeRF-synthetic with the splits of its Blender files.",
@@ -38,7 +38,7 @@ FitBudget = Annotated[float | None, typer.Option("--budget", help="Seconds of op
 
 def add_suites(app: typer.Typer) -> None:
     """One command a suite, and `table`."""
-    from pipelines.bench_table import table
+    from fieldfuse.pipelines.bench_table import table
 
     for name, text in HELP.items():
         app.command(name, help=text)(_command(name))
@@ -61,12 +61,12 @@ def _command(name: str) -> Any:
         quiet: Quiet = False,
         json: Json = False,
     ) -> None:
-        from pipelines.thread_limits import bound_threads
+        from fieldfuse.pipelines.thread_limits import bound_threads
 
         flags = {"budget": budget, "image_size": image_size, "device": device, "threads": threads, "seed": seed}
         options = gather(preset, None, pairs, **flags)
         bound_threads(options)
-        from pipelines.console import make_progress
+        from fieldfuse.pipelines.console import make_progress
 
         found = bench_suite(name, data, out, options, _names(scenes), _names(variants), make_progress(quiet))
         if json:
@@ -89,8 +89,8 @@ def bench_suite(
     Raises:
         InputError: no such scene or variant.
     """
-    from toolkit.errors import FieldfuseError, Interrupted, OutputError
-    from toolkit.evaluate.suites import suite_of
+    from fieldfuse.errors import FieldfuseError, Interrupted, OutputError
+    from fieldfuse.evaluate.suites import suite_of
 
     suite = suite_of(name)
     if options["flags"].get("image_size") is None:
@@ -116,11 +116,11 @@ def run_variant(suite: Suite, variant: Variant, source: Path, place: Path, optio
     """One scene in one variant: a run's own stages on the frames that the protocol picks."""
     import numpy as np
 
-    from pipelines.job import open_job
-    from pipelines.steps_capture import find_camera_poses, find_capture, make_views, measure_scene
-    from pipelines.steps_results import fit_radiance_field, render_test_views
-    from toolkit.evaluate.compare_score import compare_views
-    from toolkit.evaluate.report import plain
+    from fieldfuse.evaluate.compare_score import compare_views
+    from fieldfuse.evaluate.report import plain
+    from fieldfuse.pipelines.job import open_job
+    from fieldfuse.pipelines.steps_capture import find_camera_poses, find_capture, make_views, measure_scene
+    from fieldfuse.pipelines.steps_results import fit_radiance_field, render_test_views
 
     start = time.monotonic()
     with open_job(source, place, options, progress) as job:
@@ -157,9 +157,9 @@ def run_variant(suite: Suite, variant: Variant, source: Path, place: Path, optio
 
 def render_directly(job: Job, views: Views, scene: Scene) -> Pictures:
     """The stage `direct`: the networks' field, not fitted, at the test views."""
-    from pipelines.direct_field import direct_field, weights_state
-    from pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture
-    from toolkit.render.image import render_view
+    from fieldfuse.pipelines.direct_field import direct_field, weights_state
+    from fieldfuse.pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture
+    from fieldfuse.render.image import render_view
 
     kept, settings = job.folder / "renders" / "direct.safetensors", job.settings
 
@@ -186,13 +186,13 @@ def render_directly(job: Job, views: Views, scene: Scene) -> Pictures:
 
 def put(suite: Suite, rows: list[dict[str, Any]], out: Path, options: dict[str, Any]) -> dict[str, Any]:
     """Write what there is so far."""
-    from pipelines.folder import command_line
-    from pipelines.job import read_settings
-    from toolkit import __version__
-    from toolkit.config import settings_dict
-    from toolkit.evaluate.suites.base import PAPER
-    from toolkit.evaluate.suites.tables import suite_table
-    from toolkit.files import atomic_path, write_json
+    from fieldfuse import __version__
+    from fieldfuse.config import settings_dict
+    from fieldfuse.evaluate.suites.base import PAPER
+    from fieldfuse.evaluate.suites.tables import suite_table
+    from fieldfuse.files import atomic_path, write_json
+    from fieldfuse.pipelines.folder import command_line
+    from fieldfuse.pipelines.job import read_settings
 
     settings = read_settings(options)
     reported = {variant.key: variant.reported for variant in suite.variants if variant.reported}
@@ -216,7 +216,7 @@ def put(suite: Suite, rows: list[dict[str, Any]], out: Path, options: dict[str, 
 def _machine(settings: Any) -> dict[str, Any]:
     import os
 
-    from toolkit.evaluate.speed import machine
+    from fieldfuse.evaluate.speed import machine
 
     about = machine(settings.threads or os.cpu_count() or 1)
     return {**about, "device": settings.device, "measured": time.strftime("%Y-%m-%d %H:%M")}

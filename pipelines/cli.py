@@ -16,7 +16,9 @@ from typing import Annotated
 
 import typer
 
-from pipelines import (
+from fieldfuse import __version__
+from fieldfuse.errors import FieldfuseError, Interrupted
+from fieldfuse.pipelines import (
     bake,
     bench,
     bench_captures,
@@ -39,9 +41,7 @@ from pipelines import (
     tsdf,
     view,
 )
-from pipelines.options import Json
-from toolkit import __version__
-from toolkit.errors import FieldfuseError, Interrupted
+from fieldfuse.pipelines.options import Json
 
 STOPPED = 130
 
@@ -71,7 +71,7 @@ def doctor(json: Json = False) -> None:
     """Look at this machine: libraries, versions, devices, and what to do about what is missing."""
     from dataclasses import asdict
 
-    from pipelines import doctor as examination
+    from fieldfuse.pipelines import doctor as examination
 
     checks = examination.collect()
     if json:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pipelines.options import (
+from fieldfuse.pipelines.options import (
     Budget,
     Config,
     Device,
@@ -60,7 +60,7 @@ def compare(
 
     With the folder of an earlier run its results are used as they are. A capture with `ground_truth/mesh.ply` has its meshes measured.
     """
-    from pipelines.thread_limits import bound_threads
+    from fieldfuse.pipelines.thread_limits import bound_threads
 
     flags = {"budget": budget, "image_size": image_size, "holdout": holdout, "device": device, "threads": threads, "seed": seed}
     wanted = list(pairs or [])
@@ -70,7 +70,7 @@ def compare(
         wanted.insert(0, DEPTH_FROM)
     options = gather(preset, config, wanted, **flags, **{"poses.source": poses})
     bound_threads(options)
-    from pipelines.console import make_progress
+    from fieldfuse.pipelines.console import make_progress
 
     data = compare_run(target, out, options, depth, make_progress(quiet))
     show(data, target if out is None else out, quiet, json)
@@ -82,13 +82,13 @@ def compare_run(target: Path, out: Path | None, options: dict[str, Any], depth: 
     Raises:
         InputError: no test views, or depth that the capture does not bring.
     """
-    from pipelines.comparison import put_comparison
-    from pipelines.job import open_job
-    from pipelines.reconstruct import BEFORE, FOR_FIELD, RESULTS, stand
-    from pipelines.steps_compare import SURFACES, Compared, choose_surfaces, measure, not_fitted
-    from pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views
-    from toolkit.errors import InputError
-    from toolkit.evaluate.compare_truth import find_truth
+    from fieldfuse.errors import InputError
+    from fieldfuse.evaluate.compare_truth import find_truth
+    from fieldfuse.pipelines.comparison import put_comparison
+    from fieldfuse.pipelines.job import open_job
+    from fieldfuse.pipelines.reconstruct import BEFORE, FOR_FIELD, RESULTS, stand
+    from fieldfuse.pipelines.steps_compare import SURFACES, Compared, choose_surfaces, measure, not_fitted
+    from fieldfuse.pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views
 
     start = time.monotonic()
     with open_job(target, out, options, progress, (*BEFORE, *FOR_FIELD, *RESULTS, *SURFACES.values())) as job:
@@ -108,8 +108,8 @@ def compare_run(target: Path, out: Path | None, options: dict[str, Any], depth: 
 
 def show(data: dict[str, Any], folder: Path, quiet: bool, as_json: bool) -> None:
     """The result on stdout: JSON, or the table and where the page is."""
-    from pipelines.console import columns
-    from toolkit.evaluate.compare_text import comparison_text
+    from fieldfuse.evaluate.compare_text import comparison_text
+    from fieldfuse.pipelines.console import columns
 
     if as_json:
         sys.stdout.write(writer.dumps(data, indent=1) + "\n")

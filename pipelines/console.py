@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import IO, Any
 
-from toolkit.errors import FieldfuseError
-from toolkit.progress import Progress
+from fieldfuse.errors import FieldfuseError
+from fieldfuse.progress import Progress
 
 AGAIN = 0.02  # seconds until an interrupt that got lost is told again
 PLAIN_EVERY = 10.0  # seconds between two lines where there is no terminal
@@ -215,7 +215,7 @@ def make_progress(quiet: bool = False, stream: IO[str] | None = None) -> Console
 
 def show_table(data: dict[str, Any], stream: IO[str] | None = None) -> None:
     """The report's numbers as one table."""
-    from toolkit.evaluate.table import WIDEST, table  # rich and the metrics are needed only here
+    from fieldfuse.evaluate.table import WIDEST, table  # rich and the metrics are needed only here
 
     stream = stream or sys.stdout
     stream.write(str(table(data, min(columns(stream) or WIDEST, WIDEST))).rstrip() + "\n")

@@ -6,10 +6,10 @@ import sys
 import time
 from pathlib import Path
 
-from pipelines import cli
-from pipelines.console import make_progress
-from toolkit.errors import FieldfuseError, Interrupted
-from toolkit.simulate.demo import write_demo_video
+from fieldfuse.errors import FieldfuseError, Interrupted
+from fieldfuse.pipelines import cli
+from fieldfuse.pipelines.console import make_progress
+from fieldfuse.simulate.demo import write_demo_video
 
 FOLDER = Path("demo")
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from toolkit.capture.types import Views
-    from toolkit.config import Settings
-    from toolkit.poses.scene import Scene
-    from toolkit.progress import Progress
-    from toolkit.render.field import Field
+    from fieldfuse.capture.types import Views
+    from fieldfuse.config import Settings
+    from fieldfuse.poses.scene import Scene
+    from fieldfuse.progress import Progress
+    from fieldfuse.render.field import Field
 
 
 @dataclass(frozen=True)
@@ -32,14 +32,14 @@ class DirectField:
 
 def weights_of(settings: Settings) -> Path:
     """The file of the networks that the settings name, else the shipped one."""
-    from toolkit.training.from_network import SHIPPED
+    from fieldfuse.training.from_network import SHIPPED
 
     return Path(settings.network.weights) if settings.network.weights else SHIPPED
 
 
 def weights_state(settings: Settings) -> str:
     """Changes with the weights, so that results of earlier ones are not reused."""
-    from toolkit.files import fingerprint
+    from fieldfuse.files import fingerprint
 
     return fingerprint(weights_of(settings))
 
@@ -57,9 +57,9 @@ def direct_field(
         InputError: there is no training view, or no weights.
         Interrupted: the user asked to stop.
     """
-    from toolkit.evaluate.few_views import Ground
-    from toolkit.keyframes import KeyFrames
-    from toolkit.training.from_network import Inference, NetworkOptions, load_networks, voxels_to_median
+    from fieldfuse.evaluate.few_views import Ground
+    from fieldfuse.keyframes import KeyFrames
+    from fieldfuse.training.from_network import Inference, NetworkOptions, load_networks, voxels_to_median
 
     keys = Ground(views, scene, settings).keys()
     if share < 1:

@@ -166,7 +166,7 @@ def _torch() -> Check:
     count = torch.get_num_threads()
     threads = f"{count} thread{'' if count == 1 else 's'}"
     if torch.cuda.is_available():
-        from toolkit.gpu import runs_kernels
+        from fieldfuse.gpu import runs_kernels
 
         seen = f"CUDA, {torch.cuda.get_device_name(0)}; CPU with {threads}"
         if runs_kernels(torch.device("cuda")):
@@ -223,8 +223,8 @@ def _package(name: str, package: str, without: str, ask: str) -> Check:
 
 
 def _xfeat() -> Check:
-    from toolkit.errors import InputError
-    from toolkit.poses.xfeat import INSTALL, installed
+    from fieldfuse.errors import InputError
+    from fieldfuse.poses.xfeat import INSTALL, installed
 
     try:
         network = installed()
@@ -236,7 +236,7 @@ def _xfeat() -> Check:
 
 
 def _lpips() -> Check:
-    from toolkit.evaluate.perceptual import lpips_available
+    from fieldfuse.evaluate.perceptual import lpips_available
 
     if lpips_available():
         return Check("lpips", OK, "weights installed")

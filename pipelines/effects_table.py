@@ -14,14 +14,14 @@ def effects_facts(target: Path, quiet: bool) -> dict[str, Any]:
     Raises:
         InputError: a source without poses: shared points cannot be told from wrong matches without them.
     """
-    from pipelines.console import make_progress
-    from pipelines.folder import is_run_folder
-    from pipelines.kept import EFFECTS, read_kept
-    from toolkit.capture import open_capture
-    from toolkit.effects.depth_camera import look_for_offset
-    from toolkit.effects.registration import DEPTH_OFFSET
-    from toolkit.effects.survey import survey
-    from toolkit.errors import InputError
+    from fieldfuse.capture import open_capture
+    from fieldfuse.effects.depth_camera import look_for_offset
+    from fieldfuse.effects.registration import DEPTH_OFFSET
+    from fieldfuse.effects.survey import survey
+    from fieldfuse.errors import InputError
+    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.folder import is_run_folder
+    from fieldfuse.pipelines.kept import EFFECTS, read_kept
 
     if is_run_folder(target):
         if not (target / "effects.json").is_file():
@@ -57,7 +57,7 @@ def show(data: dict[str, Any]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from toolkit.evaluate.words import significant
+    from fieldfuse.evaluate.words import significant
 
     console = Console(highlight=False)
     if not console.is_terminal:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
+from fieldfuse.pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
 
 
 def evaluate(
@@ -15,7 +15,7 @@ def evaluate(
     json: Json = False,
 ) -> None:
     """Render the held-out views, score them, and write the report."""
-    from pipelines.reconstruct import BEFORE
-    from pipelines.work import work
+    from fieldfuse.pipelines.reconstruct import BEFORE
+    from fieldfuse.pipelines.work import work
 
     work(target, out, gather(None, config, pairs, threads=threads), ("render",), quiet=quiet, as_json=json, trusted=(*BEFORE, "field"))

@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
-from pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
-from toolkit.config import EXPORTS, require_formats
-from toolkit.errors import InputError
+from fieldfuse.config import EXPORTS, require_formats
+from fieldfuse.errors import InputError
+from fieldfuse.pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
 
 
 def export(
@@ -27,8 +27,8 @@ def export(
 
     --formats is for this time: what else the run was asked for is not forgotten, and files that are there of the same field stay.
     """
-    from pipelines.reconstruct import BEFORE
-    from pipelines.work import work
+    from fieldfuse.pipelines.reconstruct import BEFORE
+    from fieldfuse.pipelines.work import work
 
     wanted = None if formats is None else [name.strip() for name in formats.split(",") if name.strip()]
     if wanted == []:

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.options import Config, ImageSize, Out, Pairs, Quiet, Seed, Source, gather
+from fieldfuse.pipelines.options import Config, ImageSize, Out, Pairs, Quiet, Seed, Source, gather
 
 if TYPE_CHECKING:
-    from pipelines.job import Job
-    from toolkit.capture.types import Capture
-    from toolkit.effects.correct import Corrections
-    from toolkit.evaluate.few_views import Ground
+    from fieldfuse.capture.types import Capture
+    from fieldfuse.effects.correct import Corrections
+    from fieldfuse.evaluate.few_views import Ground
+    from fieldfuse.pipelines.job import Job
 
 ALL = "all"
 FILE = "few_views"
@@ -39,8 +39,8 @@ def few_views(
     Rows that OUT/few_views.json has already are not measured again, so an interrupted table goes on when the command is repeated. With
     other settings, or after the capture has changed, all are.
     """
-    from toolkit.evaluate.few_views import few_views_rows, few_views_table
-    from toolkit.training.from_network import load_networks
+    from fieldfuse.evaluate.few_views import few_views_rows, few_views_table
+    from fieldfuse.training.from_network import load_networks
 
     seconds, measured = numbers(budgets, "budgets"), part_of(starts)
     counts = [None if part == ALL else int(part) for part in wanted(views)]
@@ -70,8 +70,8 @@ def ablations(
     quiet: Quiet = False,
 ) -> None:
     """Direct inference with parts of the trained networks switched off: variance, direction code, GRU, pruning, second colours."""
-    from toolkit.evaluate.few_views import ablation_rows, ablation_table
-    from toolkit.training.from_network import load_networks
+    from fieldfuse.evaluate.few_views import ablation_rows, ablation_table
+    from fieldfuse.training.from_network import load_networks
 
     count = None if views == ALL else int(numbers(views, "views")[0])
     rows = []
@@ -90,7 +90,7 @@ def wanted(text: str) -> list[str]:
     Raises:
         InputError: something is neither a positive whole number nor `all`.
     """
-    from toolkit.errors import InputError
+    from fieldfuse.errors import InputError
 
     parts = [part.strip() for part in text.split(",") if part.strip()]
     for part in parts:
@@ -105,8 +105,8 @@ def part_of(text: str) -> list[str]:
     Raises:
         InputError: something is none of the starts.
     """
-    from toolkit.errors import InputError
-    from toolkit.evaluate.few_views import STARTS
+    from fieldfuse.errors import InputError
+    from fieldfuse.evaluate.few_views import STARTS
 
     parts = [part.strip() for part in text.split(",") if part.strip()]
     for part in parts:
@@ -121,7 +121,7 @@ def numbers(text: str, name: str) -> list[float]:
     Raises:
         InputError: something is not a positive number.
     """
-    from toolkit.errors import InputError
+    from fieldfuse.errors import InputError
 
     try:
         values = [float(part) for part in text.split(",") if part.strip()]
@@ -136,13 +136,13 @@ def numbers(text: str, name: str) -> list[float]:
 def opened(source: Path, out: Path, options: dict[str, Any], quiet: bool) -> Iterator[tuple[Job, Capture, Corrections]]:
     """A job of one thread on `source`, with everything up to the effects done as a run does it with all training pictures, so that poses
     are the same for every number of views."""
-    from pipelines.console import make_progress
-    from pipelines.thread_limits import bound_threads
+    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.thread_limits import bound_threads
 
     bound_threads(options)
-    from pipelines.job import open_job
-    from pipelines.steps_capture import choose_frames, find_camera_poses, find_capture
-    from pipelines.steps_effects import find_effects
+    from fieldfuse.pipelines.job import open_job
+    from fieldfuse.pipelines.steps_capture import choose_frames, find_camera_poses, find_capture
+    from fieldfuse.pipelines.steps_effects import find_effects
 
     with open_job(source, out, options, make_progress(quiet)) as job:
         capture = choose_frames(job, find_capture(job))
@@ -153,10 +153,10 @@ def opened(source: Path, out: Path, options: dict[str, Any], quiet: bool) -> Ite
 
 def ground_of(job: Job, posed: Capture, count: int | None, corrections: Corrections) -> Ground:
     """The capture with `count` of its training views (None: all), as a run would prepare it."""
-    from toolkit.capture.prepare import prepare_views
-    from toolkit.capture.subset import limited
-    from toolkit.evaluate.few_views import Ground
-    from toolkit.poses.scene import describe_scene
+    from fieldfuse.capture.prepare import prepare_views
+    from fieldfuse.capture.subset import limited
+    from fieldfuse.evaluate.few_views import Ground
+    from fieldfuse.poses.scene import describe_scene
 
     some = limited(posed, job.settings.capture.holdout, count)
     scene = describe_scene(some, job.progress)
@@ -166,9 +166,9 @@ def ground_of(job: Job, posed: Capture, count: int | None, corrections: Correcti
 
 def state_of(job: Job) -> str:
     """Changes with whatever rows depend on, but for what they say of themselves: settings, weights, and what was made of the capture."""
-    from pipelines.direct_field import weights_state
-    from toolkit.config import settings_dict
-    from toolkit.files import fingerprint
+    from fieldfuse.config import settings_dict
+    from fieldfuse.files import fingerprint
+    from fieldfuse.pipelines.direct_field import weights_state
 
     settings = settings_dict(job.settings)
     settings["fit"] = {key: value for key, value in settings["fit"].items() if key != "budget"}
@@ -177,7 +177,7 @@ def state_of(job: Job) -> str:
 
 def rows_of(job: Job, state: str) -> list[dict[str, Any]]:
     """Rows that an earlier call kept; none when they are of another `state`."""
-    from pipelines.kept import FEW_VIEWS, read_kept
+    from fieldfuse.pipelines.kept import FEW_VIEWS, read_kept
 
     path = job.folder / f"{FILE}.json"
     kept: dict[str, Any] = read_kept(path, FEW_VIEWS) if path.is_file() else {"rows": []}
@@ -188,9 +188,9 @@ def rows_of(job: Job, state: str) -> list[dict[str, Any]]:
 
 
 def keep_rows(job: Job, name: str, rows: list[dict[str, Any]], table: str, **more: str) -> None:
-    from toolkit.config import settings_dict
-    from toolkit.evaluate.speed import machine
-    from toolkit.files import atomic_path, write_json
+    from fieldfuse.config import settings_dict
+    from fieldfuse.evaluate.speed import machine
+    from fieldfuse.files import atomic_path, write_json
 
     about = {"source": str(job.source), "machine": machine(1), "settings": settings_dict(job.settings), **more, "rows": rows}
     write_json(job.folder / f"{name}.json", about)

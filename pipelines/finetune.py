@@ -2,7 +2,21 @@
 
 from __future__ import annotations
 
-from pipelines.options import Budget, Config, Decoder, Device, Engine, Json, OptionalOut, Pairs, Quiet, Seed, Target, Threads, gather
+from fieldfuse.pipelines.options import (
+    Budget,
+    Config,
+    Decoder,
+    Device,
+    Engine,
+    Json,
+    OptionalOut,
+    Pairs,
+    Quiet,
+    Seed,
+    Target,
+    Threads,
+    gather,
+)
 
 
 def finetune(
@@ -25,7 +39,7 @@ def finetune(
     With other settings of the field itself (its decoder, say) it is fitted anew on the same pictures and poses; the field of a run with
     --no-finetune is the start of the fit.
     """
-    from pipelines.work import work
+    from fieldfuse.pipelines.work import work
 
     flags = {"budget": budget, "device": device, "threads": threads, "seed": seed, "engine": engine, "decoder": decoder, "finetune": True}
     work(target, out, gather(None, config, pairs, **flags), ("field", "render", "export"), quiet=quiet, as_json=json, go_on=True)

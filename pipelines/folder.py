@@ -15,10 +15,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
-from toolkit import __version__
-from toolkit.config import Settings, settings_dict
-from toolkit.errors import FieldfuseError, InputError, Interrupted, OutputError, first_line
-from toolkit.files import atomic_path, read_json, remove, require_utf8, write_json
+from fieldfuse import __version__
+from fieldfuse.config import Settings, settings_dict
+from fieldfuse.errors import FieldfuseError, InputError, Interrupted, OutputError, first_line
+from fieldfuse.files import atomic_path, read_json, remove, require_utf8, write_json
 
 LOCK = ".lock"
 RUN = "run.json"
@@ -55,7 +55,7 @@ FILES = (
 )
 BUSY = "another fieldfuse command is working in {}; wait for it to end or choose another --out folder"
 FOREIGN = "{} holds {!r} but no fieldfuse run; choose a new or empty --out folder so that nothing of yours is replaced"
-TEMPORARY = re.compile(r"\.tmp-\d+-|\.tmp[A-Za-z0-9]{6}$")  # as toolkit.files.atomic_path names them, and safetensors its own
+TEMPORARY = re.compile(r"\.tmp-\d+-|\.tmp[A-Za-z0-9]{6}$")  # as fieldfuse.files.atomic_path names them, and safetensors its own
 WRITE_ERRORS = {errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EIO}
 WRITE_PHRASES = ("no space left", "file too large", "disk quota", "read-only file system", "disk i/o error", "database or disk is full")
 

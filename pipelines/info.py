@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.options import Json, Quiet
+from fieldfuse.pipelines.options import Json, Quiet
 
 if TYPE_CHECKING:
-    from toolkit.capture.types import Capture
-    from toolkit.progress import Progress
+    from fieldfuse.capture.types import Capture
+    from fieldfuse.progress import Progress
 
 
 OUTDATED = (
@@ -31,11 +31,11 @@ def info(
     json: Json = False,
 ) -> None:
     """Tell what was detected: kind, counts, sizes, lenses, depth, warnings."""
-    from pipelines.folder import is_run_folder
+    from fieldfuse.pipelines.folder import is_run_folder
 
     data = run_facts(target) if is_run_folder(target) else source_facts(target, fast, quiet or json)
     if effects:
-        from pipelines.effects_table import effects_facts
+        from fieldfuse.pipelines.effects_table import effects_facts
 
         data["effects"] = effects_facts(target, quiet or json)
     if json:
@@ -44,7 +44,7 @@ def info(
         typer.echo(writer.dumps(data, indent=1))
     else:
         if effects:
-            from pipelines.effects_table import show
+            from fieldfuse.pipelines.effects_table import show
 
             show(data.pop("effects"))
         for key, value in for_people(data).items():
@@ -54,12 +54,12 @@ def info(
 
 def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
     """Facts of a capture; with `fast` no pixel is decoded."""
-    from pipelines.console import make_progress
-    from pipelines.summary import describe_capture
-    from toolkit.capture import open_capture
-    from toolkit.capture.beside import unused
-    from toolkit.capture.checks import check_capture
-    from toolkit.poses.check_given import best_fitting
+    from fieldfuse.capture import open_capture
+    from fieldfuse.capture.beside import unused
+    from fieldfuse.capture.checks import check_capture
+    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.summary import describe_capture
+    from fieldfuse.poses.check_given import best_fitting
 
     capture, agreement = open_capture(source, choose=None if fast else best_fitting), None
     if not fast:
@@ -86,9 +86,9 @@ def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
 
 def check_poses(capture: Capture, progress: Progress) -> tuple[str | None, list[str]]:
     """How well the poses that a capture brings fit its images, in a line, and what a run would warn of or refuse."""
-    from toolkit.errors import PoseError
-    from toolkit.poses.check_given import Agreement, check_given
-    from toolkit.poses.given import given_poses
+    from fieldfuse.errors import PoseError
+    from fieldfuse.poses.check_given import Agreement, check_given
+    from fieldfuse.poses.given import given_poses
 
     if capture.filmed or not capture.posed:
         return None, []
@@ -111,8 +111,8 @@ def lenses(capture: Capture) -> list[dict[str, Any]]:
 
 def run_facts(folder: Path) -> dict[str, Any]:
     """What a run's folder holds."""
-    from pipelines.folder import RunFolder
-    from pipelines.stages import finished_stages, outdated
+    from fieldfuse.pipelines.folder import RunFolder
+    from fieldfuse.pipelines.stages import finished_stages, outdated
 
     run = RunFolder(folder)
     about = run.about()
@@ -141,8 +141,8 @@ def run_facts(folder: Path) -> dict[str, Any]:
 
 def scores_of(path: Path) -> dict[str, dict[str, float]]:
     """What was scored, and how well; empty when nothing was, or the file cannot be read: the run's other facts are told all the same."""
-    from pipelines.kept import EVALUATION, read_kept
-    from toolkit.errors import InputError
+    from fieldfuse.errors import InputError
+    from fieldfuse.pipelines.kept import EVALUATION, read_kept
 
     try:
         scores = read_kept(path, EVALUATION)

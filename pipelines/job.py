@@ -10,19 +10,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines.console import ConsoleProgress
-from pipelines.folder import RunFolder, is_run_folder
-from pipelines.stages import Stages
-from pipelines.thread_limits import THREAD_VARIABLES
-from toolkit.config import Settings, load_settings
-from toolkit.errors import InputError
+from fieldfuse.config import Settings, load_settings
+from fieldfuse.errors import InputError
+from fieldfuse.pipelines.console import ConsoleProgress
+from fieldfuse.pipelines.folder import RunFolder, is_run_folder
+from fieldfuse.pipelines.stages import Stages
+from fieldfuse.pipelines.thread_limits import THREAD_VARIABLES
 
 if TYPE_CHECKING:
-    from pipelines.steps_network import NetworkField
-    from pipelines.total_budget import TotalBudget
-    from toolkit.effects.correct import Corrections
-    from toolkit.keyframes import KeyFrames
-    from toolkit.poses.points import Features
+    from fieldfuse.effects.correct import Corrections
+    from fieldfuse.keyframes import KeyFrames
+    from fieldfuse.pipelines.steps_network import NetworkField
+    from fieldfuse.pipelines.total_budget import TotalBudget
+    from fieldfuse.poses.points import Features
 
 CAMERAS = "transforms.json"
 MOST_A_CORE, LEAST_MOST_THREADS = 4, 64  # threads that may be asked for: more of them only wait for each other
@@ -125,7 +125,7 @@ def _check_same_source(folder: RunFolder, source: Path) -> None:
     if before.resolve() == source.resolve():
         return
     if not before.exists():
-        from pipelines.moved import follow, same_capture
+        from fieldfuse.pipelines.moved import follow, same_capture
 
         if same_capture(folder, source):
             follow(folder, before, source)
@@ -207,7 +207,7 @@ def check_engine(engine: str, device: str) -> None:
     """
     import torch
 
-    from toolkit.gpu import runs_kernels
+    from fieldfuse.gpu import runs_kernels
 
     if engine == "triton" and not runs_kernels(torch.device(device)):
         why = "Triton for it is not installed, or it is too old" if device == "cuda" else f"the device is {device!r}"

@@ -6,8 +6,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from toolkit.errors import InputError
-from toolkit.files import read_json
+from fieldfuse.errors import InputError
+from fieldfuse.files import read_json
 
 NUMBER = "a number"
 TEXT = "text"

@@ -18,17 +18,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.render_path import read_cameras
-from pipelines.visitor import COLOURS, DEPTH, OPACITY, SMALLEST, Visitor, lens_of, pose_of
-from toolkit.camera import Array, Intrinsics, Similarity
-from toolkit.errors import FieldfuseError, InputError
-from toolkit.export.cameras import transforms
-from toolkit.files import write_json
+from fieldfuse.camera import Array, Intrinsics, Similarity
+from fieldfuse.errors import FieldfuseError, InputError
+from fieldfuse.export.cameras import transforms
+from fieldfuse.files import write_json
+from fieldfuse.pipelines.render_path import read_cameras
+from fieldfuse.pipelines.visitor import COLOURS, DEPTH, OPACITY, SMALLEST, Visitor, lens_of, pose_of
 
 if TYPE_CHECKING:
     import viser
 
-    from toolkit.capture.types import Views
+    from fieldfuse.capture.types import Views
 
 MOST_CAMERAS = 150  # that are drawn
 FRUSTUM = 0.06  # of the median depth
@@ -142,7 +142,7 @@ class Live:
 
     def _furnish(self) -> None:
         """Controls, the capture's cameras, and where a visitor begins: at the first of them."""
-        from toolkit.evaluate.pictures import spread
+        from fieldfuse.evaluate.pictures import spread
 
         gui, scene, views = self.server.gui, self.server.scene, self.shown.views
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)

@@ -7,10 +7,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from pipelines.folder import STAGES, RunFolder
-from pipelines.stages import read_record, stage_key
-from pipelines.steps_capture import source_state
-from toolkit.files import read_json, write_json
+from fieldfuse.files import read_json, write_json
+from fieldfuse.pipelines.folder import STAGES, RunFolder
+from fieldfuse.pipelines.stages import read_record, stage_key
+from fieldfuse.pipelines.steps_capture import source_state
 
 KEEPERS = {"capture": "capture.json", "frames": "frames/capture.json"}  # stage → its file that says where pictures lie
 

@@ -52,5 +52,5 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on 
 
 
 def gather(preset: str | None = None, config: Path | None = None, pairs: list[str] | None = None, **flags: Any) -> dict[str, Any]:
-    """Flags of a command → the options that `pipelines.job.read_settings` takes."""
+    """Flags of a command → the options that `fieldfuse.pipelines.job.read_settings` takes."""
     return {"preset": preset, "config": config, "pairs": list(pairs or []), "flags": flags}

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.baking import baked
-from pipelines.pictures import orbit_cameras
+from fieldfuse.pipelines.baking import baked
+from fieldfuse.pipelines.pictures import orbit_cameras
 
 if TYPE_CHECKING:
-    from pipelines.job import Job
-    from toolkit.capture.types import Views
-    from toolkit.poses.scene import Scene
-    from toolkit.render.field import Field
+    from fieldfuse.capture.types import Views
+    from fieldfuse.pipelines.job import Job
+    from fieldfuse.poses.scene import Scene
+    from fieldfuse.render.field import Field
 
 PAGE = "page"  # as `export.formats` has it
 NAME = "field.html"
@@ -26,7 +26,7 @@ def put_page(job: Job, path: Path, field: Field, views: Views, scene: Scene) -> 
         InputError: a decoder that cannot be baked, or is too wide for a page.
         OutputError: the file cannot be written.
     """
-    from toolkit.export.page import Tour, require_page, write_page
+    from fieldfuse.export.page import Tour, require_page, write_page
 
     require_page(field)
     _, _, around = orbit_cameras(views, scene, FLIGHT)

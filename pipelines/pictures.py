@@ -7,25 +7,25 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from pipelines.baking import baked_of
-from pipelines.rendered import to_picture
-from toolkit.camera import Array, Intrinsics
-from toolkit.progress import Progress
-from toolkit.tone import exposed
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.pipelines.baking import baked_of
+from fieldfuse.pipelines.rendered import to_picture
+from fieldfuse.progress import Progress
+from fieldfuse.tone import exposed
 
 if TYPE_CHECKING:
-    from pipelines.job import Job
-    from toolkit.capture.types import Views
-    from toolkit.poses.scene import Scene
-    from toolkit.render.field import Field
+    from fieldfuse.capture.types import Views
+    from fieldfuse.pipelines.job import Job
+    from fieldfuse.poses.scene import Scene
+    from fieldfuse.render.field import Field
 
 Camera = Callable[[Intrinsics, Array], Any]  # lens, pose → a `Rendered`
 
 
 def camera_of(job: Job, field: Field, views: Views, scene: Scene, baked: bool) -> Camera:
     """What takes pictures of the field, or of its baked copy, as bright as the training pictures are."""
-    from toolkit.render.bake_image import BakedRenderer
-    from toolkit.render.image import make_renderer, render_view
+    from fieldfuse.render.bake_image import BakedRenderer
+    from fieldfuse.render.image import make_renderer, render_view
 
     if baked:
         camera: Camera = BakedRenderer(baked_of(job, field, views, scene)).render
@@ -55,7 +55,7 @@ def even(lens: Intrinsics) -> Intrinsics:
 
 def orbit_cameras(views: Views, scene: Scene, frames: int) -> tuple[list[str], list[Intrinsics], Array]:
     """A closed path around what the training cameras look at."""
-    from toolkit.render.paths import orbit
+    from fieldfuse.render.paths import orbit
 
     poses = orbit(views.world_from_camera, scene.centre, frames)
     lens = even(views.intrinsics[0])

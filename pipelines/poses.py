@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipelines.options import Config, Json, OptionalOut, Pairs, PosesFrom, Quiet, Seed, Target, Threads, gather
+from fieldfuse.pipelines.options import Config, Json, OptionalOut, Pairs, PosesFrom, Quiet, Seed, Target, Threads, gather
 
 
 def poses(
@@ -17,7 +17,7 @@ def poses(
     json: Json = False,
 ) -> None:
     """Find (or read) the camera poses and write them as transforms.json and COLMAP text."""
-    from pipelines.work import work
+    from fieldfuse.pipelines.work import work
 
     options = gather(None, config, pairs, threads=threads, seed=seed, **{"poses.source": source})
     work(target, out, options, (), quiet=quiet, as_json=json, trusted=("capture", "frames"))

@@ -7,21 +7,21 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines.console import ConsoleProgress
-from pipelines.job import Job, open_job
-from pipelines.steps_capture import choose_frames, choose_keyframes, find_camera_poses, find_capture, make_views, measure_scene
-from pipelines.steps_effects import find_effects, refine
-from pipelines.steps_network import make_network_field, render_network_views, uses_network
-from pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views, score_pictures, wants_tsdf
-from pipelines.steps_stereo import reuse_matched
-from pipelines.summary import put_report, summarise_poses
-from pipelines.taken import TEXTURE, require_originals
-from pipelines.textured import TSDF_TEXTURE, texture_tsdf
+from fieldfuse.pipelines.console import ConsoleProgress
+from fieldfuse.pipelines.job import Job, open_job
+from fieldfuse.pipelines.steps_capture import choose_frames, choose_keyframes, find_camera_poses, find_capture, make_views, measure_scene
+from fieldfuse.pipelines.steps_effects import find_effects, refine
+from fieldfuse.pipelines.steps_network import make_network_field, render_network_views, uses_network
+from fieldfuse.pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views, score_pictures, wants_tsdf
+from fieldfuse.pipelines.steps_stereo import reuse_matched
+from fieldfuse.pipelines.summary import put_report, summarise_poses
+from fieldfuse.pipelines.taken import TEXTURE, require_originals
+from fieldfuse.pipelines.textured import TSDF_TEXTURE, texture_tsdf
 
 if TYPE_CHECKING:
-    from toolkit.capture.types import Capture, Views
-    from toolkit.poses.result import PoseResult
-    from toolkit.poses.scene import Scene
+    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.poses.result import PoseResult
+    from fieldfuse.poses.scene import Scene
 
 BEFORE = ("capture", "frames", "poses", "effects", "scene", "keyframes", "views")  # what every result stands on
 RESULTS = ("tsdf", "field", "render", "export")
@@ -41,7 +41,7 @@ def run_job(
     """Open the run's folder and make `goals` in it, with all that they need; see `open_job` for the arguments."""
     with open_job(target, out, options, progress, trusted) as job:
         if options.get("total_budget") is not None:
-            from pipelines.total_budget import TotalBudget
+            from fieldfuse.pipelines.total_budget import TotalBudget
 
             job.plan = TotalBudget(options["total_budget"])
         wanted = frozenset(goals)
@@ -51,7 +51,7 @@ def run_job(
 
 def stand(job: Job) -> tuple[Capture, PoseResult, Capture, Scene, Views]:
     """What every result stands on: capture, poses, the posed capture (as far as it takes part), the scene, and the views made ready."""
-    from toolkit.capture.subset import limited
+    from fieldfuse.capture.subset import limited
 
     capture = find_capture(job)
     if job.plan is not None:

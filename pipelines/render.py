@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pipelines.options import Baked, Config, Device, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
+from fieldfuse.pipelines.options import Baked, Config, Device, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
 
 
 def render(
@@ -32,11 +32,11 @@ def render(
     json: Json = False,
 ) -> None:
     """Render the field of a run (of a source, it is fitted first)."""
-    from pipelines.thread_limits import bound_threads
+    from fieldfuse.pipelines.thread_limits import bound_threads
 
     options = gather(None, config, pairs, device=device, threads=threads)
     bound_threads(options)
-    from pipelines.render_path import render_run
+    from fieldfuse.pipelines.render_path import render_run
 
     what: dict[str, Any] = {"views": views, "cameras": cameras, "frames": frames, "image_size": image_size, "baked": baked}
     data = render_run(target, out, options, **what, to=to, fps=fps, quiet=quiet)

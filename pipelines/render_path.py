@@ -12,20 +12,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.console import make_progress
-from pipelines.job import Job, open_job
-from pipelines.pictures import Camera, camera_of, orbit_cameras, pictures
-from pipelines.reconstruct import BEFORE, stand
-from pipelines.rendered import file_name, write_png
-from pipelines.room import require_pictures
-from pipelines.steps_results import fit_radiance_field
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture import nerf_json
-from toolkit.errors import InputError
-from toolkit.files import read_json, remove
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture import nerf_json
+from fieldfuse.errors import InputError
+from fieldfuse.files import read_json, remove
+from fieldfuse.pipelines.console import make_progress
+from fieldfuse.pipelines.job import Job, open_job
+from fieldfuse.pipelines.pictures import Camera, camera_of, orbit_cameras, pictures
+from fieldfuse.pipelines.reconstruct import BEFORE, stand
+from fieldfuse.pipelines.rendered import file_name, write_png
+from fieldfuse.pipelines.room import require_pictures
+from fieldfuse.pipelines.steps_results import fit_radiance_field
 
 if TYPE_CHECKING:
-    from toolkit.capture.types import Views
+    from fieldfuse.capture.types import Views
 
 VIDEO = (".mp4",)
 NUMBERED = re.compile(r"\d{4,}_.*\.png")
@@ -97,7 +97,7 @@ def write(
     """
     frames = pictures(camera, lenses, poses, job.progress)
     if to.suffix.lower() in VIDEO:
-        from toolkit.export.video import write_video
+        from fieldfuse.export.video import write_video
 
         if len({(lens.width, lens.height) for lens in lenses}) > 1:
             raise InputError("a video needs pictures of one size and these cameras differ; give a folder with --to, or --image-size")

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from toolkit.errors import InputError, OutputError, first_line
-from toolkit.files import atomic_path
-from toolkit.tone import exposed
+from fieldfuse.errors import InputError, OutputError, first_line
+from fieldfuse.files import atomic_path
+from fieldfuse.tone import exposed
 
 if TYPE_CHECKING:
-    from toolkit.poses.scene import Scene
+    from fieldfuse.poses.scene import Scene
 
 Array = NDArray[Any]
 DEEPEST = 2**16 - 1  # steps

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit import memory
-from toolkit.camera import Intrinsics
+from fieldfuse import memory
+from fieldfuse.camera import Intrinsics
 
 if TYPE_CHECKING:
-    from toolkit.capture.types import Views
-    from toolkit.render.field import Field
+    from fieldfuse.capture.types import Views
+    from fieldfuse.render.field import Field
 
 # Measured at 900×900: 200 bytes a pixel for a picture by torch (34 by a baked field), 240 for SSIM, 201 for LPIPS, 110 for PSNR.
 RENDER_BYTES = 260  # a pixel of the picture that is being rendered: rays, samples of a part of them, colour, depth, opacity

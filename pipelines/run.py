@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from pipelines.options import (
+from fieldfuse.errors import InputError
+from fieldfuse.pipelines.options import (
     Budget,
     Config,
     Decoder,
@@ -27,7 +28,6 @@ from pipelines.options import (
     Threads,
     gather,
 )
-from toolkit.errors import InputError
 
 MOST_SECONDS = 1e7  # a third of a year
 
@@ -66,7 +66,7 @@ def run(
 
     Run the same command again after an interruption: what is finished is reused.
     """
-    from pipelines.work import work
+    from fieldfuse.pipelines.work import work
 
     options_given = {"--preset": preset, "--budget": budget, "--image-size": image_size}
     for name, value in options_given.items():

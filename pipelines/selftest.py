@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.options import Json, Quiet, Threads
+from fieldfuse.pipelines.options import Json, Quiet, Threads
 
 if TYPE_CHECKING:
-    from toolkit.evaluate.selftest.case import Measure, Outcome
+    from fieldfuse.evaluate.selftest.case import Measure, Outcome
 
 
 def selftest(
@@ -25,10 +25,10 @@ def selftest(
     json: Json = False,
 ) -> None:
     """Run the hard cases: each kernel where numbers usually break. Ends with 1 if a bound is missed."""
-    from pipelines.thread_limits import bound_threads
+    from fieldfuse.pipelines.thread_limits import bound_threads
 
     bound_threads({"flags": {"threads": threads}})
-    from pipelines.job import set_threads
+    from fieldfuse.pipelines.job import set_threads
 
     set_threads(threads)
     outcomes = run(fast, only, quiet or json)
@@ -50,8 +50,8 @@ def run(fast: bool, only: str | None, quiet: bool) -> list[Outcome]:
     """
     import numpy as np
 
-    from toolkit.errors import InputError
-    from toolkit.evaluate.selftest.case import all_cases, run_cases
+    from fieldfuse.errors import InputError
+    from fieldfuse.evaluate.selftest.case import all_cases, run_cases
 
     chosen = [case for case in all_cases() if not (fast and case.slow) and (only is None or only.lower() in case.title.lower())]
     if not chosen:

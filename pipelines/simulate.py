@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.options import Json, Quiet, Seed
+from fieldfuse.pipelines.options import Json, Quiet, Seed
 
 
 def simulate(
@@ -25,9 +25,9 @@ def simulate(
     json: Json = False,
 ) -> None:
     """Film a procedural or mesh scene into a capture with ground truth beside it."""
-    from pipelines.console import make_progress
-    from toolkit.simulate.settings import read_scene_file
-    from toolkit.simulate.simulate import simulate as film_scene
+    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.simulate.settings import read_scene_file
+    from fieldfuse.simulate.simulate import simulate as film_scene
 
     path = find_scene(scene)
     settings = read_scene_file(path)
@@ -58,7 +58,7 @@ def find_scene(name: str) -> Path:
     """
     from importlib import resources
 
-    from toolkit.errors import InputError
+    from fieldfuse.errors import InputError
 
     path = Path(name)
     if path.is_file():

@@ -15,13 +15,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pipelines.console import ConsoleProgress
-from pipelines.folder import STAGES, RunFolder
-from pipelines.memory import PeakMemory
-from toolkit import __version__, libraries
-from toolkit.errors import FieldfuseError, InputError
-from toolkit.files import fingerprint, read_json, remove, write_json
-from toolkit.memory import give_back
+from fieldfuse import __version__, libraries
+from fieldfuse.errors import FieldfuseError, InputError
+from fieldfuse.files import fingerprint, read_json, remove, write_json
+from fieldfuse.memory import give_back
+from fieldfuse.pipelines.console import ConsoleProgress
+from fieldfuse.pipelines.folder import STAGES, RunFolder
+from fieldfuse.pipelines.memory import PeakMemory
 
 LONG = 0.5  # seconds of a stage after which pages of libraries are given back; shorter ones load little
 T = TypeVar("T")

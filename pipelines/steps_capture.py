@@ -8,29 +8,29 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines.job import Job, set_seeds
-from pipelines.room import require_file
-from toolkit.errors import InputError
-from toolkit.files import fingerprint, read_json, write_json
+from fieldfuse.errors import InputError
+from fieldfuse.files import fingerprint, read_json, write_json
+from fieldfuse.pipelines.job import Job, set_seeds
+from fieldfuse.pipelines.room import require_file
 
 if TYPE_CHECKING:
-    from toolkit.capture.types import Capture, Frame, Views
-    from toolkit.effects.correct import Corrections
-    from toolkit.keyframes import KeyFrames
-    from toolkit.poses.result import PoseResult
-    from toolkit.poses.scene import Scene
+    from fieldfuse.capture.types import Capture, Frame, Views
+    from fieldfuse.effects.correct import Corrections
+    from fieldfuse.keyframes import KeyFrames
+    from fieldfuse.poses.result import PoseResult
+    from fieldfuse.poses.scene import Scene
 
 MAX_LISTED = 200_000  # files of a source that are looked at for changes
 
 
 def find_capture(job: Job) -> Capture:
     """Detect what the source is, read what it says, look at every picture once (at those that `choose_frames` writes, then)."""
-    from toolkit.capture import open_capture
-    from toolkit.capture.checks import check_capture
-    from toolkit.capture.convert import to_convert
-    from toolkit.capture.photos import with_unposed
-    from toolkit.capture.storage import capture_from_dict, capture_to_dict
-    from toolkit.poses.check_given import best_fitting
+    from fieldfuse.capture import open_capture
+    from fieldfuse.capture.checks import check_capture
+    from fieldfuse.capture.convert import to_convert
+    from fieldfuse.capture.photos import with_unposed
+    from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
+    from fieldfuse.poses.check_given import best_fitting
 
     path = job.folder / "capture.json"
     masks = job.settings.capture.masks
@@ -56,9 +56,9 @@ def find_capture(job: Job) -> Capture:
 
 def choose_frames(job: Job, capture: Capture) -> Capture:
     """Pictures of a video or a film, and JPEGs of HEIF and mirrored pictures; other captures pass as they are."""
-    from toolkit.capture.convert import convert_pictures, to_convert
-    from toolkit.capture.select import select_frames
-    from toolkit.capture.storage import capture_from_dict, capture_to_dict
+    from fieldfuse.capture.convert import convert_pictures, to_convert
+    from fieldfuse.capture.select import select_frames
+    from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
 
     video = capture.filmed
     if not video and not to_convert(capture):
@@ -90,7 +90,7 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
 
 def at_home(chosen: Capture, folder: Path) -> Capture:
     """The capture with what was written to a run's `frames` where that is now: the run's folder may have been moved."""
-    from toolkit.capture.film import DEPTH
+    from fieldfuse.capture.film import DEPTH
 
     def here(frame: Frame) -> Frame:
         if not (frame.image.parent.name == folder.name and (folder / frame.image.name).is_file()):
@@ -110,12 +110,12 @@ def last_of(job: Job, *names: str) -> list[str]:
 
 def find_camera_poses(job: Job, capture: Capture) -> PoseResult:
     """Poses that the capture brings, as its images confirm them, or structure from motion."""
-    from toolkit.poses.check_given import VERSION as CHECKED
-    from toolkit.poses.check_given import check_given
-    from toolkit.poses.given import given_poses
-    from toolkit.poses.job import VERSION
-    from toolkit.poses.result import PoseResult
-    from toolkit.poses.sfm import find_poses
+    from fieldfuse.poses.check_given import VERSION as CHECKED
+    from fieldfuse.poses.check_given import check_given
+    from fieldfuse.poses.given import given_poses
+    from fieldfuse.poses.job import VERSION
+    from fieldfuse.poses.result import PoseResult
+    from fieldfuse.poses.sfm import find_poses
 
     settings = job.settings
     given = settings.poses.source == "given" or (settings.poses.source == "auto" and capture.posed)
@@ -151,7 +151,7 @@ def find_camera_poses(job: Job, capture: Capture) -> PoseResult:
 
 def measure_scene(job: Job, posed: Capture) -> Scene:
     """Working frame, region of interest, depth range."""
-    from toolkit.poses.scene import Scene, describe_scene
+    from fieldfuse.poses.scene import Scene, describe_scene
 
     path = job.folder / "scene.json"
 
@@ -180,8 +180,8 @@ def choose_keyframes(job: Job, scene: Scene, views: Views) -> KeyFrames:
     """Key frames among the training views and their neighbours, as indices into the training views; the file has their names."""
     import numpy as np
 
-    from toolkit.capture.subset import sharpness
-    from toolkit.keyframes import KeyFrames, select_keyframes
+    from fieldfuse.capture.subset import sharpness
+    from fieldfuse.keyframes import KeyFrames, select_keyframes
 
     if job.keys is not None:
         return job.keys
@@ -224,8 +224,8 @@ def choose_keyframes(job: Job, scene: Scene, views: Views) -> KeyFrames:
 
 def make_views(job: Job, posed: Capture, scene: Scene, corrections: Corrections | None = None) -> Views:
     """Pictures undistorted and resized once, in the working frame, test views marked, with `corrections` of colour."""
-    from toolkit.capture.prepare import prepare_views
-    from toolkit.capture.views_file import load_views, save_views
+    from fieldfuse.capture.prepare import prepare_views
+    from fieldfuse.capture.views_file import load_views, save_views
 
     path = job.folder / "views.safetensors"
 
@@ -258,7 +258,7 @@ def make_views(job: Job, posed: Capture, scene: Scene, corrections: Corrections 
 
 def source_state(source: Path, without: Path) -> str:
     """Hash of names, sizes and times of all files of the source, wherever it lies; `without` (the run's own folder) does not count."""
-    from toolkit.capture.replica import camera_file, looks_like_replica
+    from fieldfuse.capture.replica import camera_file, looks_like_replica
 
     if source.is_file() and source.suffix.lower() != ".json":
         return fingerprint(_state(source, source.parent))

@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.job import Job
-from pipelines.kept import COMPARED, read_kept
-from pipelines.rendered import Pictures
-from pipelines.room import require_meshes, require_scores
-from toolkit.errors import InputError
-from toolkit.files import write_json
+from fieldfuse.errors import InputError
+from fieldfuse.files import write_json
+from fieldfuse.pipelines.job import Job
+from fieldfuse.pipelines.kept import COMPARED, read_kept
+from fieldfuse.pipelines.rendered import Pictures
+from fieldfuse.pipelines.room import require_meshes, require_scores
 
 if TYPE_CHECKING:
-    from toolkit.camera import Array
-    from toolkit.capture.types import Capture, Views
-    from toolkit.evaluate.compare_truth import GroundTruth
-    from toolkit.poses.result import PoseResult
-    from toolkit.poses.scene import Scene
-    from toolkit.render.field import Field
-    from toolkit.tsdf.mesh import Mesh
+    from fieldfuse.camera import Array
+    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.evaluate.compare_truth import GroundTruth
+    from fieldfuse.poses.result import PoseResult
+    from fieldfuse.poses.scene import Scene
+    from fieldfuse.render.field import Field
+    from fieldfuse.tsdf.mesh import Mesh
 
 SURFACES = {"sensor": "tsdf", "matching": "tsdf_stereo", "exact": "tsdf_exact"}  # where depth comes from → stage and folder
 
@@ -69,8 +69,8 @@ def choose_surfaces(wanted: str, posed: Capture, truth: GroundTruth | None) -> l
 def not_fitted(job: Job, views: Views, scene: Scene) -> dict[str, Pictures]:
     """The networks' field without any fitting, as a method of its own; nothing without weights, where it is not wanted
     (`init=classical`), and where it is the field itself (`--no-finetune`)."""
-    from pipelines.direct_field import weights_of
-    from pipelines.steps_network import make_network_field, render_network_views
+    from fieldfuse.pipelines.direct_field import weights_of
+    from fieldfuse.pipelines.steps_network import make_network_field, render_network_views
 
     settings = job.settings
     if settings.field.init == "classical" or not settings.fit.finetune or not weights_of(settings).is_file():
@@ -102,8 +102,8 @@ def measure(job: Job, all_of_it: Compared) -> dict[str, Any]:
 
 def score_methods(job: Job, all_of_it: Compared) -> dict[str, Any]:
     """Method → scores, against the exact depth when the capture brings it, else against the sensor's."""
-    from toolkit.evaluate.compare_score import compare_views
-    from toolkit.evaluate.report import plain
+    from fieldfuse.evaluate.compare_score import compare_views
+    from fieldfuse.evaluate.report import plain
 
     views = all_of_it.views
     indices = np.flatnonzero(views.test)
@@ -123,7 +123,7 @@ def depths_of_test_views(all_of_it: Compared) -> list[Array | None] | None:
 
 def exact_depths_of(all_of_it: Compared, indices: Array) -> list[Array | None] | None:
     """The exact depth of the views at `indices`, None when the capture brings none."""
-    from toolkit.evaluate.compare_truth import true_depths
+    from fieldfuse.evaluate.compare_truth import true_depths
 
     truth, views = all_of_it.truth, all_of_it.views
     if truth is None or not truth.depths:
@@ -133,8 +133,8 @@ def exact_depths_of(all_of_it: Compared, indices: Array) -> list[Array | None] |
 
 def measure_matching(job: Job, all_of_it: Compared) -> dict[str, Any] | None:
     """How good the depth by matching of the training views is, against the exact depth or the sensor's; None without either."""
-    from pipelines.steps_stereo import match_pictures
-    from toolkit.evaluate.compare_stereo import matched_depth_scores
+    from fieldfuse.evaluate.compare_stereo import matched_depth_scores
+    from fieldfuse.pipelines.steps_stereo import match_pictures
 
     if "tsdf_stereo" not in all_of_it.pictures:
         return None
@@ -152,7 +152,7 @@ def mesh_files(job: Job, methods: Mapping[str, Any]) -> dict[str, Path]:
 
 def working_meshes(job: Job, all_of_it: Compared) -> tuple[dict[str, Mesh], Mesh | None]:
     """The methods' meshes that have triangles, and the true one, in the working frame."""
-    from toolkit.evaluate.geometry import read_mesh
+    from fieldfuse.evaluate.geometry import read_mesh
 
     to_working = all_of_it.scene.working_from_input
     meshes = {}
@@ -173,8 +173,8 @@ def common_voxel(all_of_it: Compared) -> float:
 
 def measure_meshes(job: Job, all_of_it: Compared) -> dict[str, Any]:
     """`geometry` by method in the input's unit, and `seen_share` of the true surface; both None without a true mesh."""
-    from toolkit.evaluate.geometry import geometry_metrics, seen_surface
-    from toolkit.tsdf.mesh import Mesh
+    from fieldfuse.evaluate.geometry import geometry_metrics, seen_surface
+    from fieldfuse.tsdf.mesh import Mesh
 
     job.progress.update(1, 2, "meshes")
     true_mesh = None if all_of_it.truth is None else all_of_it.truth.mesh

@@ -6,16 +6,16 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines.job import Job, set_seeds
-from pipelines.kept import EFFECTS, read_kept
-from pipelines.steps_capture import pixel_state
-from toolkit.effects.correct import Corrections
-from toolkit.files import write_json
+from fieldfuse.effects.correct import Corrections
+from fieldfuse.files import write_json
+from fieldfuse.pipelines.job import Job, set_seeds
+from fieldfuse.pipelines.kept import EFFECTS, read_kept
+from fieldfuse.pipelines.steps_capture import pixel_state
 
 if TYPE_CHECKING:
-    from toolkit.camera import Array
-    from toolkit.capture.types import Capture
-    from toolkit.poses.result import PoseResult
+    from fieldfuse.camera import Array
+    from fieldfuse.capture.types import Capture
+    from fieldfuse.poses.result import PoseResult
 
 NAME = "effects.json"
 SEES = {
@@ -27,7 +27,7 @@ SEES = {
 
 def find_effects(job: Job, posed: Capture) -> Corrections:
     """What is to be corrected; `effects.json` tells the evidence, the decisions and what they cost. With `effects: off` nothing is read."""
-    from toolkit.effects.decide import asleep, choose_field, decide
+    from fieldfuse.effects.decide import asleep, choose_field, decide
 
     settings, field = job.settings.effects, job.settings.field
     for wish, names in (("on", settings.on), ("off", settings.off)):
@@ -39,8 +39,8 @@ def find_effects(job: Job, posed: Capture) -> Corrections:
     holdout = job.settings.capture.holdout
 
     def make() -> dict[str, Any]:
-        from toolkit.capture.prepare import held_out
-        from toolkit.training.trial import Trial
+        from fieldfuse.capture.prepare import held_out
+        from fieldfuse.training.trial import Trial
 
         def trials(capture: Capture, validation: Array) -> Trial:
             job.progress.update(0, 1, "trying what was found in short fits")
@@ -79,7 +79,7 @@ def refine(poses: PoseResult, corrections: Corrections) -> PoseResult:
     """The poses with what was refined; they are what is exported."""
     import numpy as np
 
-    from toolkit.effects.correct import bent
+    from fieldfuse.effects.correct import bent
 
     if not corrections.geometric:
         return poses
@@ -109,7 +109,7 @@ def moved_cameras(job: Job, capture: Capture) -> list[str]:
     """How far cameras that came with the capture were moved by what pictures and depth show: what is exported lies with the moved ones."""
     import numpy as np
 
-    from toolkit.effects.bounds import apart
+    from fieldfuse.effects.bounds import apart
 
     given = {frame.name: frame.world_from_camera for frame in capture.frames if frame.world_from_camera is not None}
     names = [name for name in (job.corrections.poses if job.corrections else {}) if name in given]
@@ -131,7 +131,7 @@ def moved_depth(job: Job, capture: Capture) -> list[str]:
     """How far the depth camera stands from the pictures', where depth is carried from the one to the other."""
     import numpy as np
 
-    from toolkit.effects.bounds import apart
+    from fieldfuse.effects.bounds import apart
 
     found = job.corrections.depth if job.corrections else None
     if found is None:

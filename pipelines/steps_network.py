@@ -9,20 +9,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.job import Job, set_seeds
-from pipelines.kept import NETWORK, read_kept
-from pipelines.rendered import Pictures, depth_steps, load_pictures, save_pictures, to_picture, write_png, write_pngs
-from pipelines.room import require_pictures
-from pipelines.steps_capture import choose_keyframes
-from toolkit.errors import InputError
-from toolkit.files import fingerprint, write_json
-from toolkit.tone import exposed
+from fieldfuse.errors import InputError
+from fieldfuse.files import fingerprint, write_json
+from fieldfuse.pipelines.job import Job, set_seeds
+from fieldfuse.pipelines.kept import NETWORK, read_kept
+from fieldfuse.pipelines.rendered import Pictures, depth_steps, load_pictures, save_pictures, to_picture, write_png, write_pngs
+from fieldfuse.pipelines.room import require_pictures
+from fieldfuse.pipelines.steps_capture import choose_keyframes
+from fieldfuse.tone import exposed
 
 if TYPE_CHECKING:
-    from toolkit.capture.types import Views
-    from toolkit.poses.scene import Scene
-    from toolkit.render.field import Field
-    from toolkit.training.from_network import Inference
+    from fieldfuse.capture.types import Views
+    from fieldfuse.poses.scene import Scene
+    from fieldfuse.render.field import Field
+    from fieldfuse.training.from_network import Inference
 
 PREVIEW = "preview.png"
 DIRECT = "direct.safetensors"  # the finished field of direct inference where another one is the result
@@ -44,7 +44,7 @@ def uses_network(job: Job, views: Views) -> bool:
     Raises:
         InputError: the settings contradict each other.
     """
-    from toolkit.training.start import FEW_VIEWS
+    from fieldfuse.training.start import FEW_VIEWS
 
     settings = job.settings
     if settings.field.init == "classical" and not settings.fit.finetune:
@@ -64,8 +64,8 @@ def uses_network(job: Job, views: Views) -> bool:
 
 def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
     """The stage `network`: what a fit can start from; made once a command."""
-    from toolkit.render.field import Field
-    from toolkit.training.from_network import SHIPPED, NetworkOptions
+    from fieldfuse.render.field import Field
+    from fieldfuse.training.from_network import SHIPPED, NetworkOptions
 
     if job.network is not None:
         return job.network
@@ -78,7 +78,7 @@ def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
         raise InputError(f"there are no trained networks at {weights}; leave network.weights out for the shipped ones")
 
     def make() -> NetworkField:
-        from toolkit.training.from_network import Inference, load_networks
+        from fieldfuse.training.from_network import Inference, load_networks
 
         set_seeds(settings.seed)
         start = time.monotonic()
@@ -132,8 +132,8 @@ def preview(inference: Inference, frame: int) -> Any:
     """(H, 3 · W, 3) uint8: the newest key frame's photo, the field of all key frames so far from there, and its depth."""
     import cv2
 
-    from toolkit.evaluate.pictures import depth_picture, depth_range
-    from toolkit.render.image import make_renderer, render_view
+    from fieldfuse.evaluate.pictures import depth_picture, depth_range
+    from fieldfuse.render.image import make_renderer, render_view
 
     camera, photo = inference.train.intrinsics[frame], inference.train.images[frame]
     shrink = min(1.0, PREVIEW_SIDE / max(camera.width, camera.height))
@@ -148,7 +148,7 @@ def preview(inference: Inference, frame: int) -> Any:
 
 def direct_result(job: Job, made: NetworkField, views: Views, scene: Scene) -> Field:
     """What direct inference gives, made of what the stage `network` left: colours are looked up again if the settings say so."""
-    from toolkit.training.finer_colours import finer_colours
+    from fieldfuse.training.finer_colours import finer_colours
 
     if not job.settings.network.recolour:
         return made.field
@@ -161,7 +161,7 @@ def render_network_views(job: Job, made: NetworkField, views: Views, scene: Scen
     Args:
         keep: the field becomes a file, `DIRECT`, beside its pictures.
     """
-    from toolkit.render.image import make_renderer, render_view
+    from fieldfuse.render.image import make_renderer, render_view
 
     kept = job.folder / "renders" / "network.safetensors"
 

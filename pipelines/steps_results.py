@@ -9,22 +9,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.job import Job, set_seeds
-from pipelines.kept import EVALUATION, MATCHED, NOTES, TIMELINE, read_export_facts, read_kept
-from pipelines.rendered import Pictures, depth_steps, load_pictures, save_pictures, to_picture, write_pngs
-from pipelines.room import require_pictures, require_scores
-from pipelines.steps_capture import last_of, pixel_state
-from toolkit.errors import InputError
-from toolkit.files import write_json
+from fieldfuse.errors import InputError
+from fieldfuse.files import write_json
+from fieldfuse.pipelines.job import Job, set_seeds
+from fieldfuse.pipelines.kept import EVALUATION, MATCHED, NOTES, TIMELINE, read_export_facts, read_kept
+from fieldfuse.pipelines.rendered import Pictures, depth_steps, load_pictures, save_pictures, to_picture, write_pngs
+from fieldfuse.pipelines.room import require_pictures, require_scores
+from fieldfuse.pipelines.steps_capture import last_of, pixel_state
 
 if TYPE_CHECKING:
-    from toolkit.capture.types import Capture, Views
-    from toolkit.config import FitSettings
-    from toolkit.poses.result import PoseResult
-    from toolkit.poses.scene import Scene
-    from toolkit.render.field import Field
-    from toolkit.stereo.left_out import LeftOut
-    from toolkit.training.fit import FitResult
+    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.config import FitSettings
+    from fieldfuse.poses.result import PoseResult
+    from fieldfuse.poses.scene import Scene
+    from fieldfuse.render.field import Field
+    from fieldfuse.stereo.left_out import LeftOut
+    from fieldfuse.training.fit import FitResult
 
 
 def wants_tsdf(job: Job, capture: Capture) -> bool:
@@ -41,7 +41,7 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
         depth_from: "sensor", "matching" (pictures with each other) or "exact" (the truth that a simulated capture brings); None: the
             sensor's when the capture has depth, else by matching.
     """
-    from pipelines.steps_stereo import exact_depths, match_pictures
+    from fieldfuse.pipelines.steps_stereo import exact_depths, match_pictures
 
     folder = job.folder / name
     kept = job.folder / "renders" / f"{name}.safetensors"
@@ -50,7 +50,7 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
     matched = match_pictures(job, scene, views) if depth_from == "matching" else None
 
     def make() -> Pictures:
-        from pipelines.surface import fuse_training_frames
+        from fieldfuse.pipelines.surface import fuse_training_frames
 
         depths = exact_depths(posed, scene, views) if depth_from == "exact" else matched
         pictures, paths = fuse_training_frames(job, folder, posed, scene, views, depths, depth_from == "exact")
@@ -88,13 +88,13 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     The start is classical, or the networks' field, which is the result itself without fine-tuning. With `go_on` the field that the folder
     has is the start, and the budget is for what is added.
     """
-    from pipelines.steps_network import direct_result, make_network_field, uses_network
-    from pipelines.steps_stereo import views_for_fit
-    from toolkit.render.field import Field
-    from toolkit.stereo.left_out import load_left_out, save_left_out
-    from toolkit.training.guided import fit_guided
-    from toolkit.training.network_start import network_start
-    from toolkit.volume.grid_host import host_for
+    from fieldfuse.pipelines.steps_network import direct_result, make_network_field, uses_network
+    from fieldfuse.pipelines.steps_stereo import views_for_fit
+    from fieldfuse.render.field import Field
+    from fieldfuse.stereo.left_out import load_left_out, save_left_out
+    from fieldfuse.training.guided import fit_guided
+    from fieldfuse.training.network_start import network_start
+    from fieldfuse.volume.grid_host import host_for
 
     settings = job.settings
     path, times = job.folder / "field.safetensors", job.folder / "timeline.json"
@@ -182,7 +182,7 @@ def fit_matched(job: Job) -> dict[str, Any] | None:
 
 def fit_left_out(job: Job) -> LeftOut | None:
     """The pixels that this run's fit did without, since they show what moves; None: they were not looked for."""
-    from toolkit.stereo.left_out import load_left_out
+    from fieldfuse.stereo.left_out import load_left_out
 
     record = job.stages.records.get("field")
     return load_left_out(job.folder / LEFT_OUT) if record is not None and LEFT_OUT in record.outputs else None
@@ -190,8 +190,8 @@ def fit_left_out(job: Job) -> LeftOut | None:
 
 def render_test_views(job: Job, field: Field, views: Views, scene: Scene) -> Pictures:
     """The field's pictures at the held-out views."""
-    from toolkit.evaluate.observed import training_psnr
-    from toolkit.render.image import make_renderer, render_view
+    from fieldfuse.evaluate.observed import training_psnr
+    from fieldfuse.render.image import make_renderer, render_view
 
     kept = job.folder / "renders" / "field.safetensors"
 
@@ -229,7 +229,7 @@ def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, sc
     old, whole = job.stages.record("export"), True
 
     def make() -> dict[str, Any]:
-        from pipelines.surface import export_field
+        from fieldfuse.pipelines.surface import export_field
 
         nonlocal whole
         fits = job.stages.usable("export")
@@ -267,9 +267,9 @@ def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, sc
 
 def score_pictures(job: Job, views: Views, pictures: dict[str, Pictures]) -> dict[str, Any]:
     """The same metrics for field and TSDF, beside those of the nearest training picture."""
-    from toolkit.evaluate.baseline import nearest_image_scores
-    from toolkit.evaluate.observed import seen_share
-    from toolkit.evaluate.score import score_views
+    from fieldfuse.evaluate.baseline import nearest_image_scores
+    from fieldfuse.evaluate.observed import seen_share
+    from fieldfuse.evaluate.score import score_views
 
     path = job.folder / "evaluation.json"
 

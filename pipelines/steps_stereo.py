@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.job import Job
-from toolkit.errors import InputError
+from fieldfuse.errors import InputError
+from fieldfuse.pipelines.job import Job
 
 if TYPE_CHECKING:
-    from toolkit.capture.types import Capture, Views
-    from toolkit.poses.scene import Scene
-    from toolkit.stereo.match import StereoDepth
+    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.poses.scene import Scene
+    from fieldfuse.stereo.match import StereoDepth
 
 
 def match_pictures(job: Job, scene: Scene, views: Views) -> list[StereoDepth]:
@@ -24,9 +24,9 @@ def match_pictures(job: Job, scene: Scene, views: Views) -> list[StereoDepth]:
         InputError: the pictures cannot be matched.
         Interrupted: the user asked to stop.
     """
-    from toolkit.stereo.bare import continued
-    from toolkit.stereo.maps import load_stereo, save_stereo
-    from toolkit.stereo.match import stereo_depths
+    from fieldfuse.stereo.bare import continued
+    from fieldfuse.stereo.maps import load_stereo, save_stereo
+    from fieldfuse.stereo.match import stereo_depths
 
     path = job.folder / "stereo" / "depths.safetensors"
     training = views.subset(np.flatnonzero(~views.test))
@@ -63,7 +63,7 @@ def views_for_fit(job: Job, scene: Scene, views: Views) -> tuple[Views, list[str
         InputError: the pictures are to be matched, and cannot be.
         Interrupted: the user asked to stop.
     """
-    from toolkit.stereo.quick import with_depths
+    from fieldfuse.stereo.quick import with_depths
 
     wanted = job.settings.fit.depth_from if job.settings.fit.depth > 0 else "off"
     if wanted == "off":
@@ -87,8 +87,8 @@ def exact_depths(posed: Capture, scene: Scene, views: Views) -> list[StereoDepth
     Raises:
         InputError: a training picture has none.
     """
-    from toolkit.evaluate.compare_truth import find_truth, true_depths
-    from toolkit.stereo.match import StereoDepth
+    from fieldfuse.evaluate.compare_truth import find_truth, true_depths
+    from fieldfuse.stereo.match import StereoDepth
 
     truth = find_truth(posed)
     training = np.flatnonzero(~views.test)

@@ -11,23 +11,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.folder import command_line
-from pipelines.job import Job
-from pipelines.rendered import Pictures, depth_step
-from pipelines.steps_effects import effects_part, effects_warnings, moved_cameras, moved_depth
-from pipelines.steps_results import fit_left_out, fit_matched, fit_notes
-from pipelines.textured import TSDF_TEXTURE
-from toolkit import __version__
-from toolkit.config import settings_dict
-from toolkit.files import write_json
+from fieldfuse import __version__
+from fieldfuse.config import settings_dict
+from fieldfuse.files import write_json
+from fieldfuse.pipelines.folder import command_line
+from fieldfuse.pipelines.job import Job
+from fieldfuse.pipelines.rendered import Pictures, depth_step
+from fieldfuse.pipelines.steps_effects import effects_part, effects_warnings, moved_cameras, moved_depth
+from fieldfuse.pipelines.steps_results import fit_left_out, fit_matched, fit_notes
+from fieldfuse.pipelines.textured import TSDF_TEXTURE
 
 if TYPE_CHECKING:
-    from toolkit.camera import Array
-    from toolkit.capture.types import Capture, Views
-    from toolkit.poses.result import PoseResult
-    from toolkit.poses.scene import Scene
-    from toolkit.render.field import Field
-    from toolkit.stereo.left_out import LeftOut
+    from fieldfuse.camera import Array
+    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.poses.result import PoseResult
+    from fieldfuse.poses.scene import Scene
+    from fieldfuse.render.field import Field
+    from fieldfuse.stereo.left_out import LeftOut
 
 SEEN_BY_SFM = (
     "poses were computed from all pictures, the held-out ones included, so scores are a little kinder than with poses known beforehand"
@@ -53,7 +53,7 @@ def picture_size(capture: Capture) -> tuple[int | None, int | None]:
         return first.intrinsics.width, first.intrinsics.height
     if capture.kind == "video":
         return capture.extra.get("width"), capture.extra.get("height")
-    from toolkit.capture.headers import read_bytes, read_header
+    from fieldfuse.capture.headers import read_bytes, read_header
 
     header = read_header(read_bytes(first.image), first.image)
     turned = header.orientation >= 5  # EXIF: the stored picture lies on its side
@@ -119,10 +119,10 @@ def put_cameras(
         points, colours: (P, 3) of a surface in the input's frame, for poses that came without points: programs that start from points
             need some.
     """
-    from toolkit.capture.convert import all_converted
-    from toolkit.capture.select import SELECTED
-    from toolkit.capture.stored import stored_cameras
-    from toolkit.export.cameras import write_cameras
+    from fieldfuse.capture.convert import all_converted
+    from fieldfuse.capture.select import SELECTED
+    from fieldfuse.capture.stored import stored_cameras
+    from fieldfuse.export.cameras import write_cameras
 
     made_here = SELECTED in posed.extra or all_converted(posed)  # then the pictures lie in the run's folder
     root = posed.frames[0].image.parent.parent if made_here else posed.root
@@ -217,9 +217,9 @@ def put_report(
     seconds: float,
 ) -> dict[str, Any]:
     """Write report.json and report.html; `seconds` is what this command took so far, reused stages count as they took."""
-    from toolkit.evaluate.failure import failures
-    from toolkit.evaluate.pictures import method_pictures, moving_pictures
-    from toolkit.evaluate.report import report_data, write_report
+    from fieldfuse.evaluate.failure import failures
+    from fieldfuse.evaluate.pictures import method_pictures, moving_pictures
+    from fieldfuse.evaluate.report import report_data, write_report
 
     notes = export_facts["notes"] if export_facts else []
     began, told = time.monotonic(), None if job.plan is None else job.plan.told(job)

@@ -10,29 +10,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.job import Job
-from pipelines.page import NAME, PAGE, put_page
-from pipelines.pictures import camera_of, orbit_cameras, pictures
-from pipelines.rendered import Pictures, to_picture
-from pipelines.room import PICTURE_BYTES, SURFACE_BYTES, pixels, require_pictures
-from pipelines.steps_results import fit_left_out
-from pipelines.summary import put_cameras
-from pipelines.taken import MESHES, SURFACES, TEXTURE, as_taken, missing_originals, needs_originals
-from pipelines.textured import TEXTURED, put_textured
-from toolkit import memory
-from toolkit.camera import Array, Intrinsics, Similarity
-from toolkit.errors import InputError
-from toolkit.tone import exposed
+from fieldfuse import memory
+from fieldfuse.camera import Array, Intrinsics, Similarity
+from fieldfuse.errors import InputError
+from fieldfuse.pipelines.job import Job
+from fieldfuse.pipelines.page import NAME, PAGE, put_page
+from fieldfuse.pipelines.pictures import camera_of, orbit_cameras, pictures
+from fieldfuse.pipelines.rendered import Pictures, to_picture
+from fieldfuse.pipelines.room import PICTURE_BYTES, SURFACE_BYTES, pixels, require_pictures
+from fieldfuse.pipelines.steps_results import fit_left_out
+from fieldfuse.pipelines.summary import put_cameras
+from fieldfuse.pipelines.taken import MESHES, SURFACES, TEXTURE, as_taken, missing_originals, needs_originals
+from fieldfuse.pipelines.textured import TEXTURED, put_textured
+from fieldfuse.tone import exposed
 
 if TYPE_CHECKING:
-    from toolkit.capture.types import Capture, Views
-    from toolkit.poses.result import PoseResult
-    from toolkit.poses.scene import Scene
-    from toolkit.render.field import Field
-    from toolkit.stereo.match import StereoDepth
-    from toolkit.tsdf.fuse import Points
-    from toolkit.tsdf.mesh import Mesh
-    from toolkit.tsdf.volume import TsdfVolume
+    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.poses.result import PoseResult
+    from fieldfuse.poses.scene import Scene
+    from fieldfuse.render.field import Field
+    from fieldfuse.stereo.match import StereoDepth
+    from fieldfuse.tsdf.fuse import Points
+    from fieldfuse.tsdf.mesh import Mesh
+    from fieldfuse.tsdf.volume import TsdfVolume
 
 SMALL_PART = 0.002  # components of a mesh with less than this share of its area are specks
 MOST_TRIANGLES = 2_000_000
@@ -59,9 +59,9 @@ def fuse_training_frames(
     Returns:
         pictures, and the files written. `pictures.facts`: voxel size and range (working units), frames, blocks, seconds with decoding.
     """
-    from toolkit.export.mesh import mesh_facts
-    from toolkit.tsdf.fuse import fuse_capture
-    from toolkit.tsdf.stereo_frames import fuse_stereo
+    from fieldfuse.export.mesh import mesh_facts
+    from fieldfuse.tsdf.fuse import fuse_capture
+    from fieldfuse.tsdf.stereo_frames import fuse_stereo
 
     settings = job.settings.tsdf
     start = time.monotonic()
@@ -97,7 +97,7 @@ def fuse_training_frames(
 
 def write_surface(folder: Path, scene: Scene, mesh: Mesh, points: Points, exposure: float) -> None:
     """Mesh and points of the working frame as files in the input's, brighter by `exposure`."""
-    from toolkit.export.mesh import write_mesh
+    from fieldfuse.export.mesh import write_mesh
 
     input_from_working = scene.working_from_input.inverse()
     write_mesh(folder / "mesh.ply", replace(mesh, colours=exposed(mesh.colours, exposure)).transformed(input_from_working))
@@ -106,7 +106,7 @@ def write_surface(folder: Path, scene: Scene, mesh: Mesh, points: Points, exposu
 
 def put_points(path: Path, points: Points, input_from_working: Similarity, exposure: float) -> Path:
     """Points of the working frame as a file in the input's, brighter by `exposure`."""
-    from toolkit.export.points import write_points
+    from fieldfuse.export.points import write_points
 
     colours = exposed(points.colours, exposure)
     write_points(path, input_from_working.points(points.points), colours, input_from_working.directions(points.normals))
@@ -125,7 +125,7 @@ class Exported:
 
 def export_field(job: Job, folder: Path, field: Field, poses: PoseResult, posed: Capture, scene: Scene, views: Views) -> Exported:
     """What this command or the settings' `export.formats` name, in the input's frame."""
-    from toolkit.export.video import write_video
+    from fieldfuse.export.video import write_video
 
     formats = set(job.settings.export.formats if job.formats is None else job.formats)
     facts: dict[str, Any] = {"mesh": None, "notes": []}
@@ -187,7 +187,7 @@ def export_surface(
     Raises:
         InputError: the field has no surface.
     """
-    from toolkit.export.mesh import mesh_facts, write_mesh
+    from fieldfuse.export.mesh import mesh_facts, write_mesh
 
     volume = _volume_of(job, field, posed, scene, views)
     memory.give_back()  # what pictures and depth maps took
@@ -215,10 +215,10 @@ def export_surface(
 
 def _volume_of(job: Job, field: Field, posed: Capture, scene: Scene, views: Views) -> TsdfVolume:
     """The field's depth at the training cameras, polished, made to agree, and fused."""
-    from toolkit.export.surface import field_volume
-    from toolkit.render.image import make_renderer, render_view
-    from toolkit.stereo.polish import Polisher
-    from toolkit.stereo.settle import settled
+    from fieldfuse.export.surface import field_volume
+    from fieldfuse.render.image import make_renderer, render_view
+    from fieldfuse.stereo.polish import Polisher
+    from fieldfuse.stereo.settle import settled
 
     train = np.flatnonzero(~views.test)  # held-out pictures are not looked at
     shown, cameras = finer_views(job, posed, views, train)

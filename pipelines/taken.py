@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.errors import InputError
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.errors import InputError
 
 if TYPE_CHECKING:
-    from pipelines.job import Job
-    from toolkit.capture.types import Capture, Views
+    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.pipelines.job import Job
 
 MESHES = ("ply", "obj", "glb")  # as `export.formats` has them
 TEXTURE = "texture"
@@ -60,7 +60,7 @@ def require_originals(job: Job, posed: Capture, views: Views) -> None:
 def as_taken(job: Job, posed: Capture, indices: Array, shown: Views, side: int) -> tuple[list[Intrinsics], Iterable[Array]]:
     """Cameras and pictures of the frames `indices`, which are the views `shown`: as large as they were taken, up to `side` pixels along
     the long side, corrected as those of the fit, and read one at a time; those of the fit where the originals are no larger."""
-    from toolkit.capture.prepare import pictures_at, target_size
+    from fieldfuse.capture.prepare import pictures_at, target_size
     found = job.corrections
     lenses = []
     for index, small in zip(indices, shown.intrinsics, strict=True):

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.taken import as_taken
-from toolkit.tone import exposed
+from fieldfuse.pipelines.taken import as_taken
+from fieldfuse.tone import exposed
 
 if TYPE_CHECKING:
-    from pipelines.job import Job
-    from toolkit.capture.types import Capture, Views
-    from toolkit.poses.scene import Scene
-    from toolkit.tsdf.mesh import Mesh
+    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.pipelines.job import Job
+    from fieldfuse.poses.scene import Scene
+    from fieldfuse.tsdf.mesh import Mesh
 
 TSDF_TEXTURE = "tsdf_texture"  # the stage
 TEXTURED = "textured.glb"
@@ -27,7 +27,7 @@ def texture_tsdf(job: Job, posed: Capture, scene: Scene, views: Views) -> None:
     path = job.folder / "tsdf" / TEXTURED
 
     def make() -> Path:
-        from toolkit.evaluate.geometry import read_mesh
+        from fieldfuse.evaluate.geometry import read_mesh
 
         mesh = read_mesh(path.with_name("mesh.ply")).transformed(scene.working_from_input)
         return put_textured(job, path, mesh.with_normals(), posed, scene, views)
@@ -38,9 +38,9 @@ def texture_tsdf(job: Job, posed: Capture, scene: Scene, views: Views) -> None:
 
 def put_textured(job: Job, path: Path, mesh: Mesh, posed: Capture, scene: Scene, views: Views) -> Path:
     """A coarser mesh (working frame, with normals) with a texture of the training pictures, in the input's frame."""
-    from toolkit import memory
-    from toolkit.export.mesh import write_textured
-    from toolkit.export.texture import LARGEST, textured
+    from fieldfuse import memory
+    from fieldfuse.export.mesh import write_textured
+    from fieldfuse.export.texture import LARGEST, textured
 
     largest = LARGEST
     while largest > 1024 and TEXEL_BYTES * largest**2 > memory.bounded(TEXEL_BYTES * LARGEST**2):

@@ -23,6 +23,6 @@ def bound_threads(options: dict[str, Any]) -> None:
     wanted = options.get("flags", {}).get("threads") or next(iter(pairs), None)
     if wanted is not None and str(wanted).isdigit() and int(wanted) > 0:
         os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(wanted)))
-    from toolkit import memory
+    from fieldfuse import memory
 
     memory.one_heap()

@@ -13,19 +13,19 @@ from typing import TYPE_CHECKING, Any
 
 import psutil
 
-from pipelines.page import PAGE
-from pipelines.taken import TEXTURE
-from pipelines.textured import TSDF_TEXTURE
-from toolkit.config import EXPORTS, settings_dict
-from toolkit.errors import FieldfuseError
-from toolkit.evaluate import budget as model
-from toolkit.files import fingerprint, read_json, write_json
+from fieldfuse.config import EXPORTS, settings_dict
+from fieldfuse.errors import FieldfuseError
+from fieldfuse.evaluate import budget as model
+from fieldfuse.files import fingerprint, read_json, write_json
+from fieldfuse.pipelines.page import PAGE
+from fieldfuse.pipelines.taken import TEXTURE
+from fieldfuse.pipelines.textured import TSDF_TEXTURE
 
 if TYPE_CHECKING:
-    from pipelines.job import Job
-    from toolkit.capture.types import Capture, Views
-    from toolkit.config import Settings
-    from toolkit.poses.scene import Scene
+    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.config import Settings
+    from fieldfuse.pipelines.job import Job
+    from fieldfuse.poses.scene import Scene
 
 FILE = "plan.json"
 LONGEST_START = 60.0  # seconds; a process that is older was not started for this command
@@ -58,7 +58,7 @@ class TotalBudget:
 
     def choose_pictures(self, job: Job, capture: Capture) -> None:
         """Decide picture size and a video's frames; predict every stage."""
-        from toolkit.evaluate.budget_probe import self_test
+        from fieldfuse.evaluate.budget_probe import self_test
 
         settings = job.settings
         threads = settings.threads or psutil.cpu_count() or 1
@@ -135,7 +135,7 @@ class TotalBudget:
 
     def choose_fit(self, job: Job, views: Views, scene: Scene) -> None:
         """Decide the fit's seconds and its finest lattice from what is left, and whether meshes get textures and the field its page."""
-        from toolkit.training.start import worth_a_level
+        from fieldfuse.training.start import worth_a_level
 
         assert self.speed is not None and self.work is not None and self.choice is not None
         if not self.again:
@@ -301,9 +301,9 @@ def _round(value: float | None) -> float | None:
 
 def work_of(capture: Capture, settings: Any) -> model.Work:
     """What the capture asks for, from what its headers say."""
-    from pipelines.summary import picture_size
-    from toolkit.capture.convert import to_convert
-    from toolkit.capture.prepare import held_out
+    from fieldfuse.capture.convert import to_convert
+    from fieldfuse.capture.prepare import held_out
+    from fieldfuse.pipelines.summary import picture_size
 
     width, height = picture_size(capture)
     video = capture.filmed
@@ -340,7 +340,7 @@ def finest(job: Job, views: Views, scene: Scene) -> int:
     """The lattice that a fit would end at without a budget."""
     import numpy as np
 
-    from toolkit.training.start import MARGIN, ROOM_MARGIN, finest_resolution, make_space
+    from fieldfuse.training.start import MARGIN, ROOM_MARGIN, finest_resolution, make_space
 
     settings = job.settings.field
     if settings.resolution is not None:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pipelines.options import (
+from fieldfuse.pipelines.options import (
     Config,
     Decoder,
     Device,
@@ -69,12 +69,12 @@ def tradeoff(
 
     Each point is kept as soon as it is measured: run the same command again after an interruption and it goes on.
     """
-    from pipelines.thread_limits import bound_threads
+    from fieldfuse.pipelines.thread_limits import bound_threads
 
     flags = {"image_size": image_size, "holdout": holdout, "device": device, "threads": threads, "seed": seed, "decoder": decoder}
     options = gather(preset, config, pairs, **flags, **{"poses.source": poses})
     bound_threads(options)
-    from pipelines.console import make_progress
+    from fieldfuse.pipelines.console import make_progress
 
     data = tradeoff_run(target, out, options, axes, times, seeds, budget, make_progress(quiet))
     show(data, target if out is None else out, quiet, json)
@@ -96,13 +96,13 @@ def tradeoff_run(
         InputError: no test views, an axis that cannot be varied, times that are no numbers.
         Interrupted: the user asked to stop; what was measured is written.
     """
-    from pipelines.console import make_progress
-    from pipelines.job import open_job
-    from pipelines.reconstruct import BEFORE, stand
-    from pipelines.steps_stereo import match_pictures
-    from pipelines.tradeoff_plan import chosen_axes, chosen_times, plan
-    from pipelines.tradeoff_sweep import Swept, sweep
-    from toolkit.errors import InputError
+    from fieldfuse.errors import InputError
+    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.job import open_job
+    from fieldfuse.pipelines.reconstruct import BEFORE, stand
+    from fieldfuse.pipelines.steps_stereo import match_pictures
+    from fieldfuse.pipelines.tradeoff_plan import chosen_axes, chosen_times, plan
+    from fieldfuse.pipelines.tradeoff_sweep import Swept, sweep
 
     ladder = chosen_times(times)
     progress = make_progress(True) if progress is None else progress
@@ -134,8 +134,8 @@ def tradeoff_run(
 
 def axes_here(settings: Any) -> tuple[list[str], dict[str, str]]:
     """The axes that can be varied, and for the others why not."""
-    from toolkit.evaluate.tradeoff import AXES
-    from toolkit.training.from_network import SHIPPED
+    from fieldfuse.evaluate.tradeoff import AXES
+    from fieldfuse.training.from_network import SHIPPED
 
     why_not = {}
     if not SHIPPED.is_file():
@@ -148,9 +148,9 @@ def axes_here(settings: Any) -> tuple[list[str], dict[str, str]]:
 
 def put(job: Any, swept: Any, capture: Any, poses: Any, scene: Any, views: Any, refused: list[str]) -> dict[str, Any]:
     """Write what is known so far into the run's folder."""
-    from pipelines.comparison import machine
-    from pipelines.summary import base_data, warnings_of
-    from toolkit.evaluate.tradeoff_page import write_tradeoff
+    from fieldfuse.evaluate.tradeoff_page import write_tradeoff
+    from fieldfuse.pipelines.comparison import machine
+    from fieldfuse.pipelines.summary import base_data, warnings_of
 
     base = base_data(job, capture, poses)
     data = {
@@ -183,8 +183,8 @@ def unbounded(command: str) -> str:
 
 def show(data: dict[str, Any], folder: Path, quiet: bool, as_json: bool) -> None:
     """The result on stdout: JSON, or the sentences and where the page is."""
-    from toolkit.evaluate.tradeoff import points_of
-    from toolkit.evaluate.tradeoff_text import front_sentence, sentence, steps
+    from fieldfuse.evaluate.tradeoff import points_of
+    from fieldfuse.evaluate.tradeoff_text import front_sentence, sentence, steps
 
     if as_json:
         sys.stdout.write(writer.dumps(data, indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""The process that makes and measures one point of a sweep: `python -m pipelines.tradeoff_child JOB.json`.
+"""The process that makes and measures one point of a sweep: `python -m fieldfuse.pipelines.tradeoff_child JOB.json`.
 
 A process of its own, so that its peak memory is its own, and so that running out of memory ends this point and not the sweep.
 """
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pipelines.tradeoff_make import Ground
+    from fieldfuse.pipelines.tradeoff_make import Ground
 
 KEPT = ("psnr", "ssim", "lpips", "coverage", "psnr_masked", "acc_1", "acc_5")
 
@@ -29,8 +29,8 @@ def measure(spec: dict[str, Any]) -> list[dict[str, Any]]:
     Raises:
         InputError: the point cannot be made (a voxel too fine for the memory, say).
     """
-    from pipelines.job import read_settings, set_threads
-    from pipelines.tradeoff_make import make_direct, make_field, make_surface, open_ground
+    from fieldfuse.pipelines.job import read_settings, set_threads
+    from fieldfuse.pipelines.tradeoff_make import make_direct, make_field, make_surface, open_ground
 
     settings = read_settings({}, spec["settings"])
     settings.seed = spec["seed"]
@@ -52,7 +52,7 @@ def row_of(ground: Ground, spec: dict[str, Any], one: dict[str, Any]) -> dict[st
     """Scores of one result at the test views, beside what it cost."""
     import numpy as np
 
-    from toolkit.evaluate.compare_score import compare_views
+    from fieldfuse.evaluate.compare_score import compare_views
 
     indices = np.flatnonzero(ground.views.test)
     pictures, seconds = [], []
@@ -80,10 +80,10 @@ def row_of(ground: Ground, spec: dict[str, Any], one: dict[str, Any]) -> dict[st
 
 def main(path: str) -> int:
     """Measure the job in the file, write its answer beside it; 0 when there is one."""
-    from toolkit.errors import FieldfuseError
-    from toolkit.evaluate.report import plain
-    from toolkit.files import read_json, write_json
-    from toolkit.poses.worker import die_with_parent
+    from fieldfuse.errors import FieldfuseError
+    from fieldfuse.evaluate.report import plain
+    from fieldfuse.files import read_json, write_json
+    from fieldfuse.poses.worker import die_with_parent
 
     die_with_parent()
     spec = read_json(path)

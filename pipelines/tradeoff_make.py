@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import psutil
 
-from pipelines.memory import PeakMemory, own_bytes
-from pipelines.rendered import Picture, to_picture
-from toolkit.camera import Array, Intrinsics
-from toolkit.config import Settings, TsdfSettings
-from toolkit.errors import InputError
-from toolkit.files import read_json
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.config import Settings, TsdfSettings
+from fieldfuse.errors import InputError
+from fieldfuse.files import read_json
+from fieldfuse.pipelines.memory import PeakMemory, own_bytes
+from fieldfuse.pipelines.rendered import Picture, to_picture
 
 if TYPE_CHECKING:
-    from toolkit.capture.types import Capture, Views
-    from toolkit.poses.scene import Scene
-    from toolkit.render.field import Field
-    from toolkit.render.image import Rendered
-    from toolkit.tsdf.volume import TsdfVolume
+    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.poses.scene import Scene
+    from fieldfuse.render.field import Field
+    from fieldfuse.render.image import Rendered
+    from fieldfuse.tsdf.volume import TsdfVolume
 
 Show = Callable[[Intrinsics, Array], Picture]
 SMALL_PART = 0.002  # components of a mesh with less than this share of its area are specks
@@ -56,13 +56,13 @@ def open_ground(folder: Path, settings: Settings, share: float) -> Ground:
     Raises:
         InputError: a stage's file is missing or damaged.
     """
-    from toolkit.capture.storage import capture_from_dict
-    from toolkit.capture.views_file import load_views
-    from toolkit.evaluate.compare_truth import find_truth, true_depths
-    from toolkit.poses.result import PoseResult
-    from toolkit.poses.scene import Scene
-    from toolkit.progress import SILENT
-    from toolkit.training.engine import warm_up
+    from fieldfuse.capture.storage import capture_from_dict
+    from fieldfuse.capture.views_file import load_views
+    from fieldfuse.evaluate.compare_truth import find_truth, true_depths
+    from fieldfuse.poses.result import PoseResult
+    from fieldfuse.poses.scene import Scene
+    from fieldfuse.progress import SILENT
+    from fieldfuse.training.engine import warm_up
 
     warm_up(settings, SILENT)
     resident = own_bytes(psutil.Process().memory_info())
@@ -111,9 +111,9 @@ class Cost:
 
 def make_field(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dict[str, Any]]:
     """Fit a field, then show it as it is kept (16-bit features) and in each of the variants."""
-    from toolkit.render.field import Field
-    from toolkit.training.guided import fit_guided
-    from toolkit.volume.grid_host import host_for
+    from fieldfuse.render.field import Field
+    from fieldfuse.training.guided import fit_guided
+    from fieldfuse.volume.grid_host import host_for
 
     settings, wanted = ground.settings, spec["wanted"]
     settings.fit = replace(settings.fit, budget=float(wanted["iterations"]), patience=False)
@@ -152,7 +152,7 @@ def make_field(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dict
 
 def asked_resolution(ground: Ground, factor: float) -> tuple[int, float]:
     """Voxels a side for voxels `factor` times as large as the automatic ones, and their size in the input's unit."""
-    from toolkit.training.start import MARGIN, ROOM_MARGIN, finest_resolution, make_space
+    from fieldfuse.training.start import MARGIN, ROOM_MARGIN, finest_resolution, make_space
 
     scene, views, settings = ground.scene, ground.views, ground.settings.field
     background = scene.has_background if settings.background == "auto" else settings.background == "on"
@@ -163,7 +163,7 @@ def asked_resolution(ground: Ground, factor: float) -> tuple[int, float]:
 
 
 def shown_field(field: Field, engine: str) -> Show:
-    from toolkit.render.image import make_renderer, render_view
+    from fieldfuse.render.image import make_renderer, render_view
 
     view = make_renderer(field, engine)
     return lambda lens, pose: to_picture(render_view(field, lens, pose, view))
@@ -178,13 +178,13 @@ def vary(ground: Ground, fitted: Field, kept: Field, path: Path, changed: dict[s
     if "samples" in changed:
         return shown_field(replace(kept, fine=int(changed["samples"])), ground.settings.engine), path.stat().st_size
     if changed["precision"] == "float32":
-        from toolkit.volume.store import read_field, write_field
+        from fieldfuse.volume.store import read_field, write_field
 
         write_field(scratch / "float32.safetensors", read_field(path), precision="float32")
         return shown_field(fitted, ground.settings.engine), (scratch / "float32.safetensors").stat().st_size
-    from toolkit.render.bake import bake
-    from toolkit.render.bake_file import read_baked, write_baked
-    from toolkit.render.bake_image import BakedRenderer
+    from fieldfuse.render.bake import bake
+    from fieldfuse.render.bake_file import read_baked, write_baked
+    from fieldfuse.render.bake_image import BakedRenderer
 
     place = scratch / "baked.safetensors"
     write_baked(place, bake(kept.to("cpu")), ground.scene.working_from_input)
@@ -201,9 +201,9 @@ def vary(ground: Ground, fitted: Field, kept: Field, path: Path, changed: dict[s
 
 def make_direct(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dict[str, Any]]:
     """The networks' field of some of the key frames, or with other voxels, not fitted."""
-    from pipelines.direct_field import direct_field
-    from toolkit.progress import SILENT
-    from toolkit.render.field import Field
+    from fieldfuse.pipelines.direct_field import direct_field
+    from fieldfuse.progress import SILENT
+    from fieldfuse.render.field import Field
 
     settings, share = ground.settings, float(spec["wanted"]["keyframes"])
     path = scratch / "field.safetensors"
@@ -225,7 +225,7 @@ def make_direct(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dic
 
 def make_surface(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dict[str, Any]]:
     """Fuse depth into a surface: the sensor's, or what matching found for the run."""
-    from toolkit.export.mesh import write_mesh
+    from fieldfuse.export.mesh import write_mesh
 
     wanted = spec["wanted"]
     voxel = ground.settings.tsdf.voxel_size if spec.get("base_voxel") is None else spec["base_voxel"] * wanted["voxel_size"]
@@ -262,12 +262,12 @@ def fuse(ground: Ground, method: str, settings: TsdfSettings) -> TsdfVolume:
         InputError: no depth, or a voxel size too fine for the memory.
     """
     if method == "tsdf":
-        from toolkit.tsdf.fuse import fuse_capture
+        from fieldfuse.tsdf.fuse import fuse_capture
 
         with_depth = [int(index) for index in ground.used if ground.posed.frames[int(index)].depth is not None]
         return fuse_capture(ground.posed, ground.scene.working_from_input, with_depth, settings, tones=ground.views.toned())
-    from toolkit.stereo.maps import load_stereo
-    from toolkit.tsdf.stereo_frames import fuse_stereo
+    from fieldfuse.stereo.maps import load_stereo
+    from fieldfuse.tsdf.stereo_frames import fuse_stereo
 
     names, depths = load_stereo(ground.folder / "stereo" / "depths.safetensors")
     training = ground.views.subset(np.flatnonzero(~ground.views.test))

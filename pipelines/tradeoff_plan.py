@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from toolkit.errors import InputError
+from fieldfuse.errors import InputError
 
 TIMES = (3.0, 10.0, 30.0, 60.0, 120.0, 300.0, 900.0)
 BASE_TIME = 30.0  # the largest of the times up to this is the default that single steps start from

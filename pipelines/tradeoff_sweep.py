@@ -9,14 +9,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pipelines.direct_field import weights_state
-from pipelines.job import Job
-from pipelines.kept import MEASURED_POINT, read_kept
-from pipelines.tradeoff_plan import Wanted, point_id
-from toolkit.config import settings_dict
-from toolkit.errors import InputError
-from toolkit.files import fingerprint, read_json, remove, write_json
-from toolkit.poses.child import log_tail, run_logged
+from fieldfuse.config import settings_dict
+from fieldfuse.errors import InputError
+from fieldfuse.files import fingerprint, read_json, remove, write_json
+from fieldfuse.pipelines.direct_field import weights_state
+from fieldfuse.pipelines.job import Job
+from fieldfuse.pipelines.kept import MEASURED_POINT, read_kept
+from fieldfuse.pipelines.tradeoff_plan import Wanted, point_id
+from fieldfuse.poses.child import log_tail, run_logged
 
 VERSION = 1  # raised when what a point measures changes
 FIRST_GUESS = 15.0  # seconds that a point takes beside its fitting time, before one was measured
@@ -146,7 +146,7 @@ def run_child(job: Job, ask: Path, log: Path, expected: float) -> int:
         job.progress.check()
         job.progress.update(min(seconds, expected), expected)
 
-    return run_logged(["-m", "pipelines.tradeoff_child", str(ask)], log, tick)
+    return run_logged(["-m", "fieldfuse.pipelines.tradeoff_child", str(ask)], log, tick)
 
 
 def finish(one: Wanted, row: dict[str, Any]) -> dict[str, Any]:

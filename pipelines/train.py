@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.options import Pairs, Quiet, Threads
+from fieldfuse.pipelines.options import Pairs, Quiet, Threads
 
 
 def train(
@@ -20,15 +20,15 @@ def train(
     quiet: Quiet = False,
 ) -> None:
     """Train the networks that turn pictures into a field without fitting; writes `weights.safetensors`."""
-    from pipelines.thread_limits import bound_threads
+    from fieldfuse.pipelines.thread_limits import bound_threads
 
     bound_threads({"flags": {"threads": threads}})
-    from pipelines.console import make_progress
-    from pipelines.job import set_threads
-    from toolkit.errors import Interrupted
-    from toolkit.training.nerfusion.distributed import join_crew
-    from toolkit.training.nerfusion.settings import load_train_settings
-    from toolkit.training.nerfusion.train import WEIGHTS, Trainer
+    from fieldfuse.errors import Interrupted
+    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.job import set_threads
+    from fieldfuse.training.nerfusion.distributed import join_crew
+    from fieldfuse.training.nerfusion.settings import load_train_settings
+    from fieldfuse.training.nerfusion.train import WEIGHTS, Trainer
 
     settings = load_train_settings(config, pairs=pairs or ())
     set_threads(threads or settings.threads)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.options import Config, Holdout, ImageSize, Json, OptionalOut, Pairs, PosesFrom, Quiet, Target, Threads, gather
+from fieldfuse.pipelines.options import Config, Holdout, ImageSize, Json, OptionalOut, Pairs, PosesFrom, Quiet, Target, Threads, gather
 
 
 def tsdf(
@@ -26,7 +26,7 @@ def tsdf(
     json: Json = False,
 ) -> None:
     """Fuse the depth pictures into a surface: mesh, points, pictures and scores at the held-out views."""
-    from pipelines.work import work
+    from fieldfuse.pipelines.work import work
 
     flags = {"tsdf.enabled": "on", "tsdf.voxel_size": voxel_size, "tsdf.depth_max": depth_max, "poses.source": poses}
     flags |= {"image_size": image_size, "holdout": holdout, "threads": threads}

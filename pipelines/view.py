@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.options import Baked, Config, Device, OptionalOut, Pairs, Quiet, Target, Threads, gather
+from fieldfuse.pipelines.options import Baked, Config, Device, OptionalOut, Pairs, Quiet, Target, Threads, gather
 
 KEPT = "cameras_kept.json"
 
@@ -25,16 +25,16 @@ def view(
     quiet: Quiet = False,
 ) -> None:
     """Walk through the field of a run in the browser (of a source, it is fitted first). Ctrl-C ends it."""
-    from pipelines.thread_limits import bound_threads
+    from fieldfuse.pipelines.thread_limits import bound_threads
 
     options = gather(None, config, pairs, device=device, threads=threads)
     bound_threads(options)
-    from pipelines.console import make_progress
-    from pipelines.job import open_job
-    from pipelines.live import Live, Shown, require_server
-    from pipelines.pictures import camera_of
-    from pipelines.reconstruct import BEFORE, stand
-    from pipelines.steps_results import fit_radiance_field
+    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.job import open_job
+    from fieldfuse.pipelines.live import Live, Shown, require_server
+    from fieldfuse.pipelines.pictures import camera_of
+    from fieldfuse.pipelines.reconstruct import BEFORE, stand
+    from fieldfuse.pipelines.steps_results import fit_radiance_field
 
     require_server(host)
     with open_job(target, out, options, make_progress(quiet), (*BEFORE, "field")) as job:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.rendered import to_picture
-from toolkit.camera import Array, Intrinsics
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.pipelines.rendered import to_picture
 
 if TYPE_CHECKING:
     import viser
 
-    from pipelines.live import Live
+    from fieldfuse.pipelines.live import Live
 
 MOVING_SECONDS = 0.08  # that a picture may take while the camera moves
 REST = 0.15  # seconds without a movement after which a camera rests
@@ -79,7 +79,7 @@ def lens_of(fov: float, aspect: float, long_side: int) -> Intrinsics:
 
 def picture(rendered: Any, what: str) -> Array:
     """(H, W, 3) uint8 of what was asked for."""
-    from toolkit.evaluate.pictures import depth_picture, depth_range
+    from fieldfuse.evaluate.pictures import depth_picture, depth_range
 
     if what == DEPTH:
         return depth_picture(rendered.depth, depth_range([rendered.depth]))
@@ -90,6 +90,6 @@ def picture(rendered: Any, what: str) -> Array:
 
 def pose_of(wxyz: Any, position: Any) -> Array:
     """(4, 4) world_from_camera of a viewer's camera, whose axes are ours."""
-    from toolkit.capture.quaternion import rigid
+    from fieldfuse.capture.quaternion import rigid
 
     return rigid(np.asarray(wxyz, dtype=np.float64), np.asarray(position, dtype=np.float64), "the viewer's camera")

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from pipelines.console import make_progress, show_table
+from fieldfuse.pipelines.console import make_progress, show_table
 
 PAGE = "exports/field.html"  # the field to walk through
 
@@ -25,10 +25,10 @@ def work(
     go_on: bool = False,
 ) -> None:
     """Make `goals` in the run's folder and show the report's numbers."""
-    from pipelines.thread_limits import bound_threads
+    from fieldfuse.pipelines.thread_limits import bound_threads
 
     bound_threads(options)
-    from pipelines.reconstruct import BEFORE, run_job
+    from fieldfuse.pipelines.reconstruct import BEFORE, run_job
 
     data = run_job(target, out, options, goals, make_progress(quiet), BEFORE if trusted is None else trusted, go_on)
     show(data, quiet, as_json, folder=target if out is None else out)

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.effects import transfer
-from toolkit.errors import FieldfuseError, InputError
-from toolkit.simulate.eye import eye_of, take
-from toolkit.simulate.mesh_scene import MeshScene, load_mesh_scene
-from toolkit.training.nerfusion.paths import hand_held
-from toolkit.training.nerfusion.shards import write_shard
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.effects import transfer
+from fieldfuse.errors import FieldfuseError, InputError
+from fieldfuse.simulate.eye import eye_of, take
+from fieldfuse.simulate.mesh_scene import MeshScene, load_mesh_scene
+from fieldfuse.training.nerfusion.paths import hand_held
+from fieldfuse.training.nerfusion.shards import write_shard
 
 EYES = (0.7, 1.8)  # metres above the floor
 TRIES = 200

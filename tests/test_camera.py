@@ -12,8 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.capture.board import bend, unbend
-from toolkit.camera import (
+from fieldfuse.camera import (
     FISHEYE,
     OPENCV,
     PINHOLE,
@@ -34,7 +33,8 @@ from toolkit.camera import (
     world_from_llff,
     world_from_opengl,
 )
-from toolkit.errors import InputError
+from fieldfuse.errors import InputError
+from tests.capture.board import bend, unbend
 
 CAMERA = Intrinsics(64, 48, 50.0, 52.0, 31.0, 25.5)
 near = st.floats(-1, 1, allow_nan=False)

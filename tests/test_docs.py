@@ -65,7 +65,7 @@ def test_pages_that_the_code_names_exist() -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=where)
 def test_commands_and_options_exist(page: Path) -> None:
-    from pipelines.cli import app
+    from fieldfuse.pipelines.cli import app
 
     commands = typer.main.get_command(app)
     text = page.read_text(encoding="utf-8")
@@ -80,7 +80,7 @@ def test_commands_and_options_exist(page: Path) -> None:
 
 
 def test_every_command_is_in_the_readme() -> None:
-    from pipelines.cli import app
+    from fieldfuse.pipelines.cli import app
 
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     for name in typer.main.get_command(app).commands:  # type: ignore[attr-defined]
@@ -88,7 +88,7 @@ def test_every_command_is_in_the_readme() -> None:
 
 
 def test_settings_that_the_docs_name_exist() -> None:
-    from toolkit.config import load_settings, settings_dict
+    from fieldfuse.config import load_settings, settings_dict
 
     data = settings_dict(load_settings("balanced"))
     groups = {group for group, value in data.items() if isinstance(value, dict)}

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from pipelines import doctor
-from pipelines.doctor import FAIL, OK, WARN, Check
+from fieldfuse.pipelines import doctor
+from fieldfuse.pipelines.doctor import FAIL, OK, WARN, Check
 
 ROOT = Path(__file__).resolve().parents[1]
 

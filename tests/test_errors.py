@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from toolkit.config import load_settings
-from toolkit.errors import LONGEST, FieldfuseError, InputError, PoseError, all_lines, first_line
+from fieldfuse.config import load_settings
+from fieldfuse.errors import LONGEST, FieldfuseError, InputError, PoseError, all_lines, first_line
 
 ANYTHING = st.text(st.characters(exclude_categories=()))
 
@@ -29,9 +29,8 @@ def test_what_can_be_shown_stays():
 @pytest.mark.parametrize("name", [b"a\nb", b"caf\xe9", b"\x1b[31mred"])
 def test_a_name_that_no_terminal_can_show(tmp_path, name):
     """File names are bytes on Linux."""
-    run = subprocess.run(
-        [sys.executable, "-m", "pipelines.cli", "run", bytes(tmp_path) + b"/" + name, "--out", str(tmp_path / "out")], capture_output=True
-    )
+    command = [sys.executable, "-m", "fieldfuse.pipelines.cli", "run", bytes(tmp_path) + b"/" + name, "--out", str(tmp_path / "out")]
+    run = subprocess.run(command, capture_output=True)
     assert run.returncode == 2
     said = run.stderr.decode("utf-8")
     assert "\x1b" not in said and "unexpected" not in said and not (tmp_path / "out").exists()

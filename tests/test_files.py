@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from toolkit.errors import InputError, OutputError
-from toolkit.files import atomic_path, fingerprint, inside, read_json, remove, write_json
+from fieldfuse.errors import InputError, OutputError
+from fieldfuse.files import atomic_path, fingerprint, inside, read_json, remove, write_json
 
 
 def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:

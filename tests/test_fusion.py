@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import InputError, Interrupted
+from fieldfuse.fusion import KEPT_PICTURES, Fused, Fusion, FusionOptions, fuse_views, fusion_lattice
+from fieldfuse.keyframes import KeyFrames
+from fieldfuse.networks.block_conv import BlockConv3d
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.head import SCALE, START
+from fieldfuse.networks.lattice import Lattice
+from fieldfuse.networks.local import INSIDE
+from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.networks.refine import part
+from fieldfuse.progress import Progress
+from fieldfuse.volume.space import Space
 from tests.networks.made import HEIGHT, INTRINSICS, WIDTH, poses, small_model
-from toolkit.capture.types import Views
-from toolkit.errors import InputError, Interrupted
-from toolkit.fusion import KEPT_PICTURES, Fused, Fusion, FusionOptions, fuse_views, fusion_lattice
-from toolkit.keyframes import KeyFrames
-from toolkit.networks.block_conv import BlockConv3d
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.head import SCALE, START
-from toolkit.networks.lattice import Lattice
-from toolkit.networks.local import INSIDE
-from toolkit.networks.model import NerfusionModel
-from toolkit.networks.refine import part
-from toolkit.progress import Progress
-from toolkit.volume.space import Space
 
 SPACE = Space((0.0, 0.0, 0.0), 0.8, 0.0)
 FAR = 2.6
@@ -204,7 +204,7 @@ def test_where_a_device_works_behind_the_processor_pictures_are_encoded_ahead(mo
     monkeypatch.setattr(model, "encode", counted)
     one_by_one, expected = fused()
     assert set(together) == {1} and one_by_one == [2, *range(3, 12), 11]
-    monkeypatch.setattr("toolkit.fusion.asks_freely", lambda device: False)
+    monkeypatch.setattr("fieldfuse.fusion.asks_freely", lambda device: False)
     ahead, found = fused()
     # Four key frames and their neighbours; the next ones come when the fourth is fused.
     assert together == [5, 4, 2] and ahead == [5, 5, 5, 9, 9, 9, 9, 11, 11, 11, 11]

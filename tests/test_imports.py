@@ -10,22 +10,22 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 BLOCKED = ("open3d", "pycolmap", "trimesh")
 LIGHT = (
-    "toolkit.camera",
-    "toolkit.config",
-    "toolkit.files",
-    "toolkit.capture",
-    "toolkit.effects",
-    "toolkit.fusion",
-    "toolkit.volume.compiled",
-    "toolkit.volume.edit",
-    "toolkit.volume.lookup",
-    "toolkit.volume.space",
-    "toolkit.volume.store",
-    "toolkit.volume.topology",
-    "toolkit.networks",
-    "toolkit.render",
-    "toolkit.training",
-    "toolkit.simulate",
+    "fieldfuse.camera",
+    "fieldfuse.config",
+    "fieldfuse.files",
+    "fieldfuse.capture",
+    "fieldfuse.effects",
+    "fieldfuse.fusion",
+    "fieldfuse.volume.compiled",
+    "fieldfuse.volume.edit",
+    "fieldfuse.volume.lookup",
+    "fieldfuse.volume.space",
+    "fieldfuse.volume.store",
+    "fieldfuse.volume.topology",
+    "fieldfuse.networks",
+    "fieldfuse.render",
+    "fieldfuse.training",
+    "fieldfuse.simulate",
 )
 PRELUDE = f"""
 import importlib, pkgutil, sys
@@ -64,7 +64,7 @@ def test_every_light_module_imports_without_them() -> None:
 
 
 COMMANDS = """
-from pipelines.cli import main
+from fieldfuse.pipelines.cli import main
 codes = []
 for arguments in {commands!r}:
     sys.argv = ["fieldfuse", *arguments]
@@ -88,13 +88,13 @@ FIT = """
 import itertools
 import numpy as np, torch
 torch.set_num_threads(1)
-from toolkit.camera import Intrinsics, Similarity
-from toolkit.capture.types import Views
-from toolkit.config import load_settings
-from toolkit.poses.scene import Scene
-from toolkit.render.image import render_view
-from toolkit.simulate.demo import demo_scene, hand_held
-from toolkit.training.fit import Clock, fit_field
+from fieldfuse.camera import Intrinsics, Similarity
+from fieldfuse.capture.types import Views
+from fieldfuse.config import load_settings
+from fieldfuse.poses.scene import Scene
+from fieldfuse.render.image import render_view
+from fieldfuse.simulate.demo import demo_scene, hand_held
+from fieldfuse.training.fit import Clock, fit_field
 
 looks = itertools.count(1)
 Clock.seconds = lambda clock: next(looks) * 0.05  # as many steps on any machine

@@ -58,45 +58,52 @@ def test_pyproject_holds_only_the_build_system() -> None:
     assert list(tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))) == ["build-system"]
 
 
-def test_every_package_has_an_init_and_is_packed() -> None:
-    from setuptools import find_packages
+TOPS = {"toolkit": "fieldfuse", "pipelines": "fieldfuse.pipelines", "configs": "fieldfuse.configs"}  # folders, and what they install as
 
-    found = set(find_packages(str(ROOT), include=[line for line in setup()["options.packages.find"]["include"].split("\n") if line]))
-    folders = {
-        path.parent.relative_to(ROOT).as_posix().replace("/", ".")
-        for top in ("toolkit", "pipelines", "configs")
+
+def test_every_package_has_an_init_and_is_packed() -> None:
+    options = setup()["options"]
+    assert dict(line.split(" = ") for line in options["package_dir"].strip().splitlines()) == {name: top for top, name in TOPS.items()}
+    packages = {
+        TOPS[top] + path.parent.relative_to(ROOT).as_posix().removeprefix(top).replace("/", ".")
+        for top in TOPS
         for path in (ROOT / top).rglob("*.py")
+        if (path.parent / "__init__.py").is_file()
     }
-    assert found == folders
+    assert set(options["packages"].split()) == packages
+    assert len(packages) == len({path.parent for top in TOPS for path in (ROOT / top).rglob("*.py")}), "a folder lacks __init__.py"
 
 
 def test_data_files_are_packed() -> None:
     """Files beside the code that are read at run time must be in package_data, or an installed copy lacks them."""
     data = setup()["options.package_data"]
     patterns = [(package, pattern.strip()) for package, given in data.items() for pattern in given.split(",")]
-    packed = {path for package, pattern in patterns for path in (ROOT / package.replace(".", "/")).glob(pattern)}
+    folders = {name: top for top, name in TOPS.items()} | {
+        name: f"toolkit/{name.removeprefix('fieldfuse.').replace('.', '/')}" for name in data if name not in TOPS.values()
+    }
+    packed = {path for package, pattern in patterns for path in (ROOT / folders[package]).glob(pattern)}
     there = {
         path
-        for top in ("toolkit", "pipelines", "configs")
+        for top in TOPS
         for path in (ROOT / top).rglob("*")
         if path.is_file() and path.suffix != ".py" and "__pycache__" not in path.parts
     }
     assert packed == there
-    assert {entry.name for entry in resources.files("configs").iterdir()} >= {"fast.yaml", "balanced.yaml", "quality.yaml"}
+    assert {entry.name for entry in resources.files("fieldfuse.configs").iterdir()} >= {"fast.yaml", "balanced.yaml", "quality.yaml"}
 
 
 def test_the_command_is_declared_and_the_version_is_one() -> None:
-    import toolkit
-    from pipelines import cli
+    import fieldfuse
+    from fieldfuse.pipelines import cli
 
-    assert setup()["options.entry_points"]["console_scripts"].strip() == "fieldfuse = pipelines.cli:program"
+    assert setup()["options.entry_points"]["console_scripts"].strip() == "fieldfuse = fieldfuse.pipelines.cli:program"
     assert callable(cli.main)
-    assert setup()["metadata"]["version"] == "attr: toolkit.__version__"
+    assert setup()["metadata"]["version"] == "attr: fieldfuse.__version__"
     try:
         installed = metadata.version("fieldfuse")
     except metadata.PackageNotFoundError:
         pytest.skip("fieldfuse runs from its folder here, it is not installed")
-    assert installed == toolkit.__version__
+    assert installed == fieldfuse.__version__
 
 
 def test_licence_is_whole() -> None:
@@ -134,7 +141,7 @@ def test_demo_and_test_share_the_steps_in_order(tmp_path: Path) -> None:
     """From nothing: environment, install, and only then the work. Nothing is run here (`--dry-run`)."""
     venv = f"VENV={tmp_path / 'none'}"
     demo, test = make("--dry-run", "demo", venv).stdout, make("--dry-run", "test", venv).stdout
-    assert demo.index("-m venv") < demo.index("pip install") < demo.index("pipelines.demo")
+    assert demo.index("-m venv") < demo.index("pip install") < demo.index("fieldfuse.pipelines.demo")
     assert test.index("-m venv") < test.index("pip install") < test.index("ruff check") < test.index("bin/mypy") < test.index("-m pytest")
     assert "lint-imports" in test
     assert "constraint constraints.txt" in demo
@@ -213,6 +220,6 @@ def test_what_is_imported_is_installed_without_the_tests() -> None:
             found |= {name.split(".")[0]: str(path) for name in said}
     known, plain = metadata.packages_distributions(), {re.sub(r"[-_.]+", "-", name).lower() for name in asked}
     assert "test" in extras and len(plain) > 15 and {"numpy", "torch", "numba"} <= set(found)
-    for name in sorted(set(found) - set(sys.stdlib_module_names) - {"toolkit", "pipelines", "configs"}):
+    for name in sorted(set(found) - set(sys.stdlib_module_names) - {"fieldfuse"}):
         given = {re.sub(r"[-_.]+", "-", one).lower() for one in known.get(name, [name])}
         assert given & plain, f"{name} is imported in {found[name]}, and nothing that setup.cfg asks for brings it"

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse import key_sweeps
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Views
+from fieldfuse.fusion import FusionOptions, fuse_views
+from fieldfuse.key_sweeps import LEAST_OVERLAP, MOST, KeySweeps, beside
+from fieldfuse.keyframes import KeyFrames
+from fieldfuse.networks.sweep import Sweep
+from fieldfuse.poses.overlap import overlap
 from tests.networks.made import HEIGHT, INTRINSICS, WIDTH, lattice, small_model, wall_pictures
 from tests.networks.made import poses as poses_in_line
-from toolkit import key_sweeps
-from toolkit.camera import Array
-from toolkit.capture.types import Views
-from toolkit.fusion import FusionOptions, fuse_views
-from toolkit.key_sweeps import LEAST_OVERLAP, MOST, KeySweeps, beside
-from toolkit.keyframes import KeyFrames
-from toolkit.networks.sweep import Sweep
-from toolkit.poses.overlap import overlap
 
 NEAR, FAR = 0.5, 4.0
 

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.camera import Similarity
+from fieldfuse.errors import InputError
+from fieldfuse.keyframes import UNIFORM, KeyFrames, select_keyframes
+from fieldfuse.poses.overlap import convergence, guessed_depth, overlap, parallax
 from tests.poses.textured import CAMERA, arc, look_at
-from toolkit.camera import Similarity
-from toolkit.errors import InputError
-from toolkit.keyframes import UNIFORM, KeyFrames, select_keyframes
-from toolkit.poses.overlap import convergence, guessed_depth, overlap, parallax
 
 
 def choose(poses, depth=3.0, **options):
@@ -116,6 +116,6 @@ def test_a_blurred_key_frame_gives_way_to_a_sharp_frame_beside_it():
 
 
 def best_neighbours_of(poses):
-    from toolkit.poses.overlap import best_neighbours
+    from fieldfuse.poses.overlap import best_neighbours
 
     return best_neighbours(poses, overlap(poses, [CAMERA] * len(poses), 3.0), parallax(poses, 3.0), 2)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from toolkit import gpu
-from toolkit.networks.store import _Slots
+from fieldfuse import gpu
+from fieldfuse.networks.store import _Slots
 
 
 class Jitted:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import configparser
 import shutil
 import subprocess
@@ -22,7 +23,8 @@ def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
 def copy(tmp_path: Path) -> Path:
     """The packages and their contract, to be broken on purpose."""
     for name in ("toolkit", "pipelines", "configs"):
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+        place = tmp_path / "fieldfuse" / ("" if name == "toolkit" else name)
+        shutil.copytree(ROOT / name, place, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "setup.cfg", tmp_path)
     return tmp_path
 
@@ -35,12 +37,12 @@ def test_the_contracts_are_kept(copy: Path) -> None:
 @pytest.mark.parametrize(
     ("module", "line", "contract"),
     [
-        ("toolkit/camera.py", "from toolkit.render import march", "One direction of flow"),
-        ("toolkit/files.py", "import toolkit.camera", "One direction of flow"),
-        ("toolkit/evaluate/__init__.py", "import pipelines.doctor", "knows nothing of the pipelines"),
-        ("toolkit/training/__init__.py", "import open3d", "needs no Open3D"),
-        ("toolkit/capture/__init__.py", "import pycolmap", "needs no Open3D"),
-        ("toolkit/volume/topology.py", "from toolkit.volume import grid", "needs no Open3D"),
+        ("fieldfuse/camera.py", "from fieldfuse.render import march", "One direction of flow"),
+        ("fieldfuse/files.py", "import fieldfuse.camera", "One direction of flow"),
+        ("fieldfuse/evaluate/__init__.py", "import fieldfuse.pipelines.doctor", "One direction of flow"),
+        ("fieldfuse/training/__init__.py", "import open3d", "needs no Open3D"),
+        ("fieldfuse/capture/__init__.py", "import pycolmap", "needs no Open3D"),
+        ("fieldfuse/volume/topology.py", "from fieldfuse.volume import grid", "needs no Open3D"),
     ],
 )
 def test_a_wrong_import_is_told(copy: Path, module: str, line: str, contract: str) -> None:
@@ -53,7 +55,7 @@ def test_a_wrong_import_is_told(copy: Path, module: str, line: str, contract: st
 
 
 def test_a_new_part_needs_a_place_in_the_order(copy: Path) -> None:
-    (copy / "toolkit" / "newcomer.py").write_text('"""New."""\n', encoding="utf-8")
+    (copy / "fieldfuse" / "newcomer.py").write_text('"""New."""\n', encoding="utf-8")
     done = lint_imports(copy)
     assert done.returncode == 1 and "newcomer" in done.stdout
 
@@ -75,5 +77,16 @@ def test_the_layers_name_only_what_may_exist() -> None:
     parser.read(ROOT / "setup.cfg", encoding="utf-8")
     layers = parser["importlinter:contract:flow"]["layers"].replace("|", " ").split()
     required = [name for name in layers if not name.startswith("(")]
-    missing = [name for name in required if not ((ROOT / "toolkit" / name).is_dir() or (ROOT / "toolkit" / f"{name}.py").is_file())]
+    places = [ROOT / "toolkit" / name for name in required]
+    beside = ("pipelines", "configs")
+    missing = [place.name for place in places if not (place.name in beside or place.is_dir() or place.with_suffix(".py").is_file())]
     assert not missing
+
+
+def test_no_module_gives_a_constant_two_values() -> None:
+    """A name given to two thresholds of one module silently makes the first the second."""
+    for path in [*(ROOT / "toolkit").rglob("*.py"), *(ROOT / "pipelines").rglob("*.py")]:
+        lines = ast.parse(path.read_text(encoding="utf-8")).body
+        goals = [goal for line in lines if isinstance(line, ast.Assign) for goal in line.targets]
+        names = [node.id for goal in goals for node in ast.walk(goal) if isinstance(node, ast.Name)]
+        assert len(names) == len(set(names)), f"{path}: {sorted({name for name in names if names.count(name) > 1})}"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from toolkit import libraries
+from fieldfuse import libraries
 
 ROOT = Path(__file__).resolve().parents[1]
 LINUX = pytest.mark.skipif(not sys.platform.startswith("linux") or sys.maxsize < 2**32, reason="Linux on 64 bits")
@@ -18,7 +18,7 @@ PROGRAM = """
 import json, re
 import cv2, numba, numpy as np, open3d, torch
 from pathlib import Path
-from toolkit import libraries
+from fieldfuse import libraries
 
 def files():
     return int(re.search(r"RssFile:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) // 1024

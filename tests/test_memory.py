@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit import memory
-from toolkit.errors import InputError
+from fieldfuse import memory
+from fieldfuse.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -71,7 +71,7 @@ def test_files_that_a_container_holds_and_nobody_uses_are_free(tmp_path: Path, m
 
 def test_a_limit_of_the_process_counts() -> None:
     program = (
-        "import resource; from toolkit import memory; before = memory._kilobytes(memory._STATUS, 'VmSize')\n"
+        "import resource; from fieldfuse import memory; before = memory._kilobytes(memory._STATUS, 'VmSize')\n"
         "resource.setrlimit(resource.RLIMIT_AS, (before + 2**26, before + 2**26))\n"
         "print(memory.available())"
     )

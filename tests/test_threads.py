@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.threads import share, slices
+from fieldfuse.threads import share, slices
 
 
 @settings(max_examples=30, deadline=None)

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.camera import Intrinsics
-from toolkit.effects import transfer, vignetting
-from toolkit.tone import LINEAR, SHOULDER, Tone, brighter, decode, encode, exposed, positive, share, square_radius
+from fieldfuse.camera import Intrinsics
+from fieldfuse.effects import transfer, vignetting
+from fieldfuse.tone import LINEAR, SHOULDER, Tone, brighter, decode, encode, exposed, positive, share, square_radius
 
 CAMERA = Intrinsics(64, 48, 50.0, 50.0, 30.0, 25.0)
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.errors import InputError
+from fieldfuse.errors import InputError
 
 if TYPE_CHECKING:
     import torch

@@ -17,7 +17,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from toolkit.errors import InputError, brief, first_line
+from fieldfuse.errors import InputError, brief, first_line
 
 MAX_YAML = 2**18  # characters
 MAX_NESTING = 16

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError
 
-from toolkit.errors import InputError, OutputError, brief, first_line
+from fieldfuse.errors import InputError, OutputError, brief, first_line
 
 MAX_JSON_BYTES = 64 * 2**20
 

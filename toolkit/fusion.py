@@ -16,24 +16,24 @@ from functools import cached_property, partial
 import torch
 from torch import Tensor
 
-from toolkit.capture.types import Views
-from toolkit.errors import InputError
-from toolkit.gpu import asks_freely, sent
-from toolkit.key_sweeps import Brought, KeySweeps, Recent, picture, sensed, together
-from toolkit.keyframes import KeyFrames
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.cull import all_blocks, block_balls, visible_at_once, visible_blocks
-from toolkit.networks.lattice import LatentVolume, Lattice
-from toolkit.networks.matching import SIDE, SIDE_WITHIN
-from toolkit.networks.model import NerfusionModel
-from toolkit.networks.precision import FLOAT32, computing
-from toolkit.networks.refine import children, merged, solid_cells, split_volume
-from toolkit.networks.store import GlobalStore
-from toolkit.networks.sweep import Empty, Sweep
-from toolkit.networks.unproject import EncodedView
-from toolkit.progress import SILENT, Progress
-from toolkit.volume.space import Space
-from toolkit.volume.topology import BLOCK, VOXELS, Topology
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import InputError
+from fieldfuse.gpu import asks_freely, sent
+from fieldfuse.key_sweeps import Brought, KeySweeps, Recent, picture, sensed, together
+from fieldfuse.keyframes import KeyFrames
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.cull import all_blocks, block_balls, visible_at_once, visible_blocks
+from fieldfuse.networks.lattice import LatentVolume, Lattice
+from fieldfuse.networks.matching import SIDE, SIDE_WITHIN
+from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.networks.precision import FLOAT32, computing
+from fieldfuse.networks.refine import children, merged, solid_cells, split_volume
+from fieldfuse.networks.store import GlobalStore
+from fieldfuse.networks.sweep import Empty, Sweep
+from fieldfuse.networks.unproject import EncodedView
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
 
 KEPT_PICTURES = 12  # encoded pictures kept for key frames to come …
 KEPT_ON_DEVICE = 32  # … and where they are encoded ahead, 20 MB each at 640×480

@@ -15,15 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.types import Views
-from toolkit.gpu import asks_freely
-from toolkit.keyframes import KeyFrames
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.matching import describe
-from toolkit.networks.sweep import Compared, Sweep, compare, decide
-from toolkit.networks.witness import Witness, alone, evidence, witness
-from toolkit.poses.overlap import overlap, parallax
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.gpu import asks_freely
+from fieldfuse.keyframes import KeyFrames
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.matching import describe
+from fieldfuse.networks.sweep import Compared, Sweep, compare, decide
+from fieldfuse.networks.witness import Witness, alone, evidence, witness
+from fieldfuse.poses.overlap import overlap, parallax
 
 MOST = 8  # witnesses of a key frame
 LEAST_OVERLAP = 0.1  # either way

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.errors import InputError
-from toolkit.poses.overlap import best_neighbours, overlap, parallax
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.errors import InputError
+from fieldfuse.poses.overlap import best_neighbours, overlap, parallax
 
 BY_PARALLAX = "parallax"
 UNIFORM = "uniform"

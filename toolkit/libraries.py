@@ -13,7 +13,7 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-from toolkit.memory import madvise
+from fieldfuse.memory import madvise
 
 _HEADER = struct.Struct("<16sHHIQQQIHHHHHH")  # of an ELF file of 64 bits
 _SEGMENT = struct.Struct("<IIQQQQQQ")  # type, flags, offset, address, physical address, bytes in the file, bytes in memory, alignment

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.errors import InputError
+from fieldfuse.errors import InputError
 
 GIB = 2**30
 SPARE = 128 * 2**20  # left to everything else

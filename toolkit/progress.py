@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from toolkit.errors import Interrupted
+from fieldfuse.errors import Interrupted
 
 
 class Progress:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
+from fieldfuse.camera import Array, Intrinsics
 
 Gain = tuple[float, float, float]  # of red, green and blue
 CLIPPED = 254  # of 255: such a pixel may have been brighter

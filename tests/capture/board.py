@@ -1,4 +1,4 @@
-"""A checkerboard seen through a lens, for tests. The lens formulas stand here a second time, independent of `toolkit.camera`."""
+"""A checkerboard seen through a lens, for tests. The lens formulas stand here a second time, independent of `fieldfuse.camera`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit.camera import FISHEYE, Array, Intrinsics
-from toolkit.capture.types import Capture, Frame
+from fieldfuse.camera import FISHEYE, Array, Intrinsics
+from fieldfuse.capture.types import Capture, Frame
 
 SQUARE = 0.25
 DISTANCE = 2.0  # the board lies in the plane z = DISTANCE of a camera at the origin,

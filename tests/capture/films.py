@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".mkv": "mp4v", ".avi": "MJPG", ".webm": "VP80"}
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from fieldfuse.camera import Array
 from tests.capture.films import film
 from tests.capture.made import Eye, Pinhole, eyes, render, save_depth, save_picture
-from toolkit.camera import Array
 
 OFF_CENTRE = Pinhole(80, 60, 71.0, 73.0, 42.25, 27.5)
 CENTRED = Pinhole(80, 60, 72.0, 72.0, 40.0, 30.0)

@@ -1,6 +1,6 @@
 """A small made-up scene with exactly known cameras, for tests that write it in some layout and read it back.
 
-Cameras are kept as three axes and a centre, and are projected with dot products here: nothing of `toolkit.camera` is used to make
+Cameras are kept as three axes and a centre, and are projected with dot products here: nothing of `fieldfuse.camera` is used to make
 what the readers are measured against.
 """
 
@@ -13,8 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, project, unproject
-from toolkit.capture.types import Capture
+from fieldfuse.camera import Array, Intrinsics, project, unproject
+from fieldfuse.capture.types import Capture
 
 BALL = np.array([0.1, -0.2, 0.6])
 RADIUS = 0.6

@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Array, Intrinsics, Similarity
+from fieldfuse.capture import Capture, open_capture
+from fieldfuse.capture.alpha import HEADERS, cut_out
+from fieldfuse.capture.prepare import prepare_views
+from fieldfuse.capture.types import Frame
+from fieldfuse.config import CaptureSettings
 from tests.capture.board import texture
 from tests.capture.layouts import LAYOUTS
-from toolkit.camera import Array, Intrinsics, Similarity
-from toolkit.capture import Capture, open_capture
-from toolkit.capture.alpha import HEADERS, cut_out
-from toolkit.capture.prepare import prepare_views
-from toolkit.capture.types import Frame
-from toolkit.config import CaptureSettings
 
 # Counts as cut out; JPEG and video hold no alpha.
 OTHERS = ("blender", "polycam", "record3d", "redwood", "replica", "scannet", "scanner3d", "sens", "stray")

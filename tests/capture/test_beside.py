@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from fieldfuse.camera import Array
+from fieldfuse.capture import Capture, open_capture
+from fieldfuse.capture.beside import unused
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.duplicates import copies
+from fieldfuse.errors import InputError
 from tests.capture.films import film, quarters
 from tests.capture.layouts import write_colmap_bin, write_transforms
-from toolkit.camera import Array
-from toolkit.capture import Capture, open_capture
-from toolkit.capture.beside import unused
-from toolkit.capture.checks import check_capture
-from toolkit.capture.duplicates import copies
-from toolkit.errors import InputError
 
 
 def scene(index: int, size: tuple[int, int] = (160, 120)) -> Array:

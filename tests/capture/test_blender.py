@@ -8,11 +8,11 @@ from pathlib import Path
 import cv2
 import pytest
 
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.blender import read_blender
+from fieldfuse.errors import InputError
 from tests.capture.layouts import write_blender
 from tests.conftest import shared_data
-from toolkit.capture import open_capture
-from toolkit.capture.blender import read_blender
-from toolkit.errors import InputError
 
 
 def test_splits_alpha_and_up(tmp_path: Path) -> None:

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from toolkit.camera import FISHEYE, OPENCV, Array, Intrinsics, invert
-from toolkit.capture.carried import _rays, carried
-from toolkit.capture.images import load_depth
-from toolkit.capture.storage import capture_from_dict, capture_to_dict
-from toolkit.capture.types import Capture, Frame
+from fieldfuse.camera import FISHEYE, OPENCV, Array, Intrinsics, invert
+from fieldfuse.capture.carried import _rays, carried
+from fieldfuse.capture.images import load_depth
+from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
+from fieldfuse.capture.types import Capture, Frame
 
 CAMERA = Intrinsics(96, 72, 80.0, 82.0, 47.0, 37.5)
 LENSES = {

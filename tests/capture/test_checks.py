@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.depth_checks import Sample, check_depth, unit_factor
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import FieldfuseError, InputError, Interrupted
+from fieldfuse.progress import Progress
+from fieldfuse.simulate.paths import PathSettings, plan
+from fieldfuse.simulate.procedural import random_scene
 from tests.capture.board import capture_of, save, texture
 from tests.conftest import shared_data
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture import open_capture
-from toolkit.capture.checks import check_capture
-from toolkit.capture.depth_checks import Sample, check_depth, unit_factor
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import FieldfuseError, InputError, Interrupted
-from toolkit.progress import Progress
-from toolkit.simulate.paths import PathSettings, plan
-from toolkit.simulate.procedural import random_scene
 
 SIZE = (120, 160)
 

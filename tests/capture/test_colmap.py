@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Intrinsics, project
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.colmap import candidate_captures, read_colmap
+from fieldfuse.capture.colmap_model import MODELS, intrinsics_of, read_model
+from fieldfuse.errors import InputError
 from tests.capture.layouts import OFF_CENTRE, POINTS, half_size, write_colmap_bin, write_colmap_txt
 from tests.capture.made import eyes, pixel_error, render, save_picture
-from toolkit.camera import Intrinsics, project
-from toolkit.capture import open_capture
-from toolkit.capture.colmap import candidate_captures, read_colmap
-from toolkit.capture.colmap_model import MODELS, intrinsics_of, read_model
-from toolkit.errors import InputError
 
 PARAMETERS = {
     "SIMPLE_PINHOLE": [70, 41, 29],

@@ -14,13 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageCms
 
+from fieldfuse.camera import Array
+from fieldfuse.capture.colours import MOST_BYTES, SAME, to_srgb
+from fieldfuse.capture.convert import write_picture
+from fieldfuse.capture.images import load_image, load_mask
+from fieldfuse.capture.primaries import png_colours, profile_of
+from fieldfuse.capture.types import Frame
 from tests.capture.board import texture
-from toolkit.camera import Array
-from toolkit.capture.colours import MOST_BYTES, SAME, to_srgb
-from toolkit.capture.convert import write_picture
-from toolkit.capture.images import load_image, load_mask
-from toolkit.capture.primaries import png_colours, profile_of
-from toolkit.capture.types import Frame
 
 # Chromaticities of red, green and blue (SMPTE EG 432-1; Adobe RGB (1998); ITU-R BT.709), all under the white D65.
 P3 = ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060))

@@ -9,6 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.detect import READERS, detect_kind
+from fieldfuse.capture.images import load_image
+from fieldfuse.capture.listing import fitted, natural_key, unique_names
+from fieldfuse.errors import InputError
 from tests.capture.films import film
 from tests.capture.layouts import (
     EIGHTH_525,
@@ -22,13 +29,6 @@ from tests.capture.layouts import (
 )
 from tests.capture.made import colour_difference, eyes, left_out, pixel_error, render, reprojection, save_picture
 from tests.conftest import shared_data
-from toolkit.camera import Intrinsics
-from toolkit.capture import open_capture
-from toolkit.capture.checks import check_capture
-from toolkit.capture.detect import READERS, detect_kind
-from toolkit.capture.images import load_image
-from toolkit.capture.listing import fitted, natural_key, unique_names
-from toolkit.errors import InputError
 
 # What a reader would do wrong: turn about each axis (OpenGL for OpenCV, …), take the inverse, or take the axes in LLFF's order.
 MISTAKES = {

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.dtu import camera_for, decompose, read_dtu
+from fieldfuse.errors import InputError
 from tests.capture.layouts import OFF_CENTRE, write_dtu
 from tests.capture.made import Pinhole, eyes, pixel_error, render, save_picture
 from tests.conftest import shared_data
-from toolkit.capture import open_capture
-from toolkit.capture.dtu import camera_for, decompose, read_dtu
-from toolkit.errors import InputError
 
 
 @settings(max_examples=60, deadline=None)

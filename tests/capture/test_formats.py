@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from PIL import Image, TiffImagePlugin
 
+from fieldfuse.camera import Array
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.headers import orientation_of, read_bytes, read_header
+from fieldfuse.capture.images import load_image, read_picture, turns_by_exif
+from fieldfuse.capture.listing import picture_header
+from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
+from fieldfuse.capture.tiff import read_tiff, unturned
+from fieldfuse.capture.types import Frame
+from fieldfuse.errors import InputError
 from tests.pipelines.made import make_room
-from toolkit.camera import Array
-from toolkit.capture import open_capture
-from toolkit.capture.checks import check_capture
-from toolkit.capture.headers import orientation_of, read_bytes, read_header
-from toolkit.capture.images import load_image, read_picture, turns_by_exif
-from toolkit.capture.listing import picture_header
-from toolkit.capture.storage import capture_from_dict, capture_to_dict
-from toolkit.capture.tiff import read_tiff, unturned
-from toolkit.capture.types import Frame
-from toolkit.errors import InputError
 
 HEIGHT, WIDTH = 40, 56
 

@@ -12,16 +12,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from fieldfuse.camera import Array
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.convert import CONVERTED, all_converted, convert_pictures, to_convert
+from fieldfuse.capture.headers import read_header
+from fieldfuse.capture.images import load_image
+from fieldfuse.capture.types import Frame
+from fieldfuse.errors import InputError, Interrupted
+from fieldfuse.progress import Progress
 from tests.capture.board import texture
-from toolkit.camera import Array
-from toolkit.capture import open_capture
-from toolkit.capture.checks import check_capture
-from toolkit.capture.convert import CONVERTED, all_converted, convert_pictures, to_convert
-from toolkit.capture.headers import read_header
-from toolkit.capture.images import load_image
-from toolkit.capture.types import Frame
-from toolkit.errors import InputError, Interrupted
-from toolkit.progress import Progress
 
 pillow_heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not installed; make test brings it")
 
@@ -103,7 +103,7 @@ def test_what_is_there_as_jpeg_too_is_used_once(tmp_path: Path) -> None:
 
 
 def test_the_small_copy_in_the_file_is_looked_at_where_there_is_one(tmp_path: Path) -> None:
-    from toolkit.capture.checks import THUMB_SIDE, thumbnail
+    from fieldfuse.capture.checks import THUMB_SIDE, thumbnail
 
     seen = smooth(0, 360, 480)
     for name, options in (("with", {"thumbnails": [400]}), ("without", {})):

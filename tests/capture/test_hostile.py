@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.capture import open_capture
+from fieldfuse.errors import InputError
 from tests.capture.layouts import LAYOUTS
-from toolkit.capture import open_capture
-from toolkit.errors import InputError
 
 FILES = {
     "transforms": ("transforms.json",),

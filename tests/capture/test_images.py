@@ -14,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, ImageOps
 
+from fieldfuse.capture.headers import MAX_PIXELS, read_header
+from fieldfuse.capture.images import load_depth, load_image, load_mask, turns_by_exif, upright
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
 from tests.capture.board import capture_of, save, texture
-from toolkit.capture.headers import MAX_PIXELS, read_header
-from toolkit.capture.images import load_depth, load_image, load_mask, turns_by_exif, upright
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
 
 
 def frame(path: Path) -> Frame:

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.llff import read_llff
+from fieldfuse.errors import InputError
 from tests.capture.layouts import CENTRED, half_size, write_llff
 from tests.capture.made import Pinhole, eyes, pixel_error, render, save_picture
 from tests.conftest import shared_data
-from toolkit.capture import open_capture
-from toolkit.capture.llff import read_llff
-from toolkit.errors import InputError
 
 FULL = Pinhole(320, 240, 288.0, 288.0, 160.0, 120.0)
 

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from fieldfuse.camera import Array, Similarity
+from fieldfuse.capture import Capture, open_capture
+from fieldfuse.capture.images import load_image, load_mask, usable_pixels
+from fieldfuse.capture.masks import is_mask_folder
+from fieldfuse.capture.photos import read_photos
+from fieldfuse.capture.prepare import prepare_views
+from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
+from fieldfuse.capture.types import Frame
+from fieldfuse.config import CaptureSettings
+from fieldfuse.errors import InputError
+from fieldfuse.poses.points import triangulate
 from tests.capture.layouts import write_blender, write_colmap_bin, write_llff, write_transforms
 from tests.conftest import shared_data
-from toolkit.camera import Array, Similarity
-from toolkit.capture import Capture, open_capture
-from toolkit.capture.images import load_image, load_mask, usable_pixels
-from toolkit.capture.masks import is_mask_folder
-from toolkit.capture.photos import read_photos
-from toolkit.capture.prepare import prepare_views
-from toolkit.capture.storage import capture_from_dict, capture_to_dict
-from toolkit.capture.types import Frame
-from toolkit.config import CaptureSettings
-from toolkit.errors import InputError
-from toolkit.poses.points import triangulate
 
 SAME = Similarity(1.0, np.eye(3), np.zeros(3))
 

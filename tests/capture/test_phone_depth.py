@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.images import load_depth, load_image
+from fieldfuse.capture.select import select_frames
+from fieldfuse.config import CaptureSettings
+from fieldfuse.errors import InputError
 from tests.capture.layouts import PHONE, quarter_size, write_polycam, write_scanner3d, write_stray
 from tests.capture.made import eyes, left_out, pixel_error, render
-from toolkit.capture import open_capture
-from toolkit.capture.images import load_depth, load_image
-from toolkit.capture.select import select_frames
-from toolkit.config import CaptureSettings
-from toolkit.errors import InputError
 
 WRITERS = {"polycam": write_polycam, "stray": write_stray, "scanner3d": write_scanner3d}
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.photos import focal_from_exif, read_photos
+from fieldfuse.errors import InputError
 from tests.capture.films import film, quarters
-from toolkit.capture import open_capture
-from toolkit.capture.checks import check_capture
-from toolkit.capture.photos import focal_from_exif, read_photos
-from toolkit.errors import InputError
 
 
 def photo(path: Path, size: tuple[int, int] = (120, 90), exif: dict[int, object] | None = None, orientation: int | None = None) -> Path:

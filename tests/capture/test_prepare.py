@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldfuse.camera import FISHEYE, OPENCV, Intrinsics, Similarity, undistort_maps
+from fieldfuse.capture.prepare import held_out, pictures_at, prepare_views, target_size
+from fieldfuse.capture.types import Frame, Views
+from fieldfuse.config import CaptureSettings
+from fieldfuse.errors import InputError, Interrupted
+from fieldfuse.progress import Progress
 from tests.capture.board import capture_of, corners, found_corners, photograph, posed, save, texture
-from toolkit.camera import FISHEYE, OPENCV, Intrinsics, Similarity, undistort_maps
-from toolkit.capture.prepare import held_out, pictures_at, prepare_views, target_size
-from toolkit.capture.types import Frame, Views
-from toolkit.config import CaptureSettings
-from toolkit.errors import InputError, Interrupted
-from toolkit.progress import Progress
 
 PLAIN = Intrinsics(480, 360, 400.0, 396.0, 236.5, 183.25)
 BARREL = replace(PLAIN, lens=OPENCV, distortion=(-0.18, 0.04, 0.002, -0.0015))

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+from fieldfuse.camera import OPENCV, Array, Intrinsics, invert
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.types import Capture, Frame
 from tests.capture.made import colour_difference, reprojection
 from tests.conftest import shared_data
-from toolkit.camera import OPENCV, Array, Intrinsics, invert
-from toolkit.capture import open_capture
-from toolkit.capture.types import Capture, Frame
 
 FLIPS = {"OpenGL axes": np.diag([1.0, -1, -1, 1]), "half turn": np.diag([-1.0, -1, 1, 1]), "quarter turn": np.array(
     [[0, 1.0, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])}  # fmt: skip

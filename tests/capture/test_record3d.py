@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.capture import Capture, open_capture
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.images import load_depth, load_image
+from fieldfuse.capture.select import select_frames
+from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
+from fieldfuse.config import CaptureSettings
+from fieldfuse.errors import InputError
 from tests.capture.layouts import PHONE, quarter_size, write_polycam, write_record3d, zipped
 from tests.capture.made import Pinhole, eyes, pixel_error, render
-from toolkit.capture import Capture, open_capture
-from toolkit.capture.checks import check_capture
-from toolkit.capture.images import load_depth, load_image
-from toolkit.capture.select import select_frames
-from toolkit.capture.storage import capture_from_dict, capture_to_dict
-from toolkit.config import CaptureSettings
-from toolkit.errors import InputError
 
 codecs = pytest.importorskip("imagecodecs", reason="imagecodecs is not installed; make test brings it")
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.detect import detect_kind
+from fieldfuse.errors import InputError
 from tests.capture.layouts import OFF_CENTRE, rows, write_redwood, write_scannet
 from tests.capture.made import Pinhole, eyes, pixel_error, render, save_depth, save_picture
 from tests.conftest import shared_data
-from toolkit.capture import open_capture
-from toolkit.capture.detect import detect_kind
-from toolkit.errors import InputError
 
 
 def test_flags(tmp_path: Path) -> None:

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.steps_capture import source_state
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.images import load_depth
+from fieldfuse.errors import InputError
+from fieldfuse.pipelines.steps_capture import source_state
 from tests.capture.layouts import OFF_CENTRE, write_replica
 from tests.capture.made import eyes, pixel_error, render, save_depth, save_picture
-from toolkit.capture import open_capture
-from toolkit.capture.images import load_depth
-from toolkit.errors import InputError
 
 
 def test_flags_and_depth(tmp_path: Path) -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from toolkit.capture import resolve
-from toolkit.capture.resolve import DEPTH, MASK, POINTS, CaptureFiles
-from toolkit.errors import InputError
+from fieldfuse.capture import resolve
+from fieldfuse.capture.resolve import DEPTH, MASK, POINTS, CaptureFiles
+from fieldfuse.errors import InputError
 
 
 def put(root: Path, *names: str) -> None:

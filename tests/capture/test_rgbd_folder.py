@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Array
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.images import load_depth
+from fieldfuse.errors import InputError
 from tests.capture.layouts import OFF_CENTRE, quaternion, rows
 from tests.capture.made import eyes, render, save_picture
 from tests.conftest import shared_data
-from toolkit.camera import Array
-from toolkit.capture import open_capture
-from toolkit.capture.checks import check_capture
-from toolkit.capture.images import load_depth
-from toolkit.errors import InputError
 
 K = OFF_CENTRE
 FX, FY, CX, CY = K.fx, K.fy, K.cx - 0.5, K.cy - 0.5  # as files have it: pixel centres at whole numbers

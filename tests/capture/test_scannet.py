@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.images import load_depth
+from fieldfuse.errors import InputError
 from tests.capture.layouts import OFF_CENTRE, SCANNET_COLOUR, rows, whole_centres, write_scannet, write_seven_scenes
 from tests.capture.made import Pinhole, eyes, pixel_error, render, save_picture
 from tests.conftest import shared_data
-from toolkit.capture import open_capture
-from toolkit.capture.images import load_depth
-from toolkit.errors import InputError
 
 
 def test_two_cameras_units_and_up(tmp_path: Path) -> None:

@@ -13,17 +13,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldfuse.camera import Array
+from fieldfuse.capture.images import load_image
+from fieldfuse.capture.select import Measure, choose, displacement, measure_frames, select_frames, stride_of
+from fieldfuse.capture.types import Capture
+from fieldfuse.capture.video import iterate_video, read_video
+from fieldfuse.config import CaptureSettings
+from fieldfuse.errors import InputError, Interrupted, OutputError
+from fieldfuse.progress import Progress
 from tests.capture.board import texture
 from tests.capture.films import film, film_at, turn
 from tests.conftest import shared_data
-from toolkit.camera import Array
-from toolkit.capture.images import load_image
-from toolkit.capture.select import Measure, choose, displacement, measure_frames, select_frames, stride_of
-from toolkit.capture.types import Capture
-from toolkit.capture.video import iterate_video, read_video
-from toolkit.config import CaptureSettings
-from toolkit.errors import InputError, Interrupted, OutputError
-from toolkit.progress import Progress
 
 SIZE = (120, 160)
 
@@ -266,7 +266,7 @@ def test_of_a_long_video_every_nth_frame_is_measured(tmp_path: Path, monkeypatch
     offsets = list(np.linspace(0, 300, 120))
     blurred = set(range(2, 120, 6))  # even ones, which are those looked at
     video = film(tmp_path / "clip.avi", pan(offsets, blurred), fps=30)
-    monkeypatch.setattr("toolkit.capture.select.MEASURED", 60)
+    monkeypatch.setattr("fieldfuse.capture.select.MEASURED", 60)
     chosen = select(video, tmp_path / "run", 15)
     assert 12 <= len(chosen.frames) <= 15 and chosen.extra["selected_from"] == 120 and not chosen.warnings
     assert all(index % 2 == 0 for index in indices(chosen)) and not set(indices(chosen)) & blurred

@@ -11,19 +11,19 @@ import cv2
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Similarity
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.images import load_depth, load_image
+from fieldfuse.capture.prepare import prepare_views
+from fieldfuse.capture.scannet import read_scannet
+from fieldfuse.capture.select import select_frames
+from fieldfuse.capture.sens import scan
+from fieldfuse.config import CaptureSettings
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.suites import suite_of
+from fieldfuse.training.nerfusion.datasets.scannet import scannet_folders, scannet_scene
 from tests.capture.layouts import OFF_CENTRE, SCANNET_COLOUR, rows, sens_of, whole_centres, write_sens
 from tests.capture.made import eyes, pixel_error, render
-from toolkit.camera import Similarity
-from toolkit.capture import open_capture
-from toolkit.capture.images import load_depth, load_image
-from toolkit.capture.prepare import prepare_views
-from toolkit.capture.scannet import read_scannet
-from toolkit.capture.select import select_frames
-from toolkit.capture.sens import scan
-from toolkit.config import CaptureSettings
-from toolkit.errors import InputError
-from toolkit.evaluate.suites import suite_of
-from toolkit.training.nerfusion.datasets.scannet import scannet_folders, scannet_scene
 
 NAME = "scene0000_00.sens"
 HEAD = 12 + len(b"StructureSensor")  # where the cameras begin
@@ -236,6 +236,6 @@ def test_only_headers_are_read_and_only_once(tmp_path: Path, monkeypatch: pytest
     frame = (data[BODY : BODY + 80] + struct.pack("<2Q", 1, 0)) + b"\0"
     (tmp_path / NAME).write_bytes(sens_of([], count=20_000)[:BODY] + frame * 20_000)
     assert len(scan(tmp_path / NAME)) == 20_000
-    monkeypatch.setattr("toolkit.capture.sens._read", None)
+    monkeypatch.setattr("fieldfuse.capture.sens._read", None)
     assert len(scan(tmp_path / NAME)) == 20_000
 

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.images import load_depth
+from fieldfuse.capture.seven_scenes import read_seven_scenes
+from fieldfuse.errors import InputError
 from tests.capture.layouts import EIGHTH_585, rows, write_seven_scenes
 from tests.capture.made import Pinhole, eyes, left_out, pixel_error, render, save_depth, save_picture
 from tests.conftest import shared_data
-from toolkit.capture import open_capture
-from toolkit.capture.images import load_depth
-from toolkit.capture.seven_scenes import read_seven_scenes
-from toolkit.errors import InputError
 
 
 def test_depth_has_a_camera_of_its_own_and_metres(tmp_path: Path) -> None:

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.camera import FISHEYE, Intrinsics
+from fieldfuse.capture import Capture, Frame, open_capture
+from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
+from fieldfuse.errors import InputError
 from tests.capture.layouts import LAYOUTS
-from toolkit.camera import FISHEYE, Intrinsics
-from toolkit.capture import Capture, Frame, open_capture
-from toolkit.capture.storage import capture_from_dict, capture_to_dict
-from toolkit.errors import InputError
 
 
 def same(one: Capture, two: Capture) -> bool:

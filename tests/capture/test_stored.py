@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.summary import put_cameras
+from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, invert, pixel_grid, project
+from fieldfuse.capture import Capture, open_capture
+from fieldfuse.capture.convert import CONVERTED, convert_pictures, to_convert
+from fieldfuse.capture.headers import orientation_of
+from fieldfuse.capture.images import load_image, upright
+from fieldfuse.pipelines.summary import put_cameras
+from fieldfuse.poses.result import SFM, PoseResult
 from tests.capture.board import texture
-from toolkit.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, invert, pixel_grid, project
-from toolkit.capture import Capture, open_capture
-from toolkit.capture.convert import CONVERTED, convert_pictures, to_convert
-from toolkit.capture.headers import orientation_of
-from toolkit.capture.images import load_image, upright
-from toolkit.poses.result import SFM, PoseResult
 
 WIDTH, HEIGHT = 64, 48  # of the files
 LENSES = {

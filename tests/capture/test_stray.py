@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.capture import Capture, open_capture
+from fieldfuse.capture.images import load_image
+from fieldfuse.capture.select import select_frames
+from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
+from fieldfuse.capture.video import iterate_video, read_video
+from fieldfuse.config import CaptureSettings, PosesSettings
+from fieldfuse.errors import InputError
+from fieldfuse.poses.job import plan
 from tests.capture.films import film, hide_first, names, quarters, turn
 from tests.capture.layouts import PHONE, write_stray
 from tests.capture.made import eyes, left_out, pixel_error, render
-from toolkit.capture import Capture, open_capture
-from toolkit.capture.images import load_image
-from toolkit.capture.select import select_frames
-from toolkit.capture.storage import capture_from_dict, capture_to_dict
-from toolkit.capture.video import iterate_video, read_video
-from toolkit.config import CaptureSettings, PosesSettings
-from toolkit.errors import InputError
-from toolkit.poses.job import plan
 
 NOW = ", fx, fy, cx, cy, distortion_center_x, distortion_center_y"
 OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"

@@ -8,9 +8,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from toolkit.capture.prepare import held_out
-from toolkit.capture.subset import evenly, limited, sharpness
-from toolkit.capture.types import Capture, Frame
+from fieldfuse.capture.prepare import held_out
+from fieldfuse.capture.subset import evenly, limited, sharpness
+from fieldfuse.capture.types import Capture, Frame
 
 
 def capture(count: int, split: bool = False) -> Capture:

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 import pytest
 
+from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.transforms import read_transforms
+from fieldfuse.errors import InputError
 from tests.capture.layouts import OFF_CENTRE, half_size, write_transforms
 from tests.capture.made import Pinhole, eyes, pixel_error, render, save_depth, save_picture
 from tests.conftest import shared_data
-from toolkit.camera import FISHEYE, OPENCV, PINHOLE
-from toolkit.capture import open_capture
-from toolkit.capture.transforms import read_transforms
-from toolkit.errors import InputError
 
 
 def edit(root: Path, change: Callable[[dict[str, Any]], Any]) -> None:

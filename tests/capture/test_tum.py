@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.camera import OPENCV
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.images import load_depth
+from fieldfuse.capture.tum import read_tum
+from fieldfuse.errors import InputError
 from tests.capture.layouts import EIGHTH_525, write_tum
 from tests.capture.made import eyes, pixel_error, render
-from toolkit.camera import OPENCV
-from toolkit.capture import open_capture
-from toolkit.capture.images import load_depth
-from toolkit.capture.tum import read_tum
-from toolkit.errors import InputError
 
 
 def test_units_names_and_up(tmp_path: Path) -> None:

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.camera import checked_pose, lenient_poses
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.capture.usable import without
+from fieldfuse.effects.adjust import rotation
+from fieldfuse.errors import InputError
 from tests.capture.layouts import LAYOUTS
 from tests.pipelines.made import circle, make_room
-from toolkit.camera import checked_pose, lenient_poses
-from toolkit.capture import open_capture
-from toolkit.capture.checks import check_capture
-from toolkit.capture.types import Capture, Frame
-from toolkit.capture.usable import without
-from toolkit.effects.adjust import rotation
-from toolkit.errors import InputError
 
 COUNT = 10
 EVERY = [name for name in LAYOUTS if name not in ("sens", "stray", "record3d")]  # those hold their images in one file

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.capture.images import load_image
+from fieldfuse.capture.video import iterate_video, read_video
+from fieldfuse.errors import InputError
 from tests.capture.films import film, film_at, names, quarters, turn
 from tests.conftest import shared_data
-from toolkit.capture.images import load_image
-from toolkit.capture.video import iterate_video, read_video
-from toolkit.errors import InputError
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mov", ".avi", ".mkv", ".webm"])
@@ -121,8 +121,8 @@ def test_nothing_is_said_on_stderr(tmp_path: Path) -> None:
     (tmp_path / "cut.mp4").write_bytes(good.read_bytes()[:-200])
     code = (
         "import sys, pathlib\n"
-        "from toolkit.capture.video import read_video, iterate_video\n"
-        "from toolkit.errors import InputError\n"
+        "from fieldfuse.capture.video import read_video, iterate_video\n"
+        "from fieldfuse.errors import InputError\n"
         "for name in ('bad', 'text', 'cut'):\n"
         "    path = pathlib.Path(sys.argv[1]) / f'{name}.mp4'\n"
         "    try:\n"

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
+from fieldfuse.camera import OPENCV, Intrinsics, Similarity
+from fieldfuse.capture.prepare import prepare_views
+from fieldfuse.capture.types import Views
+from fieldfuse.capture.views_file import load_views, save_views
+from fieldfuse.config import CaptureSettings
+from fieldfuse.errors import InputError, OutputError
+from fieldfuse.tone import Tone
 from tests.capture.board import capture_of, posed, save, texture
-from toolkit.camera import OPENCV, Intrinsics, Similarity
-from toolkit.capture.prepare import prepare_views
-from toolkit.capture.types import Views
-from toolkit.capture.views_file import load_views, save_views
-from toolkit.config import CaptureSettings
-from toolkit.errors import InputError, OutputError
-from toolkit.tone import Tone
 
 PLAIN = Intrinsics(480, 360, 400.0, 396.0, 236.5, 183.25)
 BARREL = Intrinsics(480, 360, 400.0, 396.0, 236.5, 183.25, OPENCV, (-0.18, 0.04, 0.002, -0.0015))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.effects.adjust import Problem, predict, rotation
-from toolkit.effects.sightings import Sightings
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.effects.adjust import Problem, predict, rotation
+from fieldfuse.effects.sightings import Sightings
 
 CAMERA = Intrinsics(320, 240, 260.0, 260.0, 160.0, 120.0)
 FRAMES = 14

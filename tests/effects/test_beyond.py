@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fieldfuse.effects.beyond import THRESHOLD, far
 from tests.effects.walls import AWAY, FRAMES, problem_of, wall
-from toolkit.effects.beyond import THRESHOLD, far
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from toolkit.camera import FISHEYE, OPENCV, Intrinsics, distort
-from toolkit.capture.types import Capture, Frame, Views
-from toolkit.effects import transfer, vignetting
-from toolkit.effects.correct import Corrections, bent, correctable
-from toolkit.effects.decide import CLIPS, DIMMEST, room_for_light
-from toolkit.effects.sightings import Sightings
-from toolkit.errors import InputError
-from toolkit.evaluate.score import score_views
-from toolkit.render.image import Rendered
-from toolkit.tone import Tone
-from toolkit.training.rays import PixelPool
+from fieldfuse.camera import FISHEYE, OPENCV, Intrinsics, distort
+from fieldfuse.capture.types import Capture, Frame, Views
+from fieldfuse.effects import transfer, vignetting
+from fieldfuse.effects.correct import Corrections, bent, correctable
+from fieldfuse.effects.decide import CLIPS, DIMMEST, room_for_light
+from fieldfuse.effects.sightings import Sightings
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.score import score_views
+from fieldfuse.render.image import Rendered
+from fieldfuse.tone import Tone
+from fieldfuse.training.rays import PixelPool
 
 CAMERA = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
 

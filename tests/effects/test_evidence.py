@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fieldfuse.effects import exposure, rolling_shutter, vignetting
+from fieldfuse.effects.evidence import Tracks, without_points_and_frames
+from fieldfuse.simulate.materials import TextureBank, texture_bank
 from tests.effects.tracks import CAMERA, FRAMES, Filmed, film_tracks
-from toolkit.effects import exposure, rolling_shutter, vignetting
-from toolkit.effects.evidence import Tracks, without_points_and_frames
-from toolkit.simulate.materials import TextureBank, texture_bank
 
 SEEDS = (11, 12)
 

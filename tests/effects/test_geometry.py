@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.camera import OPENCV, Intrinsics, distort
-from toolkit.effects import depth_noise, distortion, rolling_shutter
-from toolkit.errors import InputError
+from fieldfuse.camera import OPENCV, Intrinsics, distort
+from fieldfuse.effects import depth_noise, distortion, rolling_shutter
+from fieldfuse.errors import InputError
 
 CAMERA = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
 

@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.config import EffectsSettings
+from fieldfuse.effects import decide as module
+from fieldfuse.effects.adjust import LENS, POSES, ROWS, rotation
+from fieldfuse.effects.bounds import STOPS, apart, beyond, beyond_depth, bounded_gains
+from fieldfuse.effects.correct import Corrections
+from fieldfuse.effects.decide import FEWEST_TRIED, TRIED, Decision, Trial, better, decide, tried_frames
+from fieldfuse.effects.light import EXPOSURE, VIGNETTING
+from fieldfuse.effects.refine import refined_poses
+from fieldfuse.effects.sightings import Sightings
+from fieldfuse.effects.survey import Survey, look
 from tests.effects.seen import CAMERA, FRAMES, made
-from toolkit.camera import Array
-from toolkit.capture.types import Capture, Frame
-from toolkit.config import EffectsSettings
-from toolkit.effects import decide as module
-from toolkit.effects.adjust import LENS, POSES, ROWS, rotation
-from toolkit.effects.bounds import STOPS, apart, beyond, beyond_depth, bounded_gains
-from toolkit.effects.correct import Corrections
-from toolkit.effects.decide import FEWEST_TRIED, TRIED, Decision, Trial, better, decide, tried_frames
-from toolkit.effects.light import EXPOSURE, VIGNETTING
-from toolkit.effects.refine import refined_poses
-from toolkit.effects.sightings import Sightings
-from toolkit.effects.survey import Survey, look
 
 TRAIN = np.arange(FRAMES) % 5 != 2
 

@@ -9,8 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.camera import Intrinsics
-from toolkit.effects import background, compression, exposure, highlights, motion_blur, sensor_noise, transfer, vignetting
+from fieldfuse.camera import Intrinsics
+from fieldfuse.effects import background, compression, exposure, highlights, motion_blur, sensor_noise, transfer, vignetting
 
 CAMERA = Intrinsics(40, 30, 35.0, 35.0, 20.0, 15.0)
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from toolkit.effects import exposure, motion_blur, vignetting
-from toolkit.effects.listed import MODULES, STRENGTHS, Effects, generator, parse
-from toolkit.errors import InputError
+from fieldfuse.effects import exposure, motion_blur, vignetting
+from fieldfuse.effects.listed import MODULES, STRENGTHS, Effects, generator, parse
+from fieldfuse.errors import InputError
 
 
 def test_all_ways_to_list() -> None:

@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from toolkit.camera import OPENCV, Array, Intrinsics, invert, pixel_grid
-from toolkit.capture import open_capture
-from toolkit.capture.images import load_depth
-from toolkit.capture.prepare import held_out
-from toolkit.config import EffectsSettings
-from toolkit.effects import depth_offset
-from toolkit.effects.correct import Corrections
-from toolkit.effects.decide import Decided, decide
-from toolkit.effects.depth_maps import DepthMaps
-from toolkit.effects.registration import DEPTH_OFFSET, FEWEST, Observations, solved
-from toolkit.simulate import procedural
-from toolkit.simulate.materials import texture_bank
-from toolkit.simulate.settings import scene_file
-from toolkit.simulate.simulate import simulate
+from fieldfuse.camera import OPENCV, Array, Intrinsics, invert, pixel_grid
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.images import load_depth
+from fieldfuse.capture.prepare import held_out
+from fieldfuse.config import EffectsSettings
+from fieldfuse.effects import depth_offset
+from fieldfuse.effects.correct import Corrections
+from fieldfuse.effects.decide import Decided, decide
+from fieldfuse.effects.depth_maps import DepthMaps
+from fieldfuse.effects.registration import DEPTH_OFFSET, FEWEST, Observations, solved
+from fieldfuse.simulate import procedural
+from fieldfuse.simulate.materials import texture_bank
+from fieldfuse.simulate.settings import scene_file
+from fieldfuse.simulate.simulate import simulate
 
 CAMERA = Intrinsics(160, 120, 140.0, 140.0, 80.0, 60.0)
 

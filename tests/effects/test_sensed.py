@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Array, invert, pixel_grid
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.effects import depth_offset
+from fieldfuse.effects.adjust import POSES, Belief, Problem, _slopes, _with, adjust, depth_residuals, predict, residuals, rotation, scatter
+from fieldfuse.effects.refine import believed
+from fieldfuse.effects.sensed import MARGIN, agreeing, scaled
 from tests.effects.test_registration import CAMERA, walls
-from toolkit.camera import Array, invert, pixel_grid
-from toolkit.capture.types import Capture, Frame
-from toolkit.effects import depth_offset
-from toolkit.effects.adjust import POSES, Belief, Problem, _slopes, _with, adjust, depth_residuals, predict, residuals, rotation, scatter
-from toolkit.effects.refine import believed
-from toolkit.effects.sensed import MARGIN, agreeing, scaled
 
 FRAMES, POINTS = 12, 160
 UNKNOWN = frozenset({POSES})

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fieldfuse.effects.evidence import HeldOut
+from fieldfuse.effects.light import EXPOSURE, VIGNETTING, Light
+from fieldfuse.effects.sheen import THRESHOLD, shiny
+from fieldfuse.effects.sightings import Sightings
 from tests.effects.walls import AWAY, FRAMES, WIDTH, problem_of, wall
-from toolkit.effects.evidence import HeldOut
-from toolkit.effects.light import EXPOSURE, VIGNETTING, Light
-from toolkit.effects.sheen import THRESHOLD, shiny
-from toolkit.effects.sightings import Sightings
 
 PLAIN = Light({}, frozenset(), {}, {}, np.ones((FRAMES, 3)), 1.0)
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from fieldfuse.effects import background, geometry, light, motion_blur, view_dependence
+from fieldfuse.effects.adjust import LENS, POSES, ROWS, adjust, predict, residuals, rotation, scatter, vectors
+from fieldfuse.effects.paid import Paid
+from fieldfuse.effects.refine import believed, refined_poses
+from fieldfuse.effects.survey import ORDER, _lens, _poses, _rows, look
 from tests.effects.seen import CAMERA, FRAMES, made
-from toolkit.effects import background, geometry, light, motion_blur, view_dependence
-from toolkit.effects.adjust import LENS, POSES, ROWS, adjust, predict, residuals, rotation, scatter, vectors
-from toolkit.effects.paid import Paid
-from toolkit.effects.refine import believed, refined_poses
-from toolkit.effects.survey import ORDER, _lens, _poses, _rows, look
 
 
 def drift(seed: int) -> np.ndarray:
@@ -230,7 +230,7 @@ def test_what_makes_held_out_points_worse_is_said_to_do_so(after: float, words: 
 
 def test_seconds_of_several_effects_are_split_evenly_and_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     now = iter([10.0, 13.0, 20.0, 21.0])
-    monkeypatch.setattr("toolkit.effects.paid.time.monotonic", lambda: next(now))
+    monkeypatch.setattr("fieldfuse.effects.paid.time.monotonic", lambda: next(now))
     paid = Paid()
     with paid.by("poses", "distortion"):
         pass

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from toolkit.effects import exposure
-from toolkit.effects.evidence import Tracks
-from toolkit.effects.light import BOTH, EXPOSURE, MARGIN, VIGNETTING, explain, spread
+from fieldfuse.effects import exposure
+from fieldfuse.effects.evidence import Tracks
+from fieldfuse.effects.light import BOTH, EXPOSURE, MARGIN, VIGNETTING, explain, spread
 
 FRAMES = 30
 

@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics, project, unproject
-from toolkit.effects import transfer
-from toolkit.effects.evidence import Tracks
-from toolkit.effects.listed import parse
-from toolkit.simulate.film import Film
-from toolkit.simulate.materials import TextureBank
-from toolkit.simulate.paths import PathSettings, plan
-from toolkit.simulate.procedural import random_scene
+from fieldfuse.camera import Array, Intrinsics, project, unproject
+from fieldfuse.effects import transfer
+from fieldfuse.effects.evidence import Tracks
+from fieldfuse.effects.listed import parse
+from fieldfuse.simulate.film import Film
+from fieldfuse.simulate.materials import TextureBank
+from fieldfuse.simulate.paths import PathSettings, plan
+from fieldfuse.simulate.procedural import random_scene
 
 CAMERA = Intrinsics(128, 96, 100.0, 100.0, 64.0, 48.0)
 FRAMES = 12

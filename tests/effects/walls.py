@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.effects.adjust import Problem
-from toolkit.effects.sightings import Sightings
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.effects.adjust import Problem
+from fieldfuse.effects.sightings import Sightings
 
 WIDTH, HEIGHT, FOCAL, FRAMES, AWAY = 200, 150, 170.0, 9, 4.0
 CAMERA = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 # Collected before the page's own scripts run, told after everything has loaded.

@@ -15,8 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from fieldfuse.camera import Array
 from tests.evaluate.browser import chromium
-from toolkit.camera import Array
 
 FLAGS = ("--headless", "--no-sandbox", "--disable-dev-shm-usage", "--no-first-run", "--disable-background-networking", "--disable-sync")
 NO_GPU = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # WebGL by the processor

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.types import Views
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.types import Views
 
 
 @dataclass

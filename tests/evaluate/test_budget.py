@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.config import load_settings
-from toolkit.evaluate import budget as model
-from toolkit.evaluate.budget import KINDS, Choice, Speed, Work, amounts, choose, effects_work, most_export_seconds, predict, sfm_work
-from toolkit.evaluate.budget_probe import self_test
-from toolkit.evaluate.budget_table import budget_table
-from toolkit.files import write_json
-from toolkit.poses.job import MAX_EXHAUSTIVE
+from fieldfuse.config import load_settings
+from fieldfuse.evaluate import budget as model
+from fieldfuse.evaluate.budget import KINDS, Choice, Speed, Work, amounts, choose, effects_work, most_export_seconds, predict, sfm_work
+from fieldfuse.evaluate.budget_probe import self_test
+from fieldfuse.evaluate.budget_table import budget_table
+from fieldfuse.files import write_json
+from fieldfuse.poses.job import MAX_EXHAUSTIVE
 
 UNITS = {"decode": 0.02, "features": 0.1, "ray": 3e-6, "fit": 1e-5, "score": 5.0}
 FOX = Work(50, 540, 960, 7, posed=True, depth=False, outlined=False)
@@ -148,7 +148,7 @@ def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path, monkeypatch:
 
 
 def test_the_self_test_measures_every_kind(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("toolkit.evaluate.budget_probe.SECONDS", 0.05)
+    monkeypatch.setattr("fieldfuse.evaluate.budget_probe.SECONDS", 0.05)
     speed = self_test(load_settings("balanced", flags={"device": "cpu"}))
     assert set(speed.units) == set(model.KINDS)
     assert 1e-8 < speed.units["ray"] < 1e-3 and 1e-8 < speed.units["fit"] < 1e-2 and speed.units["features"] > 1e-3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from toolkit.evaluate.captures_table import captures_table
+from fieldfuse.evaluate.captures_table import captures_table
 
 READ = {
     "state": "read", "error": None, "kind": "llff", "poses": "given", "registered": 20, "total": 21, "masks": 0, "psnr": 22.126,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from toolkit.camera import Intrinsics, project
-from toolkit.evaluate.compare_meshes import NOTHING, cut_box, from_outside, mesh_pictures, picture
-from toolkit.render.paths import look_at
-from toolkit.tsdf.mesh import Mesh
+from fieldfuse.camera import Intrinsics, project
+from fieldfuse.evaluate.compare_meshes import NOTHING, cut_box, from_outside, mesh_pictures, picture
+from fieldfuse.render.paths import look_at
+from fieldfuse.tsdf.mesh import Mesh
 
 CAMERA = Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0)
 POSE = look_at(np.array([[0.0, -4, 0]]), np.zeros(3), np.array([0.0, 0, 1]))[0]

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.compare import compare_data, table
+from fieldfuse.evaluate.compare_meshes import MeshPictures
+from fieldfuse.evaluate.compare_page import write_comparison
+from fieldfuse.evaluate.compare_text import comparison_text
+from fieldfuse.evaluate.pictures import Pictures, Tiles, ViewPictures
 from tests.evaluate.browser import embedded_pictures, open_page
-from toolkit.errors import InputError
-from toolkit.evaluate.compare import compare_data, table
-from toolkit.evaluate.compare_meshes import MeshPictures
-from toolkit.evaluate.compare_page import write_comparison
-from toolkit.evaluate.compare_text import comparison_text
-from toolkit.evaluate.pictures import Pictures, Tiles, ViewPictures
 
 SCORE = {"psnr": 25.0, "ssim": 0.8, "lpips": 0.2, "seconds_per_view": 0.5, "coverage": None, "on": {}, "depth_scale": 1.5, "abs_err": 0.02}
 DEPTH = {"acc_1": 0.5, "acc_5": 0.9, "depth": {"median_rel": 0.01, "coverage": 1.0}}

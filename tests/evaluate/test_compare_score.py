@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from toolkit.camera import OPENCV, Array, Intrinsics
-from toolkit.capture.types import Capture, Frame, Views
-from toolkit.errors import InputError
-from toolkit.evaluate.compare_score import compare_views, depth_accuracy, depth_scale
-from toolkit.evaluate.compare_stereo import matched_depth_scores
-from toolkit.evaluate.compare_truth import find_truth, true_depths
-from toolkit.evaluate.images import psnr, ssim
-from toolkit.stereo.match import StereoDepth
+from fieldfuse.camera import OPENCV, Array, Intrinsics
+from fieldfuse.capture.types import Capture, Frame, Views
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.compare_score import compare_views, depth_accuracy, depth_scale
+from fieldfuse.evaluate.compare_stereo import matched_depth_scores
+from fieldfuse.evaluate.compare_truth import find_truth, true_depths
+from fieldfuse.evaluate.images import psnr, ssim
+from fieldfuse.stereo.match import StereoDepth
 
 CAMERA = Intrinsics(48, 36, 40.0, 40.0, 24.0, 18.0)
 
@@ -25,7 +25,7 @@ CAMERA = Intrinsics(48, 36, 40.0, 40.0, 24.0, 18.0)
 @pytest.fixture(autouse=True)
 def no_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     """LPIPS has tests of its own; here it would only take time."""
-    monkeypatch.setattr("toolkit.evaluate.perceptual._layers", lambda: None)
+    monkeypatch.setattr("fieldfuse.evaluate.perceptual._layers", lambda: None)
 
 
 @dataclass

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.errors import InputError
-from toolkit.evaluate.depth import KEYS, depth_metrics
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.depth import KEYS, depth_metrics
 
 
 def test_by_hand() -> None:

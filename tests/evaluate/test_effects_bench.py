@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.bench_effects import fits_table, table
+from fieldfuse.capture import open_capture
+from fieldfuse.evaluate import effects_fits, effects_plan
+from fieldfuse.evaluate.effects_bench import Looked, confusion
+from fieldfuse.evaluate.effects_plan import EFFECTS, STRENGTHS, Planned, film, plan
+from fieldfuse.pipelines.bench_effects import fits_table, table
 from tests.pipelines.short import steady
-from toolkit.capture import open_capture
-from toolkit.evaluate import effects_fits, effects_plan
-from toolkit.evaluate.effects_bench import Looked, confusion
-from toolkit.evaluate.effects_plan import EFFECTS, STRENGTHS, Planned, film, plan
 
 
 def test_sixty_captures_clean_alone_and_pairs() -> None:

@@ -8,16 +8,16 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.bench_effects import switched_table
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.prepare import held_out
+from fieldfuse.errors import InputError, Interrupted
+from fieldfuse.evaluate import effects_fits, effects_plan, effects_switch
+from fieldfuse.evaluate.effects_plan import Planned, drifting, film
+from fieldfuse.evaluate.effects_truth import canonical_capture, known_light
+from fieldfuse.pipelines.bench_effects import switched_table
+from fieldfuse.progress import Progress
+from fieldfuse.tone import Tone
 from tests.pipelines.short import steady
-from toolkit.capture import open_capture
-from toolkit.capture.prepare import held_out
-from toolkit.errors import InputError, Interrupted
-from toolkit.evaluate import effects_fits, effects_plan, effects_switch
-from toolkit.evaluate.effects_plan import Planned, drifting, film
-from toolkit.evaluate.effects_truth import canonical_capture, known_light
-from toolkit.progress import Progress
-from toolkit.tone import Tone
 
 DRIFT = (("exposure", "medium"), ("vignetting", "medium"))
 

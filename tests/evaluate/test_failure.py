@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from toolkit.evaluate.failure import failures
+from fieldfuse.evaluate.failure import failures
 
 
 def report(held: float = 24.0, floor: float = 15.0, training: float | None = 27.0, **parts: Any) -> dict[str, Any]:

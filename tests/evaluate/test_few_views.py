@@ -6,9 +6,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from toolkit.evaluate.few_views import without
-from toolkit.networks.gru import RunningMean
-from toolkit.networks.model import NerfusionModel
+from fieldfuse.evaluate.few_views import without
+from fieldfuse.networks.gru import RunningMean
+from fieldfuse.networks.model import NerfusionModel
 
 
 def test_the_direction_code_is_off_for_a_recording_as_well() -> None:

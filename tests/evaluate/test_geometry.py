@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from toolkit.camera import Array, Intrinsics, Similarity
-from toolkit.errors import InputError
-from toolkit.evaluate.coverage import in_picture, seen_points
-from toolkit.evaluate.geometry import distances, geometry_metrics, inside, read_mesh, seen_surface, surface_points
-from toolkit.export.mesh import write_mesh
-from toolkit.render.paths import look_at
-from toolkit.tsdf.mesh import Mesh
+from fieldfuse.camera import Array, Intrinsics, Similarity
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.coverage import in_picture, seen_points
+from fieldfuse.evaluate.geometry import distances, geometry_metrics, inside, read_mesh, seen_surface, surface_points
+from fieldfuse.export.mesh import write_mesh
+from fieldfuse.render.paths import look_at
+from fieldfuse.tsdf.mesh import Mesh
 
 CAMERA = Intrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
 UP = np.array([0.0, 0.0, 1.0])

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.images import C1, PSNR_CAP, psnr, ssim
 from tests.evaluate.samples import picture, ripple
-from toolkit.camera import Array
-from toolkit.errors import InputError
-from toolkit.evaluate.images import C1, PSNR_CAP, psnr, ssim
 
 # scikit-image 0.26 on `picture()` and `ripple(picture())`: peak_signal_noise_ratio(data_range=1) and structural_similarity(
 # channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1).

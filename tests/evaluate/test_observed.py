@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Array, Intrinsics, pixel_grid, rays
+from fieldfuse.evaluate.observed import every_nth, seen_share, training_psnr
 from tests.evaluate.samples import make_views
-from toolkit.camera import Array, Intrinsics, pixel_grid, rays
-from toolkit.evaluate.observed import every_nth, seen_share, training_psnr
 
 
 @pytest.mark.parametrize("step", [1, 2, 3, 7])

@@ -5,14 +5,14 @@ from __future__ import annotations
 from copy import deepcopy
 from pathlib import Path
 
+from fieldfuse.evaluate.compare_page import write_comparison
+from fieldfuse.evaluate.report import write_report
+from fieldfuse.evaluate.tradeoff import points_of
+from fieldfuse.evaluate.tradeoff_page import render_tradeoff, tradeoff_data
 from tests.evaluate.driven import Driven, driven, until
 from tests.evaluate.test_compare_page import made, pictures
 from tests.evaluate.test_report import sample
 from tests.evaluate.test_tradeoff import ladder
-from toolkit.evaluate.compare_page import write_comparison
-from toolkit.evaluate.report import write_report
-from toolkit.evaluate.tradeoff import points_of
-from toolkit.evaluate.tradeoff_page import render_tradeoff, tradeoff_data
 
 PHONE, SMALL = 390, 1100  # CSS pixels
 WIDE = "document.documentElement.scrollWidth - document.documentElement.clientWidth"

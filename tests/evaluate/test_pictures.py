@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.evaluate.samples import draw, make_views
-from toolkit.errors import OutputError
-from toolkit.evaluate.pictures import (
+from fieldfuse.errors import OutputError
+from fieldfuse.evaluate.pictures import (
     DEPTH_COLOURS,
     ERROR_TOP,
     LABEL,
@@ -29,7 +28,8 @@ from toolkit.evaluate.pictures import (
     write_picture,
     write_strips,
 )
-from toolkit.stereo.left_out import LeftOut
+from fieldfuse.stereo.left_out import LeftOut
+from tests.evaluate.samples import draw, make_views
 
 
 def test_error_scale_is_fixed() -> None:

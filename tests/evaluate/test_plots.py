@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import pytest
 from matplotlib.figure import Figure
 
-from toolkit.evaluate.plots import CSS, bar_label, label_places, psnr_over_time, stage_bars
+from fieldfuse.evaluate.plots import CSS, bar_label, label_places, psnr_over_time, stage_bars
 
 TIMELINE = [{"seconds": 1.0, "psnr": 15.0}, {"seconds": 10.0, "psnr": 24.0}, {"seconds": 5.0, "psnr": 21.0}]
 STAGES = [

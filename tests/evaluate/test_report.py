@@ -17,15 +17,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse import __version__
+from fieldfuse.errors import InputError, OutputError
+from fieldfuse.evaluate.baseline import nearest_image_scores
+from fieldfuse.evaluate.page import render_page
+from fieldfuse.evaluate.pictures import Pictures, make_pictures
+from fieldfuse.evaluate.report import CAPTURE, FIELD, POINT, POSES, SCORE, SFM_NOTE, STAGE, plain, report_data, write_report
+from fieldfuse.evaluate.score import score_views
+from fieldfuse.evaluate.table import table
 from tests.evaluate.samples import draw, make_views
-from toolkit import __version__
-from toolkit.errors import InputError, OutputError
-from toolkit.evaluate.baseline import nearest_image_scores
-from toolkit.evaluate.page import render_page
-from toolkit.evaluate.pictures import Pictures, make_pictures
-from toolkit.evaluate.report import CAPTURE, FIELD, POINT, POSES, SCORE, SFM_NOTE, STAGE, plain, report_data, write_report
-from toolkit.evaluate.score import score_views
-from toolkit.evaluate.table import table
 
 NASTY = '<script>alert("x")</script><img src=x onerror=alert(1)>&"\'{{ 7 * 7 }}{% raw %}'
 VOID = {"meta", "img", "br", "hr", "link", "input"}

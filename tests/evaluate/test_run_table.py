@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from toolkit.evaluate.run_table import is_report, run_table
+from fieldfuse.evaluate.run_table import is_report, run_table
 
 
 def run(source: str, psnr: float, seed: int = 0, tsdf: float | None = None, command: str = "") -> dict[str, Any]:

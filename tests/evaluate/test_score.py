@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.baseline import nearest_image_scores, nearest_training
+from fieldfuse.evaluate.images import PSNR_CAP, psnr, ssim
+from fieldfuse.evaluate.score import score_views
 from tests.evaluate.samples import Drawn, draw, make_views
-from toolkit.errors import InputError
-from toolkit.evaluate.baseline import nearest_image_scores, nearest_training
-from toolkit.evaluate.images import PSNR_CAP, psnr, ssim
-from toolkit.evaluate.score import score_views
 
 MEANS = {"psnr", "ssim", "lpips", "depth_abs_err", "psnr_corrected", "psnr_masked", "coverage"}
 NAMES = {"views", "seconds_per_view", "depth", "per_view", *MEANS}

@@ -7,13 +7,13 @@ import json
 import numpy as np
 import pytest
 
-from pipelines import bench
-from toolkit.evaluate import speed, speed_cases, speed_growth
-from toolkit.evaluate.speed import Case, Timed
-from toolkit.evaluate.speed_state import CHANNELS, around, lens, sphere_field, sphere_pixels
-from toolkit.render.bake import bake
-from toolkit.render.bake_image import BakedRenderer
-from toolkit.training.fused import FusedOptimiser
+from fieldfuse.evaluate import speed, speed_cases, speed_growth
+from fieldfuse.evaluate.speed import Case, Timed
+from fieldfuse.evaluate.speed_state import CHANNELS, around, lens, sphere_field, sphere_pixels
+from fieldfuse.pipelines import bench
+from fieldfuse.render.bake import bake
+from fieldfuse.render.bake_image import BakedRenderer
+from fieldfuse.training.fused import FusedOptimiser
 
 
 def test_the_compiled_step_is_at_least_twice_as_fast_as_torch() -> None:

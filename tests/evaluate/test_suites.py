@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.suites import SUITES, suite_of
+from fieldfuse.evaluate.suites.tables import portable, put_between_marks, suite_table
 from tests.capture.layouts import LAYOUTS
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
-from toolkit.evaluate.suites import SUITES, suite_of
-from toolkit.evaluate.suites.tables import portable, put_between_marks, suite_table
 
 
 def capture_of(count: int, split: bool = False) -> Capture:
@@ -95,7 +95,7 @@ def test_scannets_rooms_bring_their_split(tmp_path: Path) -> None:
 
 
 def test_all_suites_are_described() -> None:
-    from pipelines.bench_suite import HELP
+    from fieldfuse.pipelines.bench_suite import HELP
 
     assert list(HELP) == list(SUITES)
     for suite in SUITES.values():

@@ -13,14 +13,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.tradeoff import NUMBERS, Point, checked_row, pareto, points_of, series
+from fieldfuse.evaluate.tradeoff_page import csv_text, tradeoff_data, write_tradeoff
+from fieldfuse.evaluate.tradeoff_plots import quality_plot
+from fieldfuse.evaluate.tradeoff_table import tradeoff_table
+from fieldfuse.evaluate.tradeoff_text import front_sentence, length, sentence, steps, times_text
+from fieldfuse.files import read_json
 from tests.evaluate.browser import embedded_pictures, open_page
-from toolkit.errors import InputError
-from toolkit.evaluate.tradeoff import NUMBERS, Point, checked_row, pareto, points_of, series
-from toolkit.evaluate.tradeoff_page import csv_text, tradeoff_data, write_tradeoff
-from toolkit.evaluate.tradeoff_plots import quality_plot
-from toolkit.evaluate.tradeoff_table import tradeoff_table
-from toolkit.evaluate.tradeoff_text import front_sentence, length, sentence, steps, times_text
-from toolkit.files import read_json
 
 
 def row(method: str, axes: list[str], psnr: float, seconds: float, memory: float, seed: int = 0, **setting: Any) -> dict[str, Any]:

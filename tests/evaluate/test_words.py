@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from toolkit.evaluate import words
+from fieldfuse.evaluate import words
 
 
 @pytest.mark.parametrize(

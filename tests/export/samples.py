@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from toolkit.camera import FISHEYE, OPENCV, Array, Intrinsics, Similarity
-from toolkit.render.paths import look_at
-from toolkit.tsdf.mesh import Mesh
+from fieldfuse.camera import FISHEYE, OPENCV, Array, Intrinsics, Similarity
+from fieldfuse.render.paths import look_at
+from fieldfuse.tsdf.mesh import Mesh
 
 
 def coloured_ball(subdivisions: int = 3) -> Mesh:

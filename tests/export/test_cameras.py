@@ -13,12 +13,12 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.surface import sparse_points
+from fieldfuse.camera import Intrinsics, project
+from fieldfuse.capture import open_capture
+from fieldfuse.errors import InputError
+from fieldfuse.export.cameras import colmap_model, quaternion, write_cameras
+from fieldfuse.pipelines.surface import sparse_points
 from tests.export.samples import cameras, turned
-from toolkit.camera import Intrinsics, project
-from toolkit.capture import open_capture
-from toolkit.errors import InputError
-from toolkit.export.cameras import colmap_model, quaternion, write_cameras
 
 POINTS = np.random.default_rng(2).normal(size=(30, 3))
 

@@ -11,14 +11,14 @@ import open3d as o3d
 import pytest
 import trimesh
 
+from fieldfuse.camera import Array, Similarity
+from fieldfuse.errors import InputError, OutputError
+from fieldfuse.export.mesh import FORMATS, mesh_facts, write_mesh
+from fieldfuse.export.ply import single_precision
+from fieldfuse.export.points import write_points
+from fieldfuse.tone import encode, shares
+from fieldfuse.tsdf.mesh import Mesh
 from tests.export.samples import coloured_ball, turned
-from toolkit.camera import Array, Similarity
-from toolkit.errors import InputError, OutputError
-from toolkit.export.mesh import FORMATS, mesh_facts, write_mesh
-from toolkit.export.ply import single_precision
-from toolkit.export.points import write_points
-from toolkit.tone import encode, shares
-from toolkit.tsdf.mesh import Mesh
 
 
 def with_open3d(path: Path) -> tuple[Array, Array, Array]:

@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.speed_state import around, lens
+from fieldfuse.export.page import Tour, corner_densities, decoder_blocks, page, require_page, write_page
+from fieldfuse.networks.decoder import Deferred, make_decoder
+from fieldfuse.render.bake import BakedField, bake
+from fieldfuse.render.bake_image import BakedRenderer
+from fieldfuse.tone import brighter, decode, encode
 from tests.evaluate.browser import open_page
 from tests.evaluate.driven import Driven, driven, until
 from tests.render.made import coloured_field, random_field
-from toolkit.camera import Array
-from toolkit.errors import InputError
-from toolkit.evaluate.speed_state import around, lens
-from toolkit.export.page import Tour, corner_densities, decoder_blocks, page, require_page, write_page
-from toolkit.networks.decoder import Deferred, make_decoder
-from toolkit.render.bake import BakedField, bake
-from toolkit.render.bake_image import BakedRenderer
-from toolkit.tone import brighter, decode, encode
 
 WIDTH, HEIGHT = 48, 36
 CAMERA, POSES = lens(WIDTH, HEIGHT), around()

@@ -7,12 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.errors import InputError
+from fieldfuse.export.mesh import mesh_facts
+from fieldfuse.export.surface import field_volume, reliable_depth
+from fieldfuse.render.image import Rendered
 from tests.tsdf.scenes import CAMERA, all_round, sphere_colour, sphere_depth, sphere_frame
-from toolkit.camera import Array, Intrinsics
-from toolkit.errors import InputError
-from toolkit.export.mesh import mesh_facts
-from toolkit.export.surface import field_volume, reliable_depth
-from toolkit.render.image import Rendered
 
 CENTRE = np.array([0.2, 0.1, -0.1])
 RADIUS = 0.5

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 import trimesh
 
+from fieldfuse.camera import Array, Intrinsics, project
+from fieldfuse.errors import InputError
+from fieldfuse.export.atlas import GUTTER, Atlas, make_atlas
+from fieldfuse.export.mesh import write_textured
+from fieldfuse.export.sighted import BEST, picture_weights, strongest
+from fieldfuse.export.texture import textured
+from fieldfuse.render.paths import look_at
+from fieldfuse.tsdf.mesh import Mesh
 from tests.export.samples import coloured_ball, turned
-from toolkit.camera import Array, Intrinsics, project
-from toolkit.errors import InputError
-from toolkit.export.atlas import GUTTER, Atlas, make_atlas
-from toolkit.export.mesh import write_textured
-from toolkit.export.sighted import BEST, picture_weights, strongest
-from toolkit.export.texture import textured
-from toolkit.render.paths import look_at
-from toolkit.tsdf.mesh import Mesh
 
 FRONT = look_at(np.array([[0.3, -0.2, 3.0]]), np.zeros(3), np.array([0.0, 1, 0]))
 CAMERA = Intrinsics(96, 72, 90.0, 90.0, 48.0, 36.0)

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from toolkit.camera import Array
-from toolkit.errors import InputError, Interrupted, OutputError
-from toolkit.export.video import write_video
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError, Interrupted, OutputError
+from fieldfuse.export.video import write_video
 
 
 def fading(count: int, height: int = 96, width: int = 128) -> Iterator[Array]:

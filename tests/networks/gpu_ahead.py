@@ -19,22 +19,22 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
+from fieldfuse.networks.cull import all_blocks
+from fieldfuse.networks.gpu import convolution, describe, lookup, matching, measured, reading
+from fieldfuse.networks.gpu import volumes as volumes_gpu
+from fieldfuse.networks.gpu.gru import Step
+from fieldfuse.networks.gpu.observe import Observer
+from fieldfuse.networks.head import FieldHead
+from fieldfuse.networks.lattice import LatentVolume, LocalVolume
+from fieldfuse.networks.sweep import Sweep
+from fieldfuse.networks.witness import Witness
+from fieldfuse.render import march_gpu
+from fieldfuse.simulate import cast_gpu
+from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids, upright
+from fieldfuse.volume import blocks_gpu, split_gpu, tables_gpu
+from fieldfuse.volume.topology import Topology
 from tests.networks.made import SMALL as SIZES
 from tests.networks.made import cameras, lattice, pictures, small_model
-from toolkit.networks.cull import all_blocks
-from toolkit.networks.gpu import convolution, describe, lookup, matching, measured, reading
-from toolkit.networks.gpu import volumes as volumes_gpu
-from toolkit.networks.gpu.gru import Step
-from toolkit.networks.gpu.observe import Observer
-from toolkit.networks.head import FieldHead
-from toolkit.networks.lattice import LatentVolume, LocalVolume
-from toolkit.networks.sweep import Sweep
-from toolkit.networks.witness import Witness
-from toolkit.render import march_gpu
-from toolkit.simulate import cast_gpu
-from toolkit.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids, upright
-from toolkit.volume import blocks_gpu, split_gpu, tables_gpu
-from toolkit.volume.topology import Topology
 
 TYPES = {torch.float32: "*fp32", torch.int32: "*i32", torch.int64: "*i64", torch.uint8: "*u8", torch.bfloat16: "*bf16"}
 CAPABILITY = 90

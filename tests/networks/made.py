@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.lattice import Lattice
-from toolkit.networks.model import ModelConfig, NerfusionModel
-from toolkit.volume.space import Space
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.lattice import Lattice
+from fieldfuse.networks.model import ModelConfig, NerfusionModel
+from fieldfuse.volume.space import Space
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 SMALL = ModelConfig(

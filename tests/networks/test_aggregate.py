@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.networks.aggregate import CUES, FLAGS, aggregate, agreement, direction_spread, evidence
+from fieldfuse.networks.aggregate import CUES, FLAGS, aggregate, agreement, direction_spread, evidence
 
 
 @settings(max_examples=30, deadline=None)

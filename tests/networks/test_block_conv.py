@@ -8,8 +8,8 @@ import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.networks.block_conv import BlockConv3d, _clear, block_conv3d
-from toolkit.volume.topology import VOXELS, Topology
+from fieldfuse.networks.block_conv import BlockConv3d, _clear, block_conv3d
+from fieldfuse.volume.topology import VOXELS, Topology
 
 
 def dense_of(rows: torch.Tensor, topology: Topology, low: torch.Tensor, size: int) -> torch.Tensor:

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.evaluate.speed import pinned
+from fieldfuse.networks import compiled
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.matching import LARGE, SMALL, distribution, semi_global
+from fieldfuse.networks.sweep import Sweep, _table, carved, compare, decide, sweep
+from fieldfuse.networks.witness import Witness, certain, evidence, witness
 from tests.networks.test_sweep import slow_paths, wall
-from toolkit.evaluate.speed import pinned
-from toolkit.networks import compiled
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.matching import LARGE, SMALL, distribution, semi_global
-from toolkit.networks.sweep import Sweep, _table, carved, compare, decide, sweep
-from toolkit.networks.witness import Witness, certain, evidence, witness
 
 NEAR, FAR = 0.8, 6.0
 
@@ -74,7 +74,7 @@ def test_it_gives_what_the_tensors_give(views: int, monkeypatch: pytest.MonkeyPa
 def test_it_gives_what_the_tensors_give_within_silhouettes(monkeypatch: pytest.MonkeyPatch) -> None:
     quick = within()
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
-    monkeypatch.setattr("toolkit.networks.sweep.AT_ONCE", 100)
+    monkeypatch.setattr("fieldfuse.networks.sweep.AT_ONCE", 100)
     for name, expected in within().items():
         torch.testing.assert_close(quick[name], expected, atol=1e-4, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
 

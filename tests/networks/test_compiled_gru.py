@@ -9,12 +9,12 @@ import pytest
 import torch
 from numba import njit
 
+from fieldfuse.evaluate.speed import pinned
+from fieldfuse.networks import compiled_gru, model
+from fieldfuse.networks.lattice import LatentVolume, LocalVolume
+from fieldfuse.volume.topology import Topology
 from tests.networks.made import SMALL, lattice, small_model
 from tests.networks.test_gru import inputs
-from toolkit.evaluate.speed import pinned
-from toolkit.networks import compiled_gru, model
-from toolkit.networks.lattice import LatentVolume, LocalVolume
-from toolkit.volume.topology import Topology
 
 SIDE = 3
 

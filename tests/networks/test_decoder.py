@@ -10,11 +10,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.networks.encoding import BEHIND, DIRECTION, spherical_harmonics
+from fieldfuse.render.field import Field
+from fieldfuse.volume.store import read_field, write_field
 from tests.render.made import random_field
-from toolkit.networks.decoder import make_decoder
-from toolkit.networks.encoding import BEHIND, DIRECTION, spherical_harmonics
-from toolkit.render.field import Field
-from toolkit.volume.store import read_field, write_field
 
 DEGREES = (slice(0, 1), slice(1, 4), slice(4, 9), slice(9, 16))
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from fieldfuse.networks.encoder import STRIDE, ImageEncoder, Sampled
 from tests.networks.made import pictures
-from toolkit.networks.encoder import STRIDE, ImageEncoder, Sampled
 
 
 def test_features_are_alive_at_the_start() -> None:

@@ -18,30 +18,30 @@ if importlib.util.find_spec("triton") is None or torch.cuda.is_available():
     pytest.skip("needs Triton, interpreting; with a CUDA device see test_gpu_device.py", allow_module_level=True)
 os.environ.setdefault("TRITON_INTERPRET", "1")
 
+from fieldfuse import gpu
+from fieldfuse.fusion import Fusion, FusionOptions
+from fieldfuse.networks import compiled, compiled_lookup
+from fieldfuse.networks.block_conv import BlockConv3d, Prepared, block_conv3d
+from fieldfuse.networks.cull import all_blocks
+from fieldfuse.networks.gpu import convolution, lookup, matching, observe, reading
+from fieldfuse.networks.gpu import describe as describing
+from fieldfuse.networks.gpu import gru as compiled_rows
+from fieldfuse.networks.gpu import volumes as volumes_gpu
+from fieldfuse.networks.lattice import LatentVolume, Lattice, cells, rows_of
+from fieldfuse.networks.matching import describe, distribution, semi_global
+from fieldfuse.networks.sweep import _table, compare, decide
+from fieldfuse.networks.unproject import look_up, project
+from fieldfuse.networks.witness import alone, evidence, witness
+from fieldfuse.render.march import MarchGrid, march
+from fieldfuse.volume import blocks_gpu, split_gpu, tables_gpu
+from fieldfuse.volume.edit import corner_nodes, split
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import Topology
 from tests.networks.made import SMALL as SIZES
 from tests.networks.made import cameras, lattice, pictures, small_model
 from tests.networks.test_compiled import FAR, NEAR, boxed, everything
 from tests.networks.test_compiled_gru import trained, volumes
 from tests.networks.test_sweep import wall
-from toolkit import gpu
-from toolkit.fusion import Fusion, FusionOptions
-from toolkit.networks import compiled, compiled_lookup
-from toolkit.networks.block_conv import BlockConv3d, Prepared, block_conv3d
-from toolkit.networks.cull import all_blocks
-from toolkit.networks.gpu import convolution, lookup, matching, observe, reading
-from toolkit.networks.gpu import describe as describing
-from toolkit.networks.gpu import gru as compiled_rows
-from toolkit.networks.gpu import volumes as volumes_gpu
-from toolkit.networks.lattice import LatentVolume, Lattice, cells, rows_of
-from toolkit.networks.matching import describe, distribution, semi_global
-from toolkit.networks.sweep import _table, compare, decide
-from toolkit.networks.unproject import look_up, project
-from toolkit.networks.witness import alone, evidence, witness
-from toolkit.render.march import MarchGrid, march
-from toolkit.volume import blocks_gpu, split_gpu, tables_gpu
-from toolkit.volume.edit import corner_nodes, split
-from toolkit.volume.space import Space
-from toolkit.volume.topology import Topology
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -93,8 +93,8 @@ def test_matching(shape: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_sweep_and_its_witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
     views = 3
-    monkeypatch.setattr("toolkit.networks.sweep.SPACING", 14)  # the interpreter is slow
-    monkeypatch.setattr("toolkit.networks.sweep.PLANES", (8, 16))
+    monkeypatch.setattr("fieldfuse.networks.sweep.SPACING", 14)  # the interpreter is slow
+    monkeypatch.setattr("fieldfuse.networks.sweep.PLANES", (8, 16))
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
     slow = everything(views, 1000)
     forced(monkeypatch)
@@ -115,8 +115,8 @@ def test_what_pictures_are_compared_by(size: tuple[int, int], last: bool, monkey
 
 
 def test_pictures_of_several_sizes_and_silhouettes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("toolkit.networks.sweep.WITHIN", 7)
-    monkeypatch.setattr("toolkit.networks.sweep.PLANES", (8, 16))
+    monkeypatch.setattr("fieldfuse.networks.sweep.WITHIN", 7)
+    monkeypatch.setattr("fieldfuse.networks.sweep.PLANES", (8, 16))
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
     described, seen_by = wall(3)
     described = [described[0], described[1][:, ::2].contiguous(), described[2][:, :, ::3]]
@@ -134,9 +134,9 @@ def test_pictures_of_several_sizes_and_silhouettes(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("within", [False, True])
 def test_what_a_sensor_measured(within: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("toolkit.networks.sweep.SPACING", 8)
-    monkeypatch.setattr("toolkit.networks.sweep.WITHIN", 7)
-    monkeypatch.setattr("toolkit.networks.sweep.PLANES", (8, 16))
+    monkeypatch.setattr("fieldfuse.networks.sweep.SPACING", 8)
+    monkeypatch.setattr("fieldfuse.networks.sweep.WITHIN", 7)
+    monkeypatch.setattr("fieldfuse.networks.sweep.PLANES", (8, 16))
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
     described, seen_by = wall(2)
     depth = 1.5 + torch.rand(31, 45, generator=torch.Generator().manual_seed(0))
@@ -152,9 +152,9 @@ def test_what_a_sensor_measured(within: bool, monkeypatch: pytest.MonkeyPatch) -
 
 def test_what_witnesses_say_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of their own pictures alone and not, from elsewhere, with other planes, and on a grid with an odd number of rows."""
-    monkeypatch.setattr("toolkit.networks.sweep.SPACING", 14)
-    monkeypatch.setattr("toolkit.networks.sweep.PLANES", (8, 16))
-    monkeypatch.setattr("toolkit.networks.witness.SURE", 0.4)
+    monkeypatch.setattr("fieldfuse.networks.sweep.SPACING", 14)
+    monkeypatch.setattr("fieldfuse.networks.sweep.PLANES", (8, 16))
+    monkeypatch.setattr("fieldfuse.networks.witness.SURE", 0.4)
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
     monkeypatch.setattr(reading, "BLOCK", 32)
     monkeypatch.setattr(reading, "PARTS", 2)
@@ -267,11 +267,11 @@ def on_device(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(convolution, "convolve", convolved)
     monkeypatch.setattr(gpu, "takes", lambda values: True)
     monkeypatch.setattr(gpu, "there", lambda values: True)
-    monkeypatch.setattr("toolkit.networks.gru.on_cpu", lambda device: False)
+    monkeypatch.setattr("fieldfuse.networks.gru.on_cpu", lambda device: False)
     for module in ("fusion", "networks.lattice", "networks.store", "networks.model", "volume.topology", "volume.edit", "networks.cull"):
-        monkeypatch.setattr(f"toolkit.{module}.asks_freely", lambda device: False)
+        monkeypatch.setattr(f"fieldfuse.{module}.asks_freely", lambda device: False)
     for module in ("networks.compiled_lookup", "networks.model"):
-        monkeypatch.setattr(f"toolkit.{module}.fits", lambda *values: False)
+        monkeypatch.setattr(f"fieldfuse.{module}.fits", lambda *values: False)
 
 
 def same(one: LatentVolume, other: LatentVolume, names: tuple[str, ...]) -> None:
@@ -339,7 +339,7 @@ def test_key_frames_are_fused(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_step_of_the_gru(busy: int, monkeypatch: pytest.MonkeyPatch) -> None:
     part, local = volumes(busy, busy)
     made = trained()
-    monkeypatch.setattr("toolkit.networks.model.fits", lambda *_: False)
+    monkeypatch.setattr("fieldfuse.networks.model.fits", lambda *_: False)
     with torch.no_grad():
         expected = made.fuse_part(part, local)
         on_device(monkeypatch)
@@ -361,7 +361,7 @@ def test_a_finer_lattice(believed: bool, monkeypatch: pytest.MonkeyPatch) -> Non
     nodes = corner_nodes(slow, inside)
     if believed:
         topology = Topology(keys, bounds=((-1, -1, -1), (5, 5, 5)))
-        for module in ("toolkit.volume.edit", "toolkit.volume.topology"):
+        for module in ("fieldfuse.volume.edit", "fieldfuse.volume.topology"):
             monkeypatch.setattr(f"{module}.asks_freely", lambda device: False)
     monkeypatch.setattr(gpu, "fits", lambda *values: True)
     monkeypatch.setattr(gpu, "there", lambda values: True)

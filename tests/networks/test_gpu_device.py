@@ -10,20 +10,20 @@ from typing import Any
 import pytest
 import torch
 
-from toolkit import gpu
+from fieldfuse import gpu
 
 if not torch.cuda.is_available():
     pytest.skip("needs a CUDA device", allow_module_level=True)
 
+from fieldfuse.networks.block_conv import block_conv3d
+from fieldfuse.networks.matching import describe, distribution, semi_global
+from fieldfuse.networks.sweep import _table, compare, decide, sweep
+from fieldfuse.networks.unproject import EncodedView, look_up, project
+from fieldfuse.networks.witness import alone as by_itself
+from fieldfuse.networks.witness import certain, evidence, witness
+from fieldfuse.volume.topology import Topology
 from tests.networks.made import cameras, pictures, small_model
 from tests.networks.test_sweep import wall
-from toolkit.networks.block_conv import block_conv3d
-from toolkit.networks.matching import describe, distribution, semi_global
-from toolkit.networks.sweep import _table, compare, decide, sweep
-from toolkit.networks.unproject import EncodedView, look_up, project
-from toolkit.networks.witness import alone as by_itself
-from toolkit.networks.witness import certain, evidence, witness
-from toolkit.volume.topology import Topology
 
 DEVICE = torch.device("cuda")
 

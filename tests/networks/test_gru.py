@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 
+from fieldfuse.networks.gru import FusionGRU, RunningMean
+from fieldfuse.networks.head import FieldHead
+from fieldfuse.networks.local import LocalReconstruction, colour_latent, inside_latent
+from fieldfuse.volume.topology import Topology
 from tests.networks.test_block_conv import cube, dense_of, rows_of
-from toolkit.networks.gru import FusionGRU, RunningMean
-from toolkit.networks.head import FieldHead
-from toolkit.networks.local import LocalReconstruction, colour_latent, inside_latent
-from toolkit.volume.topology import Topology
 
 CHANNELS = 4
 

@@ -8,11 +8,11 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from fieldfuse.errors import InputError
+from fieldfuse.networks import lite
+from fieldfuse.networks.encoder import ImageEncoder
+from fieldfuse.networks.lite import EPSILON, Block, lite_trunk, load_imagenet
 from tests.networks.made import SMALL, pictures
-from toolkit.errors import InputError
-from toolkit.networks import lite
-from toolkit.networks.encoder import ImageEncoder
-from toolkit.networks.lite import EPSILON, Block, lite_trunk, load_imagenet
 
 
 def stored(seed: int = 0) -> dict[str, torch.Tensor]:

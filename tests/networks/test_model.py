@@ -9,11 +9,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.networks.lattice import LatentVolume, LocalVolume
+from fieldfuse.networks.model import ModelConfig, NerfusionModel
+from fieldfuse.networks.refine import solid_cells
+from fieldfuse.volume.topology import VOXELS, Topology
 from tests.networks.made import SMALL, cameras, lattice, pictures, small_model
-from toolkit.networks.lattice import LatentVolume, LocalVolume
-from toolkit.networks.model import ModelConfig, NerfusionModel
-from toolkit.networks.refine import solid_cells
-from toolkit.volume.topology import VOXELS, Topology
 
 
 def local(model: NerfusionModel, views: list[int], seed: int = 0, shift: float = 0.0, shell: float = 0.0) -> LocalVolume:

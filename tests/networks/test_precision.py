@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from fieldfuse.fusion import Fusion, FusionOptions
+from fieldfuse.networks import precision
+from fieldfuse.networks.precision import computing, has_bfloat16
 from tests.networks.made import cameras, lattice, pictures, small_model
-from toolkit.fusion import Fusion, FusionOptions
-from toolkit.networks import precision
-from toolkit.networks.precision import computing, has_bfloat16
 
 CPU = torch.device("cpu")
 

@@ -6,8 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.networks import compiled_lookup
-from toolkit.networks.pyramid import Pyramid, middles
+from fieldfuse.networks import compiled_lookup
+from fieldfuse.networks.pyramid import Pyramid, middles
 
 
 def slow(levels: list[torch.Tensor], stride: int, u: float, v: float, footprint: float) -> torch.Tensor:

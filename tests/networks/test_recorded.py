@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from toolkit.networks import recorded
-from toolkit.networks.recorded import MOST, Recorded
+from fieldfuse.networks import recorded
+from fieldfuse.networks.recorded import MOST, Recorded
 
 
 class Graph:

@@ -9,12 +9,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.networks.lattice import LatentVolume, cells, empty_volume
+from fieldfuse.networks.refine import INHERITED, adopt, children, part, solid_cells, split_volume
+from fieldfuse.networks.store import GlobalStore
+from fieldfuse.volume.lookup import corners, gather
+from fieldfuse.volume.topology import VOXELS, Topology
 from tests.networks.made import lattice
-from toolkit.networks.lattice import LatentVolume, cells, empty_volume
-from toolkit.networks.refine import INHERITED, adopt, children, part, solid_cells, split_volume
-from toolkit.networks.store import GlobalStore
-from toolkit.volume.lookup import corners, gather
-from toolkit.volume.topology import VOXELS, Topology
 
 
 def volume(seed: int, share: float = 0.7, blocks: float = 0.5, channels: int = 3) -> LatentVolume:

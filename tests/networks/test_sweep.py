@@ -11,10 +11,10 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.matching import LARGE, SIDE, SMALL, describe, difference, distribution, semi_global, together
+from fieldfuse.networks.sweep import LOST, PLANES, Sweep, _table, carved, compare, decide, measured, sweep
 from tests.networks.made import cameras
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.matching import LARGE, SIDE, SMALL, describe, difference, distribution, semi_global, together
-from toolkit.networks.sweep import LOST, PLANES, Sweep, _table, carved, compare, decide, measured, sweep
 
 WALL = 2.0
 

@@ -11,15 +11,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.camera import invert
+from fieldfuse.camera import project as project_one
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.cull import all_blocks, block_balls, visible_blocks
+from fieldfuse.networks.lattice import Lattice
+from fieldfuse.networks.unproject import look_up, project
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import Topology
 from tests.networks.made import HEIGHT, INTRINSICS, WIDTH, cameras, lattice, pictures, small_model
-from toolkit.camera import invert
-from toolkit.camera import project as project_one
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
-from toolkit.networks.lattice import Lattice
-from toolkit.networks.unproject import look_up, project
-from toolkit.volume.space import Space
-from toolkit.volume.topology import Topology
 
 
 def random_pose(generator: np.random.Generator) -> np.ndarray:

@@ -10,10 +10,10 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from fieldfuse.errors import InputError, OutputError
+from fieldfuse.networks.model import ModelConfig, NerfusionModel
+from fieldfuse.networks.weights import METADATA_KEY, VERSION, config_from, load_model, save_model
 from tests.networks.made import SMALL, small_model
-from toolkit.errors import InputError, OutputError
-from toolkit.networks.model import ModelConfig, NerfusionModel
-from toolkit.networks.weights import METADATA_KEY, VERSION, config_from, load_model, save_model
 
 
 def test_there_and_back(tmp_path: Path) -> None:

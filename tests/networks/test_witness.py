@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.sweep import Compared, Sweep, compare, decide, sweep
+from fieldfuse.networks.witness import AGAINST, FOR, SHARE, certain, credit, evidence, witness
 from tests.networks.test_sweep import WALL, on_axis, wall
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.sweep import Compared, Sweep, compare, decide, sweep
-from toolkit.networks.witness import AGAINST, FOR, SHARE, certain, credit, evidence, witness
 
 NEAR, FAR = 0.8, 6.0
 

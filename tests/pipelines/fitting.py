@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 from unittest import mock
 
+from fieldfuse.training.fit import Clock
 from tests.pipelines.short import steady
-from toolkit.training.fit import Clock
 
 LOOKS = 20
 
@@ -27,7 +27,7 @@ def main() -> None:
         return plain(self)
 
     with steady(), mock.patch.object(Clock, "seconds", seconds):
-        from pipelines.cli import main as command
+        from fieldfuse.pipelines.cli import main as command
 
         command()
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from toolkit.camera import Array, Intrinsics, opengl_from_world
+from fieldfuse.camera import Array, Intrinsics, opengl_from_world
 
 ROOT = Path(__file__).resolve().parents[2]
 HALF = np.array([2.0, 1.5, 2.0])  # half size of the room, metres
@@ -141,7 +141,7 @@ def said(*arguments: object) -> Answer:
 
 def _main(arguments: tuple[object, ...]) -> int:
     """The exit code."""
-    from pipelines import cli
+    from fieldfuse.pipelines import cli
 
     with mock.patch.object(sys, "argv", ["fieldfuse", *map(str, arguments)]), pytest.raises(SystemExit) as end:
         cli.main()
@@ -150,7 +150,7 @@ def _main(arguments: tuple[object, ...]) -> int:
 
 def command(*arguments: object) -> list[str]:
     """`fieldfuse …` as a process of its own."""
-    return [sys.executable, "-m", "pipelines.cli", *map(str, arguments)]
+    return [sys.executable, "-m", "fieldfuse.pipelines.cli", *map(str, arguments)]
 
 
 def environment(**more: str) -> dict[str, str]:

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from fieldfuse.files import read_json
+from fieldfuse.training.fit import Clock
 from tests.pipelines.made import command, environment, make_room, said
-from toolkit.files import read_json
-from toolkit.training.fit import Clock
 
 ALONE = ["--threads", "1", "--init", "classical"]
 SMALL = ["--budget", "3", *ALONE, "--set", "field.resolution=32", "--set", "export.mesh_views=6", "--set", "export.video_frames=4"]

@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.folder import RunFolder, is_run_folder
-from pipelines.render_path import read_cameras
+from fieldfuse.config import load_settings
+from fieldfuse.errors import InputError, OutputError
+from fieldfuse.pipelines.folder import RunFolder, is_run_folder
+from fieldfuse.pipelines.render_path import read_cameras
 from tests.pipelines.made import CAMERA, Answer, call, circle, make_room, save_picture, shoot, spawn, write_transforms
-from toolkit.config import load_settings
-from toolkit.errors import InputError, OutputError
 
 Capsys = pytest.CaptureFixture[str]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from pipelines import bench, cli
-from toolkit.errors import InputError
+from fieldfuse.errors import InputError
+from fieldfuse.pipelines import bench, cli
 
 
 def test_some_parts_are_measured_and_written(tmp_path: Path) -> None:

@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from pipelines import bench_captures
-from pipelines.bench_captures import Plan, runs_of, sources, worth
-from pipelines.console import ConsoleProgress
+from fieldfuse.errors import InputError, Interrupted
+from fieldfuse.files import read_json, write_json
+from fieldfuse.pipelines import bench_captures
+from fieldfuse.pipelines.bench_captures import Plan, runs_of, sources, worth
+from fieldfuse.pipelines.console import ConsoleProgress
+from fieldfuse.poses import child
 from tests.pipelines.made import call, make_room
-from toolkit.errors import InputError, Interrupted
-from toolkit.files import read_json, write_json
-from toolkit.poses import child
 
 Capsys = pytest.CaptureFixture[str]
 SHORT = ["--budget", "1", "--threads", "1", "--image-size", "64"]

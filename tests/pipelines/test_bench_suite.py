@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.files import read_json, write_json
 from tests.pipelines.made import call, make_room
-from toolkit.files import read_json, write_json
 
 Capsys = pytest.CaptureFixture[str]
 

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from pipelines.steps_compare import choose_surfaces
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.compare_truth import GroundTruth
+from fieldfuse.export.mesh import write_mesh
+from fieldfuse.files import read_json, write_json
+from fieldfuse.pipelines.steps_compare import choose_surfaces
+from fieldfuse.tsdf.mesh import Mesh
 from tests.evaluate.browser import embedded_pictures, open_page
 from tests.pipelines.made import call
 from tests.pipelines.short import steady
 from tests.pipelines.test_matched import CAMERA, make_corner
 from tests.poses.textured import PLANES, arc, render
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
-from toolkit.evaluate.compare_truth import GroundTruth
-from toolkit.export.mesh import write_mesh
-from toolkit.files import read_json, write_json
-from toolkit.tsdf.mesh import Mesh
 
 Capsys = pytest.CaptureFixture[str]
 PAIRS = ["init=classical", "fit.budget=1", "field.resolution=32", "export.mesh_views=4"]
@@ -61,9 +61,9 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("compare")
     make_corner(folder / "corner", depth=True)
     add_truth(folder / "corner")
-    from pipelines.compare import compare_run
-    from pipelines.console import make_progress
-    from pipelines.options import gather
+    from fieldfuse.pipelines.compare import compare_run
+    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.options import gather
 
     options = gather("fast", None, [*PAIRS[1:], "export.formats=[ply]", "network.voxels=16"], holdout=4, threads=1)
     with steady():

@@ -11,9 +11,9 @@ import time
 
 import pytest
 
-from pipelines.console import ConsoleProgress, PlainProgress, RichProgress, clock, make_progress
-from pipelines.effects_table import show as show_effects
-from pipelines.info import for_people
+from fieldfuse.pipelines.console import ConsoleProgress, PlainProgress, RichProgress, clock, make_progress
+from fieldfuse.pipelines.effects_table import show as show_effects
+from fieldfuse.pipelines.info import for_people
 
 
 class Terminal(io.StringIO):

@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pipelines.kept import EFFECTS, fitting
-from pipelines.steps_effects import moved_cameras
-from toolkit.capture import open_capture
-from toolkit.capture.prepare import held_out
-from toolkit.config import load_settings
-from toolkit.effects.correct import Corrections
-from toolkit.effects.decide import Decided, asleep, decide, wish
-from toolkit.errors import InputError
-from toolkit.evaluate.effects_truth import known_light
-from toolkit.simulate.settings import scene_file
-from toolkit.simulate.simulate import simulate
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.prepare import held_out
+from fieldfuse.config import load_settings
+from fieldfuse.effects.correct import Corrections
+from fieldfuse.effects.decide import Decided, asleep, decide, wish
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.effects_truth import known_light
+from fieldfuse.pipelines.kept import EFFECTS, fitting
+from fieldfuse.pipelines.steps_effects import moved_cameras
+from fieldfuse.simulate.settings import scene_file
+from fieldfuse.simulate.simulate import simulate
 
 SCENE = {
     "scene": "room",
@@ -124,7 +124,7 @@ def test_settings_files_may_say_on_and_off_bare(tmp_path: Path) -> None:
 
 
 def test_info_prints_the_evidence(captures: dict[str, Path]) -> None:
-    from pipelines.cli import app
+    from fieldfuse.pipelines.cli import app
 
     shown = CliRunner().invoke(app, ["info", str(captures["drift"]), "--effects", "--fast", "--quiet"])
     assert shown.exit_code == 0, shown.output

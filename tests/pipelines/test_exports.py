@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.console import make_progress
-from pipelines.job import open_job
-from pipelines.options import gather
-from pipelines.reconstruct import BEFORE, stand
-from pipelines.steps_capture import choose_frames, find_capture
-from pipelines.steps_results import fit_radiance_field
+from fieldfuse.files import read_json
+from fieldfuse.pipelines.console import make_progress
+from fieldfuse.pipelines.job import open_job
+from fieldfuse.pipelines.options import gather
+from fieldfuse.pipelines.reconstruct import BEFORE, stand
+from fieldfuse.pipelines.steps_capture import choose_frames, find_capture
+from fieldfuse.pipelines.steps_results import fit_radiance_field
 from tests.capture.films import film
 from tests.pipelines.made import call, circle, shoot
 from tests.pipelines.short import ALONE, finished, stages
-from toolkit.files import read_json
 
 Capsys = pytest.CaptureFixture[str]
 FEW = ["--image-size", "48", "--budget", "1", *ALONE, "--set", "field.resolution=16", "--set", "export.mesh_views=3", "--quiet", "--json"]

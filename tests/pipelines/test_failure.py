@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import pytest
 
+from fieldfuse.files import read_json
 from tests.pipelines.made import call, make_room, write_transforms
 from tests.pipelines.short import FAST, report
-from toolkit.files import read_json
 
 
 def test_scores_of_images_that_are_there_twice_are_not_believed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.steps_results import going_on
+from fieldfuse.config import load_settings
+from fieldfuse.files import read_json
+from fieldfuse.pipelines.steps_results import going_on
 from tests.pipelines.made import CAMERA, call, make_room
 from tests.training.test_fit import ticking
 from tests.training.test_not_finite import spoiling
-from toolkit.config import load_settings
-from toolkit.files import read_json
 
 OPTIONS = (
     "--budget",

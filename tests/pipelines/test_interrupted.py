@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.console import STOPPING
+from fieldfuse.pipelines.console import STOPPING
+from fieldfuse.render.field import Field
 from tests.pipelines.made import CAMERA, Answer, call, environment, make_room
 from tests.pipelines.short import FAST, HUNG, report, stages, start, wait_for
-from toolkit.render.field import Field
 
 Capsys = pytest.CaptureFixture[str]
 # Of a fit that does not end by itself while a test looks at it; without matching steps begin at once.
@@ -100,11 +100,11 @@ def test_ctrl_c_twice_ends_at_once(tmp_path: Path) -> None:
 def test_ctrl_c_while_code_is_made_from_text(tmp_path: Path) -> None:
     """Many imports do that. CPython then ends `python -m` by the signal, although the interrupt was caught."""
     (tmp_path / "interrupted.py").write_text(
-        "import atexit, signal, pipelines.cli\n"
+        "import atexit, signal, fieldfuse.pipelines.cli\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # tests that run in the background inherit that it is ignored
         "atexit.register(print, 'tidied')\n"
-        "pipelines.cli.app = lambda: exec('import signal; signal.raise_signal(signal.SIGINT)')\n"
-        "pipelines.cli.program()\n"
+        "fieldfuse.pipelines.cli.app = lambda: exec('import signal; signal.raise_signal(signal.SIGINT)')\n"
+        "fieldfuse.pipelines.cli.program()\n"
     )
     there = environment(PYTHONPATH=os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])]))
     answer = subprocess.run([sys.executable, "-m", "interrupted"], env=there, capture_output=True, text=True, timeout=HUNG)

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from pipelines import kept
-from pipelines.kept import FLAG, NUMBER, TEXT, misfit, read_kept
+from fieldfuse.errors import InputError
+from fieldfuse.pipelines import kept
+from fieldfuse.pipelines.kept import FLAG, NUMBER, TEXT, misfit, read_kept
 from tests.pipelines.made import call
-from toolkit.errors import InputError
 
 
 @pytest.mark.parametrize(

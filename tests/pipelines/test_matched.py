@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.summary import describe_left_out, describe_matching
+from fieldfuse.camera import Intrinsics, opengl_from_world
+from fieldfuse.files import read_json
+from fieldfuse.pipelines.summary import describe_left_out, describe_matching
+from fieldfuse.stereo import moving
+from fieldfuse.stereo.left_out import LeftOut, load_left_out
 from tests.pipelines.made import call, save_picture, write_transforms
 from tests.poses.textured import arc, render
-from toolkit.camera import Intrinsics, opengl_from_world
-from toolkit.files import read_json
-from toolkit.stereo import moving
-from toolkit.stereo.left_out import LeftOut, load_left_out
 
 Capsys = pytest.CaptureFixture[str]
 CAMERA = Intrinsics(128, 96, 120.0, 120.0, 64.0, 48.0)
@@ -78,7 +78,7 @@ def test_without_being_asked_pictures_are_matched_for_the_fit_alone(
         assert any("matching 4 training pictures" in note for note in data["notes"])
     # A fit that goes on does not match them again: what was found before is told.
     before = data["field"]["matched"]
-    monkeypatch.setattr("toolkit.stereo.quick.guided", refuse)
+    monkeypatch.setattr("fieldfuse.stereo.quick.guided", refuse)
     answer = call(capsys, "finetune", out, "--budget", "0.5", "--threads", "1", "--quiet")
     assert answer.code == 0, answer.err
     after = read_json(out / "report.json")

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.few_views import numbers, part_of, wanted
-from pipelines.steps_network import uses_network
+from fieldfuse.config import load_settings
+from fieldfuse.errors import InputError
+from fieldfuse.files import read_json
+from fieldfuse.pipelines.few_views import numbers, part_of, wanted
+from fieldfuse.pipelines.steps_network import uses_network
 from tests.pipelines.made import CAMERA, call, make_room
 from tests.pipelines.short import clocked, start, wait_for
-from toolkit.config import load_settings
-from toolkit.errors import InputError
-from toolkit.files import read_json
 
 Capsys = pytest.CaptureFixture[str]
 FAST = [
@@ -104,7 +104,7 @@ def test_with_many_pictures_too_the_networks_field_is_fitted_further(
     room: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By itself a run with so many pictures would start classically; what the folder has does not stand on that."""
-    monkeypatch.setattr("toolkit.training.start.FEW_VIEWS", 1)
+    monkeypatch.setattr("fieldfuse.training.start.FEW_VIEWS", 1)
     out = tmp_path / "out"
     assert stages(run(capsys, room, out, "--no-finetune", "--init", "auto"))["network"] is False
     timelines = []
@@ -215,8 +215,8 @@ def test_lists_of_numbers() -> None:
 
 def test_engines_are_measured_side_by_side(room: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each engine fits within the same seconds, and pictures of its field are timed."""
-    monkeypatch.setattr("toolkit.evaluate.engines.PICTURE", (96, 72))
-    monkeypatch.setattr("toolkit.evaluate.engines.STEPS", 2)
+    monkeypatch.setattr("fieldfuse.evaluate.engines.PICTURE", (96, 72))
+    monkeypatch.setattr("fieldfuse.evaluate.engines.STEPS", 2)
     with clocked(lambda: time.process_time):  # what else the machine does is not counted
         answer = call(
             *(capsys, "bench", "engines", room, "--out", tmp_path / "engines", "--budgets", "1", "--engines", "auto,torch"),

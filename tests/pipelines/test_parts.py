@@ -12,12 +12,12 @@ from pathlib import Path
 import cv2
 import pytest
 
-from pipelines.folder import FILES, SUBFOLDERS
-from pipelines.thread_limits import THREAD_VARIABLES, bound_threads
+from fieldfuse.errors import InputError
+from fieldfuse.files import read_json
+from fieldfuse.pipelines.folder import FILES, SUBFOLDERS
+from fieldfuse.pipelines.thread_limits import THREAD_VARIABLES, bound_threads
 from tests.pipelines.made import call, make_room
 from tests.pipelines.short import FAST, finished, report, stages
-from toolkit.errors import InputError
-from toolkit.files import read_json
 
 Capsys = pytest.CaptureFixture[str]
 
@@ -142,7 +142,7 @@ def test_a_field_without_surface_is_exported_as_far_as_it_goes(out: Path, capsys
     def nothing_opaque(*_: object, **__: object) -> None:
         raise InputError("no rendered view shows a surface")
 
-    monkeypatch.setattr("toolkit.export.surface.field_volume", nothing_opaque)
+    monkeypatch.setattr("fieldfuse.export.surface.field_volume", nothing_opaque)
     wish = ["--set", "export.formats=[ply,cameras]"]
     answer = call(capsys, "run", out.parent / "room", "--out", out, *FAST, *wish, "--quiet", "--json")
     assert answer.code == 0, answer.err
@@ -193,5 +193,5 @@ def test_waiting_threads_sleep_soon_unless_told_otherwise(
 
 def test_threads_are_bounded_before_numpy_is_loaded() -> None:
     """NumPy's BLAS reads the count when it is loaded; later it is too late."""
-    code = "import sys, pipelines.cli, pipelines.run, pipelines.work, pipelines.thread_limits; sys.exit('numpy' in sys.modules)"
+    code = "import sys; from fieldfuse.pipelines import cli, run, work, thread_limits; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

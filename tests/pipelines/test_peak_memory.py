@@ -14,7 +14,7 @@ import numpy as np
 import psutil
 import pytest
 
-from pipelines.memory import PeakMemory, own_bytes
+from fieldfuse.pipelines.memory import PeakMemory, own_bytes
 
 SIZE = 2**27  # 128 MiB
 

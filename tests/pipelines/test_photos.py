@@ -17,10 +17,10 @@ import psutil
 import pytest
 from PIL import Image
 
-from pipelines.steps_capture import at_home
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.pipelines.steps_capture import at_home
 from tests.pipelines.made import CAMERA, call, circle, command, environment, look_at, make_photos, shoot
 from tests.pipelines.short import HUNG
-from toolkit.capture.types import Capture, Frame
 
 Capsys = pytest.CaptureFixture[str]
 PHOTO = CAMERA.scaled(288, 216)

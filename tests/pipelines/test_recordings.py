@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipelines.steps_capture import at_home
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.images import load_depth
+from fieldfuse.capture.select import select_frames
+from fieldfuse.config import CaptureSettings
+from fieldfuse.pipelines.steps_capture import at_home
 from tests.capture.layouts import write_record3d, zipped
 from tests.capture.made import BALL, RADIUS
 from tests.pipelines.made import call
-from toolkit.capture import open_capture
-from toolkit.capture.images import load_depth
-from toolkit.capture.select import select_frames
-from toolkit.config import CaptureSettings
 
 pytest.importorskip("imagecodecs", reason="imagecodecs is not installed; make test brings it")
 

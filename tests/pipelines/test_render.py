@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.rendered import Picture, Pictures, depth_step, depth_steps, write_pngs
+from fieldfuse.files import read_json, write_json
+from fieldfuse.pipelines.rendered import Picture, Pictures, depth_step, depth_steps, write_pngs
+from fieldfuse.poses.scene import Scene
 from tests.pipelines.made import call, circle, shoot
 from tests.pipelines.short import report
-from toolkit.files import read_json, write_json
-from toolkit.poses.scene import Scene
 
 Capsys = pytest.CaptureFixture[str]
 

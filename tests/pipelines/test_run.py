@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from fieldfuse.files import read_json
 from tests.pipelines.made import HALF, call
 from tests.pipelines.short import SMALL, report, stages
-from toolkit.files import read_json
 
 Capsys = pytest.CaptureFixture[str]
 PARTS = {

@@ -12,26 +12,26 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
-from pipelines.cli import app
-from pipelines.pictures import camera_of
-from pipelines.rendered import Pictures, load_pictures, to_picture, write_pngs
-from pipelines.surface import write_surface
+from fieldfuse.camera import Similarity
+from fieldfuse.capture.types import Views
+from fieldfuse.capture.views_file import load_views
+from fieldfuse.evaluate.baseline import nearest_image_scores
+from fieldfuse.evaluate.geometry import read_mesh
+from fieldfuse.evaluate.images import psnr
+from fieldfuse.evaluate.speed_state import around
+from fieldfuse.evaluate.speed_state import lens as around_lens
+from fieldfuse.files import read_json
+from fieldfuse.pipelines.cli import app
+from fieldfuse.pipelines.pictures import camera_of
+from fieldfuse.pipelines.rendered import Pictures, load_pictures, to_picture, write_pngs
+from fieldfuse.pipelines.surface import write_surface
+from fieldfuse.render.image import render_view
+from fieldfuse.simulate.settings import scene_file
+from fieldfuse.simulate.simulate import simulate
+from fieldfuse.tone import Tone, exposed
+from fieldfuse.tsdf.mesh import Mesh
+from fieldfuse.tsdf.volume import Points
 from tests.render.made import coloured_field
-from toolkit.camera import Similarity
-from toolkit.capture.types import Views
-from toolkit.capture.views_file import load_views
-from toolkit.evaluate.baseline import nearest_image_scores
-from toolkit.evaluate.geometry import read_mesh
-from toolkit.evaluate.images import psnr
-from toolkit.evaluate.speed_state import around
-from toolkit.evaluate.speed_state import lens as around_lens
-from toolkit.files import read_json
-from toolkit.render.image import render_view
-from toolkit.simulate.settings import scene_file
-from toolkit.simulate.simulate import simulate
-from toolkit.tone import Tone, exposed
-from toolkit.tsdf.mesh import Mesh
-from toolkit.tsdf.volume import Points
 
 SCENE = {
     "scene": "room",

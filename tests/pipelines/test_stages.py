@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from pipelines.console import ConsoleProgress
-from pipelines.folder import RunFolder
-from pipelines.stages import Stages, finished_stages
-from toolkit.config import Settings
-from toolkit.errors import InputError, Interrupted, OutputError
-from toolkit.files import read_json, write_json
+from fieldfuse.config import Settings
+from fieldfuse.errors import InputError, Interrupted, OutputError
+from fieldfuse.files import read_json, write_json
+from fieldfuse.pipelines.console import ConsoleProgress
+from fieldfuse.pipelines.folder import RunFolder
+from fieldfuse.pipelines.stages import Stages, finished_stages
 
 
 class Chain:
@@ -172,11 +172,11 @@ def test_memory_of_children_counts(tmp_path: Path) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from pipelines.console import ConsoleProgress
-from pipelines.folder import RunFolder
-from pipelines.stages import Stages
-from toolkit.config import Settings
-from toolkit.files import atomic_path
+from fieldfuse.pipelines.console import ConsoleProgress
+from fieldfuse.pipelines.folder import RunFolder
+from fieldfuse.pipelines.stages import Stages
+from fieldfuse.config import Settings
+from fieldfuse.files import atomic_path
 
 when = sys.argv[2]
 with RunFolder(Path(sys.argv[1])) as folder:

@@ -39,7 +39,7 @@ def test_help_is_quick() -> None:
 
 def test_heavy_libraries_are_not_loaded_for_help() -> None:
     heavy = {"torch", "open3d", "cv2", "numpy", "pycolmap", "trimesh"}
-    program = f"import sys, pipelines.cli; print(sorted({heavy} & set(sys.modules)))"
+    program = f"import sys, fieldfuse.pipelines.cli; print(sorted({heavy} & set(sys.modules)))"
     answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment())
     assert answer.stdout.strip() == "[]", answer.stdout + answer.stderr
 
@@ -50,7 +50,7 @@ def test_unexpected_errors_leave_a_log_and_no_traceback(tmp_path: Path, capsys: 
     def fail(*_: object) -> None:
         raise RuntimeError("a bolt is loose")
 
-    monkeypatch.setattr("toolkit.poses.given.given_poses", fail)
+    monkeypatch.setattr("fieldfuse.poses.given.given_poses", fail)
     answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", "--quiet")
     assert answer.code == 1
     assert "error.log" in answer.sentence() and "RuntimeError" in answer.sentence()
@@ -65,7 +65,7 @@ def test_doctor_as_json(capsys: Capsys) -> None:
 
 
 def test_help_tells_when_a_fit_starts_from_the_networks(capsys: Capsys) -> None:
-    from toolkit.training.start import FEW_VIEWS
+    from fieldfuse.training.start import FEW_VIEWS
 
     assert f"fewer than {FEW_VIEWS} training pictures" in " ".join(call(capsys, "run", "--help").out.split())
 

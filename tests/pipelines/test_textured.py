@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipelines.console import make_progress
-from pipelines.job import open_job
-from pipelines.options import gather
-from pipelines.reconstruct import stand
-from pipelines.surface import finer_views
-from pipelines.taken import as_taken
+from fieldfuse.effects.correct import Corrections
+from fieldfuse.errors import InputError
+from fieldfuse.files import read_json
+from fieldfuse.pipelines.console import make_progress
+from fieldfuse.pipelines.job import open_job
+from fieldfuse.pipelines.options import gather
+from fieldfuse.pipelines.reconstruct import stand
+from fieldfuse.pipelines.surface import finer_views
+from fieldfuse.pipelines.taken import as_taken
+from fieldfuse.tone import Tone
 from tests.pipelines.made import CAMERA, call, make_room, said
 from tests.pipelines.short import ALONE, steady
-from toolkit.effects.correct import Corrections
-from toolkit.errors import InputError
-from toolkit.files import read_json
-from toolkit.tone import Tone
 
 Capsys = pytest.CaptureFixture[str]
 FEW = ["--image-size", "48", "--budget", "1", *ALONE, "--set", "field.resolution=32", "--set", "export.mesh_views=6", "--quiet"]
@@ -90,7 +90,7 @@ def test_a_mesh_is_made_of_pictures_as_they_were_taken_where_there_is_room(run: 
         assert {picture.shape for picture in shown.images} == {(96, 128, 3)}
         assert {(camera.width, camera.height) for camera in cameras} == {(128, 96)}
         assert shown.names == [views.names[index] for index in train]
-        monkeypatch.setattr("toolkit.memory.available", lambda: 130 * 2**20)
+        monkeypatch.setattr("fieldfuse.memory.available", lambda: 130 * 2**20)
         shown, cameras = finer_views(job, posed, views, train)
         assert {picture.shape for picture in shown.images} == {(36, 48, 3)} and {camera.width for camera in cameras} == {48}
 
@@ -108,7 +108,7 @@ def test_a_mesh_stays_when_its_texture_cannot_be_made(
     def too_many(*_: object, **__: object) -> None:
         raise InputError("80000 triangles do not fit into a texture")
 
-    monkeypatch.setattr("toolkit.export.texture.textured", too_many)
+    monkeypatch.setattr("fieldfuse.export.texture.textured", too_many)
     out = shutil.copytree(run / "out", tmp_path / "out")
     (out / "exports" / "textured.glb").unlink()
     answer = call(capsys, "run", run / "room", "--out", out, *FEW, "--set", "export.formats=[ply,texture]")

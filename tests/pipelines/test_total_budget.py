@@ -13,11 +13,11 @@ from typing import Any
 import psutil
 import pytest
 
-from pipelines.total_budget import LONGEST_START, TotalBudget
+from fieldfuse.config import EXPORTS, load_settings
+from fieldfuse.evaluate import budget as model
+from fieldfuse.files import read_json, write_json
+from fieldfuse.pipelines.total_budget import LONGEST_START, TotalBudget
 from tests.pipelines.made import call, make_room
-from toolkit.config import EXPORTS, load_settings
-from toolkit.evaluate import budget as model
-from toolkit.files import read_json, write_json
 
 Capsys = pytest.CaptureFixture[str]
 
@@ -107,7 +107,7 @@ def fitted(seconds: float, formats: list[str] | None = None, spent: float = 10.0
     plan._began -= spent
     job = SimpleNamespace(settings=settings, stages=SimpleNamespace(cached={}, records={}))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipelines.total_budget.finest", lambda *_: 512)
+        patch.setattr("fieldfuse.pipelines.total_budget.finest", lambda *_: 512)
         plan.choose_fit(job, None, None)  # type: ignore[arg-type]
     return settings, plan
 
@@ -158,8 +158,8 @@ def test_a_flag_that_would_be_chosen_is_refused(tmp_path: Path, capsys: Capsys) 
 
 
 def test_the_work_of_a_capture_is_read_from_its_headers(tmp_path: Path) -> None:
-    from pipelines.total_budget import work_of
-    from toolkit.capture import open_capture
+    from fieldfuse.capture import open_capture
+    from fieldfuse.pipelines.total_budget import work_of
 
     make_room(tmp_path / "room", 8, depth=True)
     work = work_of(open_capture(tmp_path / "room"), load_settings("balanced", flags={"holdout": 4}))

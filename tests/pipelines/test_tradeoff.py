@@ -7,20 +7,20 @@ from pathlib import Path
 
 import pytest
 
-from pipelines import tradeoff_child
-from pipelines.direct_field import direct_field
-from pipelines.job import Job
-from pipelines.tradeoff import unbounded
-from pipelines.tradeoff_plan import base_time, chosen_axes, chosen_times, plan
-from pipelines.tradeoff_sweep import run_child
+from fieldfuse.config import Settings
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.tradeoff import MEASURES, checked_row, points_of, series
+from fieldfuse.files import read_json, write_json
+from fieldfuse.pipelines import tradeoff_child
+from fieldfuse.pipelines.direct_field import direct_field
+from fieldfuse.pipelines.job import Job
+from fieldfuse.pipelines.tradeoff import unbounded
+from fieldfuse.pipelines.tradeoff_plan import base_time, chosen_axes, chosen_times, plan
+from fieldfuse.pipelines.tradeoff_sweep import run_child
+from fieldfuse.progress import SILENT
 from tests.pipelines.made import call
 from tests.pipelines.test_matched import make_corner
 from tests.training.test_network_start import scene, wall_views
-from toolkit.config import Settings
-from toolkit.errors import InputError
-from toolkit.evaluate.tradeoff import MEASURES, checked_row, points_of, series
-from toolkit.files import read_json, write_json
-from toolkit.progress import SILENT
 
 Capsys = pytest.CaptureFixture[str]
 SMALL = ["--holdout", "4", "--threads", "1", "--quiet", "--json", "--set", "field.resolution=32"]
@@ -108,9 +108,9 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, capsys: Capsys, monkey
     command = ["tradeoff", tmp_path / "corner", "--out", out, *SMALL, "--times", "1", "--axes", "iterations,precision"]
     short = json.loads(call(capsys, *command, "--budget", "1").out)
     assert short["rows"] == [] and short["left_out"] == ["field-1s-seed0", "tsdf-seed0"]  # nothing fits into a second
-    monkeypatch.setattr("pipelines.tradeoff_sweep.run_child", surfaces_here)
-    monkeypatch.setattr("toolkit.poses.worker.die_with_parent", lambda: None)
-    monkeypatch.setattr("toolkit.evaluate.tradeoff_page.MEASURES", {"psnr": MEASURES["psnr"]})  # all plots: tests/evaluate
+    monkeypatch.setattr("fieldfuse.pipelines.tradeoff_sweep.run_child", surfaces_here)
+    monkeypatch.setattr("fieldfuse.poses.worker.die_with_parent", lambda: None)
+    monkeypatch.setattr("fieldfuse.evaluate.tradeoff_page.MEASURES", {"psnr": MEASURES["psnr"]})  # all plots: tests/evaluate
     answer = call(capsys, *command)
     assert answer.code == 0, answer.err
     data = json.loads(answer.out)

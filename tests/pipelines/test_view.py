@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.visitor import lens_of, pose_of
+from fieldfuse.camera import Array
+from fieldfuse.files import read_json
+from fieldfuse.pipelines.visitor import lens_of, pose_of
 from tests.evaluate.driven import driven, until
 from tests.pipelines.made import CAMERA, call, make_room
 from tests.pipelines.short import FAST, HUNG, finished, start
-from toolkit.camera import Array
-from toolkit.files import read_json
 
 Capsys = pytest.CaptureFixture[str]
 msgspec, zstandard, viser = (pytest.importorskip(name) for name in ("msgspec", "zstandard", "viser"))

@@ -11,19 +11,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from fieldfuse.capture import open_capture
+from fieldfuse.config import PosesSettings
+from fieldfuse.poses import database as store
+from fieldfuse.poses import placing
+from fieldfuse.poses.agreement import agreement, epipolar_distance, leave_out
+from fieldfuse.poses.health import doubts
+from fieldfuse.poses.job import Job, plan
+from fieldfuse.poses.mapping import Model, plain
+from fieldfuse.poses.match import match
+from fieldfuse.poses.pairs import exhaustive_pairs
+from fieldfuse.poses.sfm import find_poses
 from tests.conftest import shared_data
 from tests.poses.textured import aligned_error, arc, render, turning, write_capture
-from toolkit.capture import open_capture
-from toolkit.config import PosesSettings
-from toolkit.poses import database as store
-from toolkit.poses import placing
-from toolkit.poses.agreement import agreement, epipolar_distance, leave_out
-from toolkit.poses.health import doubts
-from toolkit.poses.job import Job, plan
-from toolkit.poses.mapping import Model, plain
-from toolkit.poses.match import match
-from toolkit.poses.pairs import exhaustive_pairs
-from toolkit.poses.sfm import find_poses
 
 
 def silent(done: float, total: float, note: str) -> None:
@@ -88,7 +88,7 @@ def test_places_that_may_be_wrong_are_named():
 
 
 def test_a_camera_that_turns_on_the_spot_stays_refused(tmp_path):
-    from toolkit.errors import PoseError
+    from fieldfuse.errors import PoseError
 
     with pytest.raises(PoseError, match="turned on the spot"):
         find_poses(write_capture(tmp_path / "photos", turning(6)), tmp_path, PosesSettings(max_features=400), seed=3, threads=1)

@@ -12,21 +12,21 @@ import cv2
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Array, invert
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.photos import with_unposed
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import PoseError
+from fieldfuse.export.cameras import write_colmap
+from fieldfuse.poses import check_given as module
+from fieldfuse.poses.check_given import LEAST_MATCHES, best_fitting, check_given, choose_images, same_poses
+from fieldfuse.poses.given import given_poses
+from fieldfuse.poses.mistakes import FILE_AXES, from_quaternion, readings, to_quaternion
+from fieldfuse.poses.points import Features
+from fieldfuse.poses.result import PoseResult
+from fieldfuse.poses.two_view import deviation, find_matches
 from tests.conftest import shared_data
 from tests.poses.textured import CAMERA, arc, render
-from toolkit.camera import Array, invert
-from toolkit.capture import open_capture
-from toolkit.capture.photos import with_unposed
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import PoseError
-from toolkit.export.cameras import write_colmap
-from toolkit.poses import check_given as module
-from toolkit.poses.check_given import LEAST_MATCHES, best_fitting, check_given, choose_images, same_poses
-from toolkit.poses.given import given_poses
-from toolkit.poses.mistakes import FILE_AXES, from_quaternion, readings, to_quaternion
-from toolkit.poses.points import Features
-from toolkit.poses.result import PoseResult
-from toolkit.poses.two_view import deviation, find_matches
 
 COUNT = 12
 RIGHT = arc(COUNT, 70.0)

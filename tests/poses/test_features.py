@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from toolkit.camera import Array
-from toolkit.poses.features import sift
+from fieldfuse.camera import Array
+from fieldfuse.poses.features import sift
 
 
 def blobs() -> tuple[Array, Array]:

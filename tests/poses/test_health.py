@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.poses.health import (
+from fieldfuse.poses.health import (
     components,
     failure,
     hopeless,
@@ -21,7 +21,7 @@ from toolkit.poses.health import (
     turned_only,
     way,
 )
-from toolkit.poses.job import GLOBAL, LOOSE
+from fieldfuse.poses.job import GLOBAL, LOOSE
 
 
 def picture(n: int, keypoints: int = 900, grey: int | None = None) -> dict[str, Any]:
@@ -220,7 +220,7 @@ def moved_features(world_turns: float, camera_turns: float, shift: tuple[float, 
 @pytest.mark.parametrize("seed", range(4))
 def test_an_object_turned_before_a_standing_camera_contradicts_its_background(seed):
     pytest.importorskip("pycolmap")
-    from toolkit.poses.database import stands
+    from fieldfuse.poses.database import stands
 
     found = stands(*moved_features(20, 0, (0, 0, 0), 9, seed))
     assert found is not None and found[0] > 0.2
@@ -233,7 +233,7 @@ def test_an_object_turned_before_a_standing_camera_contradicts_its_background(se
 
 def test_an_object_turned_about_the_line_of_sight_leaves_no_point_to_go_away_from():
     pytest.importorskip("pycolmap")
-    from toolkit.poses.database import stands
+    from fieldfuse.poses.database import stands
 
     random = np.random.default_rng(3)
     thing, rest = random.uniform(220, 420, (80, 2)), random.uniform(0, 640, (60, 2))

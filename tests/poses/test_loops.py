@@ -14,15 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from fieldfuse.config import PosesSettings
+from fieldfuse.poses import loops, sfm
+from fieldfuse.poses.health import fold
+from fieldfuse.poses.job import Job
+from fieldfuse.poses.mapping import Model, Report, plain
+from fieldfuse.poses.result import PoseResult
+from fieldfuse.poses.sfm import find_poses
+from fieldfuse.poses.worker import Mouth, work
 from tests.poses.textured import aligned_error, orbit, post, render, write_capture
-from toolkit.config import PosesSettings
-from toolkit.poses import loops, sfm
-from toolkit.poses.health import fold
-from toolkit.poses.job import Job
-from toolkit.poses.mapping import Model, Report, plain
-from toolkit.poses.result import PoseResult
-from toolkit.poses.sfm import find_poses
-from toolkit.poses.worker import Mouth, work
 
 FRAMES, TURNS = 40, 1.2
 POSES = orbit(FRAMES, TURNS)

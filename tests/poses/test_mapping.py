@@ -6,11 +6,11 @@ import numpy as np
 import pycolmap
 import pytest
 
+from fieldfuse.config import PosesSettings
+from fieldfuse.poses import mapping
+from fieldfuse.poses.job import Job
+from fieldfuse.poses.sfm import find_poses
 from tests.poses.textured import aligned_error, arc, render, write_capture
-from toolkit.config import PosesSettings
-from toolkit.poses import mapping
-from toolkit.poses.job import Job
-from toolkit.poses.sfm import find_poses
 
 POSES = arc(8)
 

@@ -13,12 +13,12 @@ import numpy as np
 import pycolmap
 import pytest
 
+from fieldfuse.config import PosesSettings
+from fieldfuse.poses import database as store
+from fieldfuse.poses import match
+from fieldfuse.poses.job import Job, plan
+from fieldfuse.poses.pairs import exhaustive_pairs
 from tests.poses.textured import orbit, post, render, write_capture
-from toolkit.config import PosesSettings
-from toolkit.poses import database as store
-from toolkit.poses import match
-from toolkit.poses.job import Job, plan
-from toolkit.poses.pairs import exhaustive_pairs
 
 COUNT = 12
 PAIRS = exhaustive_pairs(COUNT)  # two steps, and a part of one

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from toolkit.poses.pairs import (
+from fieldfuse.poses.pairs import (
     coarse,
     common,
     exhaustive_pairs,

@@ -9,15 +9,15 @@ import numpy as np
 import pycolmap
 import pytest
 
+from fieldfuse.config import PosesSettings
+from fieldfuse.poses import database as store
+from fieldfuse.poses import placing
+from fieldfuse.poses.job import MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, Job, plan
+from fieldfuse.poses.mapping import plain
+from fieldfuse.poses.match import match
+from fieldfuse.poses.pairs import exhaustive_pairs, pairs_with
+from fieldfuse.poses.selection import choose_pairs
 from tests.poses.textured import aligned_error, orbit, post, render, write_capture
-from toolkit.config import PosesSettings
-from toolkit.poses import database as store
-from toolkit.poses import placing
-from toolkit.poses.job import MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, Job, plan
-from toolkit.poses.mapping import plain
-from toolkit.poses.match import match
-from toolkit.poses.pairs import exhaustive_pairs, pairs_with
-from toolkit.poses.selection import choose_pairs
 
 COUNT, LATE = 14, [5, 11]
 POSES = orbit(COUNT, 0.4)
@@ -80,7 +80,7 @@ def test_few_photos_are_all_matched_and_many_with_those_that_look_alike(matched,
     try:
         assert choose_pairs(matched, database, silent) == exhaustive_pairs(COUNT)
         many = replace(matched, pictures=matched.pictures * 4)
-        monkeypatch.setattr("toolkit.poses.selection.sketches", lambda *_: list(np.zeros((len(many.pictures), 0, 128), np.float32)))
+        monkeypatch.setattr("fieldfuse.poses.selection.sketches", lambda *_: list(np.zeros((len(many.pictures), 0, 128), np.float32)))
         assert len(many.pictures) > MAX_EXHAUSTIVE and len(choose_pairs(many, database, silent)) < len(exhaustive_pairs(len(many.pictures)))
     finally:
         database.close()

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError, PoseError
+from fieldfuse.poses.given import given_poses
+from fieldfuse.poses.result import GIVEN, SFM, PoseResult, listed
 from tests.poses.textured import CAMERA, arc
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError, PoseError
-from toolkit.poses.given import given_poses
-from toolkit.poses.result import GIVEN, SFM, PoseResult, listed
 
 
 def capture(count: int = 6) -> Capture:

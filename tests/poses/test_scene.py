@@ -12,9 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.conftest import shared_data
-from tests.poses.textured import CAMERA, arc, look_at, render
-from toolkit.camera import (
+from fieldfuse.camera import (
     OPENCV,
     Intrinsics,
     Similarity,
@@ -22,12 +20,12 @@ from toolkit.camera import (
     project,
     world_from_opengl,
 )
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError, PoseError
-from toolkit.poses.cloud import cloud_of_depth, cloud_of_points
-from toolkit.poses.gravity import camera_frame, tight_turn, turn_about_z, up_direction
-from toolkit.poses.points import intersect, tracks, triangulate, undistorted
-from toolkit.poses.region import (
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError, PoseError
+from fieldfuse.poses.cloud import cloud_of_depth, cloud_of_points
+from fieldfuse.poses.gravity import camera_frame, tight_turn, turn_about_z, up_direction
+from fieldfuse.poses.points import intersect, tracks, triangulate, undistorted
+from fieldfuse.poses.region import (
     FORWARD,
     OBJECT,
     ROOM,
@@ -35,7 +33,9 @@ from toolkit.poses.region import (
     layout,
     weighted_percentiles,
 )
-from toolkit.poses.scene import Scene, describe_scene
+from fieldfuse.poses.scene import Scene, describe_scene
+from tests.conftest import shared_data
+from tests.poses.textured import CAMERA, arc, look_at, render
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +140,7 @@ def test_undistorted_undoes_the_lens(k1, k2, p1):
 
 
 def test_fox_points_reproject_within_two_pixels():
-    from toolkit.capture import open_capture
+    from fieldfuse.capture import open_capture
 
     fox = open_capture(shared_data("fox_540x960"))
     fox = fox.with_frames(fox.frames[:12])

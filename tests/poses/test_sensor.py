@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Similarity, pixel_grid, unproject
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.poses.result import SFM, PoseResult
+from fieldfuse.poses.sensor import scale_to_depth
 from tests.poses.textured import CAMERA, arc, render
-from toolkit.camera import Similarity, pixel_grid, unproject
-from toolkit.capture.types import Capture, Frame
-from toolkit.poses.result import SFM, PoseResult
-from toolkit.poses.sensor import scale_to_depth
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,14 @@ import psutil
 import pytest
 from PIL import Image
 
+from fieldfuse.config import PosesSettings
+from fieldfuse.errors import InputError, Interrupted, PoseError
+from fieldfuse.files import read_json
+from fieldfuse.poses.child import run_child
+from fieldfuse.poses.job import GONE_FAR, GONE_ON
+from fieldfuse.poses.result import PoseResult
+from fieldfuse.poses.sfm import find_poses
+from fieldfuse.progress import Progress
 from tests.poses.textured import (
     aligned_error,
     arc,
@@ -23,14 +31,6 @@ from tests.poses.textured import (
     turning,
     write_capture,
 )
-from toolkit.config import PosesSettings
-from toolkit.errors import InputError, Interrupted, PoseError
-from toolkit.files import read_json
-from toolkit.poses.child import run_child
-from toolkit.poses.job import GONE_FAR, GONE_ON
-from toolkit.poses.result import PoseResult
-from toolkit.poses.sfm import find_poses
-from toolkit.progress import Progress
 
 SMALL = PosesSettings(max_features=800)
 FEW = PosesSettings(max_features=400)  # where it is not about how good the cameras are
@@ -38,7 +38,7 @@ FEW = PosesSettings(max_features=400)  # where it is not about how good the came
 
 def workers() -> list[psutil.Process]:
     def works(process: psutil.Process) -> bool:
-        return "toolkit.poses.worker" in (process.info["cmdline"] or []) and process.status() != psutil.STATUS_ZOMBIE
+        return "fieldfuse.poses.worker" in (process.info["cmdline"] or []) and process.status() != psutil.STATUS_ZOMBIE
 
     return [process for process in psutil.process_iter(["cmdline"]) if works(process)]
 
@@ -97,7 +97,7 @@ def test_points_reproject_and_opencv_axes_hold(found):
 
 
 def test_what_would_not_repeat_takes_one_thread_unless_pictures_are_many():
-    from toolkit.poses.job import REPEATABLE, Job, Picture
+    from fieldfuse.poses.job import REPEATABLE, Job, Picture
 
     for count, expected in ((2, 1), (REPEATABLE, 1), (REPEATABLE + 1, 4)):
         assert Job("out", (Picture("a", "a.png"),) * count, True, True, False, 1600, 4096, 0, 4).repeating == expected
@@ -110,7 +110,7 @@ def test_a_second_run_reuses_features_and_gives_the_same(found, pictures, tmp_pa
     capture = write_capture(tmp_path / "fresh", pictures[0])
     fresh = find_poses(capture, tmp_path, SMALL, seed=3, threads=2)
     np.testing.assert_array_equal(fresh.world_from_camera, result.world_from_camera)  # one thread and two
-    from toolkit.capture.types import Capture, Frame
+    from fieldfuse.capture.types import Capture, Frame
 
     frames = tuple(Frame(path.stem, path) for path in sorted((out / "photos").iterdir()))
     again = find_poses(Capture("photos", out / "photos", frames), out, SMALL, seed=3, threads=1, progress=listener)
@@ -159,7 +159,7 @@ def test_a_partial_model_names_what_is_missing_and_why(pictures, tmp_path):
 def test_pictures_turned_by_exif_are_seen_upright(pictures, tmp_path):
     capture = write_capture(tmp_path / "photos", [])
     frames = []
-    from toolkit.capture.types import Capture, Frame
+    from fieldfuse.capture.types import Capture, Frame
 
     for n, picture in enumerate(pictures[0][:5]):
         image = Image.fromarray(np.ascontiguousarray(np.rot90(picture)))  # stored turned; orientation 6 turns it back
@@ -215,7 +215,7 @@ def test_the_child_dies_with_its_parent(pictures, tmp_path):
     write_capture(tmp_path / "photos", pictures[0])
     script = (
         "import sys; from pathlib import Path\n"
-        "from toolkit.capture.types import Capture, Frame; from toolkit.poses.sfm import find_poses\n"
+        "from fieldfuse.capture.types import Capture, Frame; from fieldfuse.poses.sfm import find_poses\n"
         "root = Path(sys.argv[1]); frames = tuple(Frame(p.stem, p) for p in sorted((root / 'photos').iterdir()))\n"
         "find_poses(Capture('photos', root, frames), root, threads=1)\n"
     )
@@ -252,7 +252,7 @@ def test_a_full_disk_is_said_to_be_one(pictures, tmp_path):
     capture = write_capture(tmp_path / "photos", pictures[0][:3])
     script = (
         "import resource, signal, sys; from pathlib import Path\n"
-        "from toolkit.capture.types import Capture, Frame; from toolkit.errors import OutputError; from toolkit.poses.sfm import "
+        "from fieldfuse.capture.types import Capture, Frame; from fieldfuse.errors import OutputError; from fieldfuse.poses.sfm import "
         "find_poses\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000))\n"
         "root = Path(sys.argv[1]); frames = tuple(Frame(p.stem, p) for p in sorted((root / 'photos').iterdir()))\n"

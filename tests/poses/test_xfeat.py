@@ -15,18 +15,18 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from fieldfuse.capture import open_capture
+from fieldfuse.config import PosesSettings
+from fieldfuse.errors import InputError, PoseError
+from fieldfuse.poses import database as store
+from fieldfuse.poses import placing, sfm, xfeat
+from fieldfuse.poses.features import floats, learned, sift
+from fieldfuse.poses.job import GONE_ON, SIFT, XFEAT, Job, plan
+from fieldfuse.poses.mapping import Model, plain
+from fieldfuse.poses.match import match
+from fieldfuse.poses.pairs import exhaustive_pairs
 from tests.conftest import shared_data
 from tests.poses.textured import aligned_error, arc, render, turning, write_capture
-from toolkit.capture import open_capture
-from toolkit.config import PosesSettings
-from toolkit.errors import InputError, PoseError
-from toolkit.poses import database as store
-from toolkit.poses import placing, sfm, xfeat
-from toolkit.poses.features import floats, learned, sift
-from toolkit.poses.job import GONE_ON, SIFT, XFEAT, Job, plan
-from toolkit.poses.mapping import Model, plain
-from toolkit.poses.match import match
-from toolkit.poses.pairs import exhaustive_pairs
 
 needs_weights = pytest.mark.skipif(xfeat.weights_file() is None, reason=f"XFeat's weights are not installed: {xfeat.INSTALL}")
 
@@ -196,7 +196,7 @@ def test_with_damaged_weights_sift_serves_and_it_is_said(tmp_path, weights):
 
 
 def test_doctor_says_what_to_install(tmp_path, weights):
-    from pipelines import doctor
+    from fieldfuse.pipelines import doctor
 
     weights(None)
     assert doctor._xfeat().status == doctor.WARN and "make xfeat" in doctor._xfeat().advice

@@ -10,8 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, invert
-from toolkit.capture.types import Capture, Frame
+from fieldfuse.camera import Array, Intrinsics, invert
+from fieldfuse.capture.types import Capture, Frame
 
 CAMERA = Intrinsics(320, 240, 300.0, 300.0, 160.0, 120.0)
 # Point, two edges: floor, two walls that meet, and a box's face and top before them.

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import torch
 
-from toolkit.evaluate.speed_state import sphere_field
-from toolkit.networks.decoder import make_decoder
-from toolkit.render.field import Field
-from toolkit.training.levels import all_places, first_field
-from toolkit.volume.host import TorchHost
-from toolkit.volume.space import Space
+from fieldfuse.evaluate.speed_state import sphere_field
+from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.render.field import Field
+from fieldfuse.training.levels import all_places, first_field
+from fieldfuse.volume.host import TorchHost
+from fieldfuse.volume.space import Space
 
 
 def random_field(

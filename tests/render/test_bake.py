@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
+from fieldfuse.camera import Intrinsics
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.speed_state import around, lens
+from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.render.bake import BakedField, bake
+from fieldfuse.render.bake_file import METADATA_KEY, read_baked, write_baked
+from fieldfuse.render.bake_image import BakedRenderer
+from fieldfuse.render.bake_views import seen_voxels
+from fieldfuse.render.field import Field
+from fieldfuse.render.image import render_view
 from tests.render.made import coloured_field, random_field
-from toolkit.camera import Intrinsics
-from toolkit.errors import InputError
-from toolkit.evaluate.speed_state import around, lens
-from toolkit.networks.decoder import make_decoder
-from toolkit.render.bake import BakedField, bake
-from toolkit.render.bake_file import METADATA_KEY, read_baked, write_baked
-from toolkit.render.bake_image import BakedRenderer
-from toolkit.render.bake_views import seen_voxels
-from toolkit.render.field import Field
-from toolkit.render.image import render_view
 
 CAMERA, POSE = lens(40, 30), around()[1]
 
@@ -64,7 +64,7 @@ def test_threads_change_nothing(baked: BakedField) -> None:
 
 
 def test_only_corners_beside_voxels_are_stored(field: Field, baked: BakedField) -> None:
-    from toolkit.volume.edit import corner_nodes
+    from fieldfuse.volume.edit import corner_nodes
 
     beside = int(corner_nodes(field.topology, field.occupied).sum())
     assert beside <= baked.corners < 1.5 * beside  # those on faces between blocks are stored with each

@@ -9,8 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.render.composite import distortion, exclusive_sum, ray_sum, thickness_gradient, weights
-from toolkit.render.march import first_of_ray
+from fieldfuse.render.composite import distortion, exclusive_sum, ray_sum, thickness_gradient, weights
+from fieldfuse.render.march import first_of_ray
 
 
 def loop_weights(thickness: list[float], ray: list[int]) -> list[float]:

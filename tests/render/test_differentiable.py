@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from fieldfuse.render.differentiable import look_up, render_with_gradients
+from fieldfuse.render.field import Field
+from fieldfuse.render.rays import render_rays
 from tests.render.made import random_field, random_rays
-from toolkit.render.differentiable import look_up, render_with_gradients
-from toolkit.render.field import Field
-from toolkit.render.rays import render_rays
 
 
 def double(field: Field) -> Field:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.camera import Intrinsics, Similarity
+from fieldfuse.errors import InputError
+from fieldfuse.render.field import Field, density
+from fieldfuse.render.image import render_view
+from fieldfuse.render.rays import render_rays
 from tests.render.made import random_field, random_rays
-from toolkit.camera import Intrinsics, Similarity
-from toolkit.errors import InputError
-from toolkit.render.field import Field, density
-from toolkit.render.image import render_view
-from toolkit.render.rays import render_rays
 
 
 @pytest.mark.parametrize("decoder", ["deferred", "per_sample"])
@@ -46,7 +46,7 @@ def test_settling_changes_nothing_that_is_seen() -> None:
     ],
 )  # fmt: skip
 def test_a_field_with_a_spoiled_configuration_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
-    from toolkit.volume.store import read_field, write_field
+    from fieldfuse.volume.store import read_field, write_field
 
     path = tmp_path / "field.safetensors"
     random_field(keep=0.02).save(path)

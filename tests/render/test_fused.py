@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.camera import pixel_grid, rays
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.cull import all_blocks
+from fieldfuse.networks.lattice import LatentVolume, Lattice
+from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.render.differentiable import render_with_gradients
+from fieldfuse.render.field import Field
+from fieldfuse.render.fused import make_field, without_empty_blocks
+from fieldfuse.render.rays import render_rays
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import Topology
 from tests.networks.made import HEIGHT, INTRINSICS, WIDTH, lattice, small_model, wall_pictures
-from toolkit.camera import pixel_grid, rays
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.cull import all_blocks
-from toolkit.networks.lattice import LatentVolume, Lattice
-from toolkit.networks.model import NerfusionModel
-from toolkit.render.differentiable import render_with_gradients
-from toolkit.render.field import Field
-from toolkit.render.fused import make_field, without_empty_blocks
-from toolkit.render.rays import render_rays
-from toolkit.volume.space import Space
-from toolkit.volume.topology import Topology
 
 
 def full_volume(model: NerfusionModel, shell: float = 0.0, resolution: int = 32) -> LatentVolume:

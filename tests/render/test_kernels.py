@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from numba import njit
 from scipy.ndimage import distance_transform_cdt
 
-from toolkit.render import kernels as K
-from toolkit.render.compiled import FARTHEST, chessboard_distance
+from fieldfuse.render import kernels as K
+from fieldfuse.render.compiled import FARTHEST, chessboard_distance
 
 
 @njit

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from toolkit.render import kernels_row as row
-from toolkit.render.kernels import LEAF
+from fieldfuse.render import kernels_row as row
+from fieldfuse.render.kernels import LEAF
 
 
 @njit(**{**LEAF, "cache": False})

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from fieldfuse.render.march import march
 from tests.render.made import random_field, random_rays
-from toolkit.render.march import march
 
 
 @pytest.mark.parametrize("keep", [1.0, 0.05])

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.camera import Array
-from toolkit.errors import InputError
-from toolkit.render.paths import focus, interpolate, look_at, orbit
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError
+from fieldfuse.render.paths import focus, interpolate, look_at, orbit
 
 UP = np.array([0.0, 0.0, 1.0])
 CENTRE = np.array([0.4, -0.3, 0.6])

@@ -12,19 +12,19 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from fieldfuse.camera import Intrinsics, pixel_grid, rays
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.speed_state import around, lens, sphere_field
+from fieldfuse.networks.encoding import SH
+from fieldfuse.render.bake import bake
+from fieldfuse.render.bake_file import read_baked, write_baked
+from fieldfuse.render.bake_image import BakedRenderer
+from fieldfuse.render.field import Field
+from fieldfuse.render.image import render_view
+from fieldfuse.render.sky import on_sky, sky_colours
+from fieldfuse.training.behind import sky_behind
 from tests.render.made import random_field, random_rays
-from toolkit.camera import Intrinsics, pixel_grid, rays
-from toolkit.capture.types import Views
-from toolkit.errors import InputError
-from toolkit.evaluate.speed_state import around, lens, sphere_field
-from toolkit.networks.encoding import SH
-from toolkit.render.bake import bake
-from toolkit.render.bake_file import read_baked, write_baked
-from toolkit.render.bake_image import BakedRenderer
-from toolkit.render.field import Field
-from toolkit.render.image import render_view
-from toolkit.render.sky import on_sky, sky_colours
-from toolkit.training.behind import sky_behind
 
 CAMERA = Intrinsics(40, 30, 30.0, 30.0, 20.0, 15.0)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, project, unproject
-from toolkit.simulate.baked import BakedScene, Light, _ball, _sphere
-from toolkit.simulate.trace import Rectangle, Sphere
+from fieldfuse.camera import Array, Intrinsics, project, unproject
+from fieldfuse.simulate.baked import BakedScene, Light, _ball, _sphere
+from fieldfuse.simulate.trace import Rectangle, Sphere
 
 CAMERA = Intrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
 FRONT = np.array([[1, 0, 0, 0], [0, 0, 1, -3], [0, -1, 0, 0.5], [0, 0, 0, 1]], dtype=float)  # at y = −3, looking along y; z is up

@@ -8,10 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.camera import Array
-from toolkit.simulate import cast as caster
-from toolkit.simulate.cast import FAR, cast, tile_order
-from toolkit.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solid, Solids, rod, upright
+from fieldfuse.camera import Array
+from fieldfuse.simulate import cast as caster
+from fieldfuse.simulate.cast import FAR, cast, tile_order
+from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solid, Solids, rod, upright
 
 
 def interval(solid: Solid, origin: Array, direction: Array) -> tuple[float, float]:

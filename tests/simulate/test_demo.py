@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from toolkit.camera import Array, project, unproject
-from toolkit.errors import Interrupted, OutputError
-from toolkit.progress import Progress
-from toolkit.simulate import demo
-from toolkit.simulate.demo import Filmed, demo_scene, hand_held, write_demo_video
+from fieldfuse.camera import Array, project, unproject
+from fieldfuse.errors import Interrupted, OutputError
+from fieldfuse.progress import Progress
+from fieldfuse.simulate import demo
+from fieldfuse.simulate.demo import Filmed, demo_scene, hand_held, write_demo_video
 
 
 @pytest.fixture(scope="module", autouse=True)

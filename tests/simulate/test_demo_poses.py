@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from toolkit.camera import Array
-from toolkit.capture.select import select_frames
-from toolkit.capture.video import read_video
-from toolkit.config import CaptureSettings, PosesSettings
-from toolkit.poses.sfm import find_poses
-from toolkit.simulate import demo
+from fieldfuse.camera import Array
+from fieldfuse.capture.select import select_frames
+from fieldfuse.capture.video import read_video
+from fieldfuse.config import CaptureSettings, PosesSettings
+from fieldfuse.poses.sfm import find_poses
+from fieldfuse.simulate import demo
 
 
 def aligned(source: Array, target: Array) -> tuple[float, Array, Array]:

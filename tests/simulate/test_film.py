@@ -13,15 +13,15 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from toolkit.camera import Intrinsics, project, unproject
-from toolkit.effects import exposure, motion_blur, rolling_shutter, sensor_noise, transfer, vignetting
-from toolkit.effects.listed import MODULES, Effects, parse
-from toolkit.simulate.eye import eye_of, take
-from toolkit.simulate.film import Film, Shot
-from toolkit.simulate.materials import TextureBank, texture_bank
-from toolkit.simulate.paths import PathSettings, plan
-from toolkit.simulate.procedural import random_scene
-from toolkit.simulate.scene import Scene
+from fieldfuse.camera import Intrinsics, project, unproject
+from fieldfuse.effects import exposure, motion_blur, rolling_shutter, sensor_noise, transfer, vignetting
+from fieldfuse.effects.listed import MODULES, Effects, parse
+from fieldfuse.simulate.eye import eye_of, take
+from fieldfuse.simulate.film import Film, Shot
+from fieldfuse.simulate.materials import TextureBank, texture_bank
+from fieldfuse.simulate.paths import PathSettings, plan
+from fieldfuse.simulate.procedural import random_scene
+from fieldfuse.simulate.scene import Scene
 
 CAMERA = Intrinsics(80, 60, 60.0, 60.0, 40.0, 30.0)
 PATH = PathSettings("walk", frames=6, fps=5.0, speed=0.6, shake=6.0)

@@ -10,19 +10,19 @@ import pytest
 import torch
 from PIL import Image
 
+from fieldfuse.camera import Intrinsics
+from fieldfuse.effects.background import Background
+from fieldfuse.effects.highlights import Highlights
+from fieldfuse.errors import InputError
+from fieldfuse.export.mesh import write_mesh
+from fieldfuse.simulate.eye import eye_of, take
+from fieldfuse.simulate.mesh_scene import MeshScene, load_mesh_scene
+from fieldfuse.simulate.paths import PathSettings, plan
+from fieldfuse.simulate.settings import scene_file
+from fieldfuse.simulate.simulate import simulate
+from fieldfuse.tsdf.mesh import Mesh
 from tests.conftest import shared_data
 from tests.simulate.test_procedural import plain_operations
-from toolkit.camera import Intrinsics
-from toolkit.effects.background import Background
-from toolkit.effects.highlights import Highlights
-from toolkit.errors import InputError
-from toolkit.export.mesh import write_mesh
-from toolkit.simulate.eye import eye_of, take
-from toolkit.simulate.mesh_scene import MeshScene, load_mesh_scene
-from toolkit.simulate.paths import PathSettings, plan
-from toolkit.simulate.settings import scene_file
-from toolkit.simulate.simulate import simulate
-from toolkit.tsdf.mesh import Mesh
 
 trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("open3d")

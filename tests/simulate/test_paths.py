@@ -8,11 +8,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.errors import InputError
-from toolkit.simulate.curve import Motion, Shake, rotations
-from toolkit.simulate.materials import TextureBank, texture_bank
-from toolkit.simulate.paths import MAKERS, PathSettings, plan
-from toolkit.simulate.procedural import KINDS, random_scene
+from fieldfuse.errors import InputError
+from fieldfuse.simulate.curve import Motion, Shake, rotations
+from fieldfuse.simulate.materials import TextureBank, texture_bank
+from fieldfuse.simulate.paths import MAKERS, PathSettings, plan
+from fieldfuse.simulate.procedural import KINDS, random_scene
 
 
 @pytest.fixture(scope="module")

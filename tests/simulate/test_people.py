@@ -11,22 +11,22 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
+from fieldfuse.camera import Array, Intrinsics, project
+from fieldfuse.capture.types import Views
+from fieldfuse.effects import passers
+from fieldfuse.effects.listed import parse
+from fieldfuse.effects.passers import EYES, PRESETS, Passers, Walk
+from fieldfuse.simulate.eye import eye_of, take
+from fieldfuse.simulate.film import Film
+from fieldfuse.simulate.materials import TextureBank, texture_bank
+from fieldfuse.simulate.mesh_scene import load_mesh_scene
+from fieldfuse.simulate.paths import PathSettings, plan
+from fieldfuse.simulate.people import Peopled, peopled
+from fieldfuse.simulate.procedural import random_scene
+from fieldfuse.stereo import moving
 from tests.simulate.test_film import CAMERA
 from tests.simulate.test_mesh_scene import wall
 from tests.simulate.test_simulate import made
-from toolkit.camera import Array, Intrinsics, project
-from toolkit.capture.types import Views
-from toolkit.effects import passers
-from toolkit.effects.listed import parse
-from toolkit.effects.passers import EYES, PRESETS, Passers, Walk
-from toolkit.simulate.eye import eye_of, take
-from toolkit.simulate.film import Film
-from toolkit.simulate.materials import TextureBank, texture_bank
-from toolkit.simulate.mesh_scene import load_mesh_scene
-from toolkit.simulate.paths import PathSettings, plan
-from toolkit.simulate.people import Peopled, peopled
-from toolkit.simulate.procedural import random_scene
-from toolkit.stereo import moving
 
 PATH = PathSettings("walk", frames=24, fps=3.0, speed=0.5)
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from toolkit.camera import Array, Intrinsics, project, unproject
-from toolkit.errors import InputError
-from toolkit.simulate.cast import FAR
-from toolkit.simulate.materials import TextureBank, texture_bank
-from toolkit.simulate.procedural import KINDS, random_scene
-from toolkit.simulate.scene import Lamp, Rays, Scene
+from fieldfuse.camera import Array, Intrinsics, project, unproject
+from fieldfuse.errors import InputError
+from fieldfuse.simulate.cast import FAR
+from fieldfuse.simulate.materials import TextureBank, texture_bank
+from fieldfuse.simulate.procedural import KINDS, random_scene
+from fieldfuse.simulate.scene import Lamp, Rays, Scene
 
 CAMERA = Intrinsics(96, 72, 80.0, 80.0, 48.0, 36.0)
 
@@ -105,7 +105,7 @@ def test_a_picture_is_the_same_as_its_rays_in_any_order(bank: TextureBank) -> No
     pose = looking(standing(scene), scene.focus)
     picture = scene.render(CAMERA, pose, side=1)
     pixels = np.random.default_rng(0).permutation(96 * 72)[:500]
-    from toolkit.camera import pixel_grid, rays
+    from fieldfuse.camera import pixel_grid, rays
 
     origins, directions, cosine = rays(CAMERA, pose, pixel_grid(96, 72)[pixels])
     seen = scene.see(Rays(origins, directions, 1 / CAMERA.fx))  # an origin a ray, scattered

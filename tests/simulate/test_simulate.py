@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from toolkit.camera import Similarity, project, unproject
-from toolkit.capture import open_capture
-from toolkit.capture.checks import check_capture
-from toolkit.capture.ply_points import read_ply_points
-from toolkit.capture.prepare import prepare_views
-from toolkit.config import CaptureSettings
-from toolkit.errors import InputError, Interrupted
-from toolkit.progress import Progress
-from toolkit.simulate import procedural
-from toolkit.simulate.materials import texture_bank
-from toolkit.simulate.settings import read_scene_file, scene_file
-from toolkit.simulate.simulate import simulate
+from fieldfuse.camera import Similarity, project, unproject
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.ply_points import read_ply_points
+from fieldfuse.capture.prepare import prepare_views
+from fieldfuse.config import CaptureSettings
+from fieldfuse.errors import InputError, Interrupted
+from fieldfuse.progress import Progress
+from fieldfuse.simulate import procedural
+from fieldfuse.simulate.materials import texture_bank
+from fieldfuse.simulate.settings import read_scene_file, scene_file
+from fieldfuse.simulate.simulate import simulate
 
 SMALL = {"camera": {"width": 64, "height": 48}, "path": {"frames": 4, "fps": 4, "speed": 0.4}, "side": 1}
 
@@ -236,7 +236,7 @@ def test_scenes_that_come_along_can_be_filmed(path: Path, tmp_path: Path) -> Non
 
 
 def test_the_command_films_and_tells(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipelines.cli import app, main
+    from fieldfuse.pipelines.cli import app, main
 
     (tmp_path / "scene.yaml").write_text("camera: {width: 32, height: 24}\npath: {frames: 2}\neffects: [vignetting]\n")
 

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.camera import Array
-from toolkit.simulate.baked import surface
-from toolkit.simulate.trace import FAR, Rectangle, Shapes, Sphere
+from fieldfuse.camera import Array
+from fieldfuse.simulate.baked import surface
+from fieldfuse.simulate.trace import FAR, Rectangle, Shapes, Sphere
 
 
 def reference(rectangles: list[Rectangle], spheres: list[Sphere], origin: Array, direction: Array) -> tuple[float, int]:

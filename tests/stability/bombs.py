@@ -23,20 +23,20 @@ from imagecodecs import lzfse_encode
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.images import load_depth, load_image
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.capture.video import read_video
+from fieldfuse.config import load_settings
+from fieldfuse.errors import FieldfuseError
+from fieldfuse.evaluate.selftest.edit import small_field
+from fieldfuse.files import read_json
+from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.render.field import Field
+from fieldfuse.volume.store import METADATA_KEY, read_field
 from tests.capture.layouts import LAYOUTS, sens_of, write_record3d, zipped
 from tests.stability.fuzz.watch import SECONDS, bound_memory
-from toolkit.capture import open_capture
-from toolkit.capture.checks import check_capture
-from toolkit.capture.images import load_depth, load_image
-from toolkit.capture.types import Capture, Frame
-from toolkit.capture.video import read_video
-from toolkit.config import load_settings
-from toolkit.errors import FieldfuseError
-from toolkit.evaluate.selftest.edit import small_field
-from toolkit.files import read_json
-from toolkit.networks.decoder import make_decoder
-from toolkit.render.field import Field
-from toolkit.volume.store import METADATA_KEY, read_field
 
 
 def png(width: int, height: int, depth: int, kind: int, data: bytes) -> bytes:

@@ -18,10 +18,10 @@ import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from fieldfuse.files import fingerprint, read_json, write_json
 from tests.pipelines.made import environment
 from tests.stability.page import replace_part
 from tests.stability.runs import NETWORK, ROOT, command, corrupt, differences, launch, leftovers, make_source
-from toolkit.files import fingerprint, read_json, write_json
 
 EACH = 5  # kills before a run is left alone
 NETWORK_SHARE = 1 / 3  # of the kills meet runs that start from the networks

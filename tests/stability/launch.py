@@ -39,7 +39,7 @@ def strike_at(count: int, number: int) -> None:
 
 def at_stage(stage: str, strike: Callable[[], None]) -> None:
     """Do something as soon as a stage begins."""
-    from pipelines.console import ConsoleProgress
+    from fieldfuse.pipelines.console import ConsoleProgress
 
     plain = ConsoleProgress.begin
 
@@ -73,7 +73,7 @@ def main() -> None:
         at_stage(plan["stage"], lambda: little_memory(plan["memory"]))
     if "event" in plan:
         strike_at(plan["event"], getattr(signal, plan["signal"]))
-    from pipelines.cli import main as command
+    from fieldfuse.pipelines.cli import main as command
 
     command()
 

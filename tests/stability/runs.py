@@ -12,10 +12,10 @@ import cv2
 import trimesh
 from safetensors import safe_open
 
+from fieldfuse.capture.views_file import load_views
+from fieldfuse.files import read_json
+from fieldfuse.render.field import Field
 from tests.pipelines.made import CAMERA, environment, make_room
-from toolkit.capture.views_file import load_views
-from toolkit.files import read_json
-from toolkit.render.field import Field
 
 ROOT = Path(__file__).resolve().parents[2]
 OPTIONS = ("--budget", "0.5", "--threads", "1", "--holdout", "4", "--set", "field.resolution=16", "--set", "export.mesh_views=3",

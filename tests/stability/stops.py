@@ -23,10 +23,10 @@ from unittest import mock
 
 import cv2
 
+from fieldfuse.files import read_json
 from tests.pipelines.made import CAMERA, Answer, circle, make_room, shoot
 from tests.stability.page import replace_part
 from tests.stability.runs import OPTIONS, STAGES, TICK, corrupt, differences, leftovers, make_source
-from toolkit.files import read_json
 
 REPORT = "report"  # not a stage with a record: the last thing that a run does
 PHOTO = CAMERA.scaled(288, 216)
@@ -78,8 +78,8 @@ KEEPS = ("field", "evaluate", REPORT)
 
 def fieldfuse(*arguments: object) -> Answer:
     """The command line in this process, its fit on a clock that advances by looks."""
-    from pipelines import cli
-    from toolkit.training import fit
+    from fieldfuse.pipelines import cli
+    from fieldfuse.training import fit
 
     out, err, looks = io.StringIO(), io.StringIO(), itertools.count(1)
     with (
@@ -99,8 +99,8 @@ def fieldfuse(*arguments: object) -> Answer:
 @contextlib.contextmanager
 def struck(stage: str, number: int, times: int) -> Iterator[None]:
     """Send a signal to this process as soon as `stage` begins."""
-    from pipelines import reconstruct, summary
-    from pipelines.console import ConsoleProgress
+    from fieldfuse.pipelines import reconstruct, summary
+    from fieldfuse.pipelines.console import ConsoleProgress
 
     def strike() -> None:
         for _ in range(times):

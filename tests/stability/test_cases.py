@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.evaluate.selftest import compositing, lookup, rays
+from fieldfuse.evaluate.selftest.case import Case, Measure, absolute, all_cases, by_size, not_finite, refused, relative, run_case
+from fieldfuse.render import march as marching
+from fieldfuse.render.composite import exclusive_sum
 from tests.pipelines.made import call
-from toolkit.evaluate.selftest import compositing, lookup, rays
-from toolkit.evaluate.selftest.case import Case, Measure, absolute, all_cases, by_size, not_finite, refused, relative, run_case
-from toolkit.render import march as marching
-from toolkit.render.composite import exclusive_sum
 
 CASES = all_cases()
 QUICK = [case for case in CASES if not case.slow]

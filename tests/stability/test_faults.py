@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.folder import RunFolder
+from fieldfuse.config import Settings
+from fieldfuse.pipelines.folder import RunFolder
 from tests.pipelines.made import Answer, environment
 from tests.stability.kills import kill_runs
 from tests.stability.runs import OPTIONS, PATIENCE, ROOT, corrupt, differences, launch, leftovers, make_source
 from tests.stability.stops import KINDS, fieldfuse, stop_everywhere
 from tests.stability.writers_more import ELSEWHERE
-from toolkit.config import Settings
 
 LONG = pytest.mark.timeout(900)  # what takes half a minute alone takes minutes on a busy machine
 
@@ -156,8 +156,8 @@ def test_a_stage_that_does_not_fit_into_memory_is_refused_with_numbers(tmp_path:
 RACE = """
 import sys
 from pathlib import Path
-from pipelines.folder import RunFolder
-from toolkit.errors import OutputError
+from fieldfuse.pipelines.folder import RunFolder
+from fieldfuse.errors import OutputError
 print("ready", flush=True)
 sys.stdin.readline()
 try:

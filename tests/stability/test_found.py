@@ -12,30 +12,30 @@ import trimesh
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
-from pipelines.bench_table import sections
-from pipelines.console import ConsoleProgress
-from pipelines.folder import RunFolder
-from pipelines.kept import FEW_VIEWS, read_kept
-from pipelines.stages import Stages
-from toolkit.camera import Intrinsics
-from toolkit.capture.storage import capture_from_dict, capture_to_dict
-from toolkit.capture.types import Capture
-from toolkit.config import load_settings
-from toolkit.effects.correct import Corrections
-from toolkit.errors import InputError
-from toolkit.evaluate.compare_truth import find_truth
-from toolkit.evaluate.few_views import few_views_table
-from toolkit.evaluate.selftest.edit import small_field
-from toolkit.evaluate.selftest.fits import scene_of
-from toolkit.export.mesh import mesh_facts
-from toolkit.files import read_json, write_json
-from toolkit.poses.scene import Scene
-from toolkit.render.bake import bake
-from toolkit.render.bake_file import METADATA_KEY, read_baked, write_baked
-from toolkit.simulate.mesh_scene import load_mesh_scene
-from toolkit.simulate.settings import read_scene_file
-from toolkit.training.nerfusion.settings import load_train_settings
-from toolkit.tsdf.mesh import Mesh
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
+from fieldfuse.capture.types import Capture
+from fieldfuse.config import load_settings
+from fieldfuse.effects.correct import Corrections
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.compare_truth import find_truth
+from fieldfuse.evaluate.few_views import few_views_table
+from fieldfuse.evaluate.selftest.edit import small_field
+from fieldfuse.evaluate.selftest.fits import scene_of
+from fieldfuse.export.mesh import mesh_facts
+from fieldfuse.files import read_json, write_json
+from fieldfuse.pipelines.bench_table import sections
+from fieldfuse.pipelines.console import ConsoleProgress
+from fieldfuse.pipelines.folder import RunFolder
+from fieldfuse.pipelines.kept import FEW_VIEWS, read_kept
+from fieldfuse.pipelines.stages import Stages
+from fieldfuse.poses.scene import Scene
+from fieldfuse.render.bake import bake
+from fieldfuse.render.bake_file import METADATA_KEY, read_baked, write_baked
+from fieldfuse.simulate.mesh_scene import load_mesh_scene
+from fieldfuse.simulate.settings import read_scene_file
+from fieldfuse.training.nerfusion.settings import load_train_settings
+from fieldfuse.tsdf.mesh import Mesh
 
 
 def test_numbers_of_400_digits_in_a_stored_capture() -> None:

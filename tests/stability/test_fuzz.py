@@ -35,7 +35,7 @@ from tests.stability.fuzz import watch as watching
 from tests.stability.fuzz.targets import Target
 from tests.stability.fuzz.watch import Watch, bound_memory
 from tests.stability.fuzz.worker import Counts, one
-from toolkit.errors import InputError
+from fieldfuse.errors import InputError
 
 place = Path(sys.argv[1])
 root = place / "captures" / "planted"

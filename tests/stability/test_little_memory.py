@@ -7,20 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines import room
+from fieldfuse import memory
+from fieldfuse.camera import Similarity
+from fieldfuse.config import PosesSettings, TsdfSettings
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.selftest.fits import texture, views_of
+from fieldfuse.pipelines import room
+from fieldfuse.poses import sfm
+from fieldfuse.stereo.match import stereo_depths
+from fieldfuse.tsdf.fuse import fuse_capture
+from fieldfuse.tsdf.volume import BYTES_PER_BLOCK, TsdfVolume
 from tests.stability.runs import OPTIONS, make_source
 from tests.stability.stops import fieldfuse
 from tests.tsdf.scenes import CAMERA
 from tests.tsdf.test_frames import written
-from toolkit import memory
-from toolkit.camera import Similarity
-from toolkit.config import PosesSettings, TsdfSettings
-from toolkit.errors import InputError
-from toolkit.evaluate.selftest.fits import texture, views_of
-from toolkit.poses import sfm
-from toolkit.stereo.match import stereo_depths
-from toolkit.tsdf.fuse import fuse_capture
-from toolkit.tsdf.volume import BYTES_PER_BLOCK, TsdfVolume
 
 
 def allow(monkeypatch: pytest.MonkeyPatch, free: int) -> None:

@@ -10,20 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Array
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.prepare import prepare_views
+from fieldfuse.capture.types import Views
+from fieldfuse.config import CaptureSettings, load_settings
+from fieldfuse.evaluate.images import psnr
+from fieldfuse.evaluate.selftest.place import rotation
+from fieldfuse.poses.given import given_poses
+from fieldfuse.poses.scene import Scene, describe_scene
+from fieldfuse.render.image import make_renderer, render_view
+from fieldfuse.training.fit import fit_field
 from tests.pipelines.made import CAMERA, make_room
 from tests.stability.runs import TICK
-from toolkit.camera import Array
-from toolkit.capture import open_capture
-from toolkit.capture.checks import check_capture
-from toolkit.capture.prepare import prepare_views
-from toolkit.capture.types import Views
-from toolkit.config import CaptureSettings, load_settings
-from toolkit.evaluate.images import psnr
-from toolkit.evaluate.selftest.place import rotation
-from toolkit.poses.given import given_poses
-from toolkit.poses.scene import Scene, describe_scene
-from toolkit.render.image import make_renderer, render_view
-from toolkit.training.fit import fit_field
 
 FAR = np.array([6.0e6, -1.0e6, 3.0e5])  # metres in an earth-centred frame
 NOWHERE, AS_IT_IS = np.zeros(3), np.eye(3)

@@ -11,14 +11,14 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from toolkit.camera import FISHEYE, OPENCV, Intrinsics, lens_limit
-from toolkit.evaluate.depth import depth_metrics
-from toolkit.evaluate.images import psnr, ssim
-from toolkit.evaluate.selftest import compositing, edit, lookup, metrics, network, place, rays, rays_background, volume
-from toolkit.evaluate.selftest.cameras import LENS, POSE, lens_errors, of_fov, projection_errors
-from toolkit.evaluate.selftest.case import by_size
-from toolkit.evaluate.selftest.compositing_more import distortion_errors
-from toolkit.volume.topology import Topology
+from fieldfuse.camera import FISHEYE, OPENCV, Intrinsics, lens_limit
+from fieldfuse.evaluate.depth import depth_metrics
+from fieldfuse.evaluate.images import psnr, ssim
+from fieldfuse.evaluate.selftest import compositing, edit, lookup, metrics, network, place, rays, rays_background, volume
+from fieldfuse.evaluate.selftest.cameras import LENS, POSE, lens_errors, of_fov, projection_errors
+from fieldfuse.evaluate.selftest.case import by_size
+from fieldfuse.evaluate.selftest.compositing_more import distortion_errors
+from fieldfuse.volume.topology import Topology
 
 QUICK = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 FEW = settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -77,7 +77,7 @@ def test_marching_beyond_the_region(away: float, seed: int, power: float) -> Non
 
 
 def background_grid(half: float) -> rays.MarchGrid:
-    from toolkit.volume.space import Space
+    from fieldfuse.volume.space import Space
 
     grid = rays.lattice_grid(256, 1.0, 0, 1.0, 1.0) if not _KEPT else _KEPT[0]
     _KEPT[:] = [grid]

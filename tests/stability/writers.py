@@ -18,24 +18,24 @@ from typing import Any
 import numpy as np
 import torch
 
-from pipelines.rendered import Picture, Pictures, save_pictures, write_png, write_pngs
+from fieldfuse.camera import Intrinsics, Similarity
+from fieldfuse.capture.types import Views
+from fieldfuse.capture.views_file import save_views
+from fieldfuse.errors import OutputError
+from fieldfuse.evaluate.report import write_report
+from fieldfuse.evaluate.selftest.data import poses, texture
+from fieldfuse.evaluate.selftest.edit import small_field
+from fieldfuse.evaluate.selftest.place_files import ball
+from fieldfuse.export.cameras import write_cameras
+from fieldfuse.export.mesh import write_mesh
+from fieldfuse.export.points import write_points
+from fieldfuse.export.video import write_video
+from fieldfuse.files import write_json
+from fieldfuse.pipelines.rendered import Picture, Pictures, save_pictures, write_png, write_pngs
+from fieldfuse.tsdf.frames import DepthFrame
+from fieldfuse.tsdf.store import save_volume
+from fieldfuse.tsdf.volume import TsdfVolume
 from tests.stability.writers_more import more_writers
-from toolkit.camera import Intrinsics, Similarity
-from toolkit.capture.types import Views
-from toolkit.capture.views_file import save_views
-from toolkit.errors import OutputError
-from toolkit.evaluate.report import write_report
-from toolkit.evaluate.selftest.data import poses, texture
-from toolkit.evaluate.selftest.edit import small_field
-from toolkit.evaluate.selftest.place_files import ball
-from toolkit.export.cameras import write_cameras
-from toolkit.export.mesh import write_mesh
-from toolkit.export.points import write_points
-from toolkit.export.video import write_video
-from toolkit.files import write_json
-from toolkit.tsdf.frames import DepthFrame
-from toolkit.tsdf.store import save_volume
-from toolkit.tsdf.volume import TsdfVolume
 
 Write = Callable[[Path], object]
 LIMITS = (0, 1, 700)  # bytes a file may have

@@ -14,41 +14,41 @@ import pillow_heif
 import torch
 from PIL import Image
 
-from pipelines.folder import RunFolder
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.convert import convert_pictures
+from fieldfuse.capture.film import Film
+from fieldfuse.capture.photos import read_photos
+from fieldfuse.capture.select import select_frames
+from fieldfuse.capture.video import read_video
+from fieldfuse.config import CaptureSettings, Settings
+from fieldfuse.evaluate.compare_page import write_comparison
+from fieldfuse.evaluate.pictures import write_picture, write_strips
+from fieldfuse.evaluate.selftest.data import texture
+from fieldfuse.evaluate.selftest.edit import small_field
+from fieldfuse.evaluate.tradeoff_page import write_tradeoff
+from fieldfuse.export.page import Tour, write_page
+from fieldfuse.networks.weights import save_model
+from fieldfuse.pipelines.folder import RunFolder
+from fieldfuse.render.bake import bake
+from fieldfuse.render.bake_file import write_baked
+from fieldfuse.simulate import procedural
+from fieldfuse.simulate.materials import texture_bank
+from fieldfuse.simulate.settings import scene_file
+from fieldfuse.simulate.simulate import simulate
+from fieldfuse.stereo.left_out import LeftOut, save_left_out
+from fieldfuse.stereo.maps import save_stereo
+from fieldfuse.stereo.match import StereoDepth
+from fieldfuse.training.nerfusion.caution import Caution
+from fieldfuse.training.nerfusion.checkpoint import save_checkpoint
+from fieldfuse.training.nerfusion.curve import Curve
+from fieldfuse.training.nerfusion.shards import write_shard
+from fieldfuse.training.nerfusion.train import make_model
 from tests.capture.layouts import write_record3d, write_sens
 from tests.evaluate.test_compare_page import made, pictures
 from tests.evaluate.test_tradeoff import ladder
 from tests.simulate.test_simulate import SMALL
 from tests.training.nerfusion.tiny import tiny_settings
-from toolkit.camera import Intrinsics
-from toolkit.capture import open_capture
-from toolkit.capture.convert import convert_pictures
-from toolkit.capture.film import Film
-from toolkit.capture.photos import read_photos
-from toolkit.capture.select import select_frames
-from toolkit.capture.video import read_video
-from toolkit.config import CaptureSettings, Settings
-from toolkit.evaluate.compare_page import write_comparison
-from toolkit.evaluate.pictures import write_picture, write_strips
-from toolkit.evaluate.selftest.data import texture
-from toolkit.evaluate.selftest.edit import small_field
-from toolkit.evaluate.tradeoff_page import write_tradeoff
-from toolkit.export.page import Tour, write_page
-from toolkit.networks.weights import save_model
-from toolkit.render.bake import bake
-from toolkit.render.bake_file import write_baked
-from toolkit.simulate import procedural
-from toolkit.simulate.materials import texture_bank
-from toolkit.simulate.settings import scene_file
-from toolkit.simulate.simulate import simulate
-from toolkit.stereo.left_out import LeftOut, save_left_out
-from toolkit.stereo.maps import save_stereo
-from toolkit.stereo.match import StereoDepth
-from toolkit.training.nerfusion.caution import Caution
-from toolkit.training.nerfusion.checkpoint import save_checkpoint
-from toolkit.training.nerfusion.curve import Curve
-from toolkit.training.nerfusion.shards import write_shard
-from toolkit.training.nerfusion.train import make_model
 
 Write = Callable[[Path], object]
 

@@ -6,10 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.stereo.match import StereoDepth
 from tests.poses.textured import arc, render
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.types import Views
-from toolkit.stereo.match import StereoDepth
 
 CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
 NEAR, FAR, MEDIAN = 1.0, 9.0, 3.4

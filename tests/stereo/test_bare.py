@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Array, Intrinsics, pixel_grid, unproject
+from fieldfuse.capture.types import Views
+from fieldfuse.stereo import bare
+from fieldfuse.stereo.bare import continued
+from fieldfuse.stereo.match import StereoDepth, stereo_depths
+from fieldfuse.stereo.plane_maps import depth_of, numbers_of
+from fieldfuse.stereo.planes import ON, Points, find_planes
 from tests.poses.textured import PLANES, arc, render, texture
 from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, relative_errors, views_of
-from toolkit.camera import Array, Intrinsics, pixel_grid, unproject
-from toolkit.capture.types import Views
-from toolkit.stereo import bare
-from toolkit.stereo.bare import continued
-from toolkit.stereo.match import StereoDepth, stereo_depths
-from toolkit.stereo.plane_maps import depth_of, numbers_of
-from toolkit.stereo.planes import ON, Points, find_planes
 
 Made = tuple[Views, list[Array], list[StereoDepth]]
 

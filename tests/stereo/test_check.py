@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError
+from fieldfuse.stereo.check import confirmed
+from fieldfuse.stereo.maps import load_stereo, save_stereo
+from fieldfuse.stereo.match import StereoDepth
 from tests.tsdf.scenes import CAMERA, plane_frame, ring, sphere_frame
-from toolkit.camera import Array
-from toolkit.errors import InputError
-from toolkit.stereo.check import confirmed
-from toolkit.stereo.maps import load_stereo, save_stereo
-from toolkit.stereo.match import StereoDepth
 
 CENTRE, RADIUS = np.array([0.1, -0.2, 0.3]), 0.5
 POSES = ring(CENTRE, 1.6, 12)

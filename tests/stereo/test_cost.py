@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Array, Intrinsics, pixel_grid, project, unproject
+from fieldfuse.stereo.correlate import NOISE
+from fieldfuse.stereo.cost import UNKNOWN, GreyView, Matcher, best_half, grey_view, plane_homography, sweep
 from tests.stereo.made import CAMERA, corner
-from toolkit.camera import Array, Intrinsics, pixel_grid, project, unproject
-from toolkit.stereo.correlate import NOISE
-from toolkit.stereo.cost import UNKNOWN, GreyView, Matcher, best_half, grey_view, plane_homography, sweep
 
 
 def test_a_plane_maps_pixels_as_projection_does() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.stereo.maps import depth_at, enlarged
-from toolkit.stereo.match import StereoDepth
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.stereo.maps import depth_at, enlarged
+from fieldfuse.stereo.match import StereoDepth
 
 WIDTH, HEIGHT, STEP = 24, 16, 11
 

@@ -8,17 +8,17 @@ import cv2
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Array, Intrinsics, pixel_grid, unproject
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import InputError, Interrupted
+from fieldfuse.poses.overlap import parallax, spread_parallax
+from fieldfuse.progress import Progress
+from fieldfuse.stereo import match
+from fieldfuse.stereo.cost import grey_view, plane_homography
+from fieldfuse.stereo.match import LENIENT, MANY, STRICT, StereoDepth, demands, inverse_depths, stereo_depths, usable_neighbours
+from fieldfuse.stereo.polish import Polisher
 from tests.poses.textured import arc, look_at, render
 from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, corner, relative_errors, views_of
-from toolkit.camera import Array, Intrinsics, pixel_grid, unproject
-from toolkit.capture.types import Views
-from toolkit.errors import InputError, Interrupted
-from toolkit.poses.overlap import parallax, spread_parallax
-from toolkit.progress import Progress
-from toolkit.stereo import match
-from toolkit.stereo.cost import grey_view, plane_homography
-from toolkit.stereo.match import LENIENT, MANY, STRICT, StereoDepth, demands, inverse_depths, stereo_depths, usable_neighbours
-from toolkit.stereo.polish import Polisher
 
 
 @lru_cache(maxsize=1)

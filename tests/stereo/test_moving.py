@@ -12,15 +12,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldfuse.camera import Array, Intrinsics, project, unproject
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import InputError, Interrupted
+from fieldfuse.progress import Progress
+from fieldfuse.stereo import moving
+from fieldfuse.stereo.consensus import AGREED, SAME, consensus
+from fieldfuse.stereo.left_out import LeftOut, load_left_out, save_left_out
+from fieldfuse.stereo.match import StereoDepth, stereo_depths
 from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, corner
-from toolkit.camera import Array, Intrinsics, project, unproject
-from toolkit.capture.types import Views
-from toolkit.errors import InputError, Interrupted
-from toolkit.progress import Progress
-from toolkit.stereo import moving
-from toolkit.stereo.consensus import AGREED, SAME, consensus
-from toolkit.stereo.left_out import LeftOut, load_left_out, save_left_out
-from toolkit.stereo.match import StereoDepth, stereo_depths
 
 PASSED = {1: (20, 30), 4: (95, 50)}  # picture → left and top of somebody who stands before it
 WIDE, TALL = 38, 60

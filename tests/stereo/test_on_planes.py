@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Array
+from fieldfuse.stereo.bare import points_of
+from fieldfuse.stereo.cost import UNKNOWN, grey_view
+from fieldfuse.stereo.match import StereoDepth
+from fieldfuse.stereo.on_planes import Unsure, best_placed, matching_costs, shown_planes
+from fieldfuse.stereo.plane_maps import depth_of, in_camera, numbers_of
+from fieldfuse.stereo.planes import find_planes
 from tests.poses.textured import look_at
 from tests.stereo.made import CAMERA
 from tests.stereo.test_bare import filmed
-from toolkit.camera import Array
-from toolkit.stereo.bare import points_of
-from toolkit.stereo.cost import UNKNOWN, grey_view
-from toolkit.stereo.match import StereoDepth
-from toolkit.stereo.on_planes import Unsure, best_placed, matching_costs, shown_planes
-from toolkit.stereo.plane_maps import depth_of, in_camera, numbers_of
-from toolkit.stereo.planes import find_planes
 
 HOLE = slice(60, 100), slice(30, 80)
 

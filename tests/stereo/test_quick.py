@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldfuse.capture.types import Views
+from fieldfuse.stereo import quick
+from fieldfuse.stereo.match import LONG_SIDE
 from tests.simulate.test_procedural import plain_operations
 from tests.stereo.made import FAR, MEDIAN, NEAR, corner
-from toolkit.capture.types import Views
-from toolkit.stereo import quick
-from toolkit.stereo.match import LONG_SIDE
 
 
 @given(st.integers(2, 2000), st.floats(1, 2000), st.floats(0.3, 1))

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import Interrupted
+from fieldfuse.progress import Progress
+from fieldfuse.stereo.settle import settled
 from tests.stereo.made import CAMERA, MEDIAN
 from tests.stereo.test_bare import filmed
-from toolkit.camera import Array
-from toolkit.capture.types import Views
-from toolkit.errors import Interrupted
-from toolkit.progress import Progress
-from toolkit.stereo.settle import settled
 
 FLOOR_OR_WALL = slice(70, 100), slice(20, 70)  # rows, columns
 
@@ -52,7 +52,7 @@ def guessed(views: Views, truth: list[Array]) -> tuple[list[Array], list[Array]]
 @pytest.mark.parametrize(("planar", "share"), [(2.0, 0.98), (0.6, 0.97)])
 def test_exact_depth_stays(corner: tuple[Views, list[Array]], monkeypatch: pytest.MonkeyPatch, planar: float, share: float) -> None:
     """Where pictures are asked, a plane may be taken at their borders for what stands before it: few others see what they show."""
-    monkeypatch.setattr("toolkit.stereo.settle.PLANAR", planar)
+    monkeypatch.setattr("fieldfuse.stereo.settle.PLANAR", planar)
     views, truth = corner
     for depth, true in zip(made(views, truth), truth, strict=True):
         assert (depth > 0)[true > 0].mean() > 0.97 and depth.dtype == np.float32
@@ -93,7 +93,7 @@ def test_no_plane_goes_where_nothing_was(corner: tuple[Views, list[Array]]) -> N
 
 def test_beside_what_is_sure_no_plane_goes_far_from_what_was(corner: tuple[Views, list[Array]], monkeypatch: pytest.MonkeyPatch) -> None:
     """In scenes that are not of planes, where pictures are not asked."""
-    monkeypatch.setattr("toolkit.stereo.settle.PLANAR", 2.0)
+    monkeypatch.setattr("fieldfuse.stereo.settle.PLANAR", 2.0)
     views, truth = corner
     hole = np.zeros(truth[0].shape, bool)
     hole[FLOOR_OR_WALL] = True
@@ -124,7 +124,7 @@ def test_of_what_is_round_planes_go_no_farther_than_beside_what_is_sure(
     views, truth = corner
     asked: list[int] = []
     monkeypatch.setattr(
-        "toolkit.stereo.settle.shown_planes", lambda index, maps, *_: asked.append(index) or np.full(maps[0].sure.shape, -1, np.int32)
+        "fieldfuse.stereo.settle.shown_planes", lambda index, maps, *_: asked.append(index) or np.full(maps[0].sure.shape, -1, np.int32)
     )
     v, u = np.mgrid[: truth[0].shape[0], : truth[0].shape[1]]
     bent = [(depth * (1 + 0.05 * np.sin(u / 9) * np.cos(v / 9))).astype(np.float32) for depth in truth]

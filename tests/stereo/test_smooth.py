@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from toolkit.camera import Array
-from toolkit.stereo.smooth import PATHS, SOFT_EDGE, smoothed_planes
+from fieldfuse.camera import Array
+from fieldfuse.stereo.smooth import PATHS, SOFT_EDGE, smoothed_planes
 
 
 def slow_total(cost: Array, grey: Array, small: float, large: float) -> Array:

@@ -8,14 +8,14 @@ from dataclasses import replace
 import pytest
 import torch
 
+from fieldfuse.networks.decoder import PerSample
+from fieldfuse.render.field import Field
+from fieldfuse.render.march import march
+from fieldfuse.training import step as step_module
+from fieldfuse.training.rays import Batch, PixelPool
+from fieldfuse.training.step import Optimiser, Rates
+from fieldfuse.volume.lookup import corners, gather
 from tests.render.test_differentiable import double
-from toolkit.networks.decoder import PerSample
-from toolkit.render.field import Field
-from toolkit.render.march import march
-from toolkit.training import step as step_module
-from toolkit.training.rays import Batch, PixelPool
-from toolkit.training.step import Optimiser, Rates
-from toolkit.volume.lookup import corners, gather
 
 
 def some_weights(count: int) -> torch.Tensor:

@@ -17,13 +17,13 @@ import numpy as np
 import torch
 from numba.core.dispatcher import Dispatcher
 
+from fieldfuse.capture.types import Views
+from fieldfuse.stereo import moving
+from fieldfuse.training import depth_start, fit
+from fieldfuse.training.guided import fit_guided
+from fieldfuse.volume.grid_host import GridHost
 from tests.stereo.test_moving import with_passer
 from tests.training.test_guided import SCENE, wanted
-from toolkit.capture.types import Views
-from toolkit.stereo import moving
-from toolkit.training import depth_start, fit
-from toolkit.training.guided import fit_guided
-from toolkit.volume.grid_host import GridHost
 
 Kernels = set[tuple[str, str]]
 
@@ -31,7 +31,7 @@ Kernels = set[tuple[str, str]]
 def ready() -> Kernels:
     """Names of the toolkit's kernels, and the signatures that they are ready for."""
     every = (one for one in gc.get_objects() if Dispatcher in type(one).__mro__)  # `isinstance` takes a second for a million of them
-    found = [one for one in every if one.py_func.__module__.startswith("toolkit.")]
+    found = [one for one in every if one.py_func.__module__.startswith("fieldfuse.")]
     return {(f"{one.py_func.__module__}.{one.py_func.__name__}", str(signature)) for one in found for signature in one.signatures}
 
 

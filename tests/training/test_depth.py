@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.camera import Intrinsics, Similarity
+from fieldfuse.capture.types import Views
+from fieldfuse.config import FitSettings
+from fieldfuse.poses.scene import Scene
+from fieldfuse.render.image import render_view
+from fieldfuse.training.depth import FINE, REACH, ROUGH, Trust, depth_gradient, ray_distances
+from fieldfuse.training.fit import fit_field
+from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.schedule import Schedule
+from fieldfuse.training.step import Rates
 from tests.poses.textured import arc, render
 from tests.training.test_fit import ticking, wanted
 from tests.training.test_fused import made_views
-from toolkit.camera import Intrinsics, Similarity
-from toolkit.capture.types import Views
-from toolkit.config import FitSettings
-from toolkit.poses.scene import Scene
-from toolkit.render.image import render_view
-from toolkit.training.depth import FINE, REACH, ROUGH, Trust, depth_gradient, ray_distances
-from toolkit.training.fit import fit_field
-from toolkit.training.rays import PixelPool
-from toolkit.training.schedule import Schedule
-from toolkit.training.step import Rates
 
 
 def test_distances_along_rays_are_those_of_the_pools_directions() -> None:
@@ -98,7 +98,7 @@ def test_a_fit_knows_where_depth_comes_from(rough: bool, monkeypatch: pytest.Mon
             asked.append(rates.depth_noise)
             return rates
 
-    monkeypatch.setattr("toolkit.training.fit.Schedule", Told)
+    monkeypatch.setattr("fieldfuse.training.fit.Schedule", Told)
     ticking(monkeypatch, 0.05)
     views = replace(blank_views(), rough=rough)
     scene = Scene(Similarity.identity(), np.array([0.0, -1.5, 1.0]), np.full(3, 4.5), 3.4, 1.0, 8.0, 0.0, False, False)
@@ -119,7 +119,7 @@ def blank_views() -> Views:
 def test_a_wall_without_texture_is_found_by_its_depth(weight: str, found: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """At a held-out view. The start, which depth empties too, is taken away from both, so that the term alone decides."""
     ticking(monkeypatch, 0.015)
-    monkeypatch.setattr("toolkit.training.fit.possible", lambda _space, _resolution, places, _views: places)
+    monkeypatch.setattr("fieldfuse.training.fit.possible", lambda _space, _resolution, places, _views: places)
     views = blank_views()
     scene = Scene(Similarity.identity(), np.array([0.0, -1.5, 1.0]), np.full(3, 4.5), 3.4, 1.0, 8.0, 0.0, False, False)
     field = fit_field(views, scene, wanted(weight)).field

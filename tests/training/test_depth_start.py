@@ -10,14 +10,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.stereo.made import FAR, MEDIAN, NEAR, corner
-from toolkit.camera import Array, Similarity, invert, unproject
-from toolkit.capture.types import Views
-from toolkit.config import Settings, load_settings
-from toolkit.poses.scene import Scene
-from toolkit.render.field import Field
-from toolkit.render.image import make_renderer, render_view
-from toolkit.training.depth_start import (
+from fieldfuse.camera import Array, Similarity, invert, unproject
+from fieldfuse.capture.types import Views
+from fieldfuse.config import Settings, load_settings
+from fieldfuse.poses.scene import Scene
+from fieldfuse.render.field import Field
+from fieldfuse.render.image import make_renderer, render_view
+from fieldfuse.training.depth_start import (
     KNOWN,
     RESOLUTION,
     RESOLUTION_KNOWN,
@@ -29,10 +28,11 @@ from toolkit.training.depth_start import (
     starts_by_depth,
     votes,
 )
-from toolkit.training.levels import all_places
-from toolkit.training.start import THIN, WHOLE, radii
-from toolkit.volume.space import Space
-from toolkit.volume.topology import BLOCK, Topology
+from fieldfuse.training.levels import all_places
+from fieldfuse.training.start import THIN, WHOLE, radii
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import BLOCK, Topology
+from tests.stereo.made import FAR, MEDIAN, NEAR, corner
 
 SCENE = Scene(Similarity.identity(), np.array([0.0, 0.0, 0.0]), np.full(3, 1.5), MEDIAN, NEAR, FAR, 0.0, True, False)
 SPACE = Space((0.0, 0.0, 0.0), 3.0, 1.0)

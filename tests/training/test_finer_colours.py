@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import Interrupted
+from fieldfuse.progress import Progress
+from fieldfuse.render.field import Field
+from fieldfuse.render.image import render_view
+from fieldfuse.render.recolour import COLOURS, recoloured
+from fieldfuse.training import finer_colours as module
+from fieldfuse.training.finer_colours import PIXELS, finer_colours
+from fieldfuse.training.levels import finer
+from fieldfuse.volume.host import TorchHost
 from tests.render.test_recolour import DEPTH, decibel, grey, painted, pictures_of, stripes
-from toolkit.capture.types import Views
-from toolkit.errors import Interrupted
-from toolkit.progress import Progress
-from toolkit.render.field import Field
-from toolkit.render.image import render_view
-from toolkit.render.recolour import COLOURS, recoloured
-from toolkit.training import finer_colours as module
-from toolkit.training.finer_colours import PIXELS, finer_colours
-from toolkit.training.levels import finer
-from toolkit.volume.host import TorchHost
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_voxels_and_lattices_are_bounded(coarse: Field, views: Views, monkeypatc
     monkeypatch.setattr(module, "MOST_RESOLUTION", 16)  # a lattice that is finer already stays
     assert finer_colours(coarse, views, DEPTH).resolution == coarse.resolution
     monkeypatch.undo()
-    monkeypatch.setattr("toolkit.memory.available", lambda: 0)  # nothing free: the lattice stays
+    monkeypatch.setattr("fieldfuse.memory.available", lambda: 0)  # nothing free: the lattice stays
     found = finer_colours(coarse, views, DEPTH)
     assert found.resolution == coarse.resolution and found.feature_rows.any()
 

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from toolkit.camera import Intrinsics, Similarity, pixel_grid, rays
-from toolkit.capture.types import Views
-from toolkit.config import Settings, load_settings
-from toolkit.poses.scene import Scene
-from toolkit.progress import Progress
-from toolkit.render.image import render_view
-from toolkit.training.fit import fit_field
-from toolkit.training.levels import all_places, finer, looked_at, visible
-from toolkit.training.start import levels, make_space, possible
-from toolkit.volume.grid_host import GridHost
+from fieldfuse.camera import Intrinsics, Similarity, pixel_grid, rays
+from fieldfuse.capture.types import Views
+from fieldfuse.config import Settings, load_settings
+from fieldfuse.poses.scene import Scene
+from fieldfuse.progress import Progress
+from fieldfuse.render.image import render_view
+from fieldfuse.training.fit import fit_field
+from fieldfuse.training.levels import all_places, finer, looked_at, visible
+from fieldfuse.training.start import levels, make_space, possible
+from fieldfuse.volume.grid_host import GridHost
 
 SIZE = 40
 
@@ -67,7 +67,7 @@ def ticking(monkeypatch: pytest.MonkeyPatch, tick: float) -> dict[str, int]:
         looks["count"] += 1
         return looks["count"] * tick
 
-    monkeypatch.setattr("toolkit.training.fit.Clock.seconds", seconds)
+    monkeypatch.setattr("fieldfuse.training.fit.Clock.seconds", seconds)
     return looks
 
 
@@ -96,7 +96,7 @@ def test_budget_is_kept() -> None:
 
 
 def test_a_fit_of_few_views_ends_with_its_passes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("toolkit.training.schedule.LEAST_RAYS", 0.0)
+    monkeypatch.setattr("fieldfuse.training.schedule.LEAST_RAYS", 0.0)
     ticking(monkeypatch, 1e-3)
     views = sphere_views(8)  # too few for a validation split
     pixels = 7 * SIZE * SIZE
@@ -150,9 +150,9 @@ def test_levels_end_at_the_finest(finest: int, expected: list[int]) -> None:
 
 @pytest.mark.parametrize("resolution", [128, 96])
 def test_a_finer_lattice_shows_the_same(resolution: int) -> None:
+    from fieldfuse.render.rays import render_rays
+    from fieldfuse.volume.host import TorchHost
     from tests.render.made import random_field, random_rays
-    from toolkit.render.rays import render_rays
-    from toolkit.volume.host import TorchHost
 
     field = random_field(resolution=64, keep=1.0, raw=-2.0)
     origins, directions = random_rays(200)

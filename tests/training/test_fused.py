@@ -11,20 +11,20 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.networks.encoding import spherical_harmonics
+from fieldfuse.render.compiled import CompiledRenderer, decoder_arrays
+from fieldfuse.render.kernels_decode import RAYS, decode, layers_of
+from fieldfuse.render.rays import render_rays
+from fieldfuse.training import fused_decoder, fused_order
+from fieldfuse.training.depth import ROUGH
+from fieldfuse.training.fused import FusedOptimiser
+from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.step import Optimiser, Rates
 from tests.render.made import random_field, random_rays
 from tests.training.gradients import exact_gradients, some_weights, torch_gradients, weighed
-from toolkit.camera import Intrinsics
-from toolkit.capture.types import Views
-from toolkit.networks.decoder import Deferred
-from toolkit.networks.encoding import spherical_harmonics
-from toolkit.render.compiled import CompiledRenderer, decoder_arrays
-from toolkit.render.kernels_decode import RAYS, decode, layers_of
-from toolkit.render.rays import render_rays
-from toolkit.training import fused_decoder, fused_order
-from toolkit.training.depth import ROUGH
-from toolkit.training.fused import FusedOptimiser
-from toolkit.training.rays import PixelPool
-from toolkit.training.step import Optimiser, Rates
 
 RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03, depth=0.05)
 SLOW = replace(RATES, slow_within=3.0, depth_noise=ROUGH.noise)  # the made views look from 3 away: half of what they see moves slowly
@@ -78,7 +78,7 @@ def gradients(engine: FusedOptimiser, picks: torch.Tensor, rates: Rates = RATES)
         counts[thread] = used
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("toolkit.training.fused.moves.adam_pass", keep_sums)
+        patch.setattr("fieldfuse.training.fused.moves.adam_pass", keep_sums)
         engine.step_on(picks.numpy(), np.zeros(len(picks), np.float32), rates, some_weights(len(picks)).numpy())
     assert len(counts) == engine.threads
     dense = [torch.zeros_like(field.density_rows), torch.zeros_like(field.feature_rows)]

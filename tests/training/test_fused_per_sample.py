@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.networks.decoder import PerSample
+from fieldfuse.networks.encoding import positional
+from fieldfuse.render import kernels_net
+from fieldfuse.render.compiled_per_sample import PerSampleRenderer, net_arrays, write_back
+from fieldfuse.render.field import Field
+from fieldfuse.render.kernels_matrix import add_outer, product
+from fieldfuse.render.rays import render_rays
+from fieldfuse.training.depth import ROUGH
+from fieldfuse.training.fused_per_sample import FusedPerSampleOptimiser
+from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.step import Optimiser, Rates
 from tests.render.made import random_field, random_rays
 from tests.training.gradients import clear_of_zero, exact_gradients, some_weights, torch_gradients, weighed
 from tests.training.test_fused import made_views
-from toolkit.networks.decoder import PerSample
-from toolkit.networks.encoding import positional
-from toolkit.render import kernels_net
-from toolkit.render.compiled_per_sample import PerSampleRenderer, net_arrays, write_back
-from toolkit.render.field import Field
-from toolkit.render.kernels_matrix import add_outer, product
-from toolkit.render.rays import render_rays
-from toolkit.training.depth import ROUGH
-from toolkit.training.fused_per_sample import FusedPerSampleOptimiser
-from toolkit.training.rays import PixelPool
-from toolkit.training.step import Optimiser, Rates
 
 RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03, depth=0.05)
 SLOW = replace(RATES, slow_within=3.0, depth_noise=ROUGH.noise)  # the made views look from 3 away: half of what they see moves slowly
@@ -30,8 +30,8 @@ SLOW = replace(RATES, slow_within=3.0, depth_noise=ROUGH.noise)  # the made view
 @pytest.fixture
 def every_sample(monkeypatch: pytest.MonkeyPatch) -> None:
     """The compiled engine looks at samples behind spent light too, as the reference does."""
-    monkeypatch.setattr("toolkit.training.fused.STOP", 0.0)
-    monkeypatch.setattr("toolkit.training.fused_per_sample.NEGLIGIBLE", -1.0)
+    monkeypatch.setattr("fieldfuse.training.fused.STOP", 0.0)
+    monkeypatch.setattr("fieldfuse.training.fused_per_sample.NEGLIGIBLE", -1.0)
 
 
 def made_field(shell: float, keep: float, raw: float) -> Field:
@@ -106,7 +106,7 @@ def gradients(
         counts[thread] = used
 
     with monkeypatch.context() as patch:
-        patch.setattr("toolkit.training.fused.moves.adam_pass", keep_sums)
+        patch.setattr("fieldfuse.training.fused.moves.adam_pass", keep_sums)
         engine.step_on(picks.numpy(), np.zeros(len(picks), np.float32), rates, some_weights(len(picks)).numpy())
     assert len(counts) == engine.threads
     dense = [torch.zeros_like(field.density_rows), torch.zeros_like(field.feature_rows)]
@@ -142,7 +142,7 @@ def test_gradients_agree(shell: float, seed: int, threads: int, rates: Rates, ev
     exact = exact_gradients(field, weighed(pool, picks), rates)
     with monkeypatch.context() as patch:
         # In float32 the reference's own angles are off by 1e-5.
-        patch.setattr("toolkit.networks.decoder.positional", lambda values, count: positional(values.double(), count).float())
+        patch.setattr("fieldfuse.networks.decoder.positional", lambda values, count: positional(values.double(), count).float())
         reference = torch_gradients(field, weighed(pool, picks), rates)
     compiled = gradients(FusedPerSampleOptimiser(field, pool, threads=threads), picks, monkeypatch, rates)
     names = ["density_rows", "feature_rows", *(name for name, _ in field.decoder.named_parameters())]

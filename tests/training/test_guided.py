@@ -10,20 +10,20 @@ from itertools import count
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Similarity
+from fieldfuse.capture.types import Views
+from fieldfuse.config import Settings, load_settings
+from fieldfuse.errors import Interrupted
+from fieldfuse.poses.scene import Scene
+from fieldfuse.progress import Progress
+from fieldfuse.render.field import Field
+from fieldfuse.render.image import make_renderer, render_view
+from fieldfuse.stereo import moving, quick
+from fieldfuse.training import depth_start
+from fieldfuse.training.fit import LEAST_VIEWS
+from fieldfuse.training.guided import find_moving, fit_guided, looks_for_moving, wants_matching
 from tests.stereo.made import FAR, MEDIAN, NEAR, corner
 from tests.stereo.test_moving import PASSED, with_passer
-from toolkit.camera import Similarity
-from toolkit.capture.types import Views
-from toolkit.config import Settings, load_settings
-from toolkit.errors import Interrupted
-from toolkit.poses.scene import Scene
-from toolkit.progress import Progress
-from toolkit.render.field import Field
-from toolkit.render.image import make_renderer, render_view
-from toolkit.stereo import moving, quick
-from toolkit.training import depth_start
-from toolkit.training.fit import LEAST_VIEWS
-from toolkit.training.guided import find_moving, fit_guided, looks_for_moving, wants_matching
 
 SCENE = Scene(Similarity.identity(), np.array([0.0, 0.0, 0.0]), np.full(3, 1.5), MEDIAN, NEAR, FAR, 0.0, True, False)
 

@@ -10,18 +10,18 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.config import Settings
+from fieldfuse.errors import InputError
+from fieldfuse.training import fused_draw
+from fieldfuse.training.engine import TorchEngine, make_engine
+from fieldfuse.training.fit import fit_field
+from fieldfuse.training.fused import FusedOptimiser
+from fieldfuse.training.fused_order import Tiles
+from fieldfuse.training.importance import SHARE, TOP, Errors, densities
+from fieldfuse.training.rays import PixelPool
 from tests.render.made import random_field
 from tests.training.test_fit import scene, wanted
 from tests.training.test_fused import RATES, made_views
-from toolkit.config import Settings
-from toolkit.errors import InputError
-from toolkit.training import fused_draw
-from toolkit.training.engine import TorchEngine, make_engine
-from toolkit.training.fit import fit_field
-from toolkit.training.fused import FusedOptimiser
-from toolkit.training.fused_order import Tiles
-from toolkit.training.importance import SHARE, TOP, Errors, densities
-from toolkit.training.rays import PixelPool
 
 ROUNDS = 150
 

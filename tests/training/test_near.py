@@ -10,14 +10,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.config import FitSettings
+from fieldfuse.training.fused_kernels import slow_near
+from fieldfuse.training.near import slowness
+from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.schedule import Schedule
 from tests.render.made import random_field
 from tests.training.gradients import torch_gradients
 from tests.training.test_fused import RATES, made_views
-from toolkit.config import FitSettings
-from toolkit.training.fused_kernels import slow_near
-from toolkit.training.near import slowness
-from toolkit.training.rays import PixelPool
-from toolkit.training.schedule import Schedule
 
 BOUNDS = st.floats(0.0625, 100, width=32)
 DISTANCES = st.floats(-1, 1000, width=32)

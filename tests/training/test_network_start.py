@@ -10,19 +10,18 @@ import numpy as np
 import pytest
 import torch
 
-from tests.networks.made import INTRINSICS, SMALL, small_model, wall_pictures
-from toolkit.camera import Intrinsics, Similarity, pixel_grid, rays
-from toolkit.capture.types import Views
-from toolkit.config import Settings, load_settings
-from toolkit.errors import InputError
-from toolkit.evaluate.speed_state import around, lens
-from toolkit.keyframes import KeyFrames
-from toolkit.networks.decoder import Deferred
-from toolkit.poses.scene import Scene
-from toolkit.render.field import Field
-from toolkit.render.image import render_view
-from toolkit.training.fit import fit_field
-from toolkit.training.from_network import (
+from fieldfuse.camera import Intrinsics, Similarity, pixel_grid, rays
+from fieldfuse.capture.types import Views
+from fieldfuse.config import Settings, load_settings
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.speed_state import around, lens
+from fieldfuse.keyframes import KeyFrames
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.poses.scene import Scene
+from fieldfuse.render.field import Field
+from fieldfuse.render.image import render_view
+from fieldfuse.training.fit import fit_field
+from fieldfuse.training.from_network import (
     MEASURED_PIXELS,
     OBJECT_PIXELS,
     PIXELS,
@@ -32,11 +31,12 @@ from toolkit.training.from_network import (
     load_networks,
     voxels_to_median,
 )
-from toolkit.training.network_start import THICK, THIN, network_start, widened
-from toolkit.training.silhouettes import inside_silhouettes, visual_hull
-from toolkit.training.start import space_of
-from toolkit.volume.lookup import corners, gather
-from toolkit.volume.space import Space
+from fieldfuse.training.network_start import THICK, THIN, network_start, widened
+from fieldfuse.training.silhouettes import inside_silhouettes, visual_hull
+from fieldfuse.training.start import space_of
+from fieldfuse.volume.lookup import corners, gather
+from fieldfuse.volume.space import Space
+from tests.networks.made import INTRINSICS, SMALL, small_model, wall_pictures
 
 DEPTH = 2.0
 

@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.errors import InputError
+from fieldfuse.progress import SILENT
+from fieldfuse.training import guard, step
+from fieldfuse.training.adam import LazyAdam
+from fieldfuse.training.engine import Engine, TorchEngine, make_engine, warm_up
+from fieldfuse.training.finite import NotFiniteError, check
+from fieldfuse.training.fit import _first, fit_field
+from fieldfuse.training.fused import FusedOptimiser
+from fieldfuse.training.fused_per_sample import FusedPerSampleOptimiser
+from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.step import Rates
+from fieldfuse.volume.host import TorchHost
 from tests.training.test_fit import scene, sphere_views, ticking, wanted
-from toolkit.errors import InputError
-from toolkit.progress import SILENT
-from toolkit.training import guard, step
-from toolkit.training.adam import LazyAdam
-from toolkit.training.engine import Engine, TorchEngine, make_engine, warm_up
-from toolkit.training.finite import NotFiniteError, check
-from toolkit.training.fit import _first, fit_field
-from toolkit.training.fused import FusedOptimiser
-from toolkit.training.fused_per_sample import FusedPerSampleOptimiser
-from toolkit.training.rays import PixelPool
-from toolkit.training.step import Rates
-from toolkit.volume.host import TorchHost
 
 RATES = Rates(0.3, 0.05, 3e-3, 0.01)
 KINDS = [("torch", "deferred"), ("torch", "per_sample"), ("numba", "deferred"), ("numba", "per_sample")]

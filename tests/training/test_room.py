@@ -10,20 +10,20 @@ from multiprocessing import get_context
 import pytest
 import torch
 
+from fieldfuse import memory
+from fieldfuse.errors import InputError
+from fieldfuse.training import room
+from fieldfuse.training.engine import make_engine
+from fieldfuse.training.fit import fit_field
+from fieldfuse.training.levels import finer
+from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.schedule import Schedule
+from fieldfuse.training.step import Rates
+from fieldfuse.volume.compiled import finer_blocks
+from fieldfuse.volume.grid_host import GridHost
+from fieldfuse.volume.host import TorchHost
 from tests.pages import in_memory
 from tests.training.test_fit import scene, sphere_views, ticking, wanted
-from toolkit import memory
-from toolkit.errors import InputError
-from toolkit.training import room
-from toolkit.training.engine import make_engine
-from toolkit.training.fit import fit_field
-from toolkit.training.levels import finer
-from toolkit.training.rays import PixelPool
-from toolkit.training.schedule import Schedule
-from toolkit.training.step import Rates
-from toolkit.volume.compiled import finer_blocks
-from toolkit.volume.grid_host import GridHost
-from toolkit.volume.host import TorchHost
 
 
 def allow(monkeypatch: pytest.MonkeyPatch, free: int | None) -> None:

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from toolkit.camera import Intrinsics
-from toolkit.capture.types import Views
-from toolkit.effects.correct import Corrections
-from toolkit.evaluate.score import score_views
-from toolkit.render.image import Rendered
-from toolkit.tone import Tone
-from toolkit.training.sample import Sample
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.effects.correct import Corrections
+from fieldfuse.evaluate.score import score_views
+from fieldfuse.render.image import Rendered
+from fieldfuse.tone import Tone
+from fieldfuse.training.sample import Sample
 
 CAMERA = Intrinsics(40, 30, 40.0, 40.0, 20.0, 15.0)
 

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from toolkit.config import FitSettings
-from toolkit.training.schedule import (
+from fieldfuse.config import FitSettings
+from fieldfuse.training.schedule import (
     COARSE_GAIN,
     FINE_MOST,
     FINE_WORTH,
@@ -20,7 +20,7 @@ from toolkit.training.schedule import (
     Schedule,
     most_rays,
 )
-from toolkit.training.start import FINER
+from fieldfuse.training.start import FINER
 
 
 def plan() -> Schedule:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.config import FitSettings
+from fieldfuse.training import fit
+from fieldfuse.training.fit import fit_field
+from fieldfuse.training.rays import PixelPool, softened
+from fieldfuse.training.schedule import LAST_SOFT, MOST_SOFT, Schedule
 from tests.training.test_fit import scene, sphere_views, ticking, wanted
-from toolkit.config import FitSettings
-from toolkit.training import fit
-from toolkit.training.fit import fit_field
-from toolkit.training.rays import PixelPool, softened
-from toolkit.training.schedule import LAST_SOFT, MOST_SOFT, Schedule
 
 
 def noise(seed: int, height: int = 40, width: int = 60) -> np.ndarray:

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fieldfuse.training.start import FINER, FINEST, PIXELS, USUAL, finest_resolution, space_of, worth_a_level
 from tests.training.test_fit import scene, sphere_views
-from toolkit.training.start import FINER, FINEST, PIXELS, USUAL, finest_resolution, space_of, worth_a_level
 
 
 @pytest.mark.parametrize(

@@ -11,16 +11,16 @@ from pathlib import Path
 import pytest
 import torch
 
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.render.field import Field, density
+from fieldfuse.render.march import Samples, march
+from fieldfuse.training import step as step_module
+from fieldfuse.training.adam import Adam, LazyAdam
+from fieldfuse.training.depth import REACH
+from fieldfuse.training.rays import Batch
+from fieldfuse.training.step import Optimiser, Rates
+from fieldfuse.volume.lookup import corners
 from tests.render.made import random_field, random_rays
-from toolkit.networks.decoder import Deferred
-from toolkit.render.field import Field, density
-from toolkit.render.march import Samples, march
-from toolkit.training import step as step_module
-from toolkit.training.adam import Adam, LazyAdam
-from toolkit.training.depth import REACH
-from toolkit.training.rays import Batch
-from toolkit.training.step import Optimiser, Rates
-from toolkit.volume.lookup import corners
 
 Tensor = torch.Tensor
 ROOT = Path(__file__).resolve().parents[2]
@@ -143,7 +143,7 @@ def test_adam_on_whole_weights_is_torchs_to_the_bit() -> None:
 
 
 def test_a_fit_with_torch_does_without_its_compiler() -> None:
-    code = "import sys; from toolkit.training.step import Optimiser; from tests.render.made import random_field; Optimiser(random_field())"
+    code = "import sys; from fieldfuse.training.step import Optimiser; from tests.render import made; Optimiser(made.random_field())"
     done = subprocess.run([sys.executable, "-c", code + "; sys.exit('torch._dynamo' in sys.modules)"], cwd=ROOT, check=False)
     assert done.returncode == 0
 

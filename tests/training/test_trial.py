@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.types import Capture
+from fieldfuse.config import Settings, load_settings
+from fieldfuse.effects.adjust import rotation
+from fieldfuse.effects.correct import Corrections
+from fieldfuse.training import trial as module
+from fieldfuse.training.trial import Trial, same_geometry
 from tests.pipelines.made import make_room
-from toolkit.capture import open_capture
-from toolkit.capture.types import Capture
-from toolkit.config import Settings, load_settings
-from toolkit.effects.adjust import rotation
-from toolkit.effects.correct import Corrections
-from toolkit.training import trial as module
-from toolkit.training.trial import Trial, same_geometry
 
 
 @pytest.fixture(scope="module")

@@ -13,22 +13,22 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.render.field import Field
+from fieldfuse.render.rays import render_rays
+from fieldfuse.training.depth import ROUGH
+from fieldfuse.training.finite import NotFiniteError
+from fieldfuse.training.importance import TOP, Errors
+from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.step import Optimiser, Rates
 from tests.render.made import random_field, random_rays
 from tests.training.gradients import exact_gradients, weighed
 from tests.training.test_fused import made_views
-from toolkit.render.field import Field
-from toolkit.render.rays import render_rays
-from toolkit.training.depth import ROUGH
-from toolkit.training.finite import NotFiniteError
-from toolkit.training.importance import TOP, Errors
-from toolkit.training.rays import PixelPool
-from toolkit.training.step import Optimiser, Rates
 
 triton = pytest.importorskip("triton", reason="triton is not installed: it comes with torch for CUDA, and with `make test` on Linux")
 
-from toolkit.render.triton_field import Tables, TritonRenderer, bricks_to_skip  # noqa: E402
-from toolkit.training import triton_warm  # noqa: E402
-from toolkit.training.triton_engine import TritonOptimiser  # noqa: E402
+from fieldfuse.render.triton_field import Tables, TritonRenderer, bricks_to_skip  # noqa: E402
+from fieldfuse.training import triton_warm  # noqa: E402
+from fieldfuse.training.triton_engine import TritonOptimiser  # noqa: E402
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03, depth=0.05, slow_within=3.0, depth_noise=ROUGH.noise)

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import torch
 
+from fieldfuse.config import FieldSettings
+from fieldfuse.effects.decide import choose_field
+from fieldfuse.networks.decoder import Deferred, PerSample, make_decoder
+from fieldfuse.training.fit import fit_field
+from fieldfuse.training.view import HARMONICS, blind, limit, of_direction
 from tests.training.test_fit import scene, sphere_views, wanted
-from toolkit.config import FieldSettings
-from toolkit.effects.decide import choose_field
-from toolkit.networks.decoder import Deferred, PerSample, make_decoder
-from toolkit.training.fit import fit_field
-from toolkit.training.view import HARMONICS, blind, limit, of_direction
 
 
 def test_limits_take_the_harmonics_of_the_order() -> None:

@@ -13,8 +13,8 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from toolkit.progress import SILENT
-from toolkit.training import triton_engine, triton_warm
+from fieldfuse.progress import SILENT
+from fieldfuse.training import triton_engine, triton_warm
 
 TYPES = {torch.float32: "*fp32", torch.int32: "*i32", torch.int64: "*i64", torch.uint8: "*u8"}
 CAPABILITY = 80

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fieldfuse.camera import Similarity
+from fieldfuse.capture import open_capture
+from fieldfuse.errors import InputError
+from fieldfuse.tsdf.benchmark import compare_with_bare_loop
+from fieldfuse.tsdf.frames import capture_depth_frames
 from tests.conftest import shared_data
 from tests.tsdf.scenes import ring, sphere_frame
-from toolkit.camera import Similarity
-from toolkit.capture import open_capture
-from toolkit.errors import InputError
-from toolkit.tsdf.benchmark import compare_with_bare_loop
-from toolkit.tsdf.frames import capture_depth_frames
 
 
 def test_facts_of_a_comparison() -> None:

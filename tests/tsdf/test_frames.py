@@ -9,16 +9,16 @@ import cv2
 import numpy as np
 import pytest
 
+from fieldfuse.camera import FISHEYE, OPENCV, Intrinsics, Similarity, distort
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.config import TsdfSettings
+from fieldfuse.errors import InputError
+from fieldfuse.tone import Tone
+from fieldfuse.tsdf.frames import automatic_depth_max, automatic_voxel_size, capture_depth_frames
+from fieldfuse.tsdf.fuse import fuse_capture
 from tests.conftest import shared_data
 from tests.tsdf.scenes import CAMERA, directions, ring, sphere_colour, sphere_depth
-from toolkit.camera import FISHEYE, OPENCV, Intrinsics, Similarity, distort
-from toolkit.capture import open_capture
-from toolkit.capture.types import Capture, Frame
-from toolkit.config import TsdfSettings
-from toolkit.errors import InputError
-from toolkit.tone import Tone
-from toolkit.tsdf.frames import automatic_depth_max, automatic_voxel_size, capture_depth_frames
-from toolkit.tsdf.fuse import fuse_capture
 
 CENTRE = np.array([5.0, 3.0, -2.0])
 RADIUS = 0.5

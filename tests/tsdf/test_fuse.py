@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.camera import Intrinsics, project
+from fieldfuse.errors import InputError, Interrupted
+from fieldfuse.export.mesh import to_trimesh
+from fieldfuse.progress import Progress
+from fieldfuse.tsdf.frames import DepthFrame
+from fieldfuse.tsdf.fuse import estimate_blocks, fuse_frames
+from fieldfuse.tsdf.view import SurfaceCaster
+from fieldfuse.tsdf.volume import BYTES_PER_BLOCK, SLACK, TsdfVolume, default_weight_threshold
 from tests.tsdf.scenes import CAMERA, all_round, plane_frame, ring, sphere_colour, sphere_depth, sphere_frame
-from toolkit.camera import Intrinsics, project
-from toolkit.errors import InputError, Interrupted
-from toolkit.export.mesh import to_trimesh
-from toolkit.progress import Progress
-from toolkit.tsdf.frames import DepthFrame
-from toolkit.tsdf.fuse import estimate_blocks, fuse_frames
-from toolkit.tsdf.view import SurfaceCaster
-from toolkit.tsdf.volume import BYTES_PER_BLOCK, SLACK, TsdfVolume, default_weight_threshold
 
 CENTRE = np.array([0.31, -0.17, 0.08])
 RADIUS = 0.5

@@ -9,10 +9,10 @@ import open3d as o3d
 import pytest
 import trimesh
 
-from toolkit.camera import Similarity
-from toolkit.errors import InputError
-from toolkit.export.mesh import to_trimesh
-from toolkit.tsdf.mesh import Mesh, as_bytes
+from fieldfuse.camera import Similarity
+from fieldfuse.errors import InputError
+from fieldfuse.export.mesh import to_trimesh
+from fieldfuse.tsdf.mesh import Mesh, as_bytes
 
 
 def ball(radius: float = 1.0, centre: tuple[float, float, float] = (0, 0, 0), subdivisions: int = 3) -> Mesh:

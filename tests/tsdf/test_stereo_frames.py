@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import InputError
+from fieldfuse.stereo.match import StereoDepth
+from fieldfuse.tsdf.stereo_frames import fuse_stereo, stereo_frames
 from tests.tsdf.scenes import CAMERA, all_round, sphere_frame
-from toolkit.capture.types import Views
-from toolkit.errors import InputError
-from toolkit.stereo.match import StereoDepth
-from toolkit.tsdf.stereo_frames import fuse_stereo, stereo_frames
 
 CENTRE, RADIUS = np.array([0.1, -0.2, 0.3]), 0.5
 

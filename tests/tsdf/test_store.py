@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
+from fieldfuse.errors import InputError
+from fieldfuse.tsdf.fuse import TsdfVolume, fuse_frames
+from fieldfuse.tsdf.store import load_volume, save_volume
 from tests.tsdf.scenes import CAMERA, all_round, sphere_frame
-from toolkit.errors import InputError
-from toolkit.tsdf.fuse import TsdfVolume, fuse_frames
-from toolkit.tsdf.store import load_volume, save_volume
 
 CENTRE = np.array([0.1, 0.2, 0.3])
 FACTS = {"version": 1, "voxel_size": 0.02, "depth_max": 3.0, "truncation": 4.0, "frames": 8, "empty_frames": 0, "touches": 400}

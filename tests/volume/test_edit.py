@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.volume.edit import (
+from fieldfuse.volume.edit import (
     corner_nodes,
     dilate,
     erase_empty_blocks,
@@ -19,8 +19,8 @@ from toolkit.volume.edit import (
     trilinear_density,
     with_corner_blocks,
 )
-from toolkit.volume.lookup import corners, gather
-from toolkit.volume.topology import VOXELS, Topology
+from fieldfuse.volume.lookup import corners, gather
+from fieldfuse.volume.topology import VOXELS, Topology
 
 Place = tuple[int, int, int]
 

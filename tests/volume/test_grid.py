@@ -14,14 +14,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.errors import InputError
+from fieldfuse.memory import madvise
+from fieldfuse.volume.compiled import corner_nodes, let_go, refined
+from fieldfuse.volume.grid import BlockGrid
+from fieldfuse.volume.grid_host import GridHost, host_for
+from fieldfuse.volume.host import TorchHost
+from fieldfuse.volume.topology import VOXELS, Topology
 from tests.pages import in_memory
-from toolkit.errors import InputError
-from toolkit.memory import madvise
-from toolkit.volume.compiled import corner_nodes, let_go, refined
-from toolkit.volume.grid import BlockGrid
-from toolkit.volume.grid_host import GridHost, host_for
-from toolkit.volume.host import TorchHost
-from toolkit.volume.topology import VOXELS, Topology
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -150,7 +150,7 @@ def run_python(code: str) -> subprocess.CompletedProcess[str]:
 LEAKY = """
     import builtins, sys
     import torch
-    from toolkit.volume.grid import BlockGrid
+    from fieldfuse.volume.grid import BlockGrid
     grid = BlockGrid(0.1, {"value": 2}, 64)
     grid.activate(torch.zeros((1, 3), dtype=torch.int32))
     leaf = grid.rows("value").requires_grad_()

@@ -7,9 +7,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.volume.lookup import corners, gather, scatter
+from fieldfuse.volume.space import Space
 from tests.render.made import random_field
-from toolkit.volume.lookup import corners, gather, scatter
-from toolkit.volume.space import Space
 
 
 @given(st.lists(st.floats(-500, 500, width=32), min_size=3, max_size=3), st.floats(0.25, 2))

@@ -18,12 +18,12 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
-from toolkit.camera import Similarity
-from toolkit.errors import InputError, OutputError
-from toolkit.volume import store
-from toolkit.volume.edit import corner_nodes
-from toolkit.volume.store import FieldFile, compact, expand, read_field, write_field
-from toolkit.volume.topology import VOXELS, Topology
+from fieldfuse.camera import Similarity
+from fieldfuse.errors import InputError, OutputError
+from fieldfuse.volume import store
+from fieldfuse.volume.edit import corner_nodes
+from fieldfuse.volume.store import FieldFile, compact, expand, read_field, write_field
+from fieldfuse.volume.topology import VOXELS, Topology
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -317,8 +317,8 @@ def test_full_disk_is_said_and_leaves_nothing_behind(tmp_path: Path) -> None:
         import resource, signal, sys
         sys.path.insert(0, {str(ROOT)!r})
         from tests.volume.test_store import make_field
-        from toolkit.errors import OutputError
-        from toolkit.volume.store import write_field
+        from fieldfuse.errors import OutputError
+        from fieldfuse.volume.store import write_field
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
         try:

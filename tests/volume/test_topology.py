@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.volume.topology import VOXELS, Topology
+from fieldfuse.volume.topology import VOXELS, Topology
 
 Key = tuple[int, int, int]
 ENDS = (-(2**31), -(2**31) + 1, -1, 0, 1, 2**31 - 1)

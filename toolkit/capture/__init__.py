@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from toolkit.capture.types import Capture, Frame, Views
+from fieldfuse.capture.types import Capture, Frame, Views
 
 __all__ = ["Capture", "Frame", "Views", "open_capture"]
 
@@ -23,12 +23,12 @@ def open_capture(source: Path | str, masks: str = "auto", choose: Callable[[Sequ
         InputError: nothing there, nothing known, or the layout's own files are broken.
     """
     # Imported late: training and rendering need the types above on machines without Pillow.
-    from toolkit.camera import lenient_poses
-    from toolkit.capture.beside import with_remark
-    from toolkit.capture.colmap import model_captures
-    from toolkit.capture.detect import read_source
-    from toolkit.capture.masks import with_masks
-    from toolkit.capture.usable import turned_by_exif, with_usable_poses
+    from fieldfuse.camera import lenient_poses
+    from fieldfuse.capture.beside import with_remark
+    from fieldfuse.capture.colmap import model_captures
+    from fieldfuse.capture.detect import read_source
+    from fieldfuse.capture.masks import with_masks
+    from fieldfuse.capture.usable import turned_by_exif, with_usable_poses
 
     with lenient_poses() as notes:
         capture = read_source(Path(source))

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.capture.images import see_through
-from toolkit.capture.listing import picture_header
-from toolkit.capture.types import Frame
-from toolkit.errors import InputError
+from fieldfuse.capture.images import see_through
+from fieldfuse.capture.listing import picture_header
+from fieldfuse.capture.types import Frame
+from fieldfuse.errors import InputError
 
 HEADERS, PICTURES = 100, 5  # looked at at most, evenly spread: decoding all of a large capture would take minutes
 

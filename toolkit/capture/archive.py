@@ -9,7 +9,7 @@ import zipfile
 from functools import lru_cache
 from pathlib import Path
 
-from toolkit.errors import InputError, first_line
+from fieldfuse.errors import InputError, first_line
 
 SUFFIXES = (".r3d", ".zip")
 MOST_BYTES = 64 * 2**20  # of one member: a picture of a phone has five

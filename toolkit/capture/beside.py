@@ -8,11 +8,11 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-from toolkit.capture.colmap_model import holds_model
-from toolkit.capture.listing import PICTURES, counted, natural_key
-from toolkit.capture.photos import SMALLER
-from toolkit.capture.types import Capture
-from toolkit.capture.video import VIDEO_SUFFIXES
+from fieldfuse.capture.colmap_model import holds_model
+from fieldfuse.capture.listing import PICTURES, counted, natural_key
+from fieldfuse.capture.photos import SMALLER
+from fieldfuse.capture.types import Capture
+from fieldfuse.capture.video import VIDEO_SUFFIXES
 
 DEEP, MOST_FILES, LISTED = 2, 20_000, 3
 POSE_FILES = re.compile(

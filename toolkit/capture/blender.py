@@ -9,10 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from toolkit.capture import nerf_json
-from toolkit.capture.listing import assemble, picture_header, read_object, require_folder, unique_names
-from toolkit.capture.resolve import CaptureFiles
-from toolkit.capture.types import Capture, Frame
+from fieldfuse.capture import nerf_json
+from fieldfuse.capture.listing import assemble, picture_header, read_object, require_folder, unique_names
+from fieldfuse.capture.resolve import CaptureFiles
+from fieldfuse.capture.types import Capture, Frame
 
 
 def _json(root: Path, split: str) -> Path:

@@ -9,10 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.listing import fitted, read_matrix, read_object
-from toolkit.capture.nerf_json import MAX_SIDE, number
-from toolkit.errors import InputError
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.listing import fitted, read_matrix, read_object
+from fieldfuse.capture.nerf_json import MAX_SIDE, number
+from fieldfuse.errors import InputError
 
 JSON_NAMES = (
     "camera_intrinsics.json",

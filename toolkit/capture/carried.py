@@ -8,7 +8,7 @@ import cv2
 import numba
 import numpy as np
 
-from toolkit.camera import FISHEYE, Array, Intrinsics, distort, pixel_grid
+from fieldfuse.camera import FISHEYE, Array, Intrinsics, distort, pixel_grid
 
 CRACK = 0.03  # share of depth by which what shows between two neighbours must lie behind them to be a crack
 

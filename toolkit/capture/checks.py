@@ -10,19 +10,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, pinhole_share
-from toolkit.capture import heif
-from toolkit.capture.depth_checks import check_depth
-from toolkit.capture.duplicates import copies, suspects
-from toolkit.capture.headers import PANORAMA, Header, is_panorama, read_bytes, read_header
-from toolkit.capture.images import decode, largest, read_picture, turns_by_exif, upright
-from toolkit.capture.listing import TIFFS, counted, fitted, natural_key, unique_names
-from toolkit.capture.photos import size_from_exif
-from toolkit.capture.tiff import unturned
-from toolkit.capture.types import Capture, Frame
-from toolkit.capture.usable import with_usable_depth, without
-from toolkit.errors import InputError
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Array, pinhole_share
+from fieldfuse.capture import heif
+from fieldfuse.capture.depth_checks import check_depth
+from fieldfuse.capture.duplicates import copies, suspects
+from fieldfuse.capture.headers import PANORAMA, Header, is_panorama, read_bytes, read_header
+from fieldfuse.capture.images import decode, largest, read_picture, turns_by_exif, upright
+from fieldfuse.capture.listing import TIFFS, counted, fitted, natural_key, unique_names
+from fieldfuse.capture.photos import size_from_exif
+from fieldfuse.capture.tiff import unturned
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.capture.usable import with_usable_depth, without
+from fieldfuse.errors import InputError
+from fieldfuse.progress import SILENT, Progress
 
 THUMB_SIDE = 320  # at least this many pixels on the long side of what is looked at
 PIXEL_BUDGET = 600e6  # stored pixels decoded at most; of a larger capture every n-th picture is decoded, all are checked for wholeness
@@ -34,7 +34,7 @@ BLURRED = 0.25  # of the usual sharpness of the capture
 CUT_OFF = 0.1  # share of an image that is not used, from which on that is said
 FLOAT_WHITES = (255, 1023, 4095, 16383, 65535)  # that floating-point values may be meant for
 WHOLE, BRIGHT, EVERY = 4.0, 90, 7  # they are where their 90th percentile, of every 7th that is not black, is as large as this
-CUT_OFF = 1e-3  # by which values may exceed 1 before that is worth a word
+ABOVE_ONE = 1e-3  # by which values may exceed 1 before that is worth a word
 FEWER_BITS = (1023, 4095, 16383)  # largest values of sensors that store 10, 12 and 14 bits in 16
 LOOKED_AT_SHAPES, SAME_SHAPE = 5, 0.05  # images whose EXIF is looked at; difference of width to height that rounding and lenses explain
 NOTICE = 0.1  # share of pictures from which a warning is worth reading
@@ -129,7 +129,7 @@ def floats_to_white(capture: Capture, progress: Progress = SILENT) -> Capture:
         some = values[values > 0][::EVERY]
         found[frame.name] = (float(values.max()), float(np.percentile(some, BRIGHT))) if some.size else (0.0, 0.0)
     most = max((largest for largest, _ in found.values()), default=0.0)
-    beyond = sum(largest > 1 + CUT_OFF for largest, _ in found.values())
+    beyond = sum(largest > 1 + ABOVE_ONE for largest, _ in found.values())
     if not beyond:
         return capture
     if np.median([bright for _, bright in found.values()]) < WHOLE or most > FLOAT_WHITES[-1]:

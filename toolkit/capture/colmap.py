@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Intrinsics
-from toolkit.capture.colmap_model import Model, holds_model, read_model
-from toolkit.capture.listing import (
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture.colmap_model import Model, holds_model, read_model
+from fieldfuse.capture.listing import (
     assemble,
     counted,
     fits_shape,
@@ -28,10 +28,10 @@ from toolkit.capture.listing import (
     require_folder,
     unique_names,
 )
-from toolkit.capture.masks import masks_among
-from toolkit.capture.resolve import CaptureFiles, Found
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from fieldfuse.capture.masks import masks_among
+from fieldfuse.capture.resolve import CaptureFiles, Found
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
 
 USUAL = re.compile(r"((colmap|dense|distorted|undistorted)/(\d+/)?)*sparse(/\d+)?|\.")
 MOST_MODELS = 20

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, checked_place, invert
-from toolkit.capture.listing import read_text
-from toolkit.capture.quaternion import rigid
-from toolkit.errors import InputError, first_line
+from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, checked_place, invert
+from fieldfuse.capture.listing import read_text
+from fieldfuse.capture.quaternion import rigid
+from fieldfuse.errors import InputError, first_line
 
 MAX_TEXT = 2**30
 MAX_SIDE = 1_000_000

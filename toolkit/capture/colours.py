@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from PIL import Image, ImageCms
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 MOST_BYTES = 2**20  # of a profile; those of cameras have a few hundred, scanners' with tables some hundred thousand
 ROWS = 256  # of a picture that are converted at a time: few enough to stay in the cache

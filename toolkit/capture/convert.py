@@ -9,17 +9,17 @@ from pathlib import Path
 
 import cv2
 
-from toolkit.capture.checks import check_capture
-from toolkit.capture.headers import orientation_of
-from toolkit.capture.heif import file_is_heif
-from toolkit.capture.images import read_picture, turns_by_exif, upright
-from toolkit.capture.listing import counted, picture_header, unique_names
-from toolkit.capture.stored import MIRRORED
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError, OutputError, first_line
-from toolkit.files import atomic_path, fingerprint, read_json, write_json
-from toolkit.progress import SILENT, Progress
-from toolkit.threads import share
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.headers import orientation_of
+from fieldfuse.capture.heif import file_is_heif
+from fieldfuse.capture.images import read_picture, turns_by_exif, upright
+from fieldfuse.capture.listing import counted, picture_header, unique_names
+from fieldfuse.capture.stored import MIRRORED
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError, OutputError, first_line
+from fieldfuse.files import atomic_path, fingerprint, read_json, write_json
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.threads import share
 
 VERSION = 2  # of what is written
 QUALITY = 97  # of the JPEG files, as of a video's frames

@@ -7,12 +7,12 @@ from itertools import combinations
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, invert
-from toolkit.capture.images import load_depth
-from toolkit.capture.listing import fitted
-from toolkit.capture.types import Capture
-from toolkit.errors import InputError
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Array, Intrinsics, invert
+from fieldfuse.capture.images import load_depth
+from fieldfuse.capture.listing import fitted
+from fieldfuse.capture.types import Capture
+from fieldfuse.errors import InputError
+from fieldfuse.progress import SILENT, Progress
 
 LOOKED_AT = 16  # depth maps read, evenly spread
 POINTS = 200  # compared for each pair of them

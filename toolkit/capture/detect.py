@@ -19,31 +19,31 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from toolkit.capture.archive import SUFFIXES as ARCHIVES
-from toolkit.capture.blender import looks_like_blender, read_blender
-from toolkit.capture.colmap import candidate_models, has_images, looks_like_colmap, owners, read_colmap
-from toolkit.capture.dtu import looks_like_dtu, read_dtu
-from toolkit.capture.listing import PICTURES, counted, natural_key, pictures_in, require_folder
-from toolkit.capture.llff import looks_like_llff, read_llff
-from toolkit.capture.photos import looks_like_photos, photo_files, read_photos
-from toolkit.capture.polycam import looks_like_polycam, read_polycam
-from toolkit.capture.record3d import SUFFIX as RECORD3D
-from toolkit.capture.record3d import holds_record3d, looks_like_record3d, read_record3d
-from toolkit.capture.redwood import looks_like_redwood, read_redwood
-from toolkit.capture.replica import looks_like_replica, read_replica
-from toolkit.capture.resolve import CaptureFiles
-from toolkit.capture.rgbd_folder import looks_like_rgbd, read_rgbd
-from toolkit.capture.scanner3d import looks_like_scanner3d, read_scanner3d
-from toolkit.capture.scannet import looks_like_scannet, read_scannet, read_sens
-from toolkit.capture.sens import is_sens
-from toolkit.capture.seven_scenes import looks_like_seven_scenes, read_seven_scenes
-from toolkit.capture.stray import looks_like_stray, read_stray
-from toolkit.capture.transforms import looks_like_transforms, read_transforms
-from toolkit.capture.tum import looks_like_tum, read_tum
-from toolkit.capture.types import Capture
-from toolkit.capture.video import VIDEO_SUFFIXES, read_video
-from toolkit.errors import InputError
-from toolkit.files import require_utf8
+from fieldfuse.capture.archive import SUFFIXES as ARCHIVES
+from fieldfuse.capture.blender import looks_like_blender, read_blender
+from fieldfuse.capture.colmap import candidate_models, has_images, looks_like_colmap, owners, read_colmap
+from fieldfuse.capture.dtu import looks_like_dtu, read_dtu
+from fieldfuse.capture.listing import PICTURES, counted, natural_key, pictures_in, require_folder
+from fieldfuse.capture.llff import looks_like_llff, read_llff
+from fieldfuse.capture.photos import looks_like_photos, photo_files, read_photos
+from fieldfuse.capture.polycam import looks_like_polycam, read_polycam
+from fieldfuse.capture.record3d import SUFFIX as RECORD3D
+from fieldfuse.capture.record3d import holds_record3d, looks_like_record3d, read_record3d
+from fieldfuse.capture.redwood import looks_like_redwood, read_redwood
+from fieldfuse.capture.replica import looks_like_replica, read_replica
+from fieldfuse.capture.resolve import CaptureFiles
+from fieldfuse.capture.rgbd_folder import looks_like_rgbd, read_rgbd
+from fieldfuse.capture.scanner3d import looks_like_scanner3d, read_scanner3d
+from fieldfuse.capture.scannet import looks_like_scannet, read_scannet, read_sens
+from fieldfuse.capture.sens import is_sens
+from fieldfuse.capture.seven_scenes import looks_like_seven_scenes, read_seven_scenes
+from fieldfuse.capture.stray import looks_like_stray, read_stray
+from fieldfuse.capture.transforms import looks_like_transforms, read_transforms
+from fieldfuse.capture.tum import looks_like_tum, read_tum
+from fieldfuse.capture.types import Capture
+from fieldfuse.capture.video import VIDEO_SUFFIXES, read_video
+from fieldfuse.errors import InputError
+from fieldfuse.files import require_utf8
 
 FILMS = (*VIDEO_SUFFIXES, RECORD3D)
 DEEPEST, MOST_FOLDERS = 3, 200  # where captures are looked for that are not where they were said to be

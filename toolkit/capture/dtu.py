@@ -16,11 +16,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, checked_pose, single_frame
-from toolkit.capture.calibration import from_matrix
-from toolkit.capture.listing import assemble, counted, pictures_in, require_folder, same_count, size_of, unique_names
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError, first_line
+from fieldfuse.camera import Array, Intrinsics, checked_pose, single_frame
+from fieldfuse.capture.calibration import from_matrix
+from fieldfuse.capture.listing import assemble, counted, pictures_in, require_folder, same_count, size_of, unique_names
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError, first_line
 
 FOLDERS = ("image", "images", "rgb", ".")
 PREFERRED = ("cameras_sphere.npz", "cameras.npz")  # others hold perturbed or rescaled cameras

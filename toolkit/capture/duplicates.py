@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.types import Frame
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Frame
 
 # Saved again (a quarter of the size, JPEG of quality 30), images differ by up to 1.3 grey levels on average and 14 at most, at 48 × 48;
 # neighbours of eight captures by at least 6.6 and 83.

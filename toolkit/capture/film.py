@@ -11,16 +11,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.archive import archive_of
-from toolkit.capture.headers import read_bytes, read_header
-from toolkit.capture.images import load_depth, load_image
-from toolkit.capture.sens import JPEG, is_sens, scan
-from toolkit.capture.sens_frames import sens_bytes, sens_depth
-from toolkit.capture.types import Capture, Frame
-from toolkit.capture.video import iterate_video
-from toolkit.errors import InputError, OutputError
-from toolkit.files import atomic_path, fingerprint
+from fieldfuse.camera import Array
+from fieldfuse.capture.archive import archive_of
+from fieldfuse.capture.headers import read_bytes, read_header
+from fieldfuse.capture.images import load_depth, load_image
+from fieldfuse.capture.sens import JPEG, is_sens, scan
+from fieldfuse.capture.sens_frames import sens_bytes, sens_depth
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.capture.video import iterate_video
+from fieldfuse.errors import InputError, OutputError
+from fieldfuse.files import atomic_path, fingerprint
 
 QUALITY = 97  # of the JPEG files that a video's frames become
 DEPTH = "depth"  # folder beside the pictures that are written

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
-from toolkit.capture import heif
-from toolkit.capture.archive import read_member
-from toolkit.capture.primaries import heif_colours, png_colours
-from toolkit.capture.tiff import Tiff, is_tiff, read_tiff, unturned
-from toolkit.errors import InputError
+from fieldfuse.capture import heif
+from fieldfuse.capture.archive import read_member
+from fieldfuse.capture.primaries import heif_colours, png_colours
+from fieldfuse.capture.tiff import Tiff, is_tiff, read_tiff, unturned
+from fieldfuse.errors import InputError
 
 MAX_PIXELS = 200_000_000
 PANORAMA = "360° panoramas (equirectangular) are not read; cut each into perspective views first, and give these"

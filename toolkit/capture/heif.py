@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from toolkit.camera import Array
-from toolkit.errors import InputError
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError
 
 SUFFIXES = (".heic", ".heif", ".hif")
 FORMAT = "HEIF"  # Pillow's name for it

@@ -10,17 +10,17 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from toolkit.camera import Array
-from toolkit.capture import heif, lzfse
-from toolkit.capture.colours import to_srgb
-from toolkit.capture.headers import MAX_PIXELS, Header, orientation_of, read_bytes, read_header
-from toolkit.capture.listing import picture_header
-from toolkit.capture.sens import is_sens
-from toolkit.capture.sens_frames import sens_depth
-from toolkit.capture.tiff import unturned
-from toolkit.capture.types import Capture, Frame
-from toolkit.capture.video import iterate_video
-from toolkit.errors import InputError
+from fieldfuse.camera import Array
+from fieldfuse.capture import heif, lzfse
+from fieldfuse.capture.colours import to_srgb
+from fieldfuse.capture.headers import MAX_PIXELS, Header, orientation_of, read_bytes, read_header
+from fieldfuse.capture.listing import picture_header
+from fieldfuse.capture.sens import is_sens
+from fieldfuse.capture.sens_frames import sens_depth
+from fieldfuse.capture.tiff import unturned
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.capture.video import iterate_video
+from fieldfuse.errors import InputError
 
 EXIF_TURNS = "exif_turns"  # in `Capture.extra`: the cameras are those of images that are turned by EXIF
 LOSSY = ("JPEG", "MPO", "WEBP", heif.FORMAT)  # formats whose black and white come out as greys
@@ -131,7 +131,7 @@ def load_depth(frame: Frame, capture: Capture) -> Array:
     camera = frame.depth_intrinsics or frame.intrinsics
     if frame.depth_pose is None or camera is None:
         return depth
-    from toolkit.capture.carried import carried  # here: its kernels take a second to load, and few captures need them
+    from fieldfuse.capture.carried import carried  # here: its kernels take a second to load, and few captures need them
 
     height, width = depth.shape
     return carried(depth, camera.scaled(width, height), frame.depth_pose)

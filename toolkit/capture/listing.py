@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from toolkit import files
-from toolkit.camera import Array, Intrinsics, reads_leniently, unread_frames
-from toolkit.capture import heif
-from toolkit.capture.headers import NOT_EXR, orientation_of
-from toolkit.capture.tiff import read_tiff
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError, first_line
+from fieldfuse import files
+from fieldfuse.camera import Array, Intrinsics, reads_leniently, unread_frames
+from fieldfuse.capture import heif
+from fieldfuse.capture.headers import NOT_EXR, orientation_of
+from fieldfuse.capture.tiff import read_tiff
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError, first_line
 
 PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".avif", *heif.SUFFIXES)
 LYING = 5  # EXIF orientations from here on turn by 90°
@@ -290,7 +290,7 @@ def assemble(kind: str, root: Path, frames: list[Frame], remarks: Sequence[str] 
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"{root}: the picture {twice!r} is listed twice; list each picture once")
     if "alpha" not in facts:
-        from toolkit.capture.alpha import cut_out  # here: it reads pictures by what stands above
+        from fieldfuse.capture.alpha import cut_out  # here: it reads pictures by what stands above
 
         facts["alpha"] = cut_out(frames)
     ordered = sorted(frames, key=lambda frame: natural_key(frame.name))

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, checked_pose, single_frame, world_from_llff
-from toolkit.capture.listing import assemble, counted, fitted, picture_header, pictures_in, require_folder, unique_names
-from toolkit.capture.masks import is_mask_folder, masks_among
-from toolkit.capture.resolve import BESIDE, CaptureFiles
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError, first_line
+from fieldfuse.camera import Array, Intrinsics, checked_pose, single_frame, world_from_llff
+from fieldfuse.capture.listing import assemble, counted, fitted, picture_header, pictures_in, require_folder, unique_names
+from fieldfuse.capture.masks import is_mask_folder, masks_among
+from fieldfuse.capture.resolve import BESIDE, CaptureFiles
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError, first_line
 
 NAME = "poses_bounds.npy"
 

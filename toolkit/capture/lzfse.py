@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.headers import read_bytes
-from toolkit.errors import InputError
+from fieldfuse.camera import Array
+from fieldfuse.capture.headers import read_bytes
+from fieldfuse.errors import InputError
 
 TYPES: dict[str, np.dtype[Any]] = {".depth": np.dtype("<f4"), ".conf": np.dtype("u1")}
 MOST_PIXELS = 4_000_000  # of a map whose size is not told: the largest is the front camera's, 720×960

@@ -17,11 +17,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit.capture import heif
-from toolkit.capture.images import LOSSY, decode, load_image, load_mask, turns_by_exif, usable_pixels
-from toolkit.capture.listing import counted, natural_key, picture_header, pictures_in
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from fieldfuse.capture import heif
+from fieldfuse.capture.images import LOSSY, decode, load_image, load_mask, turns_by_exif, usable_pixels
+from fieldfuse.capture.listing import counted, natural_key, picture_header, pictures_in
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
 
 FOLDER_WORDS = {"mask", "masks", "matte", "mattes", "silhouette", "silhouettes"}
 FILE_WORDS = {*FOLDER_WORDS, "alpha", "removebg", "nobg", "cutout"}

@@ -13,9 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, unproject
-from toolkit.capture.images import read_picture
-from toolkit.errors import InputError
+from fieldfuse.camera import Array, Intrinsics, unproject
+from fieldfuse.capture.images import read_picture
+from fieldfuse.errors import InputError
 
 IMAGES, SIDE, FEATURES = 10, 640, 3000
 NEAR = 0.005  # of the focal length, from the epipolar line: about three pixels

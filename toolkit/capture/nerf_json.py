@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, checked_pose, world_from_opengl
-from toolkit.capture.headers import PANORAMA
-from toolkit.capture.listing import UNREADABLE, counted, fitted, picture_header
-from toolkit.capture.mirrored import mirrors, unmirrored
-from toolkit.capture.resolve import Found
-from toolkit.capture.types import Frame
-from toolkit.errors import InputError
+from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, checked_pose, world_from_opengl
+from fieldfuse.capture.headers import PANORAMA
+from fieldfuse.capture.listing import UNREADABLE, counted, fitted, picture_header
+from fieldfuse.capture.mirrored import mirrors, unmirrored
+from fieldfuse.capture.resolve import Found
+from fieldfuse.capture.types import Frame
+from fieldfuse.errors import InputError
 
 MAX_SIDE = 1_000_000  # pixels
 PANORAMAS = ("EQUIRECTANGULAR", "SPHERICAL", "VR180_L", "VR180_R", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R")

@@ -17,12 +17,12 @@ from typing import Any
 
 from PIL import Image
 
-from toolkit.capture.heif import SUFFIXES as HEIF_SUFFIXES
-from toolkit.capture.listing import assemble, counted, natural_key, picture_header, pictures_in, require_folder, unique_names
-from toolkit.capture.masks import is_mask_folder, masks_among
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
-from toolkit.files import require_utf8
+from fieldfuse.capture.heif import SUFFIXES as HEIF_SUFFIXES
+from fieldfuse.capture.listing import assemble, counted, natural_key, picture_header, pictures_in, require_folder, unique_names
+from fieldfuse.capture.masks import is_mask_folder, masks_among
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
+from fieldfuse.files import require_utf8
 
 FOLDERS = (".", "images", "input")
 DEEP, MOST_FILES = 3, 100_000

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.errors import InputError, first_line
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError, first_line
 
 MAX_BYTES = 2**30
 MAX_HEADER = 2**16

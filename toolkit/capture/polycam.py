@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, checked_pose, single_frame, world_from_opengl
-from toolkit.capture.listing import (
+from fieldfuse.camera import Array, Intrinsics, checked_pose, single_frame, world_from_opengl
+from fieldfuse.capture.listing import (
     assemble,
     files_in,
     fitted,
@@ -23,9 +23,9 @@ from toolkit.capture.listing import (
     require_folder,
     unique_names,
 )
-from toolkit.capture.nerf_json import MAX_SIDE, number
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from fieldfuse.capture.nerf_json import MAX_SIDE, number
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
 
 KEYFRAMES = "keyframes"
 BETTER = "corrected_"  # prefix of what the app has improved

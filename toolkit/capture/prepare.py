@@ -8,14 +8,14 @@ from collections.abc import Iterable, Iterator
 import cv2
 import numpy as np
 
-from toolkit import memory
-from toolkit.camera import Array, Intrinsics, Similarity, resample_maps, undistort_maps
-from toolkit.capture.images import load_depth, load_image, load_mask, turns_by_exif
-from toolkit.capture.listing import fitted, natural_key
-from toolkit.capture.types import Capture, Frame, Views
-from toolkit.config import CaptureSettings
-from toolkit.errors import InputError
-from toolkit.progress import SILENT, Progress
+from fieldfuse import memory
+from fieldfuse.camera import Array, Intrinsics, Similarity, resample_maps, undistort_maps
+from fieldfuse.capture.images import load_depth, load_image, load_mask, turns_by_exif
+from fieldfuse.capture.listing import fitted, natural_key
+from fieldfuse.capture.types import Capture, Frame, Views
+from fieldfuse.config import CaptureSettings
+from fieldfuse.errors import InputError
+from fieldfuse.progress import SILENT, Progress
 
 DEFAULT_LONG_SIDE = 640
 WHITE = (1.0, 1.0, 1.0)

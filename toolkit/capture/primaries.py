@@ -7,7 +7,7 @@ import struct
 
 import numpy as np
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 # Chromaticities of red, green and blue, by their number; the white is D65. What is BT.709's is sRGB already.
 PRIMARIES = {

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.errors import InputError
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError
 
 
 def rigid(quaternion: Array, translation: Array, where: str) -> Array:

@@ -22,15 +22,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from toolkit.capture import lzfse
-from toolkit.capture.archive import members, read_member
-from toolkit.capture.headers import read_bytes, read_header
-from toolkit.capture.listing import assemble, counted, files_in, fitted, is_file, pictures_in, read_object
-from toolkit.capture.nerf_json import number
-from toolkit.capture.record3d_metadata import cameras, depth_size, poses, up_of, world_from_camera
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError, first_line
-from toolkit.files import MAX_JSON_BYTES
+from fieldfuse.capture import lzfse
+from fieldfuse.capture.archive import members, read_member
+from fieldfuse.capture.headers import read_bytes, read_header
+from fieldfuse.capture.listing import assemble, counted, files_in, fitted, is_file, pictures_in, read_object
+from fieldfuse.capture.nerf_json import number
+from fieldfuse.capture.record3d_metadata import cameras, depth_size, poses, up_of, world_from_camera
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError, first_line
+from fieldfuse.files import MAX_JSON_BYTES
 
 SUFFIX = ".r3d"
 METADATA, FRAMES = "metadata", "rgbd"

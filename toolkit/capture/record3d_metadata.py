@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, checked_pose, world_from_opengl
-from toolkit.capture.calibration import from_matrix
-from toolkit.capture.listing import fitted
-from toolkit.capture.lzfse import MOST_PIXELS
-from toolkit.capture.nerf_json import MAX_SIDE, number
-from toolkit.capture.quaternion import rigid
-from toolkit.errors import InputError
+from fieldfuse.camera import Array, Intrinsics, checked_pose, world_from_opengl
+from fieldfuse.capture.calibration import from_matrix
+from fieldfuse.capture.listing import fitted
+from fieldfuse.capture.lzfse import MOST_PIXELS
+from fieldfuse.capture.nerf_json import MAX_SIDE, number
+from fieldfuse.capture.quaternion import rigid
+from fieldfuse.errors import InputError
 
 LENS, POSE = 4, 7  # numbers of a frame: fx, fy, cx, cy; qx, qy, qz, qw, x, y, z
 FAR = 0.1  # of a side: stabilisers move a principal point by less, and one of a picture that lies the other way is farther off

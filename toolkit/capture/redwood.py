@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Array, checked_pose, single_frame
-from toolkit.capture.calibration import PRIMESENSE, find_json
-from toolkit.capture.listing import (
+from fieldfuse.camera import Array, checked_pose, single_frame
+from fieldfuse.capture.calibration import PRIMESENSE, find_json
+from fieldfuse.capture.listing import (
     assemble,
     counted,
     files_in,
@@ -29,9 +29,9 @@ from toolkit.capture.listing import (
     same_count,
     unique_names,
 )
-from toolkit.capture.nerf_json import number
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from fieldfuse.capture.nerf_json import number
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
 
 LOG = "trajectory.log"
 OTHERS = ("*.log", "*-traj.txt", "scene/trajectory.log", "scene/key.log")  # where there is no such file

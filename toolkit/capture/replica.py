@@ -10,9 +10,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from toolkit.camera import Array, Intrinsics, checked_pose, single_frame
-from toolkit.capture.calibration import sensor
-from toolkit.capture.listing import (
+from fieldfuse.camera import Array, Intrinsics, checked_pose, single_frame
+from fieldfuse.capture.calibration import sensor
+from fieldfuse.capture.listing import (
     assemble,
     first_size,
     fitted,
@@ -23,9 +23,9 @@ from toolkit.capture.listing import (
     require_folder,
     same_count,
 )
-from toolkit.capture.nerf_json import MAX_SIDE, number
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from fieldfuse.capture.nerf_json import MAX_SIDE, number
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
 
 POSES, PICTURES, CAMERA = "traj.txt", "results", "cam_params.json"
 KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")

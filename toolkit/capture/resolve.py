@@ -17,9 +17,9 @@ from functools import cached_property
 from pathlib import Path
 from urllib.parse import unquote
 
-from toolkit import files
-from toolkit.capture.listing import PICTURES, counted, is_file
-from toolkit.errors import InputError, brief
+from fieldfuse import files
+from fieldfuse.capture.listing import PICTURES, counted, is_file
+from fieldfuse.errors import InputError, brief
 
 MAX_FILES = 200_000
 MAX_DEPTH = 6

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import OPENCV, Array, Intrinsics, checked_pose
-from toolkit.capture.calibration import from_matrix, sensor
-from toolkit.capture.depth_checks import Sample, unit_factor
-from toolkit.capture.images import load_depth
-from toolkit.capture.listing import (
+from fieldfuse.camera import OPENCV, Array, Intrinsics, checked_pose
+from fieldfuse.capture.calibration import from_matrix, sensor
+from fieldfuse.capture.depth_checks import Sample, unit_factor
+from fieldfuse.capture.images import load_depth
+from fieldfuse.capture.listing import (
     PICTURES,
     assemble,
     counted,
@@ -33,10 +33,10 @@ from toolkit.capture.listing import (
     require_folder,
     unique_names,
 )
-from toolkit.capture.masks import is_mask_folder
-from toolkit.capture.quaternion import rigid
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from fieldfuse.capture.masks import is_mask_folder
+from fieldfuse.capture.quaternion import rigid
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
 
 DEPTH_WORDS, COLOUR_WORDS = {"depth", "depths"}, {"rgb", "color", "colors", "colour", "colours", "image", "images", "img", "imgs", "frames"}
 NO_COLOUR = {*DEPTH_WORDS, "normal", "normals", "confidence", "conf", "semantic", "label", "labels", "instance", "vis"}

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, checked_pose, single_frame, world_from_opengl
-from toolkit.capture.calibration import from_matrix
-from toolkit.capture.listing import assemble, fitted, is_file, picture_header, pictures_in, read_object, require_folder, size_of
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from fieldfuse.camera import Array, Intrinsics, checked_pose, single_frame, world_from_opengl
+from fieldfuse.capture.calibration import from_matrix
+from fieldfuse.capture.listing import assemble, fitted, is_file, picture_header, pictures_in, read_object, require_folder, size_of
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
 
 PICTURE = re.compile(r"frame_([0-9]+)\.jpe?g", re.IGNORECASE)
 POSE, LENS = "cameraPoseARFrame", "intrinsics"

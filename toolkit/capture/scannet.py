@@ -13,15 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Intrinsics, checked_pose
-from toolkit.capture.calibration import from_matrix, read_matrix_for, sensor
-from toolkit.capture.listing import assemble, counted, files_in, fitted, picture_header, pictures_in, require_folder, same_count
-from toolkit.capture.sens import SUFFIX, Sens, scan
-from toolkit.capture.sens_frames import sens_size
-from toolkit.capture.seven_scenes import FrameFiles, first_sizes, frame_files, frame_folders, frame_names, lost_frames, posed_frames
-from toolkit.capture.seven_scenes_cameras import INFO
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from fieldfuse.camera import Intrinsics, checked_pose
+from fieldfuse.capture.calibration import from_matrix, read_matrix_for, sensor
+from fieldfuse.capture.listing import assemble, counted, files_in, fitted, picture_header, pictures_in, require_folder, same_count
+from fieldfuse.capture.sens import SUFFIX, Sens, scan
+from fieldfuse.capture.sens_frames import sens_size
+from fieldfuse.capture.seven_scenes import FrameFiles, first_sizes, frame_files, frame_folders, frame_names, lost_frames, posed_frames
+from fieldfuse.capture.seven_scenes_cameras import INFO
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
 
 COLOUR_CAMERA = sensor(1296, 968, 1165.72, 1165.74, 647.5, 483.5)  # nominal centre
 DEPTH_CAMERA = sensor(640, 480, 577.87, 577.87, 319.5, 239.5)

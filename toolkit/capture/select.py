@@ -12,16 +12,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.checks import check_capture
-from toolkit.capture.film import DEPTH, QUALITY, Film
-from toolkit.capture.listing import counted
-from toolkit.capture.types import Capture
-from toolkit.capture.video import UNCOUNTED
-from toolkit.config import CaptureSettings
-from toolkit.errors import InputError
-from toolkit.files import atomic_path, fingerprint, read_json, write_json
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Array
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.film import DEPTH, QUALITY, Film
+from fieldfuse.capture.listing import counted
+from fieldfuse.capture.types import Capture
+from fieldfuse.capture.video import UNCOUNTED
+from fieldfuse.config import CaptureSettings
+from fieldfuse.errors import InputError
+from fieldfuse.files import atomic_path, fingerprint, read_json, write_json
+from fieldfuse.progress import SILENT, Progress
 
 log = logging.getLogger(__name__)
 

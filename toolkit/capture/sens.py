@@ -16,9 +16,9 @@ from typing import BinaryIO
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.headers import MAX_PIXELS
-from toolkit.errors import InputError
+from fieldfuse.camera import Array
+from fieldfuse.capture.headers import MAX_PIXELS
+from fieldfuse.errors import InputError
 
 SUFFIX = ".sens"
 VERSION, OTHER_VERSIONS = 4, 100

@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.headers import read_header
-from toolkit.capture.sens import RAW, ZLIB_DEPTH, Sens, scan
-from toolkit.errors import InputError
+from fieldfuse.camera import Array
+from fieldfuse.capture.headers import read_header
+from fieldfuse.capture.sens import RAW, ZLIB_DEPTH, Sens, scan
+from fieldfuse.errors import InputError
 
 
 def iterate_sens(path: Path, indices: Collection[int] | None = None) -> Iterator[tuple[int, Array]]:

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Intrinsics, checked_pose, single_frame
-from toolkit.capture.listing import (
+from fieldfuse.camera import Intrinsics, checked_pose, single_frame
+from fieldfuse.capture.listing import (
     assemble,
     counted,
     first_size,
@@ -25,9 +25,9 @@ from toolkit.capture.listing import (
     same_count,
     unique_names,
 )
-from toolkit.capture.seven_scenes_cameras import read_cameras
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from fieldfuse.capture.seven_scenes_cameras import read_cameras
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Intrinsics
-from toolkit.capture.calibration import from_matrix, read_matrix_for
-from toolkit.capture.listing import read_text
-from toolkit.errors import InputError
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture.calibration import from_matrix, read_matrix_for
+from fieldfuse.capture.listing import read_text
+from fieldfuse.errors import InputError
 
 USUAL = (640, 480)
 # Both are nominal: the principal point is the picture's centre, so no half pixel is added.

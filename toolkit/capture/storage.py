@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError, first_line
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError, first_line
 
 VERSION = 1
 

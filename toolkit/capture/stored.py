@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from toolkit.camera import FISHEYE, Array, Intrinsics
-from toolkit.capture.headers import orientation_of
-from toolkit.capture.images import turns_by_exif
-from toolkit.capture.types import Capture
+from fieldfuse.camera import FISHEYE, Array, Intrinsics
+from fieldfuse.capture.headers import orientation_of
+from fieldfuse.capture.images import turns_by_exif
+from fieldfuse.capture.types import Capture
 
 TURNS = {3: (-1, 0), 6: (0, 1), 8: (0, -1)}  # EXIF orientation → cosine and sine of the turn from the upright picture to the stored one
 MIRRORED = (2, 4, 5, 7)  # orientations that no camera tells of: rotations do not mirror

@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, checked_pose, single_frame
-from toolkit.capture.calibration import from_matrix
-from toolkit.capture.listing import assemble, fitted, is_file, picture_header, read_text, require_folder
-from toolkit.capture.quaternion import rigid
-from toolkit.capture.types import Capture, Frame
-from toolkit.capture.video import read_video
-from toolkit.errors import InputError, first_line
+from fieldfuse.camera import Array, Intrinsics, checked_pose, single_frame
+from fieldfuse.capture.calibration import from_matrix
+from fieldfuse.capture.listing import assemble, fitted, is_file, picture_header, read_text, require_folder
+from fieldfuse.capture.quaternion import rigid
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.capture.video import read_video
+from fieldfuse.errors import InputError, first_line
 
 VIDEO, POSES, LENS = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 NUMBER, POSE, CAMERA = "frame", ("x", "y", "z", "qx", "qy", "qz", "qw"), ("fx", "fy", "cx", "cy")

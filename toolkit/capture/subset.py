@@ -7,10 +7,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.listing import natural_key
-from toolkit.capture.prepare import held_out
-from toolkit.capture.types import Capture
+from fieldfuse.camera import Array
+from fieldfuse.capture.listing import natural_key
+from fieldfuse.capture.prepare import held_out
+from fieldfuse.capture.types import Capture
 
 
 def limited(capture: Capture, holdout: int, limit: int | None) -> Capture:

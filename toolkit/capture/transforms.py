@@ -13,13 +13,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from toolkit.camera import Intrinsics
-from toolkit.capture import nerf_json
-from toolkit.capture.listing import assemble, counted, fitted, picture_header, read_object, require_folder, unique_names
-from toolkit.capture.ply_points import read_ply_points
-from toolkit.capture.resolve import DEPTH, MASK, POINTS, CaptureFiles
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture import nerf_json
+from fieldfuse.capture.listing import assemble, counted, fitted, picture_header, read_object, require_folder, unique_names
+from fieldfuse.capture.ply_points import read_ply_points
+from fieldfuse.capture.resolve import DEPTH, MASK, POINTS, CaptureFiles
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
 
 NAME = "transforms.json"
 DEPTH_KEYS = ("depth_file_path", "depth_path")

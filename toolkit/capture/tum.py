@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import OPENCV, Array, Intrinsics, checked_pose
-from toolkit.capture.calibration import PRIMESENSE, find_json
-from toolkit.capture.listing import assemble, counted, fitted, picture_header, read_text, require_folder, unique_names
-from toolkit.capture.quaternion import rigid
-from toolkit.capture.resolve import DEPTH, CaptureFiles
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from fieldfuse.camera import OPENCV, Array, Intrinsics, checked_pose
+from fieldfuse.capture.calibration import PRIMESENSE, find_json
+from fieldfuse.capture.listing import assemble, counted, fitted, picture_header, read_text, require_folder, unique_names
+from fieldfuse.capture.quaternion import rigid
+from fieldfuse.capture.resolve import DEPTH, CaptureFiles
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
 
 MAX_GAP = 0.02  # seconds
 DEPTH_SCALE = 5000.0

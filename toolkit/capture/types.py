@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.tone import Tone
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.tone import Tone
 
 SAME_EXPOSURE = 1e-3  # gains are written with six digits, and their mean is 1 by no more
 

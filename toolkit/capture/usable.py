@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from toolkit.camera import PoseNotes
-from toolkit.capture.headers import orientation_of, read_bytes, read_header
-from toolkit.capture.images import EXIF_TURNS
-from toolkit.capture.listing import LYING, PICTURES, counted, picture_header
-from toolkit.capture.types import Capture
-from toolkit.errors import InputError
+from fieldfuse.camera import PoseNotes
+from fieldfuse.capture.headers import orientation_of, read_bytes, read_header
+from fieldfuse.capture.images import EXIF_TURNS
+from fieldfuse.capture.listing import LYING, PICTURES, counted, picture_header
+from fieldfuse.capture.types import Capture
+from fieldfuse.errors import InputError
 
 MOST_BAD = 0.2  # share of the frames that may be left out; with more of them something is wrong with the capture
 LEAST = 3  # frames that have to stay

@@ -16,12 +16,12 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.sens import is_sens
-from toolkit.capture.sens_frames import iterate_sens
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
-from toolkit.files import require_utf8
+from fieldfuse.camera import Array
+from fieldfuse.capture.sens import is_sens
+from fieldfuse.capture.sens_frames import iterate_sens
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
+from fieldfuse.files import require_utf8
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".wmv")
 UNCOUNTED = (".mkv", ".webm")  # they do not say how many frames they have: what is announced is their length times their rate

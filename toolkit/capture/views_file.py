@@ -11,11 +11,11 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from toolkit.camera import PINHOLE, Array, Intrinsics
-from toolkit.capture.types import Views
-from toolkit.errors import InputError, OutputError, first_line
-from toolkit.files import atomic_path
-from toolkit.tone import Tone
+from fieldfuse.camera import PINHOLE, Array, Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import InputError, OutputError, first_line
+from fieldfuse.files import atomic_path
+from fieldfuse.tone import Tone
 
 VERSION = 1
 _OPTIONAL: dict[str, type] = {"valid": np.bool_, "alpha": np.uint8, "depth": np.float32, "photo": np.uint8}

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.effects.evidence import TUNING
+from fieldfuse.camera import Array
+from fieldfuse.effects.evidence import TUNING
 
 LENS, ROWS, POSES = "distortion", "rolling_shutter", "poses"
 UNKNOWNS = (LENS, ROWS, POSES)

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from toolkit.camera import Array
-from toolkit.effects.evidence import Evidence
+from fieldfuse.camera import Array
+from fieldfuse.effects.evidence import Evidence
 
 Tensor = torch.Tensor
 

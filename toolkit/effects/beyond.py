@@ -18,12 +18,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, distort
-from toolkit.effects.adjust import Problem
-from toolkit.effects.evidence import Evidence, HeldOut
-from toolkit.effects.sightings import Sightings
-from toolkit.poses.points import undistorted
-from toolkit.tone import LINEAR
+from fieldfuse.camera import Array, distort
+from fieldfuse.effects.adjust import Problem
+from fieldfuse.effects.evidence import Evidence, HeldOut
+from fieldfuse.effects.sightings import Sightings
+from fieldfuse.poses.points import undistorted
+from fieldfuse.tone import LINEAR
 
 THRESHOLD = 0.002  # share of the patches that tell
 LEAST = 5  # far ones: fewer may be chance

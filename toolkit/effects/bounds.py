@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, distort
-from toolkit.effects.correct import Corrections, bent
+from fieldfuse.camera import Array, Intrinsics, distort
+from fieldfuse.effects.correct import Corrections, bent
 
 STOPS, TINT = 2.0, 1.0  # of a frame's exposure from the usual one, and of its red and blue from green
 STRAY = 0.1  # share of the frames that may lie beyond: their gains are bounded; with more of them none is believed

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 
 @dataclass(frozen=True)

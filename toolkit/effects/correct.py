@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import OPENCV, PINHOLE, Array, Intrinsics, distort
-from toolkit.capture.types import Capture, Views
-from toolkit.errors import InputError, first_line
-from toolkit.tone import Gain, Tone, positive
+from fieldfuse.camera import OPENCV, PINHOLE, Array, Intrinsics, distort
+from fieldfuse.capture.types import Capture, Views
+from fieldfuse.errors import InputError, first_line
+from fieldfuse.tone import Gain, Tone, positive
 
 
 @dataclass(frozen=True)

@@ -14,24 +14,24 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.types import Capture
-from toolkit.config import EffectsSettings, FieldSettings
-from toolkit.effects import light, vignetting
-from toolkit.effects.adjust import LENS, POSES, ROWS, adjust, predict
-from toolkit.effects.bounds import beyond, beyond_depth, bounded_gains
-from toolkit.effects.correct import Corrections, correctable
-from toolkit.effects.depth_camera import NOTHING, look_for_offset
-from toolkit.effects.light import EXPOSURE, VIGNETTING
-from toolkit.effects.motion_blur import POWER
-from toolkit.effects.paid import POINTS, Paid
-from toolkit.effects.refine import refined_poses
-from toolkit.effects.registration import DEPTH_OFFSET
-from toolkit.effects.sensed import Agreed
-from toolkit.effects.sightings import Look, Sightings, gather
-from toolkit.effects.survey import BLUR, FAR, VIEWS, Finding, Survey, survey
-from toolkit.progress import SILENT, Progress
-from toolkit.tone import LINEAR, Gain, Tone
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Capture
+from fieldfuse.config import EffectsSettings, FieldSettings
+from fieldfuse.effects import light, vignetting
+from fieldfuse.effects.adjust import LENS, POSES, ROWS, adjust, predict
+from fieldfuse.effects.bounds import beyond, beyond_depth, bounded_gains
+from fieldfuse.effects.correct import Corrections, correctable
+from fieldfuse.effects.depth_camera import NOTHING, look_for_offset
+from fieldfuse.effects.light import EXPOSURE, VIGNETTING
+from fieldfuse.effects.motion_blur import POWER
+from fieldfuse.effects.paid import POINTS, Paid
+from fieldfuse.effects.refine import refined_poses
+from fieldfuse.effects.registration import DEPTH_OFFSET
+from fieldfuse.effects.sensed import Agreed
+from fieldfuse.effects.sightings import Look, Sightings, gather
+from fieldfuse.effects.survey import BLUR, FAR, VIEWS, Finding, Survey, survey
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.tone import LINEAR, Gain, Tone
 
 SHARP = 0.75  # quantile of the sharpness from which on a frame counts in full
 LEAST_WEIGHT = 0.1

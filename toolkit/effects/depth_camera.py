@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from toolkit.camera import Array, invert
-from toolkit.capture.types import Capture
-from toolkit.effects import geometry
-from toolkit.effects.adjust import Problem, adjust
-from toolkit.effects.registration import DEPTH_OFFSET, MARGIN, Registration, register
-from toolkit.effects.sightings import Look, Sightings, choose, gather
-from toolkit.effects.survey import CLOSE, FIRST_FRAMES, MOST_FRAMES, Finding
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Array, invert
+from fieldfuse.capture.types import Capture
+from fieldfuse.effects import geometry
+from fieldfuse.effects.adjust import Problem, adjust
+from fieldfuse.effects.registration import DEPTH_OFFSET, MARGIN, Registration, register
+from fieldfuse.effects.sightings import Look, Sightings, choose, gather
+from fieldfuse.effects.survey import CLOSE, FIRST_FRAMES, MOST_FRAMES, Finding
+from fieldfuse.progress import SILENT, Progress
 
 UNIT = "of depth"
 NOTHING = "too few points are shared between pictures and have depth to tell"

@@ -13,12 +13,12 @@ from functools import cached_property
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, distort
-from toolkit.capture.images import load_depth
-from toolkit.capture.listing import fitted
-from toolkit.capture.types import Capture
-from toolkit.poses.points import undistorted
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Array, Intrinsics, distort
+from fieldfuse.capture.images import load_depth
+from fieldfuse.capture.listing import fitted
+from fieldfuse.capture.types import Capture
+from fieldfuse.poses.points import undistorted
+from fieldfuse.progress import SILENT, Progress
 
 SIDE = 320  # pixels along the long side, of larger maps every so manieth is kept
 SMOOTH = 0.05  # share of depth within which four pixels are of one surface

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 JUMP = 0.05  # relative difference of depth that makes an edge
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from toolkit.camera import OPENCV, Intrinsics, lens_limit
-from toolkit.errors import InputError
+from fieldfuse.camera import OPENCV, Intrinsics, lens_limit
+from fieldfuse.errors import InputError
 
 Tensor = torch.Tensor
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 DARKEST, BRIGHTEST = 0.01, 0.85  # linear light between which a colour tells its exposure: not noise, not clipped
 ROUNDS = 6  # of reweighting

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from toolkit.camera import Array, invert
-from toolkit.effects.adjust import LENS, POSES, ROWS, UNKNOWNS, Problem, adjust, residuals, scatter
-from toolkit.effects.sightings import LONG_SIDE, LOOSE, Sightings
-from toolkit.poses.points import intersect
+from fieldfuse.camera import Array, invert
+from fieldfuse.effects.adjust import LENS, POSES, ROWS, UNKNOWNS, Problem, adjust, residuals, scatter
+from fieldfuse.effects.sightings import LONG_SIDE, LOOSE, Sightings
+from fieldfuse.poses.points import intersect
 
 MOST_POINTS = 1600  # that take part
 HELD_OUT = 4  # every so manieth point is kept out of the fits

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.effects import exposure, vignetting
-from toolkit.effects.evidence import BRIGHTEST, DARKEST, ROUNDS, Evidence, Tracks, robust, without_points_and_frames
+from fieldfuse.camera import Array
+from fieldfuse.effects import exposure, vignetting
+from fieldfuse.effects.evidence import BRIGHTEST, DARKEST, ROUNDS, Evidence, Tracks, robust, without_points_and_frames
 
 EXPOSURE, VIGNETTING = "exposure", "vignetting"
 HELD_OUT = 4  # every so manieth point is kept out of the fits

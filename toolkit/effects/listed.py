@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.effects import (
+from fieldfuse.effects import (
     background,
     compression,
     depth_noise,
@@ -26,7 +26,7 @@ from toolkit.effects import (
     sensor_noise,
     vignetting,
 )
-from toolkit.errors import InputError
+from fieldfuse.errors import InputError
 
 MODULES: dict[str, ModuleType] = {
     "distortion": distortion,

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from toolkit.camera import Array
-from toolkit.effects.evidence import ROUNDS, Evidence, Tracks, robust, without_points_and_frames
+from fieldfuse.camera import Array
+from fieldfuse.effects.evidence import ROUNDS, Evidence, Tracks, robust, without_points_and_frames
 
 Tensor = torch.Tensor
 

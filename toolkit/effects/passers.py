@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 TURN = 25.0  # degrees by which ways deviate from the right angle
 HEIGHTS = (1.55, 1.9)  # metres

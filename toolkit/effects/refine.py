@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.types import Capture
-from toolkit.effects import geometry
-from toolkit.effects.adjust import LENS, POSES, Belief, Problem, adjust, predict, resect, residuals, rotation, vectors
-from toolkit.effects.sensed import Agreed, agreeing
-from toolkit.effects.sightings import Sightings
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Capture
+from fieldfuse.effects import geometry
+from fieldfuse.effects.adjust import LENS, POSES, Belief, Problem, adjust, predict, resect, residuals, rotation, vectors
+from fieldfuse.effects.sensed import Agreed, agreeing
+from fieldfuse.effects.sightings import Sightings
+from fieldfuse.progress import SILENT, Progress
 
 STEPS, FREE_STEPS = 60, 30  # of the fit, and of one that only measures how much noise is left
 FEWEST = 12  # observations without which a frame is not placed by its own points

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.types import Capture
-from toolkit.effects.adjust import Problem, predict, residuals, uncertainty
-from toolkit.effects.depth_maps import DepthMaps, read
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Capture
+from fieldfuse.effects.adjust import Problem, predict, residuals, uncertainty
+from fieldfuse.effects.depth_maps import DepthMaps, read
+from fieldfuse.progress import SILENT, Progress
 
 DEPTH_OFFSET = "depth_offset"
 MARGIN = 0.12  # least relative fall of what held-out points are off …

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, project
-from toolkit.effects.evidence import ROUNDS, Evidence, robust
+from fieldfuse.camera import Array, Intrinsics, project
+from fieldfuse.effects.evidence import ROUNDS, Evidence, robust
 
 
 @dataclass(frozen=True)

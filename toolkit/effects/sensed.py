@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from toolkit.camera import Array, invert
-from toolkit.capture.types import Capture
-from toolkit.effects.adjust import LENS, Belief, Problem, adjust, predict, residuals, scatter
-from toolkit.effects.correct import Corrections, correctable
-from toolkit.effects.depth_maps import DepthMaps, read
-from toolkit.effects.registration import FEWEST, Observations, deep_frames, quickly, sure
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Array, invert
+from fieldfuse.capture.types import Capture
+from fieldfuse.effects.adjust import LENS, Belief, Problem, adjust, predict, residuals, scatter
+from fieldfuse.effects.correct import Corrections, correctable
+from fieldfuse.effects.depth_maps import DepthMaps, read
+from fieldfuse.effects.registration import FEWEST, Observations, deep_frames, quickly, sure
+from fieldfuse.progress import SILENT, Progress
 
 MAPS = 300  # depth maps that take part
 ROUNDS = 3  # of which the best that passes is taken

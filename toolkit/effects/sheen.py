@@ -17,13 +17,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.effects.adjust import Problem
-from toolkit.effects.beyond import carried, rays_of
-from toolkit.effects.evidence import Evidence, HeldOut
-from toolkit.effects.light import EXPOSURE, VIGNETTING, Light
-from toolkit.effects.sightings import Sightings
-from toolkit.tone import LINEAR, share, square_radius
+from fieldfuse.camera import Array
+from fieldfuse.effects.adjust import Problem
+from fieldfuse.effects.beyond import carried, rays_of
+from fieldfuse.effects.evidence import Evidence, HeldOut
+from fieldfuse.effects.light import EXPOSURE, VIGNETTING, Light
+from fieldfuse.effects.sightings import Sightings
+from fieldfuse.tone import LINEAR, share, square_radius
 
 THRESHOLD = 0.0014  # share of the patches
 LEAST = 3  # shiny ones

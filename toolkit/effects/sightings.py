@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.images import load_image, load_mask, turns_by_exif
-from toolkit.capture.types import Capture, Frame
-from toolkit.effects.evidence import Tracks
-from toolkit.poses.overlap import best_neighbours, guessed_depth, overlap, parallax
-from toolkit.poses.points import epipolar_distance, mutual_matches, tracks, undistorted
-from toolkit.progress import SILENT, Progress
-from toolkit.tone import LINEAR
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.images import load_image, load_mask, turns_by_exif
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.effects.evidence import Tracks
+from fieldfuse.poses.overlap import best_neighbours, guessed_depth, overlap, parallax
+from fieldfuse.poses.points import epipolar_distance, mutual_matches, tracks, undistorted
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.tone import LINEAR
 
 LONG_SIDE = 480  # pixels that features are looked for on
 FEATURES = 700  # a picture

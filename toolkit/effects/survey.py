@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.types import Capture
-from toolkit.effects import background, beyond, geometry, light, motion_blur, sheen, view_dependence
-from toolkit.effects.adjust import LENS, POSES, ROWS, Problem, predict
-from toolkit.effects.evidence import Evidence
-from toolkit.effects.light import EXPOSURE, VIGNETTING
-from toolkit.effects.paid import POINTS, Paid
-from toolkit.effects.sightings import QUICK, Look, Sightings, choose, gather
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Capture
+from fieldfuse.effects import background, beyond, geometry, light, motion_blur, sheen, view_dependence
+from fieldfuse.effects.adjust import LENS, POSES, ROWS, Problem, predict
+from fieldfuse.effects.evidence import Evidence
+from fieldfuse.effects.light import EXPOSURE, VIGNETTING
+from fieldfuse.effects.paid import POINTS, Paid
+from fieldfuse.effects.sightings import QUICK, Look, Sightings, choose, gather
+from fieldfuse.progress import SILENT, Progress
 
 PIXELS = "working pixels"
 BLUR, VIEWS, FAR = "motion_blur", "view_dependence", "background"

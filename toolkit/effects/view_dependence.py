@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.effects.evidence import Evidence
+from fieldfuse.camera import Array
+from fieldfuse.effects.evidence import Evidence
 
 THRESHOLD = 0.11  # share of the variance
 LIMIT = 0.3  # stops: more is a wrong match, or the mirror image of a lamp that says enough at this value

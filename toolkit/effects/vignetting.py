@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from toolkit.camera import Intrinsics
-from toolkit.effects.evidence import ROUNDS, Evidence, Tracks, robust, without_points_and_frames
+from fieldfuse.camera import Intrinsics
+from fieldfuse.effects.evidence import ROUNDS, Evidence, Tracks, robust, without_points_and_frames
 
 Tensor = torch.Tensor
 

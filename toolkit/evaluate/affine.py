@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.evaluate.images import psnr
-from toolkit.evaluate.pixels import as_float
+from fieldfuse.camera import Array
+from fieldfuse.evaluate.images import psnr
+from fieldfuse.evaluate.pixels import as_float
 
 FEWEST = 64  # pixels of the left half
 

@@ -8,11 +8,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.types import Views
-from toolkit.evaluate.images import psnr
-from toolkit.evaluate.pixels import as_float
-from toolkit.evaluate.score import entry, mean
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Views
+from fieldfuse.evaluate.images import psnr
+from fieldfuse.evaluate.pixels import as_float
+from fieldfuse.evaluate.score import entry, mean
 
 SCORES = ("psnr", "psnr_uncorrected")
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from toolkit.config import PosesSettings
-from toolkit.errors import FieldfuseError
-from toolkit.files import fingerprint, read_json, write_json
-from toolkit.poses.job import MAX_EXHAUSTIVE
+from fieldfuse.config import PosesSettings
+from fieldfuse.errors import FieldfuseError
+from fieldfuse.files import fingerprint, read_json, write_json
+from fieldfuse.poses.job import MAX_EXHAUSTIVE
 
 SIZES = (160, 240, 320, 400, 480, 640, 800, 960)  # long sides that pictures are brought to
 RAYS_A_PIXEL = 0.6  # rays that a fit should have for each training pixel: with fewer, smaller pictures end better in the same time
@@ -311,7 +311,7 @@ def cache_file() -> Path:
 
 def signature(threads: int, device: str) -> str:
     """What times depend on: processor, cores, threads, libraries, and how work is counted."""
-    from toolkit.evaluate.speed import machine
+    from fieldfuse.evaluate.speed import machine
 
     about = machine(threads)
     return fingerprint([about[key] for key in ("machine", "system", "cores", "threads", "python", "versions")], device, COUNTED)

@@ -1,4 +1,4 @@
-"""The quick self-test behind `toolkit.evaluate.budget`: a few seconds that tell what a unit of each kind of work takes here."""
+"""The quick self-test behind `fieldfuse.evaluate.budget`: a few seconds that tell what a unit of each kind of work takes here."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import torch
 
-from toolkit.config import Settings
-from toolkit.evaluate.budget import KINDS, Speed
-from toolkit.evaluate.speed_state import around, lens, sphere_field, sphere_pixels
+from fieldfuse.config import Settings
+from fieldfuse.evaluate.budget import KINDS, Speed
+from fieldfuse.evaluate.speed_state import around, lens, sphere_field, sphere_pixels
 
 SECONDS = 0.4  # for each kind, after a first call that does not count
 SIDE = 128  # voxels and pixels a side of what is rendered and fitted
@@ -21,10 +21,10 @@ RAYS = 1024
 def self_test(settings: Settings) -> Speed:
     """Units of every kind in seconds: a megapixel decoded, a picture's features found and matched, a ray rendered, a ray fitted, a
     megapixel scored."""
-    from toolkit.progress import SILENT
-    from toolkit.stereo import quick
-    from toolkit.training import depth_start
-    from toolkit.training.engine import warm_up
+    from fieldfuse.progress import SILENT
+    from fieldfuse.stereo import quick
+    from fieldfuse.training import depth_start
+    from fieldfuse.training.engine import warm_up
 
     warm_up(settings, SILENT)
     quick.warm_up()
@@ -75,7 +75,7 @@ def _decode() -> tuple[Callable[[], object], float]:
 
 
 def _features() -> tuple[Callable[[], object], float]:
-    from toolkit.poses.points import FEATURES, mutual_matches
+    from fieldfuse.poses.points import FEATURES, mutual_matches
 
     grey = cv2.cvtColor(texture(480, 640), cv2.COLOR_RGB2GRAY)
     finder = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.02)
@@ -90,7 +90,7 @@ def _features() -> tuple[Callable[[], object], float]:
 
 
 def _ray() -> tuple[Callable[[], object], float]:
-    from toolkit.render.image import make_renderer, render_view
+    from fieldfuse.render.image import make_renderer, render_view
 
     field = sphere_field(SIDE)
     view, pose, camera = make_renderer(field), around()[0], lens(SIDE, SIDE)
@@ -98,15 +98,15 @@ def _ray() -> tuple[Callable[[], object], float]:
 
 
 def _fit() -> tuple[Callable[[], object], float]:
-    from toolkit.training.fused import FusedOptimiser
-    from toolkit.training.step import Rates
+    from fieldfuse.training.fused import FusedOptimiser
+    from fieldfuse.training.step import Rates
 
     engine, rates = FusedOptimiser(sphere_field(SIDE), sphere_pixels(), 0), Rates(0.01, 0.01, 0.001, 0.01, 0.01)
     return lambda: engine.step(RAYS, rates), float(RAYS)
 
 
 def _score() -> tuple[Callable[[], object], float]:
-    from toolkit.evaluate.images import lpips, psnr, ssim
+    from fieldfuse.evaluate.images import lpips, psnr, ssim
 
     generator = np.random.default_rng(0)
     first, second = (generator.integers(0, 256, (120, 160, 3), dtype=np.uint8) for _ in range(2))

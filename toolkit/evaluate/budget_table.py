@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from toolkit.evaluate import words
-from toolkit.evaluate.budget import AGREES
-from toolkit.evaluate.page import short_name
+from fieldfuse.evaluate import words
+from fieldfuse.evaluate.budget import AGREES
+from fieldfuse.evaluate.page import short_name
 
 HEAD = ("capture", "asked for", "predicted", "real", "off by", "effects", "fit", "chosen", "PSNR")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from toolkit.evaluate import words
-from toolkit.evaluate.suites.tables import machine_line, row_line
+from fieldfuse.evaluate import words
+from fieldfuse.evaluate.suites.tables import machine_line, row_line
 
 LONGEST = 250  # characters of a sentence in the table; whole in captures.json
 MASKED = " (within its masks)"

@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from toolkit import __version__
-from toolkit.errors import InputError
-from toolkit.evaluate import words
-from toolkit.evaluate.geometry import VOXELS
-from toolkit.evaluate.report import CAPTURE, POSES, STAGE, plain
+from fieldfuse import __version__
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate import words
+from fieldfuse.evaluate.geometry import VOXELS
+from fieldfuse.evaluate.report import CAPTURE, POSES, STAGE, plain
 
 # Always there in a method, null when not known.
 METHOD = ("key", "title", "note", "reference", "stages", "seconds", "mesh_seconds", "peak_memory_mb", "disk_bytes", "memory_bytes")

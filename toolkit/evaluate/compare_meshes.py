@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.evaluate.geometry import distances
-from toolkit.evaluate.pictures import ERROR_COLOURS, coloured
-from toolkit.render.paths import look_at
-from toolkit.tsdf.mesh import Mesh
-from toolkit.tsdf.view import SurfaceCaster
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.evaluate.geometry import distances
+from fieldfuse.evaluate.pictures import ERROR_COLOURS, coloured
+from fieldfuse.render.paths import look_at
+from fieldfuse.tsdf.mesh import Mesh
+from fieldfuse.tsdf.view import SurfaceCaster
 
 ERROR_VOXELS = 4.0  # distance from the truth that gets the brightest colour
 NOTHING = (226, 230, 235)  # where no surface is

@@ -8,15 +8,15 @@ from typing import Any
 
 from markupsafe import Markup
 
-from toolkit.camera import Array
-from toolkit.evaluate import words
-from toolkit.evaluate.compare import compare_data, matching_line, table
-from toolkit.evaluate.compare_meshes import ERROR_VOXELS, MeshPictures
-from toolkit.evaluate.page import data_uri, flat, short_name, subtitle
-from toolkit.evaluate.pictures import DEPTH_COLOURS, ERROR_COLOURS, ERROR_TOP, Pictures, ViewPictures, colour_bar
-from toolkit.evaluate.plots import stage_bars
-from toolkit.evaluate.templates import template
-from toolkit.files import atomic_path, write_json
+from fieldfuse.camera import Array
+from fieldfuse.evaluate import words
+from fieldfuse.evaluate.compare import compare_data, matching_line, table
+from fieldfuse.evaluate.compare_meshes import ERROR_VOXELS, MeshPictures
+from fieldfuse.evaluate.page import data_uri, flat, short_name, subtitle
+from fieldfuse.evaluate.pictures import DEPTH_COLOURS, ERROR_COLOURS, ERROR_TOP, Pictures, ViewPictures, colour_bar
+from fieldfuse.evaluate.plots import stage_bars
+from fieldfuse.evaluate.templates import template
+from fieldfuse.files import atomic_path, write_json
 
 JSON = "compare.json"
 HTML = "compare.html"

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.types import Views
-from toolkit.evaluate.depth import has_depth
-from toolkit.evaluate.images import lpips, psnr, ssim
-from toolkit.evaluate.score import RenderedView, as_photo, entry, mean, score_views
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Views
+from fieldfuse.evaluate.depth import has_depth
+from fieldfuse.evaluate.images import lpips, psnr, ssim
+from fieldfuse.evaluate.score import RenderedView, as_photo, entry, mean, score_views
 
 WITHIN = (0.01, 0.05)  # thresholds of the depth's accuracy, in shares of the scale
 

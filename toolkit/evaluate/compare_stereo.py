@@ -8,10 +8,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.types import Views
-from toolkit.evaluate.depth import has_depth
-from toolkit.stereo.match import StereoDepth
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Views
+from fieldfuse.evaluate.depth import has_depth
+from fieldfuse.stereo.match import StereoDepth
 
 WINDOW = 7  # pixels a side
 TEXTURE = 4.0  # grey levels: standard deviation in a window from which on a pixel counts as textured

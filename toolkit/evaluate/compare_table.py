@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from toolkit.evaluate.compare import compare_data, matching_line, table
-from toolkit.evaluate.suites.tables import machine_line
+from fieldfuse.evaluate.compare import compare_data, matching_line, table
+from fieldfuse.evaluate.suites.tables import machine_line
 
 
 def compare_table(data: dict[str, Any], name: str) -> str:

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from toolkit.evaluate.compare import compare_data, matching_line, table
+from fieldfuse.evaluate.compare import compare_data, matching_line, table
 
 LABELS = 60  # columns for the measures' names
 WIDTH = 22  # for each method

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from toolkit.camera import Array, Intrinsics, resample_maps
-from toolkit.capture.types import Capture, Views
-from toolkit.errors import InputError, first_line
-from toolkit.files import inside, read_json
+from fieldfuse.camera import Array, Intrinsics, resample_maps
+from fieldfuse.capture.types import Capture, Views
+from fieldfuse.errors import InputError, first_line
+from fieldfuse.files import inside, read_json
 
 FOLDER = "ground_truth"
 MESH = "mesh.ply"

@@ -8,8 +8,8 @@ import numpy as np
 import open3d as o3d
 import open3d.core as o3c
 
-from toolkit.camera import Array, Intrinsics, invert
-from toolkit.tsdf.mesh import Mesh, ray_scene
+from fieldfuse.camera import Array, Intrinsics, invert
+from fieldfuse.tsdf.mesh import Mesh, ray_scene
 
 AT_ONCE = 1 << 19  # rays
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.errors import InputError
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError
 
 KEYS = ("abs_err", "abs_rel", "rmse", "median_rel", "delta_1", "delta_2", "delta_3", "within_5_percent", "coverage")
 NEAREST, FARTHEST = 1e-12, 1e30

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from toolkit.capture import open_capture
-from toolkit.effects.survey import VIEWS, survey
-from toolkit.evaluate.effects_plan import EFFECTS, STRENGTHS, Planned, film
-from toolkit.progress import SILENT, Progress
+from fieldfuse.capture import open_capture
+from fieldfuse.effects.survey import VIEWS, survey
+from fieldfuse.evaluate.effects_plan import EFFECTS, STRENGTHS, Planned, film
+from fieldfuse.progress import SILENT, Progress
 
 FOUND_AS = {VIEWS: "highlights"}  # the simulator's name of what detection calls by its appearance
 

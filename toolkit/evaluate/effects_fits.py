@@ -13,25 +13,25 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture import open_capture
-from toolkit.capture.prepare import held_out, prepare_views
-from toolkit.capture.types import Capture, Views
-from toolkit.config import Settings, load_settings
-from toolkit.effects.correct import Corrections
-from toolkit.effects.decide import asleep, choose_field, decide
-from toolkit.effects.survey import Survey
-from toolkit.evaluate.affine import right_half_psnr
-from toolkit.evaluate.effects_plan import Planned, film
-from toolkit.evaluate.effects_truth import canonical_capture, known_light
-from toolkit.evaluate.images import psnr
-from toolkit.evaluate.score import RenderedView, as_photo, entry, mean
-from toolkit.files import read_json, write_json
-from toolkit.poses.scene import describe_scene
-from toolkit.progress import SILENT, Progress
-from toolkit.render.image import make_renderer, render_view
-from toolkit.tone import Tone
-from toolkit.training.engine import warm_up
+from fieldfuse.camera import Array
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.prepare import held_out, prepare_views
+from fieldfuse.capture.types import Capture, Views
+from fieldfuse.config import Settings, load_settings
+from fieldfuse.effects.correct import Corrections
+from fieldfuse.effects.decide import asleep, choose_field, decide
+from fieldfuse.effects.survey import Survey
+from fieldfuse.evaluate.affine import right_half_psnr
+from fieldfuse.evaluate.effects_plan import Planned, film
+from fieldfuse.evaluate.effects_truth import canonical_capture, known_light
+from fieldfuse.evaluate.images import psnr
+from fieldfuse.evaluate.score import RenderedView, as_photo, entry, mean
+from fieldfuse.files import read_json, write_json
+from fieldfuse.poses.scene import describe_scene
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.render.image import make_renderer, render_view
+from fieldfuse.tone import Tone
+from fieldfuse.training.engine import warm_up
 
 FITS = "fits"
 
@@ -60,7 +60,7 @@ def fit_with(
         InputError, PoseError: the capture cannot be used.
         Interrupted: stopped by the user.
     """
-    from toolkit.training.fit import fit_field
+    from fieldfuse.training.fit import fit_field
 
     settings = replace(settings, field=replace(settings.field))
     warm_up(settings, progress)

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, project
-from toolkit.effects.listed import parse
-from toolkit.errors import InputError
-from toolkit.files import read_json, write_json
-from toolkit.progress import SILENT, Progress
-from toolkit.simulate.curve import rotations
-from toolkit.simulate.film import Shot
-from toolkit.simulate.settings import SceneFile, scene_file
-from toolkit.simulate.simulate import prepare, simulate
+from fieldfuse.camera import Array, Intrinsics, project
+from fieldfuse.effects.listed import parse
+from fieldfuse.errors import InputError
+from fieldfuse.files import read_json, write_json
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.simulate.curve import rotations
+from fieldfuse.simulate.film import Shot
+from fieldfuse.simulate.settings import SceneFile, scene_file
+from fieldfuse.simulate.simulate import prepare, simulate
 
 WIDTH, HEIGHT, FRAMES, FPS, SIDE = 256, 192, 16, 5.0, 1
 STRENGTHS = ("weak", "medium", "strong")

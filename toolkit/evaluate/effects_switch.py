@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.capture import open_capture
-from toolkit.capture.prepare import held_out
-from toolkit.config import load_settings
-from toolkit.effects.survey import Survey, survey
-from toolkit.errors import InputError
-from toolkit.evaluate.effects_fits import FIXED, fit_with
-from toolkit.files import read_json, write_json
-from toolkit.progress import SILENT, Progress
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.prepare import held_out
+from fieldfuse.config import load_settings
+from fieldfuse.effects.survey import Survey, survey
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.effects_fits import FIXED, fit_with
+from fieldfuse.files import read_json, write_json
+from fieldfuse.progress import SILENT, Progress
 
 ALONE = ("exposure", "vignetting", "distortion", "poses", "motion_blur")
 SWITCHES: dict[str, list[str]] = {

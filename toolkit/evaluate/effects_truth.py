@@ -13,15 +13,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.types import Capture
-from toolkit.effects.correct import Corrections
-from toolkit.effects.listed import parse
-from toolkit.files import atomic_path, read_json
-from toolkit.simulate.capture_files import TRUTH
-from toolkit.simulate.settings import scene_file
-from toolkit.simulate.simulate import prepare
-from toolkit.tone import Tone
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Capture
+from fieldfuse.effects.correct import Corrections
+from fieldfuse.effects.listed import parse
+from fieldfuse.files import atomic_path, read_json
+from fieldfuse.simulate.capture_files import TRUTH
+from fieldfuse.simulate.settings import scene_file
+from fieldfuse.simulate.simulate import prepare
+from fieldfuse.tone import Tone
 
 LIGHT = ("motion_blur", "vignetting", "exposure", "sensor_noise", "compression")  # what a canonical picture is free of
 CANONICAL = f"{TRUTH}/canonical"

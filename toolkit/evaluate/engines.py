@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.config import Settings
-from toolkit.evaluate.few_views import Ground, measured
-from toolkit.progress import SILENT, Progress
-from toolkit.render.field import Field
-from toolkit.render.image import make_renderer, render_view
-from toolkit.training.engine import chosen_engine, fit_device, make_engine
-from toolkit.training.guided import fit_guided
-from toolkit.training.rays import PixelPool
-from toolkit.training.step import Rates
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.config import Settings
+from fieldfuse.evaluate.few_views import Ground, measured
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.render.field import Field
+from fieldfuse.render.image import make_renderer, render_view
+from fieldfuse.training.engine import chosen_engine, fit_device, make_engine
+from fieldfuse.training.guided import fit_guided
+from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.step import Rates
 
 PICTURE = (640, 480)
 REPETITIONS, ENOUGH = 9, 3.0  # of a picture, at most, and seconds after which fewer will do

@@ -34,7 +34,7 @@ def failures(report: dict[str, Any]) -> list[str]:
     """Sentences for the report's warnings, the gravest first; none for a run that went well.
 
     Args:
-        report: as `toolkit.evaluate.report.report_data` answers; parts that are not known may be missing or None.
+        report: as `fieldfuse.evaluate.report.report_data` answers; parts that are not known may be missing or None.
     """
     field = (report.get("evaluation") or {}).get("field") or {}
     nearest = (report.get("evaluation") or {}).get("nearest_image") or {}

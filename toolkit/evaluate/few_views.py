@@ -15,20 +15,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from toolkit.capture.types import Views
-from toolkit.config import Settings
-from toolkit.evaluate.baseline import nearest_image_scores
-from toolkit.evaluate.score import score_views
-from toolkit.keyframes import KeyFrames, select_keyframes
-from toolkit.networks.gru import RunningMean
-from toolkit.networks.model import NerfusionModel
-from toolkit.poses.scene import Scene
-from toolkit.progress import SILENT, Progress
-from toolkit.render.field import Field
-from toolkit.render.image import make_renderer, render_view
+from fieldfuse.capture.types import Views
+from fieldfuse.config import Settings
+from fieldfuse.evaluate.baseline import nearest_image_scores
+from fieldfuse.evaluate.score import score_views
+from fieldfuse.keyframes import KeyFrames, select_keyframes
+from fieldfuse.networks.gru import RunningMean
+from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.poses.scene import Scene
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.render.field import Field
+from fieldfuse.render.image import make_renderer, render_view
 
 if TYPE_CHECKING:
-    from toolkit.training.from_network import Inference, NetworkOptions
+    from fieldfuse.training.from_network import Inference, NetworkOptions
 
 STARTS = ("direct", "network", "classical")
 SHOWN = ("psnr", "ssim", "lpips", "depth_abs_err")
@@ -79,7 +79,7 @@ def measured(field: Field, ground: Ground) -> dict[str, Any]:
 
 def infer(model: NerfusionModel, ground: Ground, options: NetworkOptions, progress: Progress = SILENT) -> tuple[Inference, dict[str, Any]]:
     """Direct inference with all key frames fused, and its seconds (processor time) and number of key frames."""
-    from toolkit.training.from_network import Inference
+    from fieldfuse.training.from_network import Inference
 
     began = time.process_time()
     inference = Inference(model, ground.views, ground.scene, ground.keys(), ground.settings.field.background, options)
@@ -110,9 +110,9 @@ def few_views_rows(
         starts: what is measured, a part of `STARTS`.
         done: (views, start, budget) of rows that are there already.
     """
-    from toolkit.training.from_network import NetworkOptions
-    from toolkit.training.guided import fit_guided
-    from toolkit.training.network_start import network_start
+    from fieldfuse.training.from_network import NetworkOptions
+    from fieldfuse.training.guided import fit_guided
+    from fieldfuse.training.network_start import network_start
 
     views, scene, settings, count = ground.views, ground.scene, ground.settings, ground.training
     budgets, starts = list(budgets), list(starts)
@@ -140,7 +140,7 @@ def few_views_rows(
 
 def ablation_rows(ground: Ground, model: NerfusionModel, progress: Progress = SILENT) -> Iterable[dict[str, Any]]:
     """Direct inference with parts of the trained networks switched off, one at a time. Nothing is trained again without them."""
-    from toolkit.training.from_network import NetworkOptions
+    from fieldfuse.training.from_network import NetworkOptions
 
     options = NetworkOptions.of(ground.settings.network)
     for name in ABLATIONS:

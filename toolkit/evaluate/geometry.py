@@ -10,11 +10,11 @@ import numpy as np
 import open3d.core as o3c
 import trimesh
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.errors import InputError
-from toolkit.evaluate.coverage import seen_points
-from toolkit.tone import encode, shares
-from toolkit.tsdf.mesh import Mesh, ray_scene
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.coverage import seen_points
+from fieldfuse.tone import encode, shares
+from fieldfuse.tsdf.mesh import Mesh, ray_scene
 
 SAMPLES = 200_000  # on each surface: F-scores of the same meshes then repeat within some thousandths
 VOXELS = (1, 2, 4)  # distances at which F-scores are given, in voxels

@@ -9,9 +9,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.evaluate.perceptual import lpips
-from toolkit.evaluate.pixels import checked_mask, pair
+from fieldfuse.camera import Array
+from fieldfuse.evaluate.perceptual import lpips
+from fieldfuse.evaluate.pixels import checked_mask, pair
 
 __all__ = ["PSNR_CAP", "lpips", "psnr", "ssim"]
 

@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.types import Views
-from toolkit.errors import InputError
-from toolkit.fusion import FusionOptions, fuse_views, fusion_lattice
-from toolkit.key_sweeps import beside
-from toolkit.keyframes import KeyFrames, select_keyframes
-from toolkit.networks.lattice import Lattice
-from toolkit.networks.model import NerfusionModel
-from toolkit.networks.weights import SHIPPED, load_model
-from toolkit.progress import SILENT, Progress
-from toolkit.simulate.materials import texture_bank
-from toolkit.simulate.procedural import random_scene
-from toolkit.simulate.scene import Scene
-from toolkit.training.nerfusion.paths import hand_held
-from toolkit.volume.space import Space
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import InputError
+from fieldfuse.fusion import FusionOptions, fuse_views, fusion_lattice
+from fieldfuse.key_sweeps import beside
+from fieldfuse.keyframes import KeyFrames, select_keyframes
+from fieldfuse.networks.lattice import Lattice
+from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.networks.weights import SHIPPED, load_model
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.simulate.materials import texture_bank
+from fieldfuse.simulate.procedural import random_scene
+from fieldfuse.simulate.scene import Scene
+from fieldfuse.training.nerfusion.paths import hand_held
+from fieldfuse.volume.space import Space
 
 EVERY = 2  # frames to a key frame: a key frame's neighbours are others' as well, as in a video
 WALKS = 20  # tries to find a clear one

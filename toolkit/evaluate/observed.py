@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.types import Views
-from toolkit.evaluate.coverage import in_picture
-from toolkit.evaluate.depth import has_depth
-from toolkit.evaluate.images import psnr
-from toolkit.evaluate.score import entry, mean
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.evaluate.coverage import in_picture
+from fieldfuse.evaluate.depth import has_depth
+from fieldfuse.evaluate.images import psnr
+from fieldfuse.evaluate.score import entry, mean
 
 MOST_VIEWS = 8  # training views that are rendered
 MOST_PIXELS = 4096  # of each: its mean error is known to a few per cent, in a tenth of a second

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from markupsafe import Markup
 
-from toolkit.camera import Array
-from toolkit.errors import OutputError
-from toolkit.evaluate import words
-from toolkit.evaluate.pictures import DEPTH_COLOURS, ERROR_COLOURS, ERROR_TOP, Pictures, colour_bar
-from toolkit.evaluate.plots import psnr_over_time, stage_bars
-from toolkit.evaluate.templates import template
+from fieldfuse.camera import Array
+from fieldfuse.errors import OutputError
+from fieldfuse.evaluate import words
+from fieldfuse.evaluate.pictures import DEPTH_COLOURS, ERROR_COLOURS, ERROR_TOP, Pictures, colour_bar
+from fieldfuse.evaluate.plots import psnr_over_time, stage_bars
+from fieldfuse.evaluate.templates import template
 
 TEMPLATE = "report.html.j2"
 LONGEST = 480  # pixels of an embedded tile's long side: sharp at the size it is shown, small in bytes

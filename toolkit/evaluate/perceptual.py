@@ -17,8 +17,8 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from toolkit.camera import Array
-from toolkit.evaluate.pixels import checked_mask, pair
+from fieldfuse.camera import Array
+from fieldfuse.evaluate.pixels import checked_mask, pair
 
 log = logging.getLogger(__name__)
 

@@ -13,14 +13,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.types import Views
-from toolkit.errors import OutputError
-from toolkit.evaluate.depth import has_depth
-from toolkit.evaluate.pixels import as_float
-from toolkit.evaluate.score import RenderedView, as_photo, entry
-from toolkit.files import atomic_path
-from toolkit.stereo.left_out import LeftOut
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import OutputError
+from fieldfuse.evaluate.depth import has_depth
+from fieldfuse.evaluate.pixels import as_float
+from fieldfuse.evaluate.score import RenderedView, as_photo, entry
+from fieldfuse.files import atomic_path
+from fieldfuse.stereo.left_out import LeftOut
 
 ERROR_TOP = 0.2  # mean absolute difference of the three channels, in [0, 1], that gets the brightest colour
 ERROR_COLOURS = cv2.COLORMAP_INFERNO

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from toolkit.evaluate.words import duration, memory
+from fieldfuse.evaluate.words import duration, memory
 
 # Colours that matplotlib draws with → what stands in the SVG.
 INK, QUIET, LINE, ACCENT, SECOND, PALE = "#010101", "#020202", "#030303", "#040404", "#050505", "#060606"

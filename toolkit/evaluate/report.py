@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from toolkit import __version__
-from toolkit.errors import InputError
-from toolkit.evaluate.pictures import Pictures
-from toolkit.evaluate.words import SCORE
-from toolkit.files import atomic_path, write_json
+from fieldfuse import __version__
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.pictures import Pictures
+from fieldfuse.evaluate.words import SCORE
+from fieldfuse.files import atomic_path, write_json
 
 JSON = "report.json"
 HTML = "report.html"
@@ -147,7 +147,7 @@ def write_report(folder: Path | str, data: dict[str, Any], pictures: Pictures | 
         InputError: a part has another form.
         OutputError: the folder is not writable or the disk is full.
     """
-    from toolkit.evaluate.page import render_page  # the template engine and the plots are needed only here
+    from fieldfuse.evaluate.page import render_page  # the template engine and the plots are needed only here
 
     folder = Path(folder)
     whole = report_data(data, folder)

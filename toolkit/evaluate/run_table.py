@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
-from toolkit.evaluate import words
-from toolkit.evaluate.page import short_name
+from fieldfuse.evaluate import words
+from fieldfuse.evaluate.page import short_name
 
 HEAD = ("capture", "views", "pixels", "how", "PSNR", "SSIM", "LPIPS", "nearest picture", "field made in", "peak memory", "whole run")
 PLAIN = ("images", "frames", "photos")

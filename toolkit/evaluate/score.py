@@ -7,14 +7,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.types import Views
-from toolkit.errors import InputError
-from toolkit.evaluate.affine import right_half_psnr
-from toolkit.evaluate.depth import KEYS as DEPTH_KEYS
-from toolkit.evaluate.depth import depth_metrics
-from toolkit.evaluate.images import lpips, psnr, ssim
-from toolkit.evaluate.pixels import as_float
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.affine import right_half_psnr
+from fieldfuse.evaluate.depth import KEYS as DEPTH_KEYS
+from fieldfuse.evaluate.depth import depth_metrics
+from fieldfuse.evaluate.images import lpips, psnr, ssim
+from fieldfuse.evaluate.pixels import as_float
 
 
 class RenderedView(Protocol):

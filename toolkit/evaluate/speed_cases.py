@@ -9,15 +9,15 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from toolkit.evaluate.speed import Case, compare, pinned
-from toolkit.evaluate.speed_state import around, lens, sphere_field, sphere_pixels
-from toolkit.render.bake import bake
-from toolkit.render.bake_image import BakedRenderer
-from toolkit.render.compiled import CompiledRenderer
-from toolkit.render.rays import render_rays
-from toolkit.training.engine import TorchEngine
-from toolkit.training.fused import FusedOptimiser
-from toolkit.training.step import Rates
+from fieldfuse.evaluate.speed import Case, compare, pinned
+from fieldfuse.evaluate.speed_state import around, lens, sphere_field, sphere_pixels
+from fieldfuse.render.bake import bake
+from fieldfuse.render.bake_image import BakedRenderer
+from fieldfuse.render.compiled import CompiledRenderer
+from fieldfuse.render.rays import render_rays
+from fieldfuse.training.engine import TorchEngine
+from fieldfuse.training.fused import FusedOptimiser
+from fieldfuse.training.step import Rates
 
 SIZES = (64, 128, 256)
 BATCH = 2048
@@ -54,7 +54,7 @@ def step_counts(engine: FusedOptimiser) -> dict[str, float]:
 def render_cases(sizes: tuple[int, ...] = SIZES, side: int = 128, repetitions: int = 5) -> Iterator[Case]:
     """Rays of a picture: compiled against torch, and baked against compiled, one thread."""
     camera, pose = lens(side, side), around()[1]
-    from toolkit.camera import pixel_grid, rays
+    from fieldfuse.camera import pixel_grid, rays
 
     with pinned(1):
         for size in sizes:
@@ -96,7 +96,7 @@ def thread_cases(threads: int, size: int = 128, repetitions: int = 5) -> Iterato
 
 def order_case(size: int = 256, repetitions: int = 5) -> Case:
     """The same rays in the order of a picture against a random order: what memory that is not in the cache costs."""
-    from toolkit.camera import pixel_grid, rays
+    from fieldfuse.camera import pixel_grid, rays
 
     renderer = CompiledRenderer(sphere_field(size), 1)
     origins, directions, _ = rays(lens(160, 160), around()[1], pixel_grid(160, 160))
@@ -108,7 +108,7 @@ def order_case(size: int = 256, repetitions: int = 5) -> Case:
 
 def lookup_case(size: int = 128, points: int = 100_000, repetitions: int = 5) -> Case:
     """Trilinear lookup through the blocks against `grid_sample` on a dense lattice of the same size."""
-    from toolkit.volume.lookup import corners, gather
+    from fieldfuse.volume.lookup import corners, gather
 
     field = sphere_field(size)
     generator = torch.Generator().manual_seed(0)
@@ -132,7 +132,7 @@ def lookup_case(size: int = 128, points: int = 100_000, repetitions: int = 5) ->
 
 def convolution_case(size: int = 64, channels: int = 16, repetitions: int = 5) -> Case:
     """Block-sparse 3×3×3 convolution against a dense one over the same cube."""
-    from toolkit.networks.block_conv import block_conv3d
+    from fieldfuse.networks.block_conv import block_conv3d
 
     field = sphere_field(size)
     topology, generator = field.topology, torch.Generator().manual_seed(0)
@@ -149,11 +149,11 @@ def convolution_case(size: int = 64, channels: int = 16, repetitions: int = 5) -
 
 def key_frame_case(side: int = 48, size: int = 32, repetitions: int = 3) -> Case:
     """Fusing a key frame on two levels against looking everywhere at the finer one. Untrained weights: the work is the same."""
-    from toolkit.fusion import Fusion, FusionOptions
-    from toolkit.networks.cameras import Cameras
-    from toolkit.networks.lattice import Lattice
-    from toolkit.networks.model import NerfusionModel
-    from toolkit.volume.space import Space
+    from fieldfuse.fusion import Fusion, FusionOptions
+    from fieldfuse.networks.cameras import Cameras
+    from fieldfuse.networks.lattice import Lattice
+    from fieldfuse.networks.model import NerfusionModel
+    from fieldfuse.volume.space import Space
 
     state = torch.get_rng_state()
     torch.manual_seed(0)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from toolkit.evaluate.speed import Case, compare, pinned
-from toolkit.evaluate.speed_cases import BATCH, RATES
-from toolkit.evaluate.speed_state import sphere_field, sphere_pixels
-from toolkit.training.fused import FusedOptimiser
-from toolkit.training.rays import PixelPool
+from fieldfuse.evaluate.speed import Case, compare, pinned
+from fieldfuse.evaluate.speed_cases import BATCH, RATES
+from fieldfuse.evaluate.speed_state import sphere_field, sphere_pixels
+from fieldfuse.training.fused import FusedOptimiser
+from fieldfuse.training.rays import PixelPool
 
 RAYS = (512, 2048, 8192)
 SIDES = (48, 96, 192, 384)

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Intrinsics, Similarity
-from toolkit.capture.types import Views
-from toolkit.config import load_settings
-from toolkit.errors import InputError
-from toolkit.evaluate.speed import once
-from toolkit.poses.scene import Scene
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Intrinsics, Similarity
+from fieldfuse.capture.types import Views
+from fieldfuse.config import load_settings
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.speed import once
+from fieldfuse.poses.scene import Scene
+from fieldfuse.progress import SILENT, Progress
 
 FRAMES = 16
 SIZES = (48, 96)  # width of the pictures; they are 4:3
@@ -20,7 +20,7 @@ SIZES = (48, 96)  # width of the pictures; they are 4:3
 
 def demo_views(width: int, frames: int = FRAMES) -> tuple[Views, Scene]:
     """The demo room filmed by hand; every 8th view is held out."""
-    from toolkit.simulate.demo import demo_scene, hand_held
+    from fieldfuse.simulate.demo import demo_scene, hand_held
 
     height = width * 3 // 4
     camera, poses, room = Intrinsics(width, height, 0.85 * width, 0.85 * width, width / 2, height / 2), hand_held(frames), demo_scene()
@@ -36,8 +36,8 @@ def fit_curves(budget: float, threads: int, progress: Progress = SILENT) -> list
     Returns:
         a row a job: `engine`, `width`, `steps`, `rays`, `processor_seconds`, final `psnr` and the `timeline` of (seconds, psnr).
     """
-    from toolkit.training.engine import warm_up
-    from toolkit.training.fit import fit_field
+    from fieldfuse.training.engine import warm_up
+    from fieldfuse.training.fit import fit_field
 
     settings = load_settings("fast", pairs=[f"budget={budget}", f"threads={threads}", "field.resolution=128"])
     warm_up(settings, progress)
@@ -69,8 +69,8 @@ def fit_curves(budget: float, threads: int, progress: Progress = SILENT) -> list
 def tsdf_frames(voxel_size: float = 0.02, frames: int = 6, rounds: int = 3) -> dict[str, float] | None:
     """`tsdf.benchmark.compare_with_bare_loop` on pictures of a plane at 320×240; None where Open3D cannot be used."""
     try:
-        from toolkit.tsdf.benchmark import compare_with_bare_loop
-        from toolkit.tsdf.frames import DepthFrame
+        from fieldfuse.tsdf.benchmark import compare_with_bare_loop
+        from fieldfuse.tsdf.frames import DepthFrame
     except (ImportError, OSError):
         return None
     camera = Intrinsics(320, 240, 272.0, 272.0, 160.0, 120.0)

@@ -7,16 +7,16 @@ import math
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.types import Views
-from toolkit.networks.decoder import make_decoder
-from toolkit.render.composite import UNITS
-from toolkit.render.field import Field
-from toolkit.render.paths import look_at
-from toolkit.training.levels import all_places, first_field
-from toolkit.training.rays import PixelPool
-from toolkit.volume.host import TorchHost
-from toolkit.volume.space import Space
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.render.composite import UNITS
+from fieldfuse.render.field import Field
+from fieldfuse.render.paths import look_at
+from fieldfuse.training.levels import all_places, first_field
+from fieldfuse.training.rays import PixelPool
+from fieldfuse.volume.host import TorchHost
+from fieldfuse.volume.space import Space
 
 RADIUS = 0.7  # of the sphere, in half sizes of the region
 THICK = 4  # voxels of the sphere's wall, on either side

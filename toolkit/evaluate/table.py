@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from toolkit.evaluate import words
-from toolkit.evaluate.report import report_data
+from fieldfuse.evaluate import words
+from fieldfuse.evaluate.report import report_data
 
 WIDEST = 100  # characters
 METHODS = (("field", "field"), ("network", "networks alone"), ("tsdf", "TSDF"))

@@ -6,7 +6,7 @@ from importlib import resources
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined, Template
 
-from toolkit.evaluate import words
+from fieldfuse.evaluate import words
 
 FILTERS = (words.decimal, words.significant, words.whole, words.size, words.memory, words.duration, words.share, words.held)
 
@@ -22,4 +22,4 @@ def template(name: str) -> Template:
 
 
 def _source(name: str) -> str:
-    return resources.files("toolkit.evaluate").joinpath(name).read_text(encoding="utf-8")
+    return resources.files("fieldfuse.evaluate").joinpath(name).read_text(encoding="utf-8")

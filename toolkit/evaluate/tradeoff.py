@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.errors import InputError
-from toolkit.evaluate.report import plain
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.report import plain
 
 # Axis → whether a larger value costs more. In the order in which they are told.
 AXES = {

@@ -9,15 +9,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from toolkit import __version__
-from toolkit.evaluate import words
-from toolkit.evaluate.page import flat, short_name, subtitle
-from toolkit.evaluate.report import CAPTURE, POSES, STAGE, plain
-from toolkit.evaluate.templates import template
-from toolkit.evaluate.tradeoff import AXES, COSTS, MEASURES, METHODS, NUMBERS, Point, checked_row, in_order, pareto, points_of
-from toolkit.evaluate.tradeoff_plots import quality_plot
-from toolkit.evaluate.tradeoff_text import AXIS_TITLES, Step, front_sentence, sentence, setting_text, steps
-from toolkit.files import atomic_path, write_json
+from fieldfuse import __version__
+from fieldfuse.evaluate import words
+from fieldfuse.evaluate.page import flat, short_name, subtitle
+from fieldfuse.evaluate.report import CAPTURE, POSES, STAGE, plain
+from fieldfuse.evaluate.templates import template
+from fieldfuse.evaluate.tradeoff import AXES, COSTS, MEASURES, METHODS, NUMBERS, Point, checked_row, in_order, pareto, points_of
+from fieldfuse.evaluate.tradeoff_plots import quality_plot
+from fieldfuse.evaluate.tradeoff_text import AXIS_TITLES, Step, front_sentence, sentence, setting_text, steps
+from fieldfuse.files import atomic_path, write_json
 
 CSV = "tradeoff.csv"
 JSON = "tradeoff.json"

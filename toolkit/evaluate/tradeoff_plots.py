@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from toolkit.evaluate import words
-from toolkit.evaluate.tradeoff import MEASURES, METHODS, Point, pareto, series
+from fieldfuse.evaluate import words
+from fieldfuse.evaluate.tradeoff import MEASURES, METHODS, Point, pareto, series
 
 COLOURS = {"field": "#1763c6", "field_per_sample": "#7a4fc4", "direct": "#1d8a5a", "tsdf": "#c2570c", "tsdf_stereo": "#c2570c"}
 MARKERS = {"field": "o", "field_per_sample": "D", "direct": "^", "tsdf": "s", "tsdf_stereo": "s"}

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from toolkit.evaluate import words
-from toolkit.evaluate.suites.tables import machine_line
-from toolkit.evaluate.tradeoff import METHODS, Point, in_order, pareto, points_of
-from toolkit.evaluate.tradeoff_text import front_sentence, sentence, setting_text, steps
+from fieldfuse.evaluate import words
+from fieldfuse.evaluate.suites.tables import machine_line
+from fieldfuse.evaluate.tradeoff import METHODS, Point, in_order, pareto, points_of
+from fieldfuse.evaluate.tradeoff_text import front_sentence, sentence, setting_text, steps
 
 
 def tradeoff_table(data: dict[str, Any], name: str) -> str:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from toolkit.evaluate import words
-from toolkit.evaluate.tradeoff import MEASURES, METHODS, Point, pareto, series
+from fieldfuse.evaluate import words
+from fieldfuse.evaluate.tradeoff import MEASURES, METHODS, Point, pareto, series
 
 AXIS_TITLES = {
     "iterations": "Seconds of fitting",

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.errors import InputError
-from toolkit.tsdf.mesh import Mesh
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError
+from fieldfuse.tsdf.mesh import Mesh
 
 SMALLEST, LARGEST = 4, 1024  # texels along a square
 GUTTER = 3  # texels of a square's side that lie outside of its triangles, so that looking up between texels never leaves them

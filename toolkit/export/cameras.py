@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import FISHEYE, Array, Intrinsics, Similarity, invert, opengl_from_world
-from toolkit.errors import InputError
-from toolkit.export.points import write_points
-from toolkit.files import atomic_path, write_json
-from toolkit.tsdf.mesh import as_bytes
+from fieldfuse.camera import FISHEYE, Array, Intrinsics, Similarity, invert, opengl_from_world
+from fieldfuse.errors import InputError
+from fieldfuse.export.points import write_points
+from fieldfuse.files import atomic_path, write_json
+from fieldfuse.tsdf.mesh import as_bytes
 
 POINTS = "points3D.ply"
 LENS_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # OpenCV's order

@@ -13,13 +13,13 @@ from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from toolkit.camera import Array, Similarity
-from toolkit.errors import InputError
-from toolkit.export.atlas import Atlas
-from toolkit.export.ply import single_precision, write_ply
-from toolkit.files import atomic_path
-from toolkit.tone import LINEAR
-from toolkit.tsdf.mesh import Mesh
+from fieldfuse.camera import Array, Similarity
+from fieldfuse.errors import InputError
+from fieldfuse.export.atlas import Atlas
+from fieldfuse.export.ply import single_precision, write_ply
+from fieldfuse.files import atomic_path
+from fieldfuse.tone import LINEAR
+from fieldfuse.tsdf.mesh import Mesh
 
 FORMATS = (".ply", ".obj", ".glb")
 JPEG_QUALITY = 95

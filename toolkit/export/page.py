@@ -20,18 +20,18 @@ import cv2
 import numpy as np
 from jinja2 import Environment, StrictUndefined
 
-from toolkit import __version__
-from toolkit.camera import Array, Intrinsics
-from toolkit.errors import InputError
-from toolkit.files import atomic_path
-from toolkit.networks.decoder import Deferred
-from toolkit.networks.encoding import BEHIND, DIRECTION, SH
-from toolkit.render.bake import BakedField
-from toolkit.render.bake_kernels import CORNERS, FINER
-from toolkit.render.field import Field
-from toolkit.render.march import MAX_STRETCH
-from toolkit.tone import SHOULDER
-from toolkit.volume.topology import VOXELS
+from fieldfuse import __version__
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.errors import InputError
+from fieldfuse.files import atomic_path
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.networks.encoding import BEHIND, DIRECTION, SH
+from fieldfuse.render.bake import BakedField
+from fieldfuse.render.bake_kernels import CORNERS, FINER
+from fieldfuse.render.field import Field
+from fieldfuse.render.march import MAX_STRETCH
+from fieldfuse.tone import SHOULDER
+from fieldfuse.volume.topology import VOXELS
 
 CHANNELS, HIDDEN = 16, 96  # at most: what lies in one word of four, and, in thirds, in uniform blocks of 16 kB
 WHOLE = 12  # hidden units are a multiple of it: three parts of rows, four units a vector
@@ -50,7 +50,7 @@ class Tour:
         test: (N,) bool, held out.
         path: (F, 4, 4) closed.
         depth: median depth of the scene, working units: how far away what is looked at is taken to be.
-        exposure: colours are shown brighter by it (`toolkit.tone.brighter`).
+        exposure: colours are shown brighter by it (`fieldfuse.tone.brighter`).
     """
 
     names: Sequence[str]
@@ -244,4 +244,4 @@ def _palette() -> Array:
 
 
 def _source(name: str) -> str:
-    return resources.files("toolkit.export").joinpath("web", name).read_text(encoding="utf-8")
+    return resources.files("fieldfuse.export").joinpath("web", name).read_text(encoding="utf-8")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.files import atomic_path
+from fieldfuse.camera import Array
+from fieldfuse.files import atomic_path
 
 # float32 positions are kept when their rounding stays below this share of the model's size; else float64 is written.
 PRECISION = 1e-7

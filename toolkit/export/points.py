@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Array, Similarity
-from toolkit.errors import InputError
-from toolkit.export.ply import write_ply
-from toolkit.tsdf.mesh import as_bytes
+from fieldfuse.camera import Array, Similarity
+from fieldfuse.errors import InputError
+from fieldfuse.export.ply import write_ply
+from fieldfuse.tsdf.mesh import as_bytes
 
 
 def write_points(

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from toolkit.camera import Array, Intrinsics, invert
-from toolkit.progress import SILENT, Progress
-from toolkit.tsdf.mesh import Mesh
+from fieldfuse.camera import Array, Intrinsics, invert
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.tsdf.mesh import Mesh
 
 BEST = 4  # pictures of a vertex
 SIDE = 320  # pixels along the depth maps that tell what is hidden

@@ -9,14 +9,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.errors import InputError
-from toolkit.progress import SILENT, Progress
-from toolkit.stereo.maps import enlarged
-from toolkit.tsdf.frames import DepthFrame
-from toolkit.tsdf.held import fuse_held
-from toolkit.tsdf.mesh import as_bytes
-from toolkit.tsdf.volume import TsdfVolume
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.errors import InputError
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.stereo.maps import enlarged
+from fieldfuse.tsdf.frames import DepthFrame
+from fieldfuse.tsdf.held import fuse_held
+from fieldfuse.tsdf.mesh import as_bytes
+from fieldfuse.tsdf.volume import TsdfVolume
 
 # (intrinsics, world_from_camera) → (rgb, depth, opacity), or an object with these names, as `render_view` gives.
 Render = Callable[[Intrinsics, Array], Any]

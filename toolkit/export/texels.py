@@ -8,7 +8,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 F = np.float32
 

@@ -10,12 +10,12 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, invert
-from toolkit.export.atlas import Atlas, make_atlas
-from toolkit.export.sighted import SHARP, picture_weights, strongest
-from toolkit.export.texels import add_picture, finish, shift
-from toolkit.progress import SILENT, Progress
-from toolkit.tsdf.mesh import Mesh
+from fieldfuse.camera import Array, Intrinsics, invert
+from fieldfuse.export.atlas import Atlas, make_atlas
+from fieldfuse.export.sighted import SHARP, picture_weights, strongest
+from fieldfuse.export.texels import add_picture, finish, shift
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.tsdf.mesh import Mesh
 
 LARGEST = 4096  # texels along a texture
 FINE_SHARE = 0.75  # of the surface that has texels as small as its pixels; a little that is seen from very near does not decide for all

@@ -10,11 +10,11 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.video import OPENING
-from toolkit.errors import InputError, OutputError
-from toolkit.files import atomic_path
-from toolkit.tsdf.mesh import as_bytes
+from fieldfuse.camera import Array
+from fieldfuse.capture.video import OPENING
+from fieldfuse.errors import InputError, OutputError
+from fieldfuse.files import atomic_path
+from fieldfuse.tsdf.mesh import as_bytes
 
 QUALITY = "18"  # constant rate factor of H.264: hardly to be told from what was rendered
 SMPTE_170M, BT_709, LIMITED = 6, 1, 1  # ITU-T H.273: the matrix that both writers use, what is nearest to sRGB, 16 … 235

@@ -15,8 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from toolkit import gpu
-from toolkit.volume.topology import BLOCK, HALO, VOXELS, Topology
+from fieldfuse import gpu
+from fieldfuse.volume.topology import BLOCK, HALO, VOXELS, Topology
 
 DEFAULT_CHUNK = 64  # blocks at a time: 4 MB of halo at 16 channels in float32
 FEW = 4096  # blocks up to which the halo's rows (4 kB a block) are kept for the next convolution on the same topology
@@ -83,7 +83,7 @@ class Prepared:
         Returns:
             (M · 512 + 1, C'), one layer's channels after the other's.
         """
-        from toolkit.networks.gpu import convolution
+        from fieldfuse.networks.gpu import convolution
 
         kind = rows.device.type
         numbers = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else rows.dtype
@@ -94,7 +94,7 @@ class Prepared:
         return rows
 
     def _parameters(self, stages: Sequence[Stage], numbers: torch.dtype) -> list[tuple[Tensor, Tensor | None]]:
-        from toolkit.networks.gpu import convolution
+        from fieldfuse.networks.gpu import convolution
 
         known = [[(one.weight, one.bias) for one in stage] for stage in stages]
         key = [numbers, *[(w.data_ptr(), w._version, b is not None and (b.data_ptr(), b._version)) for stage in known for w, b in stage]]
@@ -142,7 +142,7 @@ def block_conv3d(
     kind = rows.device.type
     reduced = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else None
     if not torch.is_grad_enabled() and gpu.takes(rows):
-        from toolkit.networks.gpu import convolution
+        from fieldfuse.networks.gpu import convolution
 
         numbers = reduced or rows.dtype
         taps, added = convolution.taps_of(weight.to(numbers)), None if bias is None else bias.to(numbers)
@@ -181,7 +181,7 @@ def _clear(rows: Tensor, kept: Tensor) -> None:
 def _convolve(rows: Tensor, weight: Tensor, bias: Tensor | None, topology: Topology, occupied: Tensor | None, chunk: int) -> Tensor:
     """(M · 512 + 1, C) → (M · 512 + 1, C')."""
     if gpu.takes(rows):
-        from toolkit.networks.gpu import convolution
+        from fieldfuse.networks.gpu import convolution
 
         return convolution.convolve(rows, topology.around, convolution.taps_of(weight), bias, occupied)
     out = rows.new_empty((topology.zero_row + 1, len(weight)))
@@ -242,7 +242,7 @@ class _BlockConv(torch.autograd.Function):
 def _weight_gradient(rows: Tensor, gradient: Tensor, weight: Tensor, topology: Topology, chunk: int) -> Tensor:
     """(C', C, 3, 3, 3) in the weight's type, summed over chunks in it."""
     if gpu.takes(rows):
-        from toolkit.networks.gpu import convolution
+        from fieldfuse.networks.gpu import convolution
 
         return convolution.weight_gradient(rows, topology.around, gradient).to(weight.dtype)
     total = torch.zeros_like(weight, memory_format=torch.contiguous_format)

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.gpu import sent
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.gpu import sent
 
 
 @dataclass(frozen=True)

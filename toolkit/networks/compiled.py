@@ -15,8 +15,8 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from toolkit.stereo.smooth import DOWN, STRAIGHT, UP, summed_paths
-from toolkit.threads import share, slices
+from fieldfuse.stereo.smooth import DOWN, STRAIGHT, UP, summed_paths
+from fieldfuse.threads import share, slices
 
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "nsz", "arcp"}}
 F = np.float32

@@ -15,8 +15,8 @@ from numba import njit, types
 from numba.extending import overload
 from torch import Tensor
 
-from toolkit.networks.compiled import OPTIONS, array, spread
-from toolkit.networks.lattice import LatentVolume, LocalVolume
+from fieldfuse.networks.compiled import OPTIONS, array, spread
+from fieldfuse.networks.lattice import LatentVolume, LocalVolume
 
 F = np.float32
 LARGE = F(4.5)  # half of where tanh is 1 in float32

@@ -11,7 +11,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from toolkit.networks.compiled import OPTIONS, F, spread
+from fieldfuse.networks.compiled import OPTIONS, F, spread
 
 
 @njit(**OPTIONS)

@@ -9,7 +9,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from toolkit.networks.compiled import OPTIONS, F, array, between, spread
+from fieldfuse.networks.compiled import OPTIONS, F, array, between, spread
 
 
 @njit(**OPTIONS)

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toolkit.camera import Array
-from toolkit.gpu import asks_freely, sent
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.lattice import Lattice
-from toolkit.volume.topology import BLOCK
+from fieldfuse.camera import Array
+from fieldfuse.gpu import asks_freely, sent
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.lattice import Lattice
+from fieldfuse.volume.topology import BLOCK
 
 SLACK = 1.25  # balls grow by this much: views tell of a voxel beside their pictures, and blocks of the contracted shell are bent
 

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from toolkit.networks.encoding import BEHIND, DIRECTION, positional, spherical_harmonics
+from fieldfuse.networks.encoding import BEHIND, DIRECTION, positional, spherical_harmonics
 
 Tensor = torch.Tensor
 FREQUENCIES = 5

@@ -16,8 +16,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from toolkit.errors import InputError
-from toolkit.networks import lite
+from fieldfuse.errors import InputError
+from fieldfuse.networks import lite
 
 STRIDE = 2  # pixels a cell of what voxels look up
 DEEPEST = 16  # pixels a cell of the deepest level; pictures are padded to multiples of it

@@ -18,11 +18,11 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from toolkit.networks.block_conv import BlockConv3d, Prepared, block_conv3d
-from toolkit.networks.compiled_gru import Step
-from toolkit.networks.lattice import LatentVolume, LocalVolume
-from toolkit.networks.local import CHANGE, INSIDE, held
-from toolkit.volume.topology import Topology
+from fieldfuse.networks.block_conv import BlockConv3d, Prepared, block_conv3d
+from fieldfuse.networks.compiled_gru import Step
+from fieldfuse.networks.lattice import LatentVolume, LocalVolume
+from fieldfuse.networks.local import CHANGE, INSIDE, held
+from fieldfuse.volume.topology import Topology
 
 LEAST = 1e-3  # of a local volume's weight
 MOST = 16  # cap on n
@@ -114,7 +114,7 @@ class FusionGRU(nn.Module):
 
     def _on_device(self, part: LatentVolume, local: LocalVolume, numbers: torch.dtype) -> tuple[Tensor, Tensor]:
         """`compiled` on CUDA: both gates' convolutions go side by side."""
-        from toolkit.networks.gpu import gru
+        from fieldfuse.networks.gpu import gru
 
         step, busy = gru.Step(part, local, LEAST, self.most), local.busy
         rows, count = step.average()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from toolkit.networks.local import COLOUR_SCALE, INSIDE, within
+from fieldfuse.networks.local import COLOUR_SCALE, INSIDE, within
 
 START = -0.5  # log optical thickness of a voxel on the surface at the start
 SCALE = 3.0  # the density output's gain

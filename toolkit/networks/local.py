@@ -7,9 +7,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from toolkit import gpu
-from toolkit.networks.block_conv import BlockConv3d, Prepared
-from toolkit.volume.topology import Topology
+from fieldfuse import gpu
+from fieldfuse.networks.block_conv import BlockConv3d, Prepared
+from fieldfuse.volume.topology import Topology
 
 COLOUR_SCALE = 4.0  # a latent colour of ±1 is a colour logit of ±4
 INSIDE = 3  # the latent that starts as how far behind the surface the voxel lies

@@ -6,8 +6,8 @@
     values = model.head(state)                                      # rows of a radiance field; also of a local volume
     model.decoder                                                   # R, shared by local and global volumes
 
-No method changes anything: gradients flow through all of them, and a state is an ordinary value. `toolkit.render.fused.make_field` turns
-a volume into a field that can be rendered, with or without gradients; `toolkit.fusion` runs the loop over key frames.
+No method changes anything: gradients flow through all of them, and a state is an ordinary value. `fieldfuse.render.fused.make_field` turns
+a volume into a field that can be rendered, with or without gradients; `fieldfuse.fusion` runs the loop over key frames.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from toolkit import gpu
-from toolkit.gpu import asks_freely
-from toolkit.networks.aggregate import CUES, FLAGS, aggregate, agreement, direction_spread, evidence
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.compiled import fits
-from toolkit.networks.cull import all_blocks, block_balls, visible_blocks
-from toolkit.networks.decoder import make_decoder
-from toolkit.networks.direction import DirectionCode
-from toolkit.networks.encoder import DEEPEST, STRIDE, ImageEncoder, Sampled, padded
-from toolkit.networks.gru import FusionGRU, RunningMean, mean_gate
-from toolkit.networks.head import FieldHead
-from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume, empty_volume, rows_of
-from toolkit.networks.local import INSIDE, LocalReconstruction, colour_latent, inside_latent
-from toolkit.networks.matching import SIDE, describe
-from toolkit.networks.pyramid import Pyramid, levelled, middles, sizes_of
-from toolkit.networks.recorded import Recorded
-from toolkit.networks.refine import least_thickness, surface_cells, with_blocks
-from toolkit.networks.sweep import Empty, Sighted, Sweep, sweep
-from toolkit.networks.unproject import COLOURED, EncodedView, look_up, project
-from toolkit.volume.topology import VOXELS, Topology
+from fieldfuse import gpu
+from fieldfuse.gpu import asks_freely
+from fieldfuse.networks.aggregate import CUES, FLAGS, aggregate, agreement, direction_spread, evidence
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.compiled import fits
+from fieldfuse.networks.cull import all_blocks, block_balls, visible_blocks
+from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.networks.direction import DirectionCode
+from fieldfuse.networks.encoder import DEEPEST, STRIDE, ImageEncoder, Sampled, padded
+from fieldfuse.networks.gru import FusionGRU, RunningMean, mean_gate
+from fieldfuse.networks.head import FieldHead
+from fieldfuse.networks.lattice import LatentVolume, Lattice, LocalVolume, empty_volume, rows_of
+from fieldfuse.networks.local import INSIDE, LocalReconstruction, colour_latent, inside_latent
+from fieldfuse.networks.matching import SIDE, describe
+from fieldfuse.networks.pyramid import Pyramid, levelled, middles, sizes_of
+from fieldfuse.networks.recorded import Recorded
+from fieldfuse.networks.refine import least_thickness, surface_cells, with_blocks
+from fieldfuse.networks.sweep import Empty, Sighted, Sweep, sweep
+from fieldfuse.networks.unproject import COLOURED, EncodedView, look_up, project
+from fieldfuse.volume.topology import VOXELS, Topology
 
 CHUNK = 2**15  # voxels at a time: what the views show of them is many times larger than what is kept
 AT_ONCE = 2**19  # where there is memory for that: 0.4 kB a voxel and view
@@ -184,7 +184,7 @@ class NerfusionModel(nn.Module):
             bounded = near > 0 or math.isfinite(far)
             swept = self.sweep(views, cameras, *((near, far) if bounded else _depths(lattice, topology, cameras)))
         if self._on_device(views, swept):
-            from toolkit.networks.gpu.local import local_volume
+            from fieldfuse.networks.gpu.local import local_volume
 
             numbers = TRUNCATION, HIDDEN, BLIND, COLOUR_GAIN, COLOURED, FREE
             sizes = self.config.sampled, self.config.variance, self.config.channels
@@ -300,7 +300,7 @@ class NerfusionModel(nn.Module):
     def surface_cells(self, volume: LatentVolume, seen: Tensor, gamma: float) -> Tensor:
         """`refine.surface_cells` of what the head says."""
         if not torch.is_grad_enabled() and self.config.channels > INSIDE and gpu.fits(volume.rows):
-            from toolkit.networks.gpu import volumes
+            from fieldfuse.networks.gpu import volumes
 
             return volumes.surface_cells(volume.topology, volume.rows, volume.count, seen, self.to_field, least_thickness(gamma))
         return surface_cells(volume, seen, self.thickness(volume), gamma)

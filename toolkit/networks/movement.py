@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from toolkit.networks.cameras import Cameras
+from fieldfuse.networks.cameras import Cameras
 
 SPOTS = np.array([[u, v, 1.0] for u in (0.1, 0.5, 0.9) for v in (0.1, 0.5, 0.9)], np.float32)  # of the first picture
 FRONT = 0.05  # of the unit of depth that a place has to lie before a view to count

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from toolkit.networks import compiled_lookup
+from fieldfuse.networks import compiled_lookup
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toolkit import gpu
-from toolkit.camera import Array
-from toolkit.gpu import asks_freely, sent
-from toolkit.networks.lattice import LatentVolume, Lattice
-from toolkit.networks.refine import adopt, part
-from toolkit.volume.topology import VOXELS, Topology
+from fieldfuse import gpu
+from fieldfuse.camera import Array
+from fieldfuse.gpu import asks_freely, sent
+from fieldfuse.networks.lattice import LatentVolume, Lattice
+from fieldfuse.networks.refine import adopt, part
+from fieldfuse.volume.topology import VOXELS, Topology
 
 CODE = np.array([1, 2**21, 2**42], np.int64)  # keys of lattices are small
 NONE = np.iinfo(np.int64).min  # no block's code
@@ -75,7 +75,7 @@ class GlobalStore:
         """A copy of some blocks, to be written next; corners of which nothing is known here are as `inherited`, a volume that has at least
         these blocks."""
         if gpu.fits(self._rows):
-            from toolkit.volume import blocks_gpu as blocks
+            from fieldfuse.volume import blocks_gpu as blocks
 
             slots = self._places(topology)  # may grow
             below = None if inherited is None else (inherited.rows, inherited.count, inherited.topology)
@@ -86,7 +86,7 @@ class GlobalStore:
     def write(self, values: LatentVolume, changed: Tensor) -> None:
         """Take over the corners `changed` (M · 512,) of some blocks."""
         if gpu.fits(self._rows, values.rows):
-            from toolkit.volume import blocks_gpu as blocks
+            from fieldfuse.volume import blocks_gpu as blocks
 
             slots = self._places(values.topology)
             blocks.put(self._rows, self._count, slots, values.rows, values.count, changed)

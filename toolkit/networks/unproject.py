@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from toolkit import gpu
-from toolkit.networks import compiled_lookup
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.pyramid import Pyramid
+from fieldfuse import gpu
+from fieldfuse.networks import compiled_lookup
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.pyramid import Pyramid
 
 MARGIN = 1.0  # voxels
 COLOURED = 0.35  # of a voxel's side: with a whole one pictures of fern and of a living room are 0.7 to 0.9 dB worse
@@ -86,7 +86,7 @@ def look_up(views: Sequence[EncodedView], projection: Projection, step: Tensor) 
     if compiled_lookup.fits(tables, projection.pixels, step, projection.footprint):
         return _filled(views, projection, step)
     if gpu.fits(*tables, projection.pixels, step, projection.footprint):
-        from toolkit.networks.gpu import lookup
+        from fieldfuse.networks.gpu import lookup
 
         return lookup.look_up(views, projection.pixels, step, projection.footprint, COLOURED)
     parts = []

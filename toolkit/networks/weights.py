@@ -11,10 +11,10 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from toolkit.errors import InputError, OutputError, all_lines, first_line
-from toolkit.files import atomic_path
-from toolkit.networks.encoder import TRUNKS
-from toolkit.networks.model import ModelConfig, NerfusionModel
+from fieldfuse.errors import InputError, OutputError, all_lines, first_line
+from fieldfuse.files import atomic_path
+from fieldfuse.networks.encoder import TRUNKS
+from fieldfuse.networks.model import ModelConfig, NerfusionModel
 
 SHIPPED = Path(__file__).parent / "weights" / "nerfusion.safetensors"
 METADATA_KEY = "fieldfuse.networks"

@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 import pycolmap
 
-from toolkit.camera import Array
-from toolkit.poses.database import MIN_INLIERS
-from toolkit.poses.job import Job
-from toolkit.poses.mapping import SMALLEST, Model
+from fieldfuse.camera import Array
+from fieldfuse.poses.database import MIN_INLIERS
+from fieldfuse.poses.job import Job
+from fieldfuse.poses.mapping import SMALLEST, Model
 
 
 def agreement(job: Job, model: Model, apart: int = 0) -> dict[int, float]:

@@ -14,14 +14,14 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, invert
-from toolkit.capture.types import Capture
-from toolkit.errors import PoseError
-from toolkit.poses.mistakes import Reading, readings, refocused
-from toolkit.poses.points import Features
-from toolkit.poses.result import PoseResult, listed
-from toolkit.poses.two_view import Matches, deviation, find_matches, roughly_right
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Array, Intrinsics, invert
+from fieldfuse.capture.types import Capture
+from fieldfuse.errors import PoseError
+from fieldfuse.poses.mistakes import Reading, readings, refocused
+from fieldfuse.poses.points import Features
+from fieldfuse.poses.result import PoseResult, listed
+from fieldfuse.poses.two_view import Matches, deviation, find_matches, roughly_right
+from fieldfuse.progress import SILENT, Progress
 
 VERSION = 1  # of what is found; a change makes runs look again
 AS_IS = "as_is"

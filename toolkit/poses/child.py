@@ -20,8 +20,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
-from toolkit.errors import PoseError
-from toolkit.progress import SILENT, Progress
+from fieldfuse.errors import PoseError
+from fieldfuse.progress import SILENT, Progress
 
 TICK = 0.2  # seconds between looks at the user's wish to stop
 SILENCE = 1800.0  # seconds without a word from the child after which it counts as hung
@@ -120,10 +120,12 @@ def log_tail(log: Path) -> str:
 
 
 def import_path() -> dict[str, str]:
-    """So that the child finds this package wherever it was started from."""
-    here = str(Path(__file__).resolve().parents[2])
-    known = os.environ.get("PYTHONPATH")
-    return {"PYTHONPATH": here if not known else os.pathsep.join([here, known])}
+    """So that the child finds this package where it is imported from a folder that only the parent's `sys.path` has."""
+    package = Path(__file__).absolute().parents[1]
+    if package.name != "fieldfuse":  # an editable install, which every Python of this environment finds
+        return {}
+    inherited = os.environ.get("PYTHONPATH")
+    return {"PYTHONPATH": str(package.parent) if not inherited else os.pathsep.join([str(package.parent), inherited])}
 
 
 def end_reason(code: int) -> str:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toolkit.camera import Array, project, unproject
-from toolkit.capture.images import load_depth
-from toolkit.capture.types import Capture
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Array, project, unproject
+from fieldfuse.capture.images import load_depth
+from fieldfuse.capture.types import Capture
+from fieldfuse.progress import SILENT, Progress
 
 DEPTH_FRAMES = 40  # depth maps that are sampled
 DEPTH_SAMPLES = 1500  # pixels of each

@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 import pycolmap
 
-from toolkit.camera import Array
-from toolkit.capture.images import load_image, usable_pixels
-from toolkit.errors import InputError
-from toolkit.files import read_json, remove, write_json
-from toolkit.poses.features import floats, learned, sift
-from toolkit.poses.job import SIFT, TOLERANCE, Job, Picture
-from toolkit.poses.pairs import coarse
+from fieldfuse.camera import Array
+from fieldfuse.capture.images import load_image, usable_pixels
+from fieldfuse.errors import InputError
+from fieldfuse.files import read_json, remove, write_json
+from fieldfuse.poses.features import floats, learned, sift
+from fieldfuse.poses.job import SIFT, TOLERANCE, Job, Picture
+from fieldfuse.poses.pairs import coarse
 
 THUMBNAIL = 32  # pixels a side of the picture kept to tell identical ones
 GUESSED_FOCAL = 1.2  # of the long side, when nothing is known

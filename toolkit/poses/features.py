@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.poses.job import SIFT
+from fieldfuse.camera import Array
+from fieldfuse.poses.job import SIFT
 
 CONTRAST = 0.014  # finds as many as COLMAP's own detector does with its threshold
 
@@ -33,7 +33,7 @@ def sift(grey: Array, most: int) -> tuple[Array, Array]:
 
 def learned(grey: Array, most: int) -> tuple[Array, Array]:
     """As `sift`, by XFeat: the surest first; (N, 128) uint8 are the bytes of (N, 64) float16."""
-    from toolkit.poses import xfeat  # torch takes a second and 200 MB, and is not always needed
+    from fieldfuse.poses import xfeat  # torch takes a second and 200 MB, and is not always needed
 
     network = xfeat.installed()
     assert network is not None  # a job with these features is made only where the weights are

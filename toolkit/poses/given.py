@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from toolkit.capture.types import Capture
-from toolkit.errors import PoseError
-from toolkit.poses.result import GIVEN, PoseResult, listed
+from fieldfuse.capture.types import Capture
+from fieldfuse.errors import PoseError
+from fieldfuse.poses.result import GIVEN, PoseResult, listed
 
 FEW, SHARE = 6, 0.1  # images with poses, and their share of all, below which the model is a failed one, or of other images
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 LEVEL = 0.25  # eigenvalue ratio below which the cameras' x axes lie in a plane (held level while turning)
 ORBIT = 0.05  # the same for camera centres: they lie in a plane

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.poses.job import GLOBAL, LOOSE
-from toolkit.poses.result import listed
+from fieldfuse.camera import Array
+from fieldfuse.poses.job import GLOBAL, LOOSE
+from fieldfuse.poses.result import listed
 
 FEW_KEYPOINTS = 40  # below which a picture cannot be matched reliably
 BARE = 0.6  # of the usual number of keypoints, below which missing texture is named as a cause

@@ -5,12 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, project
-from toolkit.capture.images import load_image, turns_by_exif
-from toolkit.capture.types import Capture
-from toolkit.poses.cloud import Cloud, cloud_of_points, every
-from toolkit.poses.overlap import convergence
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Array, project
+from fieldfuse.capture.images import load_image, turns_by_exif
+from fieldfuse.capture.types import Capture
+from fieldfuse.poses.cloud import Cloud, cloud_of_points, every
+from fieldfuse.poses.overlap import convergence
+from fieldfuse.progress import SILENT, Progress
 
 GRID = 64
 FRAMES = 32

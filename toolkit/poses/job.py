@@ -6,11 +6,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from toolkit.capture.images import turns_by_exif
-from toolkit.capture.select import SELECTED
-from toolkit.capture.types import Capture, Frame
-from toolkit.config import PosesSettings
-from toolkit.files import fingerprint, read_json, write_json
+from fieldfuse.capture.images import turns_by_exif
+from fieldfuse.capture.select import SELECTED
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.config import PosesSettings
+from fieldfuse.files import fingerprint, read_json, write_json
 
 MAX_EXHAUSTIVE = 40  # photos; beyond it pairs are chosen
 SIFT, XFEAT = "sift", "xfeat"  # features that images are matched by

@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.files import remove
-from toolkit.poses.agreement import agreement
-from toolkit.poses.database import MIN_INLIERS
-from toolkit.poses.job import Job
-from toolkit.poses.mapping import Model, Report, calibrate, joined, map_pictures, plain
-from toolkit.poses.match import match
-from toolkit.poses.overlap import guessed_depth, overlap, parallax
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.files import remove
+from fieldfuse.poses.agreement import agreement
+from fieldfuse.poses.database import MIN_INLIERS
+from fieldfuse.poses.job import Job
+from fieldfuse.poses.mapping import Model, Report, calibrate, joined, map_pictures, plain
+from fieldfuse.poses.match import match
+from fieldfuse.poses.overlap import guessed_depth, overlap, parallax
 
 NEIGHBOURS = 2  # frames apart that show the same side of things
 CONTRADICTS = np.radians(60.0)  # between the turn that a pair of pictures tells and the model's: a few blurred points are off by less

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from toolkit.camera import OPENCV, Intrinsics
-from toolkit.errors import PoseError
-from toolkit.files import remove
-from toolkit.poses.job import GLOBAL, GONE_FAR, GONE_ON, LOOSE, TOLERANCE, Job
+from fieldfuse.camera import OPENCV, Intrinsics
+from fieldfuse.errors import PoseError
+from fieldfuse.files import remove
+from fieldfuse.poses.job import GLOBAL, GONE_FAR, GONE_ON, LOOSE, TOLERANCE, Job
 
 Report = Callable[[float, float, str], None]
 STRICT = "incremental"  # the attempt by COLMAP's own rules

@@ -15,11 +15,11 @@ from queue import SimpleQueue
 
 import pycolmap
 
-from toolkit.camera import Array
-from toolkit.files import atomic_path, remove
-from toolkit.poses.database import Report, label
-from toolkit.poses.features import floats
-from toolkit.poses.job import XFEAT, Job
+from fieldfuse.camera import Array
+from fieldfuse.files import atomic_path, remove
+from fieldfuse.poses.database import Report, label
+from fieldfuse.poses.features import floats
+from fieldfuse.poses.job import XFEAT, Job
 
 # Learned features nearly always match something, and of hundreds of false matches some dozens agree with some geometry or other.
 LEAST_RATIO = 0.2  # share of such a pair's matches that have to
@@ -58,7 +58,7 @@ def match(job: Job, pairs: list[tuple[int, int]], report: Report) -> None:
 
 def _compare(job: Job, pairs: list[tuple[int, int]], tell: Callable[[int], None]) -> None:
     """Put the matches of learned features into the job's database, which COLMAP's matcher then only verifies."""
-    from toolkit.poses.xfeat import mutual
+    from fieldfuse.poses.xfeat import mutual
 
     database = pycolmap.Database.open(job.database)
     try:

@@ -13,7 +13,7 @@ from itertools import permutations, product
 
 import numpy as np
 
-from toolkit.camera import Array, invert
+from fieldfuse.camera import Array, invert
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
 LLFF = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])

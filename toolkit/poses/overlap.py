@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, invert
+from fieldfuse.camera import Array, Intrinsics, invert
 
 GRID = 5  # pixels a side of the lattice that stands for a picture
 SWEET = 8.0  # degrees of parallax that suit matching and triangulation best

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 COARSE = 256  # features of the largest scale looked at for each picture
 RATIO = 0.85  # of the angle to the best and to the second best match

@@ -8,16 +8,16 @@ from typing import Any
 
 import pycolmap
 
-from toolkit.files import read_json, remove
-from toolkit.poses import loops
-from toolkit.poses.agreement import agreement, leave_out
-from toolkit.poses.database import extract, open_database, pair_facts, tolerant
-from toolkit.poses.health import AGREES, failure, hopeless, turned_only
-from toolkit.poses.job import GLOBAL, LOOSE, MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, Job
-from toolkit.poses.mapping import LEFT_OUT, LEFT_OUT_SHARE, STRICT, Model, Report, map_pictures, plain
-from toolkit.poses.match import match
-from toolkit.poses.pairs import pairs_with
-from toolkit.poses.selection import choose_pairs
+from fieldfuse.files import read_json, remove
+from fieldfuse.poses import loops
+from fieldfuse.poses.agreement import agreement, leave_out
+from fieldfuse.poses.database import extract, open_database, pair_facts, tolerant
+from fieldfuse.poses.health import AGREES, failure, hopeless, turned_only
+from fieldfuse.poses.job import GLOBAL, LOOSE, MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, Job
+from fieldfuse.poses.mapping import LEFT_OUT, LEFT_OUT_SHARE, STRICT, Model, Report, map_pictures, plain
+from fieldfuse.poses.match import match
+from fieldfuse.poses.pairs import pairs_with
+from fieldfuse.poses.selection import choose_pairs
 
 Placed = tuple[Model | None, dict[str, Any]]
 FEW = 12  # photos; up to it their places are held against their matches one by one

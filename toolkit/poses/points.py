@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from toolkit.camera import FISHEYE, Array, Intrinsics, distort, invert
-from toolkit.capture.images import load_image, turns_by_exif, usable_pixels
-from toolkit.capture.types import Capture, Frame
-from toolkit.poses.cloud import Cloud, every
-from toolkit.poses.overlap import best_neighbours, guessed_depth, overlap, parallax
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import FISHEYE, Array, Intrinsics, distort, invert
+from fieldfuse.capture.images import load_image, turns_by_exif, usable_pixels
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.poses.cloud import Cloud, every
+from fieldfuse.poses.overlap import best_neighbours, guessed_depth, overlap, parallax
+from fieldfuse.progress import SILENT, Progress
 
 LONG_SIDE = 640  # pixels that SIFT works on
 FEATURES = 1500  # a frame

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.poses.overlap import convergence
+from fieldfuse.camera import Array
+from fieldfuse.poses.overlap import convergence
 
 OBJECT = "object"  # cameras look inwards at one place
 ROOM = "room"  # cameras look outwards, or around

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, checked_pose
-from toolkit.capture.types import Capture
-from toolkit.errors import InputError, first_line
+from fieldfuse.camera import Array, Intrinsics, checked_pose
+from fieldfuse.capture.types import Capture
+from fieldfuse.errors import InputError, first_line
 
 GIVEN = "given"
 SFM = "sfm"

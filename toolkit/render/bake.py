@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from toolkit.errors import InputError
-from toolkit.networks.decoder import Deferred
-from toolkit.render import kernels as K
-from toolkit.render.bake_kernels import CORNERS, FINER, LEVELS, Baked
-from toolkit.render.compiled import FARTHEST, chessboard_distance, decoder_arrays
-from toolkit.render.composite import RAW_MAX, UNITS
-from toolkit.render.field import Field
-from toolkit.volume.edit import erase_empty_blocks
-from toolkit.volume.space import Space
-from toolkit.volume.topology import LOOKUP, VOXELS, Topology
+from fieldfuse.errors import InputError
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.render import kernels as K
+from fieldfuse.render.bake_kernels import CORNERS, FINER, LEVELS, Baked
+from fieldfuse.render.compiled import FARTHEST, chessboard_distance, decoder_arrays
+from fieldfuse.render.composite import RAW_MAX, UNITS
+from fieldfuse.render.field import Field
+from fieldfuse.volume.edit import erase_empty_blocks
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import LOOKUP, VOXELS, Topology
 
 Array = np.ndarray[Any, Any]
 CHUNK = 512  # blocks at a time
@@ -208,7 +208,7 @@ def _feature_range(field: Field) -> tuple[Array, Array]:
 
 def _used_corners(field: Field, most: int = 200_000) -> Array:
     """Rows of corners beside occupied voxels; of many, a regular part."""
-    from toolkit.volume.edit import corner_nodes
+    from fieldfuse.volume.edit import corner_nodes
 
     rows = np.flatnonzero(corner_nodes(field.topology, field.occupied).numpy())
     return rows[:: max(1, len(rows) // most)]

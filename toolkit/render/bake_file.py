@@ -16,15 +16,15 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from toolkit.camera import Similarity
-from toolkit.errors import InputError, OutputError, all_lines, first_line
-from toolkit.files import atomic_path
-from toolkit.networks.encoding import DIRECTION
-from toolkit.render import kernels as K
-from toolkit.render.bake import BakedField
-from toolkit.render.bake_kernels import CORNERS, FINER, LEVELS, Baked
-from toolkit.render.sky import checked_sky
-from toolkit.volume.space import Space
+from fieldfuse.camera import Similarity
+from fieldfuse.errors import InputError, OutputError, all_lines, first_line
+from fieldfuse.files import atomic_path
+from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.render import kernels as K
+from fieldfuse.render.bake import BakedField
+from fieldfuse.render.bake_kernels import CORNERS, FINER, LEVELS, Baked
+from fieldfuse.render.sky import checked_sky
+from fieldfuse.volume.space import Space
 
 Array = np.ndarray[Any, Any]
 VERSION = 1

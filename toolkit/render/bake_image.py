@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics, pixel_grid, rays
-from toolkit.errors import InputError
-from toolkit.render.bake import BakedField
-from toolkit.render.bake_tiles import TILE, render_tiles
-from toolkit.render.image import SOLID, Rendered
-from toolkit.render.kernels_decode import layers_of, rays_of
-from toolkit.render.sky import on_sky
-from toolkit.threads import share
+from fieldfuse.camera import Array, Intrinsics, pixel_grid, rays
+from fieldfuse.errors import InputError
+from fieldfuse.render.bake import BakedField
+from fieldfuse.render.bake_tiles import TILE, render_tiles
+from fieldfuse.render.image import SOLID, Rendered
+from fieldfuse.render.kernels_decode import layers_of, rays_of
+from fieldfuse.render.sky import on_sky
+from fieldfuse.threads import share
 
 STOP = 1e-2  # a ray ends where less than this part of the light is left, and what it saw stands for all of it
 THRESHOLD = 5e-3  # samples of smaller weight lend no colour

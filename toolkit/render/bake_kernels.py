@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic
 
-from toolkit.render import kernels as K
-from toolkit.render.kernels_march import brick_distance
+from fieldfuse.render import kernels as K
+from fieldfuse.render.kernels_march import brick_distance
 
 F, ZERO, HALF, ONE, TWO = K.F, K.ZERO, K.HALF, K.ONE, K.TWO
 LEVELS = 255  # steps of a quantised value

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from toolkit.render import kernels as K
-from toolkit.render.bake_kernels import VW, VX, VY, VZ, baked_march
-from toolkit.render.kernels_decode import RAYS, decode, encode_direction
-from toolkit.render.kernels_row import add_mixed_bytes
+from fieldfuse.render import kernels as K
+from fieldfuse.render.bake_kernels import VW, VX, VY, VZ, baked_march
+from fieldfuse.render.kernels_decode import RAYS, decode, encode_direction
+from fieldfuse.render.kernels_row import add_mixed_bytes
 
 F, ZERO, HALF, ONE = K.F, K.ZERO, K.HALF, K.ONE
 MOST_KEPT = 512  # samples of one ray that are coloured

@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from numba import njit
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.progress import SILENT, Progress
-from toolkit.render import kernels as K
-from toolkit.render.compiled import make_space, make_volume
-from toolkit.render.composite import STOP
-from toolkit.render.field import Field
-from toolkit.render.kernels_march import march_ray
-from toolkit.threads import share
-from toolkit.volume.compiled import dilated
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.render import kernels as K
+from fieldfuse.render.compiled import make_space, make_volume
+from fieldfuse.render.composite import STOP
+from fieldfuse.render.field import Field
+from fieldfuse.render.kernels_march import march_ray
+from fieldfuse.threads import share
+from fieldfuse.volume.compiled import dilated
 
 SEEN = 0.01  # largest weight below which a voxel is left out …
 FIRM = 0.3  # … but for those beside one with as much: where thin surfaces have holes, pictures from between the views see through them

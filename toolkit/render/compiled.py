@@ -8,16 +8,16 @@ import numpy as np
 import torch
 from numba import njit
 
-from toolkit.networks.decoder import Deferred
-from toolkit.render import kernels as K
-from toolkit.render.composite import STOP, THRESHOLD
-from toolkit.render.field import Field
-from toolkit.render.kernels_decode import RAYS, decode, encode_direction, layers_of, rays_of
-from toolkit.render.kernels_lookup import gather_row
-from toolkit.render.kernels_march import march_ray
-from toolkit.render.kernels_row import add_to
-from toolkit.threads import share
-from toolkit.volume.topology import VOXELS
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.render import kernels as K
+from fieldfuse.render.composite import STOP, THRESHOLD
+from fieldfuse.render.field import Field
+from fieldfuse.render.kernels_decode import RAYS, decode, encode_direction, layers_of, rays_of
+from fieldfuse.render.kernels_lookup import gather_row
+from fieldfuse.render.kernels_march import march_ray
+from fieldfuse.render.kernels_row import add_to
+from fieldfuse.threads import share
+from fieldfuse.volume.topology import VOXELS
 
 Tensor = torch.Tensor
 MOST_KEPT = 1024  # samples of one ray whose weight exceeds the threshold: they sum to at most 1

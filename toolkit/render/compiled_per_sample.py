@@ -8,16 +8,16 @@ import numpy as np
 import torch
 from numba import njit
 
-from toolkit.networks.decoder import FREQUENCIES, PerSample
-from toolkit.networks.encoding import DIRECTION
-from toolkit.render import kernels as K
-from toolkit.render.compiled import PIECE, make_space, make_volume
-from toolkit.render.composite import STOP
-from toolkit.render.field import Field
-from toolkit.render.kernels_matrix import LANES
-from toolkit.render.kernels_net import BATCH, Net, Tape, decode_colours, make_tape
-from toolkit.render.kernels_per_sample import NEGLIGIBLE, march_ray
-from toolkit.threads import share
+from fieldfuse.networks.decoder import FREQUENCIES, PerSample
+from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.render import kernels as K
+from fieldfuse.render.compiled import PIECE, make_space, make_volume
+from fieldfuse.render.composite import STOP
+from fieldfuse.render.field import Field
+from fieldfuse.render.kernels_matrix import LANES
+from fieldfuse.render.kernels_net import BATCH, Net, Tape, decode_colours, make_tape
+from fieldfuse.render.kernels_per_sample import NEGLIGIBLE, march_ray
+from fieldfuse.threads import share
 
 Tensor = torch.Tensor
 Array = np.ndarray[Any, Any]

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from toolkit.networks.decoder import Deferred
-from toolkit.render.composite import weights
-from toolkit.render.field import Field, density
-from toolkit.render.march import Samples, march
-from toolkit.render.rays import OPACITY_FLOOR
-from toolkit.volume.lookup import corners, gather, scatter
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.render.composite import weights
+from fieldfuse.render.field import Field, density
+from fieldfuse.render.march import Samples, march
+from fieldfuse.render.rays import OPACITY_FLOOR
+from fieldfuse.volume.lookup import corners, gather, scatter
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def _ray_sum(values: Tensor, ray: Tensor, rays: int) -> Tensor:
 
 
 def look_up(values: Tensor, rows: Tensor, corner_weights: Tensor) -> Tensor:
-    """(R,) or (R, C) → (N,) or (N, C) weighted sums over eight rows each (`toolkit.volume.lookup`), differentiable in `values`."""
+    """(R,) or (R, C) → (N,) or (N, C) weighted sums over eight rows each (`fieldfuse.volume.lookup`), differentiable in `values`."""
     found: Tensor = _LookUp.apply(values, rows, corner_weights.to(values.dtype))
     return found
 

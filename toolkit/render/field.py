@@ -9,16 +9,16 @@ from typing import Any
 
 import torch
 
-from toolkit.camera import Similarity
-from toolkit.errors import InputError, first_line
-from toolkit.networks.decoder import Deferred, PerSample, make_decoder
-from toolkit.render.composite import RAW_MAX, UNITS
-from toolkit.render.march import MarchGrid
-from toolkit.render.sky import checked_sky
-from toolkit.volume.edit import corner_nodes
-from toolkit.volume.space import Space
-from toolkit.volume.store import FieldFile, compact, expand, read_field, write_field
-from toolkit.volume.topology import BLOCK, VOXELS, Topology
+from fieldfuse.camera import Similarity
+from fieldfuse.errors import InputError, first_line
+from fieldfuse.networks.decoder import Deferred, PerSample, make_decoder
+from fieldfuse.render.composite import RAW_MAX, UNITS
+from fieldfuse.render.march import MarchGrid
+from fieldfuse.render.sky import checked_sky
+from fieldfuse.volume.edit import corner_nodes
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.store import FieldFile, compact, expand, read_field, write_field
+from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
 
 Tensor = torch.Tensor
 BRIGHTEST = 1e3  # of a background that is read; colours are 0 to 1
@@ -117,7 +117,7 @@ class Field:
     def _corners(self) -> torch.Tensor:
         """(M · 512,) bool: lattice corners that voxels use."""
         if self.device.type == "cpu":
-            from toolkit.volume import compiled
+            from fieldfuse.volume import compiled
 
             return compiled.corner_nodes(self.topology, self.occupied)
         return corner_nodes(self.topology, self.occupied)

@@ -6,12 +6,12 @@ import math
 
 import torch
 
-from toolkit.networks.lattice import LatentVolume
-from toolkit.networks.model import NerfusionModel
-from toolkit.networks.refine import solid_cells
-from toolkit.render.composite import UNITS
-from toolkit.render.field import Field
-from toolkit.volume.edit import erase_empty_blocks
+from fieldfuse.networks.lattice import LatentVolume
+from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.networks.refine import solid_cells
+from fieldfuse.render.composite import UNITS
+from fieldfuse.render.field import Field
+from fieldfuse.volume.edit import erase_empty_blocks
 
 Tensor = torch.Tensor
 GAMMA = 0.6  # the paper's pruning threshold

@@ -9,12 +9,12 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics, pixel_grid, rays
-from toolkit.gpu import runs_kernels
-from toolkit.networks.decoder import Deferred
-from toolkit.render.field import Field
-from toolkit.render.rays import RayValues, render_rays
-from toolkit.render.sky import on_sky
+from fieldfuse.camera import Array, Intrinsics, pixel_grid, rays
+from fieldfuse.gpu import runs_kernels
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.render.field import Field
+from fieldfuse.render.rays import RayValues, render_rays
+from fieldfuse.render.sky import on_sky
 
 CHUNK = 8192  # rays that torch renders at a time
 SOLID = 0.5  # depth is given where at least this much of the light is stopped
@@ -43,13 +43,13 @@ def make_renderer(field: Field, engine: str = "auto") -> View:
         engine: auto | numba | triton | torch. Numba runs on the CPU alone, Triton on CUDA alone.
     """
     if engine in ("auto", "triton") and isinstance(field.decoder, Deferred) and runs_kernels(field.device):
-        from toolkit.render.triton_field import TritonRenderer
+        from fieldfuse.render.triton_field import TritonRenderer
 
         return TritonRenderer(field)
     if engine == "torch" or field.device.type != "cpu":
         return partial(_in_chunks, field)
-    from toolkit.render.compiled import CompiledRenderer
-    from toolkit.render.compiled_per_sample import PerSampleRenderer
+    from fieldfuse.render.compiled import CompiledRenderer
+    from fieldfuse.render.compiled_per_sample import PerSampleRenderer
 
     compiled = CompiledRenderer(field) if isinstance(field.decoder, Deferred) else PerSampleRenderer(field)
 

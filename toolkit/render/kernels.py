@@ -19,8 +19,8 @@ from numba.core import cgutils
 from numba.core.options import DefaultOptions
 from numba.extending import intrinsic
 
-from toolkit.render import composite
-from toolkit.render.march import MAX_STRETCH
+from fieldfuse.render import composite
+from fieldfuse.render.march import MAX_STRETCH
 
 F = np.float32
 # Sums may be reordered and multiplications fused; NaN and infinity keep their meaning, so that a broken number is seen.

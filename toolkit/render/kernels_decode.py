@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from toolkit.networks.encoding import SH
-from toolkit.render.kernels import LEAF, ONE, OPTIONS, START, ZERO, Decoder, F, aligned
-from toolkit.render.kernels_matrix import LANES, product
+from fieldfuse.networks.encoding import SH
+from fieldfuse.render.kernels import LEAF, ONE, OPTIONS, START, ZERO, Decoder, F, aligned
+from fieldfuse.render.kernels_matrix import LANES, product
 
 _C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9 = (F(value) for value in SH)
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from toolkit.render.kernels import INLINE, LEAF, ONE, START, X, Y, Z
-from toolkit.render.kernels_row import mix
+from fieldfuse.render.kernels import INLINE, LEAF, ONE, START, X, Y, Z
+from fieldfuse.render.kernels_row import mix
 
 X_ROW, Y_ROW, Z_ROW = np.uintp(1), np.uintp(8), np.uintp(64)  # rows from a corner of a block to the next one along each axis
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from toolkit.render.kernels import (
+from fieldfuse.render.kernels import (
     AFTER,
     ALONG,
     HALF,
@@ -32,7 +32,7 @@ from toolkit.render.kernels import (
     Z,
     prefetch,
 )
-from toolkit.render.kernels_lookup import corner_rows_of, raw_density
+from fieldfuse.render.kernels_lookup import corner_rows_of, raw_density
 
 
 @njit(**LEAF)

@@ -9,7 +9,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from toolkit.render.kernels import OPTIONS
+from fieldfuse.render.kernels import OPTIONS
 
 TILE = 4  # rows of a result that are summed at a time: each load of the right factor serves them all
 LANES = 16  # and columns: widths are multiples of this

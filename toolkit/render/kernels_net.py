@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from toolkit.networks.decoder import FREQUENCIES
-from toolkit.networks.encoding import DIRECTION
-from toolkit.render import kernels as K
-from toolkit.render.kernels_decode import rectify, sigmoid
-from toolkit.render.kernels_lookup import gather_feature
-from toolkit.render.kernels_matrix import TILE, product
+from fieldfuse.networks.decoder import FREQUENCIES
+from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.render import kernels as K
+from fieldfuse.render.kernels_decode import rectify, sigmoid
+from fieldfuse.render.kernels_lookup import gather_feature
+from fieldfuse.render.kernels_matrix import TILE, product
 
 F, ZERO, HALF, ONE, TWO = K.F, K.ZERO, K.HALF, K.ONE, K.TWO
 PI = F(math.pi)

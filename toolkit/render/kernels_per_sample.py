@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from toolkit.render import kernels as K
-from toolkit.render.kernels_decode import encode_direction
-from toolkit.render.kernels_lookup import corner_rows, raw_density
-from toolkit.render.kernels_march import brick_distance, mark, mark_surface
-from toolkit.render.kernels_matrix import TILE
-from toolkit.render.kernels_net import MOST, Net, Tape, decode_densities
+from fieldfuse.render import kernels as K
+from fieldfuse.render.kernels_decode import encode_direction
+from fieldfuse.render.kernels_lookup import corner_rows, raw_density
+from fieldfuse.render.kernels_march import brick_distance, mark, mark_surface
+from fieldfuse.render.kernels_matrix import TILE
+from fieldfuse.render.kernels_net import MOST, Net, Tape, decode_densities
 
 F, ZERO, HALF, ONE, TWO = K.F, K.ZERO, K.HALF, K.ONE, K.TWO
 NEGLIGIBLE = 1e-6  # samples of smaller weight have no colour and get no gradient

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from toolkit.render import kernels as K
-from toolkit.render.compiled import MOST_KEPT
-from toolkit.render.kernels_decode import RAYS, decode, encode_direction
-from toolkit.render.kernels_lookup import gather_row
-from toolkit.render.kernels_march import march_ray
-from toolkit.render.kernels_row import add_to
+from fieldfuse.render import kernels as K
+from fieldfuse.render.compiled import MOST_KEPT
+from fieldfuse.render.kernels_decode import RAYS, decode, encode_direction
+from fieldfuse.render.kernels_lookup import gather_row
+from fieldfuse.render.kernels_march import march_ray
+from fieldfuse.render.kernels_row import add_to
 
 ROOM = 2 * MOST_KEPT  # samples of all rays that are decoded together
 

@@ -13,9 +13,9 @@ from functools import cached_property
 import torch
 import torch.nn.functional as F
 
-from toolkit import gpu
-from toolkit.volume.space import Space
-from toolkit.volume.topology import BLOCK, VOXELS, Topology
+from fieldfuse import gpu
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
 
 Tensor = torch.Tensor
 BRICK = BLOCK // 2
@@ -131,7 +131,7 @@ def _coarse_distances(grid: MarchGrid, origins: Tensor, directions: Tensor, near
     far = space.shell / grid.voxel  # |y| in the outermost voxel: the last step starts before it
     limit = int(2 * math.sqrt(3) * 2 * space.extent / step) + 8
     if gpu.fits(origins, directions, jitter):
-        from toolkit.render import march_gpu
+        from fieldfuse.render import march_gpu
 
         return march_gpu.walk(origins, directions, jitter, 2 * limit, near, step, far, space.shell, space.extent, MAX_STRETCH)
     # Beyond the region a place moves in contracted space by at most c / n² of its way, c² = b² + (extent · closest approach)².

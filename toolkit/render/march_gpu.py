@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel
+from fieldfuse.gpu import kernel
 
 BLOCK = 64
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.errors import InputError
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError
 
 UP = (0.0, 0.0, 1.0)  # in the working frame
 FACING = 0.9  # length of the mean viewing direction above which all cameras look the same way (spread of about 25°)

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import torch
 
-from toolkit.networks.decoder import Deferred
-from toolkit.render.composite import STOP, ray_sum, weights
-from toolkit.render.field import Field, density
-from toolkit.render.march import Samples, march
-from toolkit.volume.lookup import corners, gather
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.render.composite import STOP, ray_sum, weights
+from fieldfuse.render.field import Field, density
+from fieldfuse.render.march import Samples, march
+from fieldfuse.volume.lookup import corners, gather
 
 Tensor = torch.Tensor
 OPACITY_FLOOR = 1e-6

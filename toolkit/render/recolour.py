@@ -15,16 +15,16 @@ import cv2
 import numpy as np
 import torch
 
-from toolkit.camera import Intrinsics, pixel_grid, rays
-from toolkit.capture.types import Views
-from toolkit.gpu import asks_freely
-from toolkit.networks.decoder import Deferred
-from toolkit.progress import SILENT, Progress
-from toolkit.render.composite import SOLID, STOP, THRESHOLD, ray_sum
-from toolkit.render.differentiable import render_with_gradients
-from toolkit.render.field import Field
-from toolkit.threads import share
-from toolkit.volume.lookup import corners, scatter
+from fieldfuse.camera import Intrinsics, pixel_grid, rays
+from fieldfuse.capture.types import Views
+from fieldfuse.gpu import asks_freely
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.render.composite import SOLID, STOP, THRESHOLD, ray_sum
+from fieldfuse.render.differentiable import render_with_gradients
+from fieldfuse.render.field import Field
+from fieldfuse.threads import share
+from fieldfuse.volume.lookup import corners, scatter
 
 Tensor = torch.Tensor
 COLOURS = 3  # the first features are logits of the colour
@@ -155,8 +155,8 @@ class _Compiled:
     """The same by the CPU's kernels; each thread has sums of its own, so that they do not depend on who comes first."""
 
     def __init__(self, field: Field) -> None:
-        from toolkit.render.compiled import decoder_arrays, make_space, make_volume
-        from toolkit.render.kernels_decode import layers_of
+        from fieldfuse.render.compiled import decoder_arrays, make_space, make_volume
+        from fieldfuse.render.kernels_decode import layers_of
 
         assert isinstance(field.decoder, Deferred)
         self.threads = torch.get_num_threads()
@@ -165,8 +165,8 @@ class _Compiled:
         self.marks = np.zeros((self.threads, len(field.occupied)), np.uint16)
 
     def add(self, origins: Tensor, directions: Tensor, colours: Tensor) -> None:
-        from toolkit.render.kernels_decode import rays_of
-        from toolkit.render.kernels_recolour import project_back_pass
+        from fieldfuse.render.kernels_decode import rays_of
+        from fieldfuse.render.kernels_recolour import project_back_pass
 
         given = [values.float().contiguous().numpy() for values in (origins, directions, colours)]
         limits = [np.float32(value) for value in (STOP, THRESHOLD, STEEPEST, MOST)]

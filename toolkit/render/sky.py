@@ -10,7 +10,7 @@ import math
 
 import torch
 
-from toolkit.networks.encoding import BEHIND, spherical_harmonics
+from fieldfuse.networks.encoding import BEHIND, spherical_harmonics
 
 Tensor = torch.Tensor
 SHAPE = (BEHIND, 3)

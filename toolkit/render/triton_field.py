@@ -6,12 +6,12 @@ import torch
 import torch.nn.functional as F
 import triton
 
-from toolkit.networks.decoder import Deferred
-from toolkit.networks.encoding import DIRECTION, spherical_harmonics
-from toolkit.render.field import Field
-from toolkit.render.march import BRICK
-from toolkit.render.rays import RayValues
-from toolkit.render.triton_march import DX, LAYERS, MEDIAN, OPACITY, RAYS, SHOWN, SUMS, composite, walk
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.networks.encoding import DIRECTION, spherical_harmonics
+from fieldfuse.render.field import Field
+from fieldfuse.render.march import BRICK
+from fieldfuse.render.rays import RayValues
+from fieldfuse.render.triton_march import DX, LAYERS, MEDIAN, OPACITY, RAYS, SHOWN, SUMS, composite, walk
 
 Tensor = torch.Tensor
 FARTHEST = 24  # bricks that are skipped at once, at most

@@ -9,8 +9,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from toolkit.render.composite import RAW_MAX, UNITS
-from toolkit.volume.topology import BLOCK, LOOKUP, VOXELS
+from fieldfuse.render.composite import RAW_MAX, UNITS
+from fieldfuse.volume.topology import BLOCK, LOOKUP, VOXELS
 
 # Constants that Triton reads must be marked as such.
 C_BLOCK, C_VOXELS, C_LOOKUP, C_SIDE = (tl.constexpr(v) for v in (BLOCK, VOXELS, LOOKUP, BLOCK + 1))

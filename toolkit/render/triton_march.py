@@ -9,9 +9,9 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from toolkit.render.composite import OPAQUE, SOLID, STOP
-from toolkit.render.march import MAX_STRETCH
-from toolkit.render.triton_lookup import (
+from fieldfuse.render.composite import OPAQUE, SOLID, STOP
+from fieldfuse.render.march import MAX_STRETCH
+from fieldfuse.render.triton_lookup import (
     C_RAW_MAX,
     C_UNITS,
     bricks_away,

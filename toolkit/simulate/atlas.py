@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import torch
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 Tensor = torch.Tensor
 

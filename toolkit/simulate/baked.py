@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics, pixel_grid, rays
-from toolkit.simulate.trace import FAR, Hits, Rectangle, Shapes, Sphere
+from fieldfuse.camera import Array, Intrinsics, pixel_grid, rays
+from fieldfuse.simulate.trace import FAR, Hits, Rectangle, Shapes, Sphere
 
 GAMMA = 2.2
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from toolkit.camera import Array
-from toolkit.simulate.materials import PLAIN, Material, TextureBank
-from toolkit.simulate.solids import BOX, ROOM, Solid, upright
+from fieldfuse.camera import Array
+from fieldfuse.simulate.materials import PLAIN, Material, TextureBank
+from fieldfuse.simulate.solids import BOX, ROOM, Solid, upright
 
 WALLS = ("plaster", "paper", "posters", "bricks", "posters")
 FLOORS = ("planks", "terrazzo", "tiles", "cloth", "planks")

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from safetensors.numpy import save
 
-from toolkit.camera import Array, Intrinsics, opengl_from_world
-from toolkit.errors import OutputError
-from toolkit.files import write_json
-from toolkit.simulate.film import Shot
-from toolkit.simulate.seen import Mesh
+from fieldfuse.camera import Array, Intrinsics, opengl_from_world
+from fieldfuse.errors import OutputError
+from fieldfuse.files import write_json
+from fieldfuse.simulate.film import Shot
+from fieldfuse.simulate.seen import Mesh
 
 TRUTH = "ground_truth"
 DEPTH_STEPS = 1000.0  # stored depth values a metre

@@ -13,8 +13,8 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from toolkit import gpu
-from toolkit.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids
+from fieldfuse import gpu
+from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids
 
 Tensor = torch.Tensor
 Vector = tuple[Tensor, Tensor, Tensor]  # x, y, z apart: elementwise work on planes is several times faster than on rows of three
@@ -50,7 +50,7 @@ def cast(solids: Solids, origins: Tensor, directions: Tensor) -> tuple[Tensor, T
         the ray starts in is not seen (rooms are seen from inside).
     """
     if gpu.fits(origins, directions):
-        from toolkit.simulate import cast_gpu
+        from fieldfuse.simulate import cast_gpu
 
         return cast_gpu.cast(solids, origins, directions, FAR, NEAREST)
     parts = [

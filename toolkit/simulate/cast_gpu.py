@@ -8,8 +8,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel
-from toolkit.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids
+from fieldfuse.gpu import kernel
+from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids
 
 BLOCK = 128
 

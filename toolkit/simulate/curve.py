@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 SHAKE_WAVES = 12  # sines a shake is made of
 SHAKE_SLOWEST, SHAKE_FASTEST = 0.7, 7.0  # cycles a second

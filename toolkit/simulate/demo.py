@@ -8,14 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.errors import OutputError
-from toolkit.files import atomic_path
-from toolkit.progress import SILENT, Progress
-from toolkit.simulate import textures
-from toolkit.simulate.baked import BakedScene, Light
-from toolkit.simulate.trace import Rectangle, Sphere
-from toolkit.simulate.workers import drawing
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.errors import OutputError
+from fieldfuse.files import atomic_path
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.simulate import textures
+from fieldfuse.simulate.baked import BakedScene, Light
+from fieldfuse.simulate.trace import Rectangle, Sphere
+from fieldfuse.simulate.workers import drawing
 
 FRAMES_A_SECOND = 12
 WALL = 1.3  # metres from the middle of the floor to each wall

@@ -8,10 +8,10 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics, pixel_grid
-from toolkit.effects import distortion
-from toolkit.simulate.cast import FAR, tile_order
-from toolkit.simulate.seen import Rays, Scenery
+from fieldfuse.camera import Array, Intrinsics, pixel_grid
+from fieldfuse.effects import distortion
+from fieldfuse.simulate.cast import FAR, tile_order
+from fieldfuse.simulate.seen import Rays, Scenery
 
 Tensor = torch.Tensor
 

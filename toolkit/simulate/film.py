@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics, invert
-from toolkit.effects import (
+from fieldfuse.camera import Array, Intrinsics, invert
+from fieldfuse.effects import (
     compression,
     depth_noise,
     depth_offset,
@@ -27,12 +27,12 @@ from toolkit.effects import (
     transfer,
     vignetting,
 )
-from toolkit.effects.listed import Effects, generator
-from toolkit.simulate.curve import Motion
-from toolkit.simulate.eye import Eye, Picture, eye_of, measure, take
-from toolkit.simulate.people import peopled
-from toolkit.simulate.scene import Scene
-from toolkit.simulate.seen import Scenery
+from fieldfuse.effects.listed import Effects, generator
+from fieldfuse.simulate.curve import Motion
+from fieldfuse.simulate.eye import Eye, Picture, eye_of, measure, take
+from fieldfuse.simulate.people import peopled
+from fieldfuse.simulate.scene import Scene
+from fieldfuse.simulate.seen import Scenery
 
 Tensor = torch.Tensor
 

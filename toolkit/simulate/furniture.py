@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from toolkit.camera import Array
-from toolkit.simulate.builder import Builder, turned
-from toolkit.simulate.solids import BALL, CYLINDER, upright
+from fieldfuse.camera import Array
+from fieldfuse.simulate.builder import Builder, turned
+from fieldfuse.simulate.solids import BALL, CYLINDER, upright
 
 
 def _parts(b: Builder, at: Array, degrees: float, parts: list[tuple[ArrayLike, ArrayLike, int]]) -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from toolkit.camera import Array
-from toolkit.effects.highlights import Highlights
-from toolkit.simulate import furniture
-from toolkit.simulate.builder import FLOORS, WALLS, Builder
-from toolkit.simulate.scene import Lamp, Scene
-from toolkit.simulate.solids import BALL, BOX, CYLINDER, rod, upright
+from fieldfuse.camera import Array
+from fieldfuse.effects.highlights import Highlights
+from fieldfuse.simulate import furniture
+from fieldfuse.simulate.builder import FLOORS, WALLS, Builder
+from fieldfuse.simulate.scene import Lamp, Scene
+from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, rod, upright
 
 AMBIENT = ((0.30, 0.31, 0.33), (0.22, 0.20, 0.18))
 

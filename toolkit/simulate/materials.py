@@ -10,9 +10,9 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from toolkit.camera import Array
-from toolkit.simulate import patterns, textures
-from toolkit.simulate.atlas import Atlas
+from fieldfuse.camera import Array
+from fieldfuse.simulate import patterns, textures
+from fieldfuse.simulate.atlas import Atlas
 
 Tensor = torch.Tensor
 

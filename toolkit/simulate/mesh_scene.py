@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import torch
 
-from toolkit.camera import Array
-from toolkit.effects import background, highlights, transfer
-from toolkit.effects.background import Background
-from toolkit.effects.highlights import Highlights
-from toolkit.errors import InputError
-from toolkit.simulate.atlas import Atlas
-from toolkit.simulate.cast import FAR
-from toolkit.simulate.seen import Mesh, Rays, Seen
-from toolkit.tone import shares
+from fieldfuse.camera import Array
+from fieldfuse.effects import background, highlights, transfer
+from fieldfuse.effects.background import Background
+from fieldfuse.effects.highlights import Highlights
+from fieldfuse.errors import InputError
+from fieldfuse.simulate.atlas import Atlas
+from fieldfuse.simulate.cast import FAR
+from fieldfuse.simulate.seen import Mesh, Rays, Seen
+from fieldfuse.tone import shares
 
 Tensor = torch.Tensor
 

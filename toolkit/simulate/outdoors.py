@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from toolkit.effects.background import Background
-from toolkit.simulate.builder import Builder
-from toolkit.simulate.scene import Lamp, Scene
-from toolkit.simulate.solids import BALL, rod, upright
+from fieldfuse.effects.background import Background
+from fieldfuse.simulate.builder import Builder
+from fieldfuse.simulate.scene import Lamp, Scene
+from fieldfuse.simulate.solids import BALL, rod, upright
 
 LENGTH = 24.0  # metres from the middle to each end
 SUN = 200.0  # metres away

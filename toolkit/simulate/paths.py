@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from toolkit.camera import Array
-from toolkit.errors import InputError
-from toolkit.simulate.curve import Curve, Motion, Shake, by_length
-from toolkit.simulate.seen import Scenery
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError
+from fieldfuse.simulate.curve import Curve, Motion, Shake, by_length
+from fieldfuse.simulate.seen import Scenery
 
 MARGINS = (0.35, 0.25, 0.15, 0.08)  # metres that a path keeps from surfaces: the widest that is possible
 TRIES = 60

@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.simulate.textures import INKS, Generator, noise, picture
+from fieldfuse.camera import Array
+from fieldfuse.simulate.textures import INKS, Generator, noise, picture
 
 WOODS = ((0.55, 0.38, 0.24), (0.72, 0.55, 0.37), (0.38, 0.25, 0.17), (0.80, 0.67, 0.50), (0.48, 0.42, 0.36))
 PAINTS = ((0.86, 0.84, 0.80), (0.78, 0.83, 0.84), (0.84, 0.78, 0.70), (0.72, 0.76, 0.68), (0.88, 0.85, 0.76), (0.66, 0.70, 0.78))

@@ -7,15 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from toolkit.camera import Array
-from toolkit.effects.background import Background
-from toolkit.effects.highlights import Highlights
-from toolkit.effects.passers import STEPS, Walk
-from toolkit.simulate.builder import Builder, turned
-from toolkit.simulate.materials import Material, TextureBank, texture_bank
-from toolkit.simulate.scene import Lamp, Scene
-from toolkit.simulate.seen import Mesh, Rays, Scenery, Seen
-from toolkit.simulate.solids import BALL, Solid, rod, upright
+from fieldfuse.camera import Array
+from fieldfuse.effects.background import Background
+from fieldfuse.effects.highlights import Highlights
+from fieldfuse.effects.passers import STEPS, Walk
+from fieldfuse.simulate.builder import Builder, turned
+from fieldfuse.simulate.materials import Material, TextureBank, texture_bank
+from fieldfuse.simulate.scene import Lamp, Scene
+from fieldfuse.simulate.seen import Mesh, Rays, Scenery, Seen
+from fieldfuse.simulate.solids import BALL, Solid, rod, upright
 
 AMBIENT = ((0.75, 0.75, 0.75), (0.4, 0.4, 0.4))  # of people in a mesh, which has its light in its colours
 STRIDE = 0.22  # of the height

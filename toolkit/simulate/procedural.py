@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from toolkit.errors import InputError
-from toolkit.simulate import indoors, outdoors
-from toolkit.simulate.builder import Builder
-from toolkit.simulate.materials import TextureBank, texture_bank
-from toolkit.simulate.scene import Scene
+from fieldfuse.errors import InputError
+from fieldfuse.simulate import indoors, outdoors
+from fieldfuse.simulate.builder import Builder
+from fieldfuse.simulate.materials import TextureBank, texture_bank
+from fieldfuse.simulate.scene import Scene
 
 BUILDERS: dict[str, Callable[[Builder], Scene]] = {
     "room": indoors.room,

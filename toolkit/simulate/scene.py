@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.effects import background, highlights, transfer
-from toolkit.effects.background import Background
-from toolkit.effects.highlights import Highlights
-from toolkit.simulate.cast import cast
-from toolkit.simulate.eye import eye_of, take
-from toolkit.simulate.materials import Material, Materials, TextureBank
-from toolkit.simulate.seen import Mesh, Rays, Seen
-from toolkit.simulate.solids import ROOM, Solid, Solids
-from toolkit.simulate.tessellate import tessellate
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.effects import background, highlights, transfer
+from fieldfuse.effects.background import Background
+from fieldfuse.effects.highlights import Highlights
+from fieldfuse.simulate.cast import cast
+from fieldfuse.simulate.eye import eye_of, take
+from fieldfuse.simulate.materials import Material, Materials, TextureBank
+from fieldfuse.simulate.seen import Mesh, Rays, Seen
+from fieldfuse.simulate.solids import ROOM, Solid, Solids
+from fieldfuse.simulate.tessellate import tessellate
 
 Tensor = torch.Tensor
 

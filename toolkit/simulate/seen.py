@@ -7,9 +7,9 @@ from typing import Protocol
 
 import torch
 
-from toolkit.camera import Array
-from toolkit.effects.background import Background
-from toolkit.effects.highlights import Highlights
+from fieldfuse.camera import Array
+from fieldfuse.effects.background import Background
+from fieldfuse.effects.highlights import Highlights
 
 Tensor = torch.Tensor
 

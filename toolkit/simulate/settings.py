@@ -12,10 +12,10 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from toolkit.camera import Intrinsics
-from toolkit.config import refuse_traps
-from toolkit.errors import InputError, first_line
-from toolkit.simulate.paths import PathSettings
+from fieldfuse.camera import Intrinsics
+from fieldfuse.config import refuse_traps
+from fieldfuse.errors import InputError, first_line
+from fieldfuse.simulate.paths import PathSettings
 
 MAX_BYTES = 2**20
 OUTPUTS = ("frames", "photos", "video")

@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.effects.listed import Effects, parse
-from toolkit.errors import InputError
-from toolkit.files import atomic_path
-from toolkit.progress import SILENT, Progress
-from toolkit.simulate.capture_files import writing
-from toolkit.simulate.film import Film
-from toolkit.simulate.mesh_scene import SUFFIXES, load_mesh_scene
-from toolkit.simulate.paths import plan
-from toolkit.simulate.procedural import random_scene
-from toolkit.simulate.seen import Scenery
-from toolkit.simulate.settings import SceneFile
-from toolkit.simulate.workers import drawing
+from fieldfuse.effects.listed import Effects, parse
+from fieldfuse.errors import InputError
+from fieldfuse.files import atomic_path
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.simulate.capture_files import writing
+from fieldfuse.simulate.film import Film
+from fieldfuse.simulate.mesh_scene import SUFFIXES, load_mesh_scene
+from fieldfuse.simulate.paths import plan
+from fieldfuse.simulate.procedural import random_scene
+from fieldfuse.simulate.seen import Scenery
+from fieldfuse.simulate.settings import SceneFile
+from fieldfuse.simulate.workers import drawing
 
 SCENE, PATH = 0, 1  # streams of random numbers
 

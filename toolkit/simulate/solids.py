@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 Tensor = torch.Tensor
 

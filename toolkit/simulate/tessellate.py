@@ -6,9 +6,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.simulate.seen import Mesh
-from toolkit.simulate.solids import BALL, CYLINDER, ROOM, Solid
+from fieldfuse.camera import Array
+from fieldfuse.simulate.seen import Mesh
+from fieldfuse.simulate.solids import BALL, CYLINDER, ROOM, Solid
 
 ROUND = 48  # corners of a circle: its flat sides lie within 0.2% of the radius
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 WORDS = ("FIELD", "VOXEL", "FUSE", "LATTICE", "PRISM", "HALO", "RADIANT", "ORBIT", "DEPTH", "KEYFRAME", "SPARSE", "BLOCK", "SURFACE")
 FONTS = (cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_SIMPLEX)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 FAR = 1e9
 RAYS_A_CHUNK = 1 << 15  # the (rays, shapes) intermediates stay in the processor's cache

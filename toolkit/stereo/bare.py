@@ -16,14 +16,14 @@ import cv2
 import numba
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.types import Views
-from toolkit.progress import SILENT, Progress
-from toolkit.stereo.check import agreement
-from toolkit.stereo.cost import shrunk
-from toolkit.stereo.match import CHECKED, MOST_WORKERS, Demands, StereoDepth, usable_neighbours, usable_pixels
-from toolkit.stereo.plane_maps import depth_of, in_camera, numbers_of
-from toolkit.stereo.planes import Points, find_planes
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Views
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.stereo.check import agreement
+from fieldfuse.stereo.cost import shrunk
+from fieldfuse.stereo.match import CHECKED, MOST_WORKERS, Demands, StereoDepth, usable_neighbours, usable_pixels
+from fieldfuse.stereo.plane_maps import depth_of, in_camera, numbers_of
+from fieldfuse.stereo.planes import Points, find_planes
 
 POINTS = 60_000  # that planes are looked for in, of all pictures together
 ON = 0.03  # share of its depth by which a pixel may miss the plane that it votes for

@@ -9,7 +9,7 @@ import cv2
 import numba
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, invert
+from fieldfuse.camera import Array, Intrinsics, invert
 
 TOLERANCE = 0.02  # share of depth by which two views may differ
 HIDDEN = 0.03  # share of a point's depth by which another view's surface before it hides its colour

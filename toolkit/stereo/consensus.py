@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, invert
-from toolkit.stereo.check import numbers
+from fieldfuse.camera import Array, Intrinsics, invert
+from fieldfuse.stereo.check import numbers
 
 AGREED = 3  # pictures that must tell the same
 SAME = 0.04  # share of depth within which points are of one surface

@@ -7,7 +7,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 WINDOW = 7  # pixels a side that are compared
 HALF = WINDOW // 2

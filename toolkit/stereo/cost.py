@@ -10,8 +10,8 @@ import cv2
 import numba
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, invert
-from toolkit.stereo.correlate import HALF, LANES, MIDDLE, NOISE, OPTIONS, WINDOW, F, correlate
+from fieldfuse.camera import Array, Intrinsics, invert
+from fieldfuse.stereo.correlate import HALF, LANES, MIDDLE, NOISE, OPTIONS, WINDOW, F, correlate
 
 UNKNOWN = 0.5  # cost where no neighbour shows anything, which is that of no correlation
 GROUP = 16  # planes that are put into the volume at once: as many costs as a cache line holds

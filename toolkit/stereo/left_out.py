@@ -12,10 +12,10 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from toolkit.camera import Array
-from toolkit.capture.types import Views
-from toolkit.errors import InputError, first_line
-from toolkit.files import atomic_path
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import InputError, first_line
+from fieldfuse.files import atomic_path
 
 MOST_SIDE = 2**13  # pixels; masks are small, so a file that says more is damaged
 

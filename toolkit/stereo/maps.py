@@ -11,10 +11,10 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.errors import InputError, first_line
-from toolkit.files import atomic_path
-from toolkit.stereo.match import StereoDepth
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.errors import InputError, first_line
+from fieldfuse.files import atomic_path
+from fieldfuse.stereo.match import StereoDepth
 
 LEAST_CONFIDENCE = 0.5  # two other views confirm a depth for each one that sees through it
 SMOOTH = 0.05  # share by which depths side by side may differ, to be interpolated, besides their noise

@@ -15,16 +15,16 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from toolkit import memory
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.types import Views
-from toolkit.errors import InputError
-from toolkit.poses.overlap import best_neighbours, overlap, parallax, spread_parallax
-from toolkit.progress import SILENT, Progress
-from toolkit.stereo.check import confirmed
-from toolkit.stereo.cost import GreyView, grey_view, plane_homography, sweep
-from toolkit.stereo.refine import refined
-from toolkit.stereo.smooth import smoothed_planes
+from fieldfuse import memory
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import InputError
+from fieldfuse.poses.overlap import best_neighbours, overlap, parallax, spread_parallax
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.stereo.check import confirmed
+from fieldfuse.stereo.cost import GreyView, grey_view, plane_homography, sweep
+from fieldfuse.stereo.refine import refined
+from fieldfuse.stereo.smooth import smoothed_planes
 
 LONG_SIDE = 400  # pixels; cost grows with the third power of it
 MATCHED = 4  # neighbours that a picture is matched with

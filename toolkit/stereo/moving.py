@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.types import Views
-from toolkit.progress import SILENT, Progress
-from toolkit.stereo.bare import spread_along
-from toolkit.stereo.consensus import AGREED, SAME, Consensus, consensus
-from toolkit.stereo.cost import shrunk
-from toolkit.stereo.match import StereoDepth, shrunk_camera, side_by_side, usable_neighbours, usable_pixels
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.stereo.bare import spread_along
+from fieldfuse.stereo.consensus import AGREED, SAME, Consensus, consensus
+from fieldfuse.stereo.cost import shrunk
+from fieldfuse.stereo.match import StereoDepth, shrunk_camera, side_by_side, usable_neighbours, usable_pixels
 
 SHARE, MOST_SHARE = 0.04, 0.1  # of a fit's seconds that looking is meant to take, and may take on the smallest pictures
 SIDES = (96, 200)  # pixels; of the pictures that are looked at

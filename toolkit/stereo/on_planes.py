@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.stereo.bare import BLUR, spread_along
-from toolkit.stereo.check import agreement
-from toolkit.stereo.cost import GreyView, Matcher
-from toolkit.stereo.plane_maps import depth_of, in_camera, numbers_of
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.stereo.bare import BLUR, spread_along
+from fieldfuse.stereo.check import agreement
+from fieldfuse.stereo.cost import GreyView, Matcher
+from fieldfuse.stereo.plane_maps import depth_of, in_camera, numbers_of
 
 ON = 0.03  # share of its depth by which a sure pixel may miss the plane that it speaks for
 SLANT = 85.0  # degrees beyond which a plane tells no depth

@@ -7,8 +7,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.stereo.check import numbers
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.stereo.check import numbers
 
 
 def in_camera(planes: Array, pose: Array) -> Array:

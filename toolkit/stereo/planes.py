@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 ON = 0.015  # share of its depth by which a point may miss a plane that it is counted to
 LEAST = 0.006  # share of all points that a plane must have

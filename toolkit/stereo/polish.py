@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.types import Views
-from toolkit.stereo.cost import GreyView, grey_view
-from toolkit.stereo.match import inverse_depths, usable_neighbours
-from toolkit.stereo.refine import refined
-from toolkit.stereo.settle import same_place
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.stereo.cost import GreyView, grey_view
+from fieldfuse.stereo.match import inverse_depths, usable_neighbours
+from fieldfuse.stereo.refine import refined
+from fieldfuse.stereo.settle import same_place
 
 NEIGHBOURS = 6  # pictures that a view is compared with
 RECOGNISED = 0.3  # matching cost up to which a pixel was recognised in its neighbours; others keep the depth they had

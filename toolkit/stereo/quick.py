@@ -12,13 +12,13 @@ from dataclasses import field as default
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.types import Views
-from toolkit.progress import SILENT, Progress
-from toolkit.stereo import consensus
-from toolkit.stereo.bare import continued
-from toolkit.stereo.maps import depth_at
-from toolkit.stereo.match import LENIENT, LONG_SIDE, StereoDepth, stereo_depths
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.stereo import consensus
+from fieldfuse.stereo.bare import continued
+from fieldfuse.stereo.maps import depth_at
+from fieldfuse.stereo.match import LENIENT, LONG_SIDE, StereoDepth, stereo_depths
 
 SHARE = 0.15  # of the fit's seconds that matching is meant to take …
 MOST_SHARE = 0.25  # … and may take with the smallest pictures before some of them are left out

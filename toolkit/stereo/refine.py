@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.stereo.cost import GreyView, Matcher
+from fieldfuse.camera import Array
+from fieldfuse.stereo.cost import GreyView, Matcher
 
 EVEN = 5  # pixels a side of the median that the depth map is evened out with before pictures are warped by it
 LEAST_BEND = 1e-4  # of the costs' parabola; flatter ones have no lowest point worth moving to

@@ -15,16 +15,16 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.types import Views
-from toolkit.progress import SILENT, Progress
-from toolkit.stereo.bare import points_of, proposal
-from toolkit.stereo.check import agreement, confirmed
-from toolkit.stereo.cost import grey_view, shrunk
-from toolkit.stereo.match import CHECKED, StereoDepth, shrunk_camera, side_by_side, usable_neighbours, usable_pixels
-from toolkit.stereo.on_planes import SLANT, Unsure, shown_planes
-from toolkit.stereo.plane_maps import depth_of, in_camera
-from toolkit.stereo.planes import find_planes, shares
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.stereo.bare import points_of, proposal
+from fieldfuse.stereo.check import agreement, confirmed
+from fieldfuse.stereo.cost import grey_view, shrunk
+from fieldfuse.stereo.match import CHECKED, StereoDepth, shrunk_camera, side_by_side, usable_neighbours, usable_pixels
+from fieldfuse.stereo.on_planes import SLANT, Unsure, shown_planes
+from fieldfuse.stereo.plane_maps import depth_of, in_camera
+from fieldfuse.stereo.planes import find_planes, shares
 
 T = TypeVar("T")
 

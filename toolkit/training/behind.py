@@ -9,10 +9,10 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from toolkit.camera import rays
-from toolkit.capture.types import Views
-from toolkit.networks.encoding import BEHIND, SH, spherical_harmonics
-from toolkit.render.sky import SHAPE
+from fieldfuse.camera import rays
+from fieldfuse.capture.types import Views
+from fieldfuse.networks.encoding import BEHIND, SH, spherical_harmonics
+from fieldfuse.render.sky import SHAPE
 
 Tensor = torch.Tensor
 PIXELS = 5_000  # that are looked at of a picture

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics
+from fieldfuse.camera import Array, Intrinsics
 
 Tensor = torch.Tensor
 REACH = 0.05  # r: share of the distance, beyond the noise, within which a sample counts as near the surface

@@ -14,14 +14,14 @@ import numba
 import numpy as np
 import torch
 
-from toolkit.camera import Array, invert, unproject
-from toolkit.capture.types import Views
-from toolkit.config import Settings
-from toolkit.networks.decoder import make_decoder
-from toolkit.poses.scene import Scene
-from toolkit.render.field import Field
-from toolkit.training.levels import FEATURE_NOISE, all_places, occupancy
-from toolkit.training.start import (
+from fieldfuse.camera import Array, invert, unproject
+from fieldfuse.capture.types import Views
+from fieldfuse.config import Settings
+from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.poses.scene import Scene
+from fieldfuse.render.field import Field
+from fieldfuse.training.levels import FEATURE_NOISE, all_places, occupancy
+from fieldfuse.training.start import (
     COARSEST,
     FEW_VIEWS,
     NEAR,
@@ -34,9 +34,9 @@ from toolkit.training.start import (
     radii,
     space_of,
 )
-from toolkit.training.view import limit
-from toolkit.volume.space import Space
-from toolkit.volume.topology import BLOCK, Topology
+from fieldfuse.training.view import limit
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import BLOCK, Topology
 
 Tensor = torch.Tensor
 RESOLUTION = 64  # voxels a side, where a part of the pictures' depth is known …

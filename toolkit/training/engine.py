@@ -11,17 +11,17 @@ from typing import Protocol
 
 import torch
 
-from toolkit import libraries
-from toolkit.config import Settings
-from toolkit.gpu import runs_kernels
-from toolkit.networks.decoder import Deferred
-from toolkit.progress import Progress
-from toolkit.render.field import Field
-from toolkit.render.rays import render_rays
-from toolkit.training.adam import LazyAdam
-from toolkit.training.importance import Errors
-from toolkit.training.rays import PixelPool
-from toolkit.training.step import Optimiser, Rates
+from fieldfuse import libraries
+from fieldfuse.config import Settings
+from fieldfuse.gpu import runs_kernels
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.progress import Progress
+from fieldfuse.render.field import Field
+from fieldfuse.render.rays import render_rays
+from fieldfuse.training.adam import LazyAdam
+from fieldfuse.training.importance import Errors
+from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.step import Optimiser, Rates
 
 Tensor = torch.Tensor
 
@@ -108,14 +108,14 @@ def make_engine(settings: Settings, field: Field, pool: PixelPool) -> Engine:
     if chosen == "torch":
         return TorchEngine(field, pool, settings.seed)
     if chosen == "triton":
-        from toolkit.training.triton_engine import TritonOptimiser
+        from fieldfuse.training.triton_engine import TritonOptimiser
 
         return TritonOptimiser(field, pool, settings.seed)
     if isinstance(field.decoder, Deferred):
-        from toolkit.training.fused import FusedOptimiser
+        from fieldfuse.training.fused import FusedOptimiser
 
         return FusedOptimiser(field, pool, settings.seed)
-    from toolkit.training.fused_per_sample import FusedPerSampleOptimiser
+    from fieldfuse.training.fused_per_sample import FusedPerSampleOptimiser
 
     return FusedPerSampleOptimiser(field, pool, settings.seed)
 
@@ -131,11 +131,11 @@ def warm_up(settings: Settings, progress: Progress) -> None:
     if chosen == "torch":
         return
     if chosen == "triton":
-        from toolkit.training import triton_warm
+        from fieldfuse.training import triton_warm
 
         triton_warm.run(settings.field.channels, settings.field.width, device, progress)
         return
-    from toolkit.training import warm
+    from fieldfuse.training import warm
 
     kind = (settings.field.decoder, settings.field.channels, settings.field.width)
     if not warm.ready(*kind):

@@ -13,15 +13,15 @@ import math
 import numpy as np
 import torch
 
-from toolkit import memory
-from toolkit.capture.types import Views
-from toolkit.progress import SILENT, Progress
-from toolkit.render.field import Field
-from toolkit.render.recolour import recoloured
-from toolkit.training.levels import beside, finer
-from toolkit.training.silhouettes import inside_silhouettes
-from toolkit.volume.host import TorchHost
-from toolkit.volume.topology import BLOCK
+from fieldfuse import memory
+from fieldfuse.capture.types import Views
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.render.field import Field
+from fieldfuse.render.recolour import recoloured
+from fieldfuse.training.levels import beside, finer
+from fieldfuse.training.silhouettes import inside_silhouettes
+from fieldfuse.volume.host import TorchHost
+from fieldfuse.volume.topology import BLOCK
 
 Tensor = torch.Tensor
 PIXELS = 1.5  # of the training views that a voxel at the median depth spans in the end …

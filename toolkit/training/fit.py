@@ -14,29 +14,29 @@ from dataclasses import field as default
 import numpy as np
 import torch
 
-from toolkit.capture.types import Views
-from toolkit.config import Settings
-from toolkit.errors import InputError
-from toolkit.memory import give_back
-from toolkit.networks.decoder import make_decoder
-from toolkit.poses.scene import Scene
-from toolkit.progress import SILENT, Progress
-from toolkit.render.field import Field
-from toolkit.stereo.left_out import LeftOut
-from toolkit.training import room
-from toolkit.training.behind import sky_behind
-from toolkit.training.depth import FINE, ROUGH
-from toolkit.training.engine import Engine, chosen_engine, fit_device, make_engine, warm_up
-from toolkit.training.finite import NotFiniteError
-from toolkit.training.guard import Guard, refuse_broken
-from toolkit.training.levels import all_places, finer, first_field, let_go, looked_at, pruned, visible
-from toolkit.training.rays import PixelPool
-from toolkit.training.sample import Sample
-from toolkit.training.schedule import RUNGS, UNTOLD, WIDER, Schedule, most_rays
-from toolkit.training.start import NEAR, THIN, colour_behind, finest_resolution, levels, possible, space_of
-from toolkit.training.view import limit
-from toolkit.volume.host import Host, TorchHost
-from toolkit.volume.space import Space
+from fieldfuse.capture.types import Views
+from fieldfuse.config import Settings
+from fieldfuse.errors import InputError
+from fieldfuse.memory import give_back
+from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.poses.scene import Scene
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.render.field import Field
+from fieldfuse.stereo.left_out import LeftOut
+from fieldfuse.training import room
+from fieldfuse.training.behind import sky_behind
+from fieldfuse.training.depth import FINE, ROUGH
+from fieldfuse.training.engine import Engine, chosen_engine, fit_device, make_engine, warm_up
+from fieldfuse.training.finite import NotFiniteError
+from fieldfuse.training.guard import Guard, refuse_broken
+from fieldfuse.training.levels import all_places, finer, first_field, let_go, looked_at, pruned, visible
+from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.sample import Sample
+from fieldfuse.training.schedule import RUNGS, UNTOLD, WIDER, Schedule, most_rays
+from fieldfuse.training.start import NEAR, THIN, colour_behind, finest_resolution, levels, possible, space_of
+from fieldfuse.training.view import limit
+from fieldfuse.volume.host import Host, TorchHost
+from fieldfuse.volume.space import Space
 
 DEFAULT_BUDGET = 120.0
 TIMELINE_POINTS = 12

@@ -15,27 +15,27 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from toolkit.capture.types import Views
-from toolkit.config import NetworkSettings
-from toolkit.errors import InputError
-from toolkit.fusion import Fused, FusionOptions, fuse_views
-from toolkit.key_sweeps import beside
-from toolkit.keyframes import KeyFrames
-from toolkit.networks import weights
-from toolkit.networks.lattice import Lattice
-from toolkit.networks.model import NerfusionModel
-from toolkit.networks.precision import AUTO
-from toolkit.networks.weights import load_model
-from toolkit.poses.scene import Scene
-from toolkit.progress import SILENT, Progress
-from toolkit.render.field import Field
-from toolkit.render.fused import make_field, without_empty_blocks
-from toolkit.training.behind import sky_behind
-from toolkit.training.finer_colours import finer_colours
-from toolkit.training.silhouettes import inside_silhouettes, visual_hull
-from toolkit.training.start import colour_behind, space_of
-from toolkit.volume.space import Space
-from toolkit.volume.topology import BLOCK
+from fieldfuse.capture.types import Views
+from fieldfuse.config import NetworkSettings
+from fieldfuse.errors import InputError
+from fieldfuse.fusion import Fused, FusionOptions, fuse_views
+from fieldfuse.key_sweeps import beside
+from fieldfuse.keyframes import KeyFrames
+from fieldfuse.networks import weights
+from fieldfuse.networks.lattice import Lattice
+from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.networks.precision import AUTO
+from fieldfuse.networks.weights import load_model
+from fieldfuse.poses.scene import Scene
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.render.field import Field
+from fieldfuse.render.fused import make_field, without_empty_blocks
+from fieldfuse.training.behind import sky_behind
+from fieldfuse.training.finer_colours import finer_colours
+from fieldfuse.training.silhouettes import inside_silhouettes, visual_hull
+from fieldfuse.training.start import colour_behind, space_of
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import BLOCK
 
 SHIPPED = weights.SHIPPED
 # Voxels that make up the median depth at least, on the finer of two lattices. One lattice of 24 alone loses 1.5 to 2.5 dB, while 104

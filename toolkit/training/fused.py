@@ -11,22 +11,22 @@ from typing import Any
 import numpy as np
 import torch
 
-from toolkit import memory
-from toolkit.networks.decoder import Deferred
-from toolkit.networks.encoding import DIRECTION
-from toolkit.render import kernels as K
-from toolkit.render.compiled import decoder_arrays, make_space, make_volume, render_pass
-from toolkit.render.composite import STOP, THRESHOLD
-from toolkit.render.field import Field
-from toolkit.render.kernels_decode import layers_of, rays_of
-from toolkit.training import fused_block, fused_decoder
-from toolkit.training import fused_kernels as kernels
-from toolkit.training import fused_moves as moves
-from toolkit.training.finite import broken, refuse
-from toolkit.training.fused_order import Batch, Tiles
-from toolkit.training.rays import PixelPool
-from toolkit.training.step import Rates
-from toolkit.training.view import blind
+from fieldfuse import memory
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.render import kernels as K
+from fieldfuse.render.compiled import decoder_arrays, make_space, make_volume, render_pass
+from fieldfuse.render.composite import STOP, THRESHOLD
+from fieldfuse.render.field import Field
+from fieldfuse.render.kernels_decode import layers_of, rays_of
+from fieldfuse.training import fused_block, fused_decoder
+from fieldfuse.training import fused_kernels as kernels
+from fieldfuse.training import fused_moves as moves
+from fieldfuse.training.finite import broken, refuse
+from fieldfuse.training.fused_order import Batch, Tiles
+from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.step import Rates
+from fieldfuse.training.view import blind
 
 Array = np.ndarray[Any, Any]
 BETAS, EPSILON = (0.9, 0.99), 1e-10  # of the decoder; rows have no first moment

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from toolkit.render import kernels as K
-from toolkit.render.kernels_decode import RAYS, Rays, decode, encode_direction
-from toolkit.render.kernels_lookup import gather_row
-from toolkit.render.kernels_march import march_ray
-from toolkit.render.kernels_row import add_row, add_to, product_with, put_row
-from toolkit.training.fused_decoder import Tape, decode_backward, forget_gradients
-from toolkit.training.fused_kernels import ask_for, depth_pull, pixel_ray, slow_near
+from fieldfuse.render import kernels as K
+from fieldfuse.render.kernels_decode import RAYS, Rays, decode, encode_direction
+from fieldfuse.render.kernels_lookup import gather_row
+from fieldfuse.render.kernels_march import march_ray
+from fieldfuse.render.kernels_row import add_row, add_to, product_with, put_row
+from fieldfuse.training.fused_decoder import Tape, decode_backward, forget_gradients
+from fieldfuse.training.fused_kernels import ask_for, depth_pull, pixel_ray, slow_near
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
 MOST = 1024  # samples of one ray that are kept, see `kernels_march`

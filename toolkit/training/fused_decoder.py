@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from numba import njit
 
-from toolkit.networks.decoder import Deferred
-from toolkit.render import kernels as K
-from toolkit.render.kernels_decode import RAYS, Layers, rays_of, whole_lanes
-from toolkit.render.kernels_matrix import add_outer, product
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.render import kernels as K
+from fieldfuse.render.kernels_decode import RAYS, Layers, rays_of, whole_lanes
+from fieldfuse.render.kernels_matrix import add_outer, product
 
 Array = np.ndarray[Any, Any]
 ZERO = K.ZERO

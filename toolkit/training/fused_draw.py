@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from toolkit.render import kernels as K
-from toolkit.training.fused_kernels import seen_at
-from toolkit.training.importance import MOST as MOST_
-from toolkit.training.importance import SHARE as SHARE_
-from toolkit.training.importance import TILE as TILE_
-from toolkit.training.importance import TOP as TOP_
+from fieldfuse.render import kernels as K
+from fieldfuse.training.fused_kernels import seen_at
+from fieldfuse.training.importance import MOST as MOST_
+from fieldfuse.training.importance import SHARE as SHARE_
+from fieldfuse.training.importance import TILE as TILE_
+from fieldfuse.training.importance import TOP as TOP_
 
 F, ZERO, ONE = K.F, K.ZERO, K.ONE
 SHARE, MOST, TOP = F(SHARE_), F(MOST_), F(TOP_)

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from toolkit.render import kernels as K
-from toolkit.training.depth import REACH as REACH_
-from toolkit.training.rays import PixelPool
+from fieldfuse.render import kernels as K
+from fieldfuse.training.depth import REACH as REACH_
+from fieldfuse.training.rays import PixelPool
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
 REACH = F(REACH_)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from toolkit.render import kernels as K
+from fieldfuse.render import kernels as K
 
 ZERO, ONE = K.ZERO, K.ONE
 COUNT, DENSITY, FEATURE = 0, 1, 2  # columns of a row's record: steps, and from where on the second moments are

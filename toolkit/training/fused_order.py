@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from toolkit.render import kernels as K
-from toolkit.training import fused_draw
-from toolkit.training.fused_kernels import ask_for, pixel_ray
-from toolkit.training.importance import KEEP as KEEP_
-from toolkit.training.importance import RENEW, tile_grid
-from toolkit.training.rays import PixelPool
+from fieldfuse.render import kernels as K
+from fieldfuse.training import fused_draw
+from fieldfuse.training.fused_kernels import ask_for, pixel_ray
+from fieldfuse.training.importance import KEEP as KEEP_
+from fieldfuse.training.importance import RENEW, tile_grid
+from fieldfuse.training.rays import PixelPool
 
 Array = np.ndarray[Any, Any]
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from toolkit.networks.decoder import PerSample
-from toolkit.networks.encoding import DIRECTION
-from toolkit.render.compiled_per_sample import net_arrays, render_pass, turn, write_back
-from toolkit.render.composite import STOP
-from toolkit.render.field import Field
-from toolkit.render.kernels_net import Net, make_tape
-from toolkit.render.kernels_per_sample import NEGLIGIBLE
-from toolkit.training import fused_per_sample_kernels as kernels
-from toolkit.training.fused import FusedOptimiser
-from toolkit.training.fused_kernels import Losses
+from fieldfuse.networks.decoder import PerSample
+from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.render.compiled_per_sample import net_arrays, render_pass, turn, write_back
+from fieldfuse.render.composite import STOP
+from fieldfuse.render.field import Field
+from fieldfuse.render.kernels_net import Net, make_tape
+from fieldfuse.render.kernels_per_sample import NEGLIGIBLE
+from fieldfuse.training import fused_per_sample_kernels as kernels
+from fieldfuse.training.fused import FusedOptimiser
+from fieldfuse.training.fused_kernels import Losses
 
 Array = np.ndarray[Any, Any]
 

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from toolkit.networks.decoder import FREQUENCIES
-from toolkit.render import kernels as K
-from toolkit.render.kernels_matrix import add_outer, product
-from toolkit.render.kernels_net import BATCH, SAMPLES, Net, Tape, decode_colours, make_tape
-from toolkit.render.kernels_per_sample import march_ray
-from toolkit.render.kernels_row import add_row, put_row
-from toolkit.training.fused_kernels import depth_pull, pixel_ray, slow_near
+from fieldfuse.networks.decoder import FREQUENCIES
+from fieldfuse.render import kernels as K
+from fieldfuse.render.kernels_matrix import add_outer, product
+from fieldfuse.render.kernels_net import BATCH, SAMPLES, Net, Tape, decode_colours, make_tape
+from fieldfuse.render.kernels_per_sample import march_ray
+from fieldfuse.render.kernels_row import add_row, put_row
+from fieldfuse.training.fused_kernels import depth_pull, pixel_ray, slow_near
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
 RAYS = 64  # rays at a time, when they have few samples

@@ -7,10 +7,10 @@ from dataclasses import field as default
 
 import torch
 
-from toolkit.errors import InputError
-from toolkit.render.field import Field
-from toolkit.training.finite import NotFiniteError
-from toolkit.training.step import Rates
+from fieldfuse.errors import InputError
+from fieldfuse.render.field import Field
+from fieldfuse.training.finite import NotFiniteError
+from fieldfuse.training.step import Rates
 
 MOST = 5  # bad steps that a fit may meet; one more, and it ends with what it has
 SLOWER = 0.5  # of the step sizes, after each of them

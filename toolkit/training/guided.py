@@ -14,20 +14,20 @@ from typing import TypedDict, Unpack
 
 import numpy as np
 
-from toolkit.capture.types import Views
-from toolkit.config import Settings
-from toolkit.errors import InputError, Interrupted
-from toolkit.memory import give_back
-from toolkit.poses.scene import Scene
-from toolkit.progress import SILENT, Progress
-from toolkit.render.field import Field
-from toolkit.stereo import moving, quick
-from toolkit.stereo.left_out import LeftOut
-from toolkit.training import depth_start
-from toolkit.training.engine import fit_device, warm_up
-from toolkit.training.fit import DEFAULT_BUDGET, Clock, FitResult, fit_field
-from toolkit.training.schedule import GUESSED, PARTLY, RUNGS
-from toolkit.volume.host import Host
+from fieldfuse.capture.types import Views
+from fieldfuse.config import Settings
+from fieldfuse.errors import InputError, Interrupted
+from fieldfuse.memory import give_back
+from fieldfuse.poses.scene import Scene
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.render.field import Field
+from fieldfuse.stereo import moving, quick
+from fieldfuse.stereo.left_out import LeftOut
+from fieldfuse.training import depth_start
+from fieldfuse.training.engine import fit_device, warm_up
+from fieldfuse.training.fit import DEFAULT_BUDGET, Clock, FitResult, fit_field
+from fieldfuse.training.schedule import GUESSED, PARTLY, RUNGS
+from fieldfuse.volume.host import Host
 
 
 class Begin(TypedDict, total=False):

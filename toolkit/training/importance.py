@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import torch
 
-from toolkit.training.rays import PixelPool
+from fieldfuse.training.rays import PixelPool
 
 Tensor = torch.Tensor
 TILE = 8  # pixels a side

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import torch
 
-from toolkit.networks.decoder import Deferred, PerSample
-from toolkit.render.field import Field
-from toolkit.volume.edit import dilate, erase_empty_blocks, resample, split, with_corner_blocks
-from toolkit.volume.host import Host
-from toolkit.volume.space import Space
-from toolkit.volume.topology import BLOCK, VOXELS, Topology
+from fieldfuse.networks.decoder import Deferred, PerSample
+from fieldfuse.render.field import Field
+from fieldfuse.volume.edit import dilate, erase_empty_blocks, resample, split, with_corner_blocks
+from fieldfuse.volume.host import Host
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
 
 Tensor = torch.Tensor
 FEATURE_NOISE = 0.05
@@ -109,7 +109,7 @@ def looked_at(field: Field, seen: Tensor, visits: Tensor, threshold: float) -> T
 def beside(topology: Topology, strong: Tensor) -> Tensor:
     """(M · 512,) bool grown by one voxel."""
     if strong.device.type == "cpu":
-        from toolkit.volume.compiled import dilated
+        from fieldfuse.volume.compiled import dilated
 
         return dilated(topology, strong)
     return dilate(topology, strong, 1, grow=False)[1]
@@ -124,7 +124,7 @@ def let_go(field: Field) -> None:
     """On the CPU, give back the memory of rows that no voxel uses any more after pruning. They read as zero, so what the field was before
     is void; its rows must be in memory of this process alone."""
     if field.device.type == "cpu":
-        from toolkit.volume import compiled
+        from fieldfuse.volume import compiled
 
         compiled.let_go(compiled.corner_nodes(field.topology, field.occupied), field.density_rows, field.feature_rows)
 
@@ -133,7 +133,7 @@ def finer(field: Field, keep: Tensor, resolution: int, host: Host) -> Field:
     """The same function, where `keep` says, on a lattice of `resolution` voxels a side; rows are new."""
     values = [field.density_rows, field.feature_rows]
     if field.device.type == "cpu":
-        from toolkit.volume.compiled import refined
+        from fieldfuse.volume.compiled import refined
 
         voxel_size = 2 * field.space.extent / resolution * field.space.half
         kept = field.occupied & keep

@@ -11,14 +11,14 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from toolkit.capture.types import Views
-from toolkit.config import Settings
-from toolkit.networks.decoder import Deferred, PerSample, make_decoder
-from toolkit.poses.scene import Scene
-from toolkit.render.field import Field
-from toolkit.training.levels import FEATURE_NOISE, all_places, occupancy
-from toolkit.training.start import NEAR, THIN, finest_resolution, levels, possible
-from toolkit.volume.edit import resample
+from fieldfuse.capture.types import Views
+from fieldfuse.config import Settings
+from fieldfuse.networks.decoder import Deferred, PerSample, make_decoder
+from fieldfuse.poses.scene import Scene
+from fieldfuse.render.field import Field
+from fieldfuse.training.levels import FEATURE_NOISE, all_places, occupancy
+from fieldfuse.training.start import NEAR, THIN, finest_resolution, levels, possible
+from fieldfuse.volume.edit import resample
 
 Tensor = torch.Tensor
 # Largest raw density of the start: a fog where surfaces may be, which a wrong guess costs little (docs/measured/few_views.md).

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import torch
 
-from toolkit.capture.types import Views
-from toolkit.training.depth import ray_distances
+from fieldfuse.capture.types import Views
+from fieldfuse.training.depth import ray_distances
 
 Tensor = torch.Tensor
 REACH = 3.0  # deviations of a Gaussian beyond which nothing counts

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import torch
 
-from toolkit import memory
-from toolkit.capture.types import Views
-from toolkit.config import Settings
-from toolkit.errors import InputError
-from toolkit.render.field import Field
-from toolkit.training.engine import chosen_engine
-from toolkit.training.schedule import Schedule
-from toolkit.volume.topology import BLOCK, VOXELS
+from fieldfuse import memory
+from fieldfuse.capture.types import Views
+from fieldfuse.config import Settings
+from fieldfuse.errors import InputError
+from fieldfuse.render.field import Field
+from fieldfuse.training.engine import chosen_engine
+from fieldfuse.training.schedule import Schedule
+from fieldfuse.volume.topology import BLOCK, VOXELS
 
 POOL_BYTES = 15  # a pixel: colour, distance, and where some are left out its place, that twice while they are put together
 HALF = BLOCK // 2
@@ -53,7 +53,7 @@ def compiled_bytes(field: Field, keep: torch.Tensor, finer: int, settings: Setti
     """Memory that the compiled engine takes beyond what there is when the voxels `keep` (M · 512,) go on in a lattice of `finer` voxels a
     side: while rows are made, or while they are fitted, whichever is more, less the memory of the field's rows if they are `replaced`.
     Blocks are counted; what of a level's rows is written to and touched is what it was on captures."""
-    from toolkit.volume.compiled import corner_nodes, finer_blocks
+    from fieldfuse.volume.compiled import corner_nodes, finer_blocks
 
     channels, threads = settings.field.channels, settings.threads or torch.get_num_threads()
     values, kept = 4 * (1 + channels), field.occupied & keep

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from toolkit.camera import Array
-from toolkit.capture.types import Views
-from toolkit.tone import decode, encode
-from toolkit.training.engine import Engine
-from toolkit.training.rays import Batch, PixelPool
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Views
+from fieldfuse.tone import decode, encode
+from fieldfuse.training.engine import Engine
+from fieldfuse.training.rays import Batch, PixelPool
 
 
 class Sample:

@@ -12,10 +12,10 @@ from dataclasses import field as default
 
 import numpy as np
 
-from toolkit.config import FitSettings
-from toolkit.training.depth import FINE, Trust
-from toolkit.training.start import COARSEST, FINER
-from toolkit.training.step import Rates
+from fieldfuse.config import FitSettings
+from fieldfuse.training.depth import FINE, Trust
+from fieldfuse.training.start import COARSEST, FINER
+from fieldfuse.training.step import Rates
 
 RUNGS = (0.1, 0.3, 0.6, 0.8, 0.9)  # share of the budget at which each level ends at the latest, from the first one on …
 PARTLY = (0.2, 0.45, 0.7, 0.85, 0.9)  # … of a fit that begins with what is known of depth, and knows a part: what is not takes longer

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from numba import njit
 
-from toolkit.capture.types import Views
-from toolkit.networks import compiled
-from toolkit.networks.lattice import Lattice
-from toolkit.render.field import Field
-from toolkit.training.levels import all_places
-from toolkit.training.start import COARSEST, WHOLE, emptied_by_views
-from toolkit.volume.space import Space
+from fieldfuse.capture.types import Views
+from fieldfuse.networks import compiled
+from fieldfuse.networks.lattice import Lattice
+from fieldfuse.render.field import Field
+from fieldfuse.training.levels import all_places
+from fieldfuse.training.start import COARSEST, WHOLE, emptied_by_views
+from fieldfuse.volume.space import Space
 
 Tensor = torch.Tensor
 HULL = 128  # voxels along a side: 256 gave no better fields

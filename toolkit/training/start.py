@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import torch
 
-from toolkit.camera import Array, invert
-from toolkit.capture.types import Views
-from toolkit.poses.scene import Scene
-from toolkit.volume.space import Space
+from fieldfuse.camera import Array, invert
+from fieldfuse.capture.types import Views
+from fieldfuse.poses.scene import Scene
+from fieldfuse.volume.space import Space
 
 Tensor = torch.Tensor
 SHELL = 1.0  # width of the contracted shell, in half sizes of the region

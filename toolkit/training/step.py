@@ -6,18 +6,18 @@ from dataclasses import dataclass
 
 import torch
 
-from toolkit.networks.decoder import Deferred
-from toolkit.render.composite import RAW_MAX, SOLID, STOP, distortion, ray_sum, thickness_gradient, weights
-from toolkit.render.field import Field, density
-from toolkit.render.march import BRICK, Samples, march
-from toolkit.render.rays import OPACITY_FLOOR
-from toolkit.training.adam import Adam, LazyAdam
-from toolkit.training.depth import FINE, depth_gradient
-from toolkit.training.finite import NotFiniteError, check
-from toolkit.training.near import slowness
-from toolkit.training.rays import Batch
-from toolkit.training.view import blind, of_direction
-from toolkit.volume.lookup import corners, gather, scatter
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.render.composite import RAW_MAX, SOLID, STOP, distortion, ray_sum, thickness_gradient, weights
+from fieldfuse.render.field import Field, density
+from fieldfuse.render.march import BRICK, Samples, march
+from fieldfuse.render.rays import OPACITY_FLOOR
+from fieldfuse.training.adam import Adam, LazyAdam
+from fieldfuse.training.depth import FINE, depth_gradient
+from fieldfuse.training.finite import NotFiniteError, check
+from fieldfuse.training.near import slowness
+from fieldfuse.training.rays import Batch
+from fieldfuse.training.view import blind, of_direction
+from fieldfuse.volume.lookup import corners, gather, scatter
 
 Tensor = torch.Tensor
 

@@ -14,15 +14,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from toolkit.camera import Array
-from toolkit.capture.prepare import prepare_views
-from toolkit.capture.types import Capture, Views
-from toolkit.config import CaptureSettings, Settings
-from toolkit.effects.correct import Corrections
-from toolkit.errors import InputError, PoseError
-from toolkit.poses.scene import Scene, describe_scene
-from toolkit.progress import SILENT, Progress
-from toolkit.training.fit import fit_field
+from fieldfuse.camera import Array
+from fieldfuse.capture.prepare import prepare_views
+from fieldfuse.capture.types import Capture, Views
+from fieldfuse.config import CaptureSettings, Settings
+from fieldfuse.effects.correct import Corrections
+from fieldfuse.errors import InputError, PoseError
+from fieldfuse.poses.scene import Scene, describe_scene
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.training.fit import fit_field
 
 LONG_SIDE = 192  # pixels of a trial's images
 RESOLUTION = 96  # voxels a side

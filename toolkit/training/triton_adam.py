@@ -5,7 +5,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from toolkit.training.triton_rates import R_DECODER, R_DENSITY, R_FEATURE
+from fieldfuse.training.triton_rates import R_DECODER, R_DENSITY, R_FEATURE
 
 
 @triton.jit(do_not_specialize=["rows"])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from toolkit.networks.encoding import SH
-from toolkit.render.triton_march import C_BEHIND, C_COUNTS, C_JITTER, C_RED, C_TARGET
-from toolkit.training.importance import TILE, TOP
+from fieldfuse.networks.encoding import SH
+from fieldfuse.render.triton_march import C_BEHIND, C_COUNTS, C_JITTER, C_RED, C_TARGET
+from fieldfuse.training.importance import TILE, TOP
 
 TRIES = 24  # evenly drawn pixels, of which the first that luck takes is looked at; one of 3·10⁴ rays takes its last one
 S0, S1, S2, S3, S4, S5, S6, S7, S8, S9 = (tl.constexpr(v) for v in SH)

@@ -12,22 +12,22 @@ import math
 import torch
 import triton
 
-from toolkit.gpu import OTHERS_GO_ON
-from toolkit.networks.decoder import Deferred
-from toolkit.networks.encoding import DIRECTION, spherical_harmonics
-from toolkit.render.field import Field
-from toolkit.render.march import BRICK
-from toolkit.render.triton_field import Tables, TritonRenderer, buffers_for, launch_composite, launch_walk
-from toolkit.render.triton_march import BEHIND, COUNTS, JITTER, NOTES, RED, TARGET
-from toolkit.training.finite import NotFiniteError
-from toolkit.training.importance import RENEW, densities, tile_grid
-from toolkit.training.rays import Batch, PixelPool
-from toolkit.training.step import Rates
-from toolkit.training.triton_adam import count_step, learn, move
-from toolkit.training.triton_draw import draw
-from toolkit.training.triton_gradients import inspect, judge, spread
-from toolkit.training.triton_rates import RATES, told
-from toolkit.training.view import blind
+from fieldfuse.gpu import OTHERS_GO_ON
+from fieldfuse.networks.decoder import Deferred
+from fieldfuse.networks.encoding import DIRECTION, spherical_harmonics
+from fieldfuse.render.field import Field
+from fieldfuse.render.march import BRICK
+from fieldfuse.render.triton_field import Tables, TritonRenderer, buffers_for, launch_composite, launch_walk
+from fieldfuse.render.triton_march import BEHIND, COUNTS, JITTER, NOTES, RED, TARGET
+from fieldfuse.training.finite import NotFiniteError
+from fieldfuse.training.importance import RENEW, densities, tile_grid
+from fieldfuse.training.rays import Batch, PixelPool
+from fieldfuse.training.step import Rates
+from fieldfuse.training.triton_adam import count_step, learn, move
+from fieldfuse.training.triton_draw import draw
+from fieldfuse.training.triton_gradients import inspect, judge, spread
+from fieldfuse.training.triton_rates import RATES, told
+from fieldfuse.training.view import blind
 
 Tensor = torch.Tensor
 SLOTS = 128  # samples of a ray that can get a gradient; lattices so fine that more exceed the threshold come when space is thin no more

@@ -8,8 +8,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from toolkit.render.triton_lookup import corner, share
-from toolkit.render.triton_march import (
+from fieldfuse.render.triton_lookup import corner, share
+from fieldfuse.render.triton_march import (
     C_AFTER,
     C_BEHIND,
     C_COUNTS,
@@ -26,9 +26,9 @@ from toolkit.render.triton_march import (
     gathered,
     noted_at,
 )
-from toolkit.training.depth import REACH
-from toolkit.training.importance import KEEP
-from toolkit.training.triton_rates import R_DEPTH, R_DISTORTION, R_NOISE, R_OPACITY, R_SLOW
+from fieldfuse.training.depth import REACH
+from fieldfuse.training.importance import KEEP
+from fieldfuse.training.triton_rates import R_DEPTH, R_DISTORTION, R_NOISE, R_OPACITY, R_SLOW
 
 C_KEEP, C_REACH = tl.constexpr(KEEP), tl.constexpr(REACH)
 HUGE = tl.constexpr(3e38)  # what is not smaller is not finite

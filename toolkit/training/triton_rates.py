@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import triton.language as tl
 
-from toolkit.training.step import Rates
+from fieldfuse.training.step import Rates
 
 R_DENSITY, R_FEATURE, R_DECODER, R_DISTORTION, R_OPACITY, R_DEPTH, R_NOISE, R_SLOW = (tl.constexpr(v) for v in range(8))
 RATES = 8

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from toolkit.camera import Intrinsics
-from toolkit.capture.types import Views
-from toolkit.networks.decoder import make_decoder
-from toolkit.progress import Progress
-from toolkit.render.triton_field import TritonRenderer
-from toolkit.render.triton_march import RAYS
-from toolkit.training.levels import finer, first_field, visible
-from toolkit.training.rays import PixelPool
-from toolkit.training.step import Rates
-from toolkit.training.triton_engine import EAGER, TritonOptimiser
-from toolkit.volume.host import TorchHost
-from toolkit.volume.space import Space
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.progress import Progress
+from fieldfuse.render.triton_field import TritonRenderer
+from fieldfuse.render.triton_march import RAYS
+from fieldfuse.training.levels import finer, first_field, visible
+from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.step import Rates
+from fieldfuse.training.triton_engine import EAGER, TritonOptimiser
+from fieldfuse.volume.host import TorchHost
+from fieldfuse.volume.space import Space
 
 _ready: set[tuple[int, int, torch.device]] = set()
 RATES = Rates(0.01, 0.01, 0.001, 0.01, 0.01)

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from toolkit.camera import Intrinsics
-from toolkit.capture.types import Views
-from toolkit.networks.decoder import make_decoder
-from toolkit.render.compiled import CompiledRenderer
-from toolkit.render.compiled_per_sample import PerSampleRenderer
-from toolkit.training.fused import FusedOptimiser
-from toolkit.training.fused_per_sample import FusedPerSampleOptimiser
-from toolkit.training.levels import finer, first_field, visible
-from toolkit.training.rays import PixelPool
-from toolkit.training.step import Rates
-from toolkit.volume.host import TorchHost
-from toolkit.volume.space import Space
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.render.compiled import CompiledRenderer
+from fieldfuse.render.compiled_per_sample import PerSampleRenderer
+from fieldfuse.training.fused import FusedOptimiser
+from fieldfuse.training.fused_per_sample import FusedPerSampleOptimiser
+from fieldfuse.training.levels import finer, first_field, visible
+from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.step import Rates
+from fieldfuse.volume.host import TorchHost
+from fieldfuse.volume.space import Space
 
 _ready: set[tuple[str, int, int]] = set()
 RATES = Rates(0.01, 0.01, 0.001, 0.01, 0.01)

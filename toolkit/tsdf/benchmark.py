@@ -10,10 +10,10 @@ import numpy as np
 import open3d as o3d
 import open3d.core as o3c
 
-from toolkit.camera import invert
-from toolkit.errors import InputError
-from toolkit.tsdf.frames import DepthFrame
-from toolkit.tsdf.volume import BLOCK, DEVICE, TsdfVolume
+from fieldfuse.camera import invert
+from fieldfuse.errors import InputError
+from fieldfuse.tsdf.frames import DepthFrame
+from fieldfuse.tsdf.volume import BLOCK, DEVICE, TsdfVolume
 
 
 def bare_loop_seconds(

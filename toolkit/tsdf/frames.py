@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, Similarity, undistort_maps
-from toolkit.capture.images import load_depth, load_image, usable_pixels
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
-from toolkit.tone import Tone
+from fieldfuse.camera import Array, Intrinsics, Similarity, undistort_maps
+from fieldfuse.capture.images import load_depth, load_image, usable_pixels
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
+from fieldfuse.tone import Tone
 
 # A voxel this share of the median depth is 1 cm at 2 m (rooms) and 2.5 mm at half a metre (objects).
 VOXELS_PER_MEDIAN_DEPTH = 200.0

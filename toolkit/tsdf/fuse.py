@@ -7,15 +7,15 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from toolkit.camera import Similarity
-from toolkit.capture.types import Capture
-from toolkit.config import TsdfSettings
-from toolkit.errors import InputError
-from toolkit.progress import SILENT, Progress
-from toolkit.tone import Tone
-from toolkit.tsdf.frames import DepthFrame, automatic_depth_max, automatic_voxel_size, capture_depth_frames
-from toolkit.tsdf.view import MeshView
-from toolkit.tsdf.volume import Points, TsdfVolume, too_fine
+from fieldfuse.camera import Similarity
+from fieldfuse.capture.types import Capture
+from fieldfuse.config import TsdfSettings
+from fieldfuse.errors import InputError
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.tone import Tone
+from fieldfuse.tsdf.frames import DepthFrame, automatic_depth_max, automatic_voxel_size, capture_depth_frames
+from fieldfuse.tsdf.view import MeshView
+from fieldfuse.tsdf.volume import Points, TsdfVolume, too_fine
 
 __all__ = ["DepthFrame", "MeshView", "Points", "TsdfVolume", "capture_depth_frames", "estimate_blocks", "fuse_capture", "fuse_frames"]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from toolkit.errors import InputError
-from toolkit.progress import SILENT, Progress
-from toolkit.tsdf.frames import DepthFrame, automatic_depth_max
-from toolkit.tsdf.fuse import with_room
-from toolkit.tsdf.volume import TsdfVolume
+from fieldfuse.errors import InputError
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.tsdf.frames import DepthFrame, automatic_depth_max
+from fieldfuse.tsdf.fuse import with_room
+from fieldfuse.tsdf.volume import TsdfVolume
 
 CONFIRMED = 1.5  # surface that a single view shows is left out ...
 MANY_VIEWS = 10  # ... from so many views on

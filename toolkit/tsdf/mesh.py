@@ -10,8 +10,8 @@ import open3d as o3d
 import open3d.core as o3c
 from numba import njit
 
-from toolkit.camera import Array, Similarity
-from toolkit.errors import InputError
+from fieldfuse.camera import Array, Similarity
+from fieldfuse.errors import InputError
 
 HASTE = (3, 5, 7, 10)  # of thinning out: the most careful that gets there is taken, each going on where the one before ended …
 OVER = 0.05  # … when there are no more than so many triangles too many

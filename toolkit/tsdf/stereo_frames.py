@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from toolkit.capture.types import Views
-from toolkit.progress import SILENT, Progress
-from toolkit.stereo.maps import LEAST_CONFIDENCE
-from toolkit.stereo.match import StereoDepth
-from toolkit.tsdf.frames import DepthFrame, cover
-from toolkit.tsdf.held import fuse_held
-from toolkit.tsdf.volume import TsdfVolume
+from fieldfuse.capture.types import Views
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.stereo.maps import LEAST_CONFIDENCE
+from fieldfuse.stereo.match import StereoDepth
+from fieldfuse.tsdf.frames import DepthFrame, cover
+from fieldfuse.tsdf.held import fuse_held
+from fieldfuse.tsdf.volume import TsdfVolume
 
 
 def stereo_frames(views: Views, depths: Sequence[StereoDepth], least_confidence: float = LEAST_CONFIDENCE) -> Iterator[DepthFrame]:

@@ -10,10 +10,10 @@ import open3d.core as o3c
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from toolkit.camera import Array
-from toolkit.errors import InputError, OutputError, first_line
-from toolkit.files import atomic_path
-from toolkit.tsdf.volume import BLOCK, TsdfVolume
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError, OutputError, first_line
+from fieldfuse.files import atomic_path
+from fieldfuse.tsdf.volume import BLOCK, TsdfVolume
 
 VERSION = 1
 CHANNELS = {"tsdf": 1, "weight": 1, "color": 3}

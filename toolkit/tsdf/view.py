@@ -8,8 +8,8 @@ import numpy as np
 import open3d as o3d
 import open3d.core as o3c
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.tsdf.mesh import Mesh
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.tsdf.mesh import Mesh
 
 RAYS_AT_ONCE = 1 << 20
 

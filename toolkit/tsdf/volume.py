@@ -23,12 +23,12 @@ import numpy as np
 import open3d as o3d
 import open3d.core as o3c
 
-from toolkit import memory
-from toolkit.camera import Array, Intrinsics, invert
-from toolkit.errors import InputError
-from toolkit.tsdf.frames import DepthFrame
-from toolkit.tsdf.mesh import Mesh, as_bytes, places
-from toolkit.tsdf.view import MeshView, SurfaceCaster
+from fieldfuse import memory
+from fieldfuse.camera import Array, Intrinsics, invert
+from fieldfuse.errors import InputError
+from fieldfuse.tsdf.frames import DepthFrame
+from fieldfuse.tsdf.mesh import Mesh, as_bytes, places
+from fieldfuse.tsdf.view import MeshView, SurfaceCaster
 
 BLOCK = 8
 DEPTH_STEPS = 60000  # 16-bit depth: this value is depth_max, what saturates above it is out of range

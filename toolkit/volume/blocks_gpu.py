@@ -9,9 +9,9 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel, power_of_two
-from toolkit.volume.tables_gpu import row_of
-from toolkit.volume.topology import VOXELS, Topology
+from fieldfuse.gpu import kernel, power_of_two
+from fieldfuse.volume.tables_gpu import row_of
+from fieldfuse.volume.topology import VOXELS, Topology
 
 TILE = 128  # voxels of a block at a time
 

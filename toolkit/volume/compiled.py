@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from numba import njit
 
-from toolkit.memory import keep_only
-from toolkit.volume.host import Host, Hosted
-from toolkit.volume.topology import Topology
+from fieldfuse.memory import keep_only
+from fieldfuse.volume.host import Host, Hosted
+from fieldfuse.volume.topology import Topology
 
 Tensor = torch.Tensor
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "boundscheck": False}

@@ -13,11 +13,11 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from toolkit import gpu
-from toolkit.gpu import asks_freely
-from toolkit.volume.lookup import corners, gather
-from toolkit.volume.rows import zero_rows
-from toolkit.volume.topology import BLOCK, VOXELS, Bounds, Topology, constant
+from fieldfuse import gpu
+from fieldfuse.gpu import asks_freely
+from fieldfuse.volume.lookup import corners, gather
+from fieldfuse.volume.rows import zero_rows
+from fieldfuse.volume.topology import BLOCK, VOXELS, Bounds, Topology, constant
 
 CHUNK = 1024  # blocks at a time …
 COPIED = 128  # … and of those that are copied
@@ -35,7 +35,7 @@ def _pooled(topology: Topology, occupied: Tensor, last: int) -> Tensor:
     """(M · 512,) bool: rows with an occupied row among the offsets −1 … `last` along each axis."""
     width = last + 2
     if gpu.there(occupied):
-        from toolkit.volume import blocks_gpu as blocks
+        from fieldfuse.volume import blocks_gpu as blocks
 
         return blocks.pooled(topology, occupied, -1, width)
     padded = torch.cat([occupied, occupied.new_zeros(1)])
@@ -227,7 +227,7 @@ def resample(
         raise ValueError(f"mode must be one of {', '.join(MODES)} and scale positive, not {mode!r} and {scale}")
     nodes = corner_nodes(topology, occupied)
     if mode == "trilinear" and topology.bounds is not None and gpu.fits(*rows):  # keys are small there
-        from toolkit.volume import blocks_gpu as blocks
+        from fieldfuse.volume import blocks_gpu as blocks
 
         return blocks.resample(topology, nodes, rows, new_keys, scale)
     row_of_valid = torch.where(nodes, torch.arange(len(nodes), device=nodes.device), topology.zero_row)

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 from torch.utils import dlpack
 
-from toolkit.errors import InputError
-from toolkit.volume.topology import BLOCK, VOXELS, Topology
+from fieldfuse.errors import InputError
+from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
 
 DEFAULT_ATTRIBUTES = {"feature": 16, "density": 1, "occupied": 1}
 LOOKED_AT = 64  # blocks at once, when memory is asked whether it is clean: each value is a byte for a moment

@@ -6,11 +6,11 @@ import numpy as np
 import open3d as o3d
 import torch
 
-from toolkit.memory import keep_only
-from toolkit.volume.grid import BlockGrid
-from toolkit.volume.host import Host, Hosted, TorchHost
-from toolkit.volume.rows import zero_rows
-from toolkit.volume.topology import VOXELS, Topology
+from fieldfuse.memory import keep_only
+from fieldfuse.volume.grid import BlockGrid
+from fieldfuse.volume.host import Host, Hosted, TorchHost
+from fieldfuse.volume.rows import zero_rows
+from fieldfuse.volume.topology import VOXELS, Topology
 
 Tensor = torch.Tensor
 LINE = 64  # bytes of a cache line

@@ -10,8 +10,8 @@ from typing import Protocol
 
 import torch
 
-from toolkit.volume.rows import zero_rows
-from toolkit.volume.topology import Topology
+from fieldfuse.volume.rows import zero_rows
+from fieldfuse.volume.topology import Topology
 
 Tensor = torch.Tensor
 

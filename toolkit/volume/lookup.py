@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 
-from toolkit.volume.topology import BLOCK, VOXELS, Topology
+from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
 
 Tensor = torch.Tensor
 SIDE = BLOCK + 1

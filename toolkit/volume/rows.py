@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from toolkit import memory
+from fieldfuse import memory
 
 Tensor = torch.Tensor
 

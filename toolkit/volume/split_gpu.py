@@ -11,10 +11,10 @@ import triton.language as tl
 from numpy.typing import NDArray
 from torch import Tensor
 
-from toolkit.gpu import kernel, power_of_two, sent
-from toolkit.volume.blocks_gpu import pooled
-from toolkit.volume.tables_gpu import row_of
-from toolkit.volume.topology import VOXELS, Bounds, Topology
+from fieldfuse.gpu import kernel, power_of_two, sent
+from fieldfuse.volume.blocks_gpu import pooled
+from fieldfuse.volume.tables_gpu import row_of
+from fieldfuse.volume.topology import VOXELS, Bounds, Topology
 
 FEW = 2**21  # block keys that there can be, up to which all are marked
 TILE = 128  # voxels of a block at a time

@@ -19,12 +19,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from toolkit import memory
-from toolkit.camera import Similarity
-from toolkit.errors import FieldfuseError, InputError, OutputError, all_lines, first_line
-from toolkit.files import atomic_path
-from toolkit.volume.rows import zero_rows
-from toolkit.volume.topology import MAX_TABLE_CELLS, VOXELS
+from fieldfuse import memory
+from fieldfuse.camera import Similarity
+from fieldfuse.errors import FieldfuseError, InputError, OutputError, all_lines, first_line
+from fieldfuse.files import atomic_path
+from fieldfuse.volume.rows import zero_rows
+from fieldfuse.volume.topology import MAX_TABLE_CELLS, VOXELS
 
 VERSION = 1
 METADATA_KEY = "fieldfuse.field"

@@ -8,7 +8,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel, pieces
+from fieldfuse.gpu import kernel, pieces
 
 BLOCK = 256
 

@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from toolkit import gpu
-from toolkit.gpu import asks_freely
+from fieldfuse import gpu
+from fieldfuse.gpu import asks_freely
 
 BLOCK = 8
 VOXELS = BLOCK**3
@@ -108,7 +108,7 @@ class Topology:
     @cached_property
     def _placed(self) -> tuple[Tensor, Tensor]:
         """The table and the cells of its own blocks; elsewhere than on CUDA already known."""
-        from toolkit.volume import tables_gpu
+        from fieldfuse.volume import tables_gpu
 
         return tables_gpu.table(self.keys, self.table_origin, self.table_size)
 
@@ -192,7 +192,7 @@ class Topology:
     def around(self) -> Tensor:
         """(M, 27) int64 slots of the 3×3×3 blocks around each, −1 absent; column (dz+1)·9 + (dy+1)·3 + (dx+1), itself in column 13."""
         if self.bounds is not None and gpu.there(self.keys):
-            from toolkit.volume import tables_gpu
+            from fieldfuse.volume import tables_gpu
 
             if self._among is None:
                 return tables_gpu.around(*self._placed)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from toolkit.files import write_json
+from fieldfuse.files import write_json
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -11,21 +11,21 @@ import torch
 from PIL import Image
 from safetensors.numpy import save_file
 
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import FieldfuseError
+from fieldfuse.evaluate.compare_truth import find_truth, true_depths
+from fieldfuse.files import write_json
+from fieldfuse.simulate.mesh_scene import load_mesh_scene
+from fieldfuse.simulate.seen import Rays
+from fieldfuse.training.nerfusion.captured import CapturedScene
+from fieldfuse.training.nerfusion.datasets.dtu import dtu_scene, dtu_scenes
+from fieldfuse.training.nerfusion.datasets.scanned_objects import scanned_object_folders, scanned_object_scene
+from fieldfuse.training.nerfusion.datasets.scannet import scannet_folders, scannet_scene
+from fieldfuse.training.nerfusion.datasets.synthetic import synthetic_folders, synthetic_scene
 from tests.capture.layouts import LAYOUTS
 from tests.training.nerfusion import layouts
-from toolkit.camera import Intrinsics
-from toolkit.capture import open_capture
-from toolkit.capture.types import Views
-from toolkit.errors import FieldfuseError
-from toolkit.evaluate.compare_truth import find_truth, true_depths
-from toolkit.files import write_json
-from toolkit.simulate.mesh_scene import load_mesh_scene
-from toolkit.simulate.seen import Rays
-from toolkit.training.nerfusion.captured import CapturedScene
-from toolkit.training.nerfusion.datasets.dtu import dtu_scene, dtu_scenes
-from toolkit.training.nerfusion.datasets.scanned_objects import scanned_object_folders, scanned_object_scene
-from toolkit.training.nerfusion.datasets.scannet import scannet_folders, scannet_scene
-from toolkit.training.nerfusion.datasets.synthetic import synthetic_folders, synthetic_scene
 
 MESHES = ("ascii.ply", "binary.ply", "coloured.ply", "model.obj", "model.mtl", "picture.png", "model.glb", "model.gltf")
 TRUTH = ("ground_truth/cameras.json", "ground_truth/0.safetensors", "ground_truth/mesh.ply")
@@ -59,7 +59,7 @@ def make_meshes(root: Path) -> None:
 
 def read_meshes(root: Path, number: int) -> None:
     """Each file as a mesh and as a scene to film, with a few rays."""
-    from toolkit.evaluate.geometry import read_mesh, surface_points  # here, for workers that read other things: it brings Open3D
+    from fieldfuse.evaluate.geometry import read_mesh, surface_points  # here, for workers that read other things: it brings Open3D
 
     directions = torch.nn.functional.normalize(torch.tensor([[0.1, 0.1, -1.0], [0.0, 0.2, -1.0]]), dim=1)
     rays = Rays(torch.tensor([[0.0, 0.0, 3.0]]), directions, 0.01)
@@ -86,7 +86,7 @@ def make_truth(root: Path) -> None:
 
 def read_truth(root: Path, number: int) -> None:
     """Depth of one view and points of the surface."""
-    from toolkit.evaluate.geometry import read_mesh, surface_points
+    from fieldfuse.evaluate.geometry import read_mesh, surface_points
 
     capture = open_capture(root)
     truth = find_truth(capture)

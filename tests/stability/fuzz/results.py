@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.summary import describe_matching
-from toolkit.files import write_json
+from fieldfuse.files import write_json
+from fieldfuse.pipelines.summary import describe_matching
 
 FILES = (
     "evaluation.json", "timeline.json", "exports/facts.json", "fit_notes.json", "fit_matched.json", "effects.json", "effects.json",
@@ -32,7 +32,7 @@ PAGE_EVERY = 25  # the whole page takes a hundred times as long as its numbers
 
 def make_results(root: Path) -> None:
     """What the stages leave, with every part that there can be."""
-    from toolkit.effects.correct import Corrections
+    from fieldfuse.effects.correct import Corrections
 
     depth = {"abs_err": 0.01, "rmse": 0.02, "coverage": 0.9, "pixels": 70}
     views = [{"index": i, "name": f"{i:03d}", "psnr": 21.5 + i, "ssim": 0.8, "lpips": None, "depth": dict(depth)} for i in (0, 4)]
@@ -88,9 +88,9 @@ def make_results(root: Path) -> None:
 
 
 def _report(root: Path) -> dict[str, Any]:
-    """What `pipelines.summary` gathers of the files in `root`."""
-    from pipelines import kept
-    from toolkit.evaluate.report import report_data
+    """What `fieldfuse.pipelines.summary` gathers of the files in `root`."""
+    from fieldfuse.evaluate.report import report_data
+    from fieldfuse.pipelines import kept
 
     scores = kept.read_kept(root / "evaluation.json", kept.EVALUATION)
     effects = kept.read_kept(root / "effects.json", kept.EFFECTS)
@@ -116,11 +116,11 @@ def _report(root: Path) -> dict[str, Any]:
 
 def read_results(root: Path, number: int) -> None:
     """What the report and `info` make of them."""
-    from pipelines.effects_table import effects_facts
-    from toolkit.effects.correct import Corrections
-    from toolkit.evaluate.page import render_page
-    from toolkit.evaluate.pictures import Pictures
-    from toolkit.evaluate.table import table
+    from fieldfuse.effects.correct import Corrections
+    from fieldfuse.evaluate.page import render_page
+    from fieldfuse.evaluate.pictures import Pictures
+    from fieldfuse.evaluate.table import table
+    from fieldfuse.pipelines.effects_table import effects_facts
 
     data = _report(root)
     str(table(data))
@@ -133,9 +133,9 @@ def read_results(root: Path, number: int) -> None:
 
 def make_measured(root: Path) -> None:
     """What `tradeoff`, `compare`, the benchmarks and runs of a total budget leave."""
-    from toolkit.evaluate.compare import compare_data
-    from toolkit.evaluate.suites import SUITES
-    from toolkit.evaluate.tradeoff_page import csv_text, tradeoff_data
+    from fieldfuse.evaluate.compare import compare_data
+    from fieldfuse.evaluate.suites import SUITES
+    from fieldfuse.evaluate.tradeoff_page import csv_text, tradeoff_data
 
     wanted = {"iterations": 10.0, "voxel_size": 1.0, "views": 1.0, "samples": 4, "precision": "float16", "decoder": "deferred"}
     numbers = {"seconds_per_view": 0.2, "peak_memory_mb": 600.0, "memory_mb": 200.0, "disk_bytes": 2_000_000, "ssim": 0.7, "lpips": 0.3}
@@ -190,13 +190,13 @@ def make_measured(root: Path) -> None:
 
 def read_measured(root: Path, number: int) -> None:
     """What the commands that go on from them, or show them, make of each; the worker judges the first that fails."""
-    from pipelines import kept
-    from pipelines.bench_table import sections
-    from pipelines.tradeoff_sweep import rows_at
-    from toolkit.evaluate.compare import compare_data
-    from toolkit.evaluate.compare_text import comparison_text
-    from toolkit.evaluate.few_views import few_views_table
-    from toolkit.evaluate.tradeoff_page import tradeoff_data
+    from fieldfuse.evaluate.compare import compare_data
+    from fieldfuse.evaluate.compare_text import comparison_text
+    from fieldfuse.evaluate.few_views import few_views_table
+    from fieldfuse.evaluate.tradeoff_page import tradeoff_data
+    from fieldfuse.pipelines import kept
+    from fieldfuse.pipelines.bench_table import sections
+    from fieldfuse.pipelines.tradeoff_sweep import rows_at
 
     def compared() -> None:
         found = kept.read_kept(root / "compare" / "scores.json", kept.COMPARED)

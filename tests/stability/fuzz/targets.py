@@ -13,6 +13,23 @@ import cv2
 import numpy as np
 import torch
 
+from fieldfuse.camera import Intrinsics, Similarity
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.images import load_image, load_mask
+from fieldfuse.capture.ply_points import read_ply_points
+from fieldfuse.capture.prepare import prepare_views
+from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
+from fieldfuse.capture.types import Capture, Views
+from fieldfuse.capture.video import iterate_video, read_video
+from fieldfuse.capture.views_file import load_views, save_views
+from fieldfuse.config import CaptureSettings, load_settings
+from fieldfuse.evaluate.selftest.edit import aimed_rays, small_field
+from fieldfuse.files import read_json, write_json
+from fieldfuse.poses.given import given_poses
+from fieldfuse.render.field import Field
+from fieldfuse.render.rays import render_rays
+from fieldfuse.tone import Tone
 from tests.capture.layouts import LAYOUTS, write_record3d, zipped
 from tests.capture.made import eyes, render, save_picture
 from tests.stability.fuzz.given import (
@@ -29,23 +46,6 @@ from tests.stability.fuzz.given import (
 from tests.stability.fuzz.models import make_models, make_training, read_baked_field, read_models, read_training
 from tests.stability.fuzz.results import FILES as RESULT_FILES
 from tests.stability.fuzz.results import MEASURED, make_measured, make_results, read_measured, read_results
-from toolkit.camera import Intrinsics, Similarity
-from toolkit.capture import open_capture
-from toolkit.capture.checks import check_capture
-from toolkit.capture.images import load_image, load_mask
-from toolkit.capture.ply_points import read_ply_points
-from toolkit.capture.prepare import prepare_views
-from toolkit.capture.storage import capture_from_dict, capture_to_dict
-from toolkit.capture.types import Capture, Views
-from toolkit.capture.video import iterate_video, read_video
-from toolkit.capture.views_file import load_views, save_views
-from toolkit.config import CaptureSettings, load_settings
-from toolkit.evaluate.selftest.edit import aimed_rays, small_field
-from toolkit.files import read_json, write_json
-from toolkit.poses.given import given_poses
-from toolkit.render.field import Field
-from toolkit.render.rays import render_rays
-from toolkit.tone import Tone
 
 Act = Callable[[Path, int], object]
 
@@ -184,12 +184,12 @@ def read_one_video(root: Path, number: int) -> None:
 
 def make_runs(root: Path) -> None:
     """The files of a run's folder that later commands read."""
-    from pipelines.folder import RunFolder
-    from pipelines.rendered import Picture, Pictures, save_pictures
-    from toolkit.config import Settings
-    from toolkit.poses.scene import Scene
-    from toolkit.tsdf.store import save_volume
-    from toolkit.tsdf.volume import TsdfVolume
+    from fieldfuse.config import Settings
+    from fieldfuse.pipelines.folder import RunFolder
+    from fieldfuse.pipelines.rendered import Picture, Pictures, save_pictures
+    from fieldfuse.poses.scene import Scene
+    from fieldfuse.tsdf.store import save_volume
+    from fieldfuse.tsdf.volume import TsdfVolume
 
     source = root / "source"
     LAYOUTS["transforms"][1](source)
@@ -226,11 +226,11 @@ def make_runs(root: Path) -> None:
 
 def read_json_files(root: Path, number: int) -> None:
     """Every JSON file of a run's folder, as the commands read it."""
-    from pipelines.folder import RunFolder
-    from pipelines.render_path import read_cameras
-    from pipelines.stages import finished_stages
-    from toolkit.poses.result import PoseResult
-    from toolkit.poses.scene import Scene
+    from fieldfuse.pipelines.folder import RunFolder
+    from fieldfuse.pipelines.render_path import read_cameras
+    from fieldfuse.pipelines.stages import finished_stages
+    from fieldfuse.poses.result import PoseResult
+    from fieldfuse.poses.scene import Scene
 
     folder = RunFolder(root)
     finished_stages(folder)
@@ -265,8 +265,8 @@ def read_fields(root: Path, number: int) -> None:
 
 
 def read_tensors(root: Path, number: int) -> None:
-    from pipelines.rendered import load_pictures
-    from toolkit.tsdf.store import load_volume
+    from fieldfuse.pipelines.rendered import load_pictures
+    from fieldfuse.tsdf.store import load_volume
 
     reader = (
         lambda: load_views(root / "views.safetensors"),

@@ -21,10 +21,10 @@ import numpy as np
 import torch
 from PIL import Image
 
+from fieldfuse.errors import FieldfuseError
 from tests.stability.fuzz.mutate import damage
 from tests.stability.fuzz.targets import TARGETS, Target
 from tests.stability.fuzz.watch import Hang, Watch, bound_memory, tree
-from toolkit.errors import FieldfuseError
 
 SENTENCE = 10, 800  # characters
 

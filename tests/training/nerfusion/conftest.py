@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from toolkit.training.nerfusion import mixture, procedural, region
+from fieldfuse.training.nerfusion import mixture, procedural, region
 
 
 @pytest.fixture(autouse=True, scope="package")

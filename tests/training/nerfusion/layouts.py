@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, invert, opengl_from_world
+from fieldfuse.camera import Array, Intrinsics, invert, opengl_from_world
 
 DEPTH = 2.0  # of the plane z = 0 from the cameras' row
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.errors import InputError
+from fieldfuse.training.nerfusion.datasets.dtu import dtu_scene, dtu_scenes, read_camera, read_rectified
+from fieldfuse.training.nerfusion.datasets.scanned_objects import scanned_object_folders, scanned_object_scene
+from fieldfuse.training.nerfusion.datasets.scannet import scannet_folders, scannet_scene
+from fieldfuse.training.nerfusion.datasets.synthetic import synthetic_folders, synthetic_scene
+from fieldfuse.training.nerfusion.drawing import draw_sample
+from fieldfuse.training.nerfusion.samples import TrainingScene
+from fieldfuse.training.nerfusion.settings import PictureSettings, VolumeSettings
 from tests.training.nerfusion import layouts
-from toolkit.errors import InputError
-from toolkit.training.nerfusion.datasets.dtu import dtu_scene, dtu_scenes, read_camera, read_rectified
-from toolkit.training.nerfusion.datasets.scanned_objects import scanned_object_folders, scanned_object_scene
-from toolkit.training.nerfusion.datasets.scannet import scannet_folders, scannet_scene
-from toolkit.training.nerfusion.datasets.synthetic import synthetic_folders, synthetic_scene
-from toolkit.training.nerfusion.drawing import draw_sample
-from toolkit.training.nerfusion.samples import TrainingScene
-from toolkit.training.nerfusion.settings import PictureSettings, VolumeSettings
 
 
 def check_sample(scene: TrainingScene) -> None:

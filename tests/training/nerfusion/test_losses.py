@@ -11,11 +11,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from toolkit.training.nerfusion.health import feature_deviation, opacity_histogram, relative_depth_error, saturation
-from toolkit.training.nerfusion.losses import FLOOR, WIDTH, Traced, annealed, depth_likelihood, mean_likelihood, psnr, rendering_loss
-from toolkit.training.nerfusion.rays import TargetRays, picture_rays, random_rays
-from toolkit.training.nerfusion.samples import Pictures
-from toolkit.training.nerfusion.step import Outcome
+from fieldfuse.training.nerfusion.health import feature_deviation, opacity_histogram, relative_depth_error, saturation
+from fieldfuse.training.nerfusion.losses import FLOOR, WIDTH, Traced, annealed, depth_likelihood, mean_likelihood, psnr, rendering_loss
+from fieldfuse.training.nerfusion.rays import TargetRays, picture_rays, random_rays
+from fieldfuse.training.nerfusion.samples import Pictures
+from fieldfuse.training.nerfusion.step import Outcome
 
 
 def traced(seed: int, rays: int = 7, samples: int = 9) -> Traced:

@@ -8,10 +8,10 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
+from fieldfuse.errors import InputError
+from fieldfuse.training.nerfusion.curve import Curve, draw_curve, smoothed
+from fieldfuse.training.nerfusion.settings import load_train_settings, train_settings_dict
 from tests.training.nerfusion.tiny import SMALL
-from toolkit.errors import InputError
-from toolkit.training.nerfusion.curve import Curve, draw_curve, smoothed
-from toolkit.training.nerfusion.settings import load_train_settings, train_settings_dict
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "train"
 RATES = {"paper.yaml": 3e-3, "cpu.yaml": 6e-4, "gpu.yaml": 4e-4}  # the paper's, the one that made the shipped weights, going on
@@ -93,7 +93,7 @@ def test_smoothing_is_a_trailing_mean() -> None:
 def test_the_command_trains_stops_and_goes_on(tmp_path: Path) -> None:
     from omegaconf import OmegaConf
 
-    from pipelines.cli import app
+    from fieldfuse.pipelines.cli import app
 
     config, out = tmp_path / "tiny.yaml", tmp_path / "out"
     OmegaConf.save(OmegaConf.create(SMALL), config)
@@ -114,9 +114,9 @@ def test_the_command_trains_stops_and_goes_on(tmp_path: Path) -> None:
 def test_a_training_that_is_stopped_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from omegaconf import OmegaConf
 
-    from pipelines.cli import app
-    from pipelines.console import ConsoleProgress
-    from toolkit.errors import Interrupted
+    from fieldfuse.errors import Interrupted
+    from fieldfuse.pipelines.cli import app
+    from fieldfuse.pipelines.console import ConsoleProgress
 
     config = tmp_path / "tiny.yaml"
     OmegaConf.save(OmegaConf.create(SMALL), config)

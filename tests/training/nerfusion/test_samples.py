@@ -10,17 +10,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.errors import InputError
+from fieldfuse.training.nerfusion import region
+from fieldfuse.training.nerfusion.drawing import depth_range, draw_sample
+from fieldfuse.training.nerfusion.mixture import Mixture
+from fieldfuse.training.nerfusion.procedural import ProceduralScene
+from fieldfuse.training.nerfusion.rays import in_sight, picture_rays
+from fieldfuse.training.nerfusion.region import lattice_resolution, region_around, surface_points
+from fieldfuse.training.nerfusion.samples import Pictures, choose_views, view_distance
+from fieldfuse.volume.space import Space
 from tests.training.nerfusion import layouts
 from tests.training.nerfusion.tiny import tiny_settings
-from toolkit.errors import InputError
-from toolkit.training.nerfusion import region
-from toolkit.training.nerfusion.drawing import depth_range, draw_sample
-from toolkit.training.nerfusion.mixture import Mixture
-from toolkit.training.nerfusion.procedural import ProceduralScene
-from toolkit.training.nerfusion.rays import in_sight, picture_rays
-from toolkit.training.nerfusion.region import lattice_resolution, region_around, surface_points
-from toolkit.training.nerfusion.samples import Pictures, choose_views, view_distance
-from toolkit.volume.space import Space
 
 
 def ring(count: int) -> np.ndarray:

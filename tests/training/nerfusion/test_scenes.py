@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from toolkit.errors import InputError
-from toolkit.training.nerfusion.paths import around, hand_held, look_at, wander
-from toolkit.training.nerfusion.procedural import ProceduralScene
-from toolkit.training.nerfusion.shards import ShardScene, shard_files, write_shard
+from fieldfuse.errors import InputError
+from fieldfuse.training.nerfusion.paths import around, hand_held, look_at, wander
+from fieldfuse.training.nerfusion.procedural import ProceduralScene
+from fieldfuse.training.nerfusion.shards import ShardScene, shard_files, write_shard
 
 
 def in_open_space(points: np.ndarray) -> np.ndarray:

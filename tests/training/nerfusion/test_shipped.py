@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from fieldfuse.networks import weights
+from fieldfuse.networks.model import ModelConfig, NerfusionModel
+from fieldfuse.training.nerfusion.drawing import draw_sample
+from fieldfuse.training.nerfusion.procedural import ProceduralScene
+from fieldfuse.training.nerfusion.step import LOCAL, Outcome, Stepper, local_of, seeded
 from tests.training.nerfusion.tiny import tiny_settings
-from toolkit.networks import weights
-from toolkit.networks.model import ModelConfig, NerfusionModel
-from toolkit.training.nerfusion.drawing import draw_sample
-from toolkit.training.nerfusion.procedural import ProceduralScene
-from toolkit.training.nerfusion.step import LOCAL, Outcome, Stepper, local_of, seeded
 
 FILE = Path(weights.__file__).parent / "weights" / "nerfusion.safetensors"
 

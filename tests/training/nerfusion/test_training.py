@@ -17,17 +17,17 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from fieldfuse.errors import InputError
+from fieldfuse.networks.weights import load_model
+from fieldfuse.progress import Progress
+from fieldfuse.training.nerfusion.caution import RECOVER, Caution
+from fieldfuse.training.nerfusion.checkpoint import checkpoint_settings, checkpoints
+from fieldfuse.training.nerfusion.curve import Curve, draw_curve
+from fieldfuse.training.nerfusion.distributed import Crew, join_crew
+from fieldfuse.training.nerfusion.health import ALIVE
+from fieldfuse.training.nerfusion.step import local_of
+from fieldfuse.training.nerfusion.train import WEIGHTS, Trainer, learning_rate, make_model
 from tests.training.nerfusion.tiny import SMALL, merged, tiny_settings
-from toolkit.errors import InputError
-from toolkit.networks.weights import load_model
-from toolkit.progress import Progress
-from toolkit.training.nerfusion.caution import RECOVER, Caution
-from toolkit.training.nerfusion.checkpoint import checkpoint_settings, checkpoints
-from toolkit.training.nerfusion.curve import Curve, draw_curve
-from toolkit.training.nerfusion.distributed import Crew, join_crew
-from toolkit.training.nerfusion.health import ALIVE
-from toolkit.training.nerfusion.step import local_of
-from toolkit.training.nerfusion.train import WEIGHTS, Trainer, learning_rate, make_model
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[3]
 @pytest.fixture(autouse=True)
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """No picture of the curve, which takes a second at each checkpoint, but where it is looked at."""
-    monkeypatch.setattr("toolkit.training.nerfusion.curve.draw_curve", lambda *_: None)
+    monkeypatch.setattr("fieldfuse.training.nerfusion.curve.draw_curve", lambda *_: None)
 
 
 def state(trainer: Trainer) -> dict[str, torch.Tensor]:
@@ -47,7 +47,7 @@ def same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> boo
 
 
 def test_a_run_leaves_weights_curve_and_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("toolkit.training.nerfusion.curve.draw_curve", draw_curve)
+    monkeypatch.setattr("fieldfuse.training.nerfusion.curve.draw_curve", draw_curve)
     trainer = Trainer(tiny_settings(record={"health_every": 2}), tmp_path, Crew())
     before = state(trainer)
     assert trainer.run() == 4
@@ -114,7 +114,7 @@ def test_a_kill_between_two_files_of_a_save_costs_no_row_of_the_curve(tmp_path: 
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
-        patched.setattr("toolkit.training.nerfusion.train.save_model", killed)  # the checkpoint is there then
+        patched.setattr("fieldfuse.training.nerfusion.train.save_model", killed)  # the checkpoint is there then
         first.run(until=1)
     second = Trainer(tiny_settings(), tmp_path, Crew(), resume=True)
     assert second.step == 1 and [row["step"] for row in second.curve.rows] == [1]
@@ -234,7 +234,7 @@ def test_a_bad_step_moves_nothing_and_the_next_ones_are_smaller(loss: bool, tmp_
 def test_training_gives_up_with_the_weights_of_the_last_good_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = Trainer(tiny_settings(), tmp_path, Crew())
     poison(trainer, monkeypatch, range(4))
-    monkeypatch.setattr("toolkit.training.nerfusion.caution.MOST", 2)
+    monkeypatch.setattr("fieldfuse.training.nerfusion.caution.MOST", 2)
     with pytest.raises(InputError, match=r"the last at step 2 in the gradient of .*; the weights of the last good step"):
         trainer.run()
     assert trainer.caution.slower == 0.25
@@ -275,9 +275,9 @@ import json, sys, torch
 from pathlib import Path
 sys.path.insert(0, {root!r})
 from tests.training.nerfusion.tiny import tiny_settings
-from toolkit.training.nerfusion import curve, mixture, procedural
-from toolkit.training.nerfusion.distributed import join_crew
-from toolkit.training.nerfusion.train import Trainer
+from fieldfuse.training.nerfusion import curve, mixture, procedural
+from fieldfuse.training.nerfusion.distributed import join_crew
+from fieldfuse.training.nerfusion.train import Trainer
 torch.set_num_threads(1)
 procedural.TEXELS, mixture.BANKS = 128, 1
 curve.draw_curve = lambda *_: None

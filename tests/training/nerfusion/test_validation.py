@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.camera import Intrinsics
+from fieldfuse.errors import InputError
+from fieldfuse.training.nerfusion.procedural import ProceduralScene
+from fieldfuse.training.nerfusion.real import load_cases
+from fieldfuse.training.nerfusion.train import make_model
+from fieldfuse.training.nerfusion.validate import predict, validate
 from tests.conftest import shared_data
 from tests.training.nerfusion.layouts import write, write_matrix
 from tests.training.nerfusion.tiny import tiny_settings
-from toolkit.camera import Intrinsics
-from toolkit.errors import InputError
-from toolkit.training.nerfusion.procedural import ProceduralScene
-from toolkit.training.nerfusion.real import load_cases
-from toolkit.training.nerfusion.train import make_model
-from toolkit.training.nerfusion.validate import predict, validate
 
 
 def capture(root: Path, frames: int = 17) -> Path:

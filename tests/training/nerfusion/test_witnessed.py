@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from fieldfuse.networks.matching import describe
+from fieldfuse.networks.sweep import compare, decide
+from fieldfuse.networks.witness import certain, evidence, witness
+from fieldfuse.simulate.eye import take, take_all
+from fieldfuse.training.nerfusion.distributed import Crew
+from fieldfuse.training.nerfusion.mixture import Mixture
+from fieldfuse.training.nerfusion.procedural import ProceduralScene
+from fieldfuse.training.nerfusion.train import Trainer
+from fieldfuse.training.nerfusion.witnessed import cameras_of, sweeps_of
 from tests.training.nerfusion.tiny import tiny_settings
-from toolkit.networks.matching import describe
-from toolkit.networks.sweep import compare, decide
-from toolkit.networks.witness import certain, evidence, witness
-from toolkit.simulate.eye import take, take_all
-from toolkit.training.nerfusion.distributed import Crew
-from toolkit.training.nerfusion.mixture import Mixture
-from toolkit.training.nerfusion.procedural import ProceduralScene
-from toolkit.training.nerfusion.train import Trainer
-from toolkit.training.nerfusion.witnessed import cameras_of, sweeps_of
 
 
 def test_a_samples_sweeps_are_held_against_each_other() -> None:

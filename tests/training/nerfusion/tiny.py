@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from toolkit.training.nerfusion.settings import TrainSettings, load_train_settings
+from fieldfuse.training.nerfusion.settings import TrainSettings, load_train_settings
 
 SMALL: dict[str, Any] = {
     "device": "cpu",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import (
+from fieldfuse.camera import (
     FISHEYE,
     OPENCV,
     PINHOLE,
@@ -22,10 +22,10 @@ from toolkit.camera import (
     undistort_maps,
     unproject,
 )
-from toolkit.evaluate.selftest import reference
-from toolkit.evaluate.selftest.case import Measure, absolute, case, not_finite, relative
-from toolkit.poses.points import undistorted
-from toolkit.render.paths import look_at
+from fieldfuse.evaluate.selftest import reference
+from fieldfuse.evaluate.selftest.case import Measure, absolute, case, not_finite, relative
+from fieldfuse.poses.points import undistorted
+from fieldfuse.render.paths import look_at
 
 GROUP = "cameras"
 LENS = 1e-8  # image-plane units

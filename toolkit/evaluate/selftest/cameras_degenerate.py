@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, checked_pose
-from toolkit.capture.types import Capture, Frame, Views
-from toolkit.errors import InputError, PoseError
-from toolkit.evaluate.baseline import nearest_training
-from toolkit.evaluate.selftest.case import Measure, absolute, case, not_finite, refused
-from toolkit.keyframes import select_keyframes
-from toolkit.poses.given import given_poses
-from toolkit.poses.gravity import up_direction
-from toolkit.poses.points import intersect
-from toolkit.render.paths import focus, interpolate, look_at, orbit
+from fieldfuse.camera import Array, Intrinsics, checked_pose
+from fieldfuse.capture.types import Capture, Frame, Views
+from fieldfuse.errors import InputError, PoseError
+from fieldfuse.evaluate.baseline import nearest_training
+from fieldfuse.evaluate.selftest.case import Measure, absolute, case, not_finite, refused
+from fieldfuse.keyframes import select_keyframes
+from fieldfuse.poses.given import given_poses
+from fieldfuse.poses.gravity import up_direction
+from fieldfuse.poses.points import intersect
+from fieldfuse.render.paths import focus, interpolate, look_at, orbit
 
 GROUP = "cameras"
 CAMERA = Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0)

@@ -102,7 +102,7 @@ def case(group: str, name: str, slow: bool = False) -> Callable[[Run], Run]:
 def all_cases() -> list[Case]:
     """Every case, in the order of `MODULES`."""
     for name in MODULES:
-        importlib.import_module(f"toolkit.evaluate.selftest.{name}")
+        importlib.import_module(f"fieldfuse.evaluate.selftest.{name}")
     return list(_CASES.values())
 
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from toolkit.camera import Array
-from toolkit.capture.types import Views
-from toolkit.evaluate.selftest.case import Measure, absolute, case, not_finite
-from toolkit.evaluate.speed_state import around, lens, sphere_field
-from toolkit.render.composite import RAW_MAX
-from toolkit.render.recolour import COLOURS, MOST, recoloured
-from toolkit.render.sky import sky_colours
-from toolkit.training.behind import sky_behind
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Views
+from fieldfuse.evaluate.selftest.case import Measure, absolute, case, not_finite
+from fieldfuse.evaluate.speed_state import around, lens, sphere_field
+from fieldfuse.render.composite import RAW_MAX
+from fieldfuse.render.recolour import COLOURS, MOST, recoloured
+from fieldfuse.render.sky import sky_colours
+from fieldfuse.training.behind import sky_behind
 
 GROUP = "colours of pictures"
 SIDE, DISTANCE = 24, 2.4  # pixels of a picture, and how far its camera is from the middle

@@ -9,10 +9,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from toolkit.evaluate.selftest import reference
-from toolkit.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite, relative
-from toolkit.render.composite import ray_sum, thickness_gradient, weights
-from toolkit.render.march import first_of_ray
+from fieldfuse.evaluate.selftest import reference
+from fieldfuse.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite, relative
+from fieldfuse.render.composite import ray_sum, thickness_gradient, weights
+from fieldfuse.render.march import first_of_ray
 
 GROUP = "compositing"
 EXACT = 2e-6  # a weight is a product of two float32 factors, each with an exponential in it

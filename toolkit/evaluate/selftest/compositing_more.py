@@ -7,12 +7,12 @@ from pathlib import Path
 
 import torch
 
-from toolkit.evaluate.selftest import reference
-from toolkit.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite, relative
-from toolkit.evaluate.selftest.compositing import GROUP, flatten, spread
-from toolkit.render.composite import distortion, ray_sum, thickness_gradient, weights
-from toolkit.render.field import density
-from toolkit.render.march import first_of_ray
+from fieldfuse.evaluate.selftest import reference
+from fieldfuse.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite, relative
+from fieldfuse.evaluate.selftest.compositing import GROUP, flatten, spread
+from fieldfuse.render.composite import distortion, ray_sum, thickness_gradient, weights
+from fieldfuse.render.field import density
+from fieldfuse.render.march import first_of_ray
 
 # What comes to less, of weights and places of about 1, is told by the double sums to some 1e-16, not to a share of itself.
 LEAST = 1e-9

@@ -11,15 +11,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toolkit.camera import Array, Similarity, opengl_from_world
-from toolkit.capture import open_capture
-from toolkit.capture.checks import check_capture
-from toolkit.capture.prepare import prepare_views
-from toolkit.capture.types import Capture, Views
-from toolkit.config import CaptureSettings
-from toolkit.errors import FieldfuseError, InputError
-from toolkit.evaluate.selftest.case import Measure, absolute, case, not_finite, refused
-from toolkit.render.paths import look_at
+from fieldfuse.camera import Array, Similarity, opengl_from_world
+from fieldfuse.capture import open_capture
+from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.prepare import prepare_views
+from fieldfuse.capture.types import Capture, Views
+from fieldfuse.config import CaptureSettings
+from fieldfuse.errors import FieldfuseError, InputError
+from fieldfuse.evaluate.selftest.case import Measure, absolute, case, not_finite, refused
+from fieldfuse.render.paths import look_at
 
 GROUP = "data"
 Paint = Callable[[int, int, int], Array]

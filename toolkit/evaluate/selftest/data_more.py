@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.errors import FieldfuseError, InputError, PoseError
-from toolkit.evaluate.selftest.case import Measure, absolute, case, not_finite, refused
-from toolkit.evaluate.selftest.data import GROUP, no_opacity, poses, prepared, texture, write_capture
-from toolkit.poses.given import given_poses
-from toolkit.poses.scene import describe_scene
-from toolkit.render.paths import look_at
-from toolkit.tsdf.frames import DepthFrame
-from toolkit.tsdf.volume import TsdfVolume
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.errors import FieldfuseError, InputError, PoseError
+from fieldfuse.evaluate.selftest.case import Measure, absolute, case, not_finite, refused
+from fieldfuse.evaluate.selftest.data import GROUP, no_opacity, poses, prepared, texture, write_capture
+from fieldfuse.poses.given import given_poses
+from fieldfuse.poses.scene import describe_scene
+from fieldfuse.render.paths import look_at
+from fieldfuse.tsdf.frames import DepthFrame
+from fieldfuse.tsdf.volume import TsdfVolume
 
 HEIGHT, WIDTH = 32, 40
 

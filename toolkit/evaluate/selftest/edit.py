@@ -8,16 +8,16 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from toolkit.errors import InputError
-from toolkit.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite, refused
-from toolkit.evaluate.selftest.lookup import lattice, scattered_blocks
-from toolkit.networks.decoder import make_decoder
-from toolkit.render.field import Field, density
-from toolkit.render.rays import render_rays
-from toolkit.volume.edit import corner_nodes, erase_empty_blocks, prune, resample, split, trilinear_density, with_corner_blocks
-from toolkit.volume.lookup import corners, gather
-from toolkit.volume.space import Space
-from toolkit.volume.topology import VOXELS, Topology
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite, refused
+from fieldfuse.evaluate.selftest.lookup import lattice, scattered_blocks
+from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.render.field import Field, density
+from fieldfuse.render.rays import render_rays
+from fieldfuse.volume.edit import corner_nodes, erase_empty_blocks, prune, resample, split, trilinear_density, with_corner_blocks
+from fieldfuse.volume.lookup import corners, gather
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import VOXELS, Topology
 
 GROUP = "prune and split"
 CHANNELS = 16  # of a field, as by default: kernels are compiled for each number of them

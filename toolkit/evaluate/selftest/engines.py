@@ -9,12 +9,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from toolkit.evaluate.selftest import reference
-from toolkit.evaluate.selftest.case import Measure, case, not_finite
-from toolkit.evaluate.selftest.edit import aimed_rays, small_field
-from toolkit.render.compiled import CompiledRenderer
-from toolkit.render.field import Field, density
-from toolkit.render.rays import render_rays
+from fieldfuse.evaluate.selftest import reference
+from fieldfuse.evaluate.selftest.case import Measure, case, not_finite
+from fieldfuse.evaluate.selftest.edit import aimed_rays, small_field
+from fieldfuse.render.compiled import CompiledRenderer
+from fieldfuse.render.field import Field, density
+from fieldfuse.render.rays import render_rays
 
 GROUP = "engines"
 OPACITY = 1e-6

@@ -11,22 +11,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toolkit.camera import Intrinsics
-from toolkit.capture.types import Views
-from toolkit.evaluate.selftest.case import Measure, by_size, case, not_finite
-from toolkit.evaluate.selftest.edit import small_field
-from toolkit.networks.decoder import Deferred, PerSample
-from toolkit.render.compiled_per_sample import write_back
-from toolkit.render.differentiable import render_with_gradients
-from toolkit.render.field import Field
-from toolkit.render.kernels_decode import Layers
-from toolkit.render.march import BRICK
-from toolkit.render.paths import look_at
-from toolkit.training.fused import BETAS, FusedOptimiser
-from toolkit.training.fused_decoder import write_layers
-from toolkit.training.fused_per_sample import FusedPerSampleOptimiser
-from toolkit.training.rays import Batch, PixelPool
-from toolkit.training.step import Rates
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.evaluate.selftest.case import Measure, by_size, case, not_finite
+from fieldfuse.evaluate.selftest.edit import small_field
+from fieldfuse.networks.decoder import Deferred, PerSample
+from fieldfuse.render.compiled_per_sample import write_back
+from fieldfuse.render.differentiable import render_with_gradients
+from fieldfuse.render.field import Field
+from fieldfuse.render.kernels_decode import Layers
+from fieldfuse.render.march import BRICK
+from fieldfuse.render.paths import look_at
+from fieldfuse.training.fused import BETAS, FusedOptimiser
+from fieldfuse.training.fused_decoder import write_layers
+from fieldfuse.training.fused_per_sample import FusedPerSampleOptimiser
+from fieldfuse.training.rays import Batch, PixelPool
+from fieldfuse.training.step import Rates
 
 GROUP = "engines"
 SIDE, FOCAL = 20, 22.0

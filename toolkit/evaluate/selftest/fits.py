@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics, Similarity
-from toolkit.capture.types import Views
-from toolkit.config import load_settings
-from toolkit.evaluate.selftest.case import Measure, case, not_finite
-from toolkit.evaluate.selftest.data import flat, one_pixel, poses, saturated, texture
-from toolkit.poses.scene import Scene
-from toolkit.render.field import Field
-from toolkit.render.image import make_renderer, render_view
-from toolkit.training.fit import fit_field
+from fieldfuse.camera import Array, Intrinsics, Similarity
+from fieldfuse.capture.types import Views
+from fieldfuse.config import load_settings
+from fieldfuse.evaluate.selftest.case import Measure, case, not_finite
+from fieldfuse.evaluate.selftest.data import flat, one_pixel, poses, saturated, texture
+from fieldfuse.poses.scene import Scene
+from fieldfuse.render.field import Field
+from fieldfuse.render.image import make_renderer, render_view
+from fieldfuse.training.fit import fit_field
 
 GROUP = "fits"
 SECONDS = 0.4

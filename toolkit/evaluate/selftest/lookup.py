@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from toolkit.evaluate.selftest import reference
-from toolkit.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite
-from toolkit.volume.lookup import corners, gather, scatter
-from toolkit.volume.topology import BLOCK, VOXELS, Topology
+from fieldfuse.evaluate.selftest import reference
+from fieldfuse.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite
+from fieldfuse.volume.lookup import corners, gather, scatter
+from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
 
 GROUP = "lookup"
 VALUE = 1e-6

@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.capture.types import Views
-from toolkit.errors import InputError
-from toolkit.evaluate.baseline import nearest_image_scores
-from toolkit.evaluate.depth import KEYS, depth_metrics
-from toolkit.evaluate.images import PSNR_CAP, psnr, ssim
-from toolkit.evaluate.perceptual import lpips, lpips_available
-from toolkit.evaluate.score import score_views
-from toolkit.evaluate.selftest import reference
-from toolkit.evaluate.selftest.case import Measure, case, refused
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.types import Views
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.baseline import nearest_image_scores
+from fieldfuse.evaluate.depth import KEYS, depth_metrics
+from fieldfuse.evaluate.images import PSNR_CAP, psnr, ssim
+from fieldfuse.evaluate.perceptual import lpips, lpips_available
+from fieldfuse.evaluate.score import score_views
+from fieldfuse.evaluate.selftest import reference
+from fieldfuse.evaluate.selftest.case import Measure, case, refused
 
 GROUP = "metrics"
 SHAPE = (24, 32, 3)

@@ -8,14 +8,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from toolkit.evaluate.selftest import reference
-from toolkit.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite
-from toolkit.evaluate.selftest.lookup import lattice, scattered_blocks
-from toolkit.networks.aggregate import aggregate, evidence
-from toolkit.networks.block_conv import block_conv3d
-from toolkit.networks.decoder import make_decoder
-from toolkit.networks.encoding import positional, spherical_harmonics
-from toolkit.volume.topology import Topology
+from fieldfuse.evaluate.selftest import reference
+from fieldfuse.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite
+from fieldfuse.evaluate.selftest.lookup import lattice, scattered_blocks
+from fieldfuse.networks.aggregate import aggregate, evidence
+from fieldfuse.networks.block_conv import block_conv3d
+from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.networks.encoding import positional, spherical_harmonics
+from fieldfuse.volume.topology import Topology
 
 GROUP = "networks"
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from toolkit.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite
-from toolkit.networks.gru import LEAST, FusionGRU, RunningMean
-from toolkit.training.nerfusion.health import saturation
-from toolkit.volume.topology import Topology
+from fieldfuse.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite
+from fieldfuse.networks.gru import LEAST, FusionGRU, RunningMean
+from fieldfuse.training.nerfusion.health import saturation
+from fieldfuse.volume.topology import Topology
 
 GROUP = "networks"
 SIZE = 512  # corners of one block

@@ -9,11 +9,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from toolkit.evaluate.selftest.case import Measure, absolute, case, not_finite
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.matching import LARGE, SMALL, TEMPERATURE, UNKNOWN, describe
-from toolkit.networks.sweep import Sweep, carved, compare, decide, sweep
-from toolkit.networks.witness import AGAINST, FOR, SHARE, evidence, witness
+from fieldfuse.evaluate.selftest.case import Measure, absolute, case, not_finite
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.matching import LARGE, SMALL, TEMPERATURE, UNKNOWN, describe
+from fieldfuse.networks.sweep import Sweep, carved, compare, decide, sweep
+from fieldfuse.networks.witness import AGAINST, FOR, SHARE, evidence, witness
 
 GROUP = "networks"
 WIDTH, HEIGHT, FOCAL = 24, 18, 22.0

@@ -8,16 +8,16 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from toolkit.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite, relative
-from toolkit.evaluate.selftest.edit import aimed_rays, small_field
-from toolkit.evaluate.selftest.lookup import scattered_blocks
-from toolkit.evaluate.selftest.network import GROUP
-from toolkit.networks.aggregate import aggregate, evidence
-from toolkit.networks.block_conv import block_conv3d
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.decoder import make_decoder
-from toolkit.networks.unproject import MARGIN, project
-from toolkit.training.step import Optimiser, Rates
+from fieldfuse.evaluate.selftest.case import Measure, absolute, by_size, case, not_finite, relative
+from fieldfuse.evaluate.selftest.edit import aimed_rays, small_field
+from fieldfuse.evaluate.selftest.lookup import scattered_blocks
+from fieldfuse.evaluate.selftest.network import GROUP
+from fieldfuse.networks.aggregate import aggregate, evidence
+from fieldfuse.networks.block_conv import block_conv3d
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.networks.unproject import MARGIN, project
+from fieldfuse.training.step import Optimiser, Rates
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 50.0
 SIDE = 0.05  # of a voxel
@@ -125,9 +125,9 @@ def reduced_gradients(folder: Path) -> list[Measure]:
 
 @case("prune and split", "the optimiser's state survives pruning, and starts afresh at a split")
 def optimiser_state(folder: Path) -> list[Measure]:
-    from toolkit.training.levels import finer, pruned
-    from toolkit.training.rays import Batch
-    from toolkit.volume.host import TorchHost
+    from fieldfuse.training.levels import finer, pruned
+    from fieldfuse.training.rays import Batch
+    from fieldfuse.volume.host import TorchHost
 
     field = small_field(3, 0.4)
     origins, directions = aimed_rays(200, 2)

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics, Similarity, checked_pose, invert, pixel_grid, rays
-from toolkit.evaluate.selftest.case import Measure, absolute, case, not_finite, relative
-from toolkit.evaluate.selftest.edit import small_field
-from toolkit.render.image import render_view
-from toolkit.render.paths import look_at
+from fieldfuse.camera import Array, Intrinsics, Similarity, checked_pose, invert, pixel_grid, rays
+from fieldfuse.evaluate.selftest.case import Measure, absolute, case, not_finite, relative
+from fieldfuse.evaluate.selftest.edit import small_field
+from fieldfuse.render.image import render_view
+from fieldfuse.render.paths import look_at
 
 GROUP = "scale and place"
 EARTH = 6.0e6  # metres from an earth-centred frame's origin
@@ -121,7 +121,7 @@ def _psnr(picture: Array, truth: Array) -> float:
 def working_unit(folder: Path) -> list[Measure]:
     from dataclasses import replace
 
-    from toolkit.volume.space import Space
+    from fieldfuse.volume.space import Space
 
     field = small_field(6)
     camera = Intrinsics(40, 30, 45.0, 45.0, 20.0, 15.0)

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from toolkit.camera import FISHEYE, OPENCV, Array, Intrinsics, Similarity, invert, world_from_opengl
-from toolkit.evaluate.selftest.case import Measure, absolute, case
-from toolkit.evaluate.selftest.place import EARTH, SCALES, similarity
-from toolkit.export.cameras import quaternion, write_cameras
-from toolkit.export.mesh import write_mesh
-from toolkit.export.points import write_points
-from toolkit.files import read_json
-from toolkit.render.paths import look_at
-from toolkit.tsdf.mesh import Mesh
+from fieldfuse.camera import FISHEYE, OPENCV, Array, Intrinsics, Similarity, invert, world_from_opengl
+from fieldfuse.evaluate.selftest.case import Measure, absolute, case
+from fieldfuse.evaluate.selftest.place import EARTH, SCALES, similarity
+from fieldfuse.export.cameras import quaternion, write_cameras
+from fieldfuse.export.mesh import write_mesh
+from fieldfuse.export.points import write_points
+from fieldfuse.files import read_json
+from fieldfuse.render.paths import look_at
+from fieldfuse.tsdf.mesh import Mesh
 
 GROUP = "scale and place"
 RELATIVE = 1e-6  # of the model's size, in the input's coordinates

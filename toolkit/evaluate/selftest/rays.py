@@ -9,11 +9,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from toolkit.evaluate.selftest import reference
-from toolkit.evaluate.selftest.case import Measure, case, not_finite
-from toolkit.render.march import MarchGrid, march
-from toolkit.volume.space import Space
-from toolkit.volume.topology import BLOCK, VOXELS, Topology
+from fieldfuse.evaluate.selftest import reference
+from fieldfuse.evaluate.selftest.case import Measure, case, not_finite
+from fieldfuse.render.march import MarchGrid, march
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
 
 GROUP = "rays"
 ROUNDING = 2e-3  # of a voxel: how far float32 may move a sample over a border

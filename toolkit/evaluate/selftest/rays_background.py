@@ -7,11 +7,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from toolkit.evaluate.selftest.case import Measure, absolute, case, not_finite, relative
-from toolkit.evaluate.selftest.rays import lattice_grid, random_rays, unit
-from toolkit.render.march import MarchGrid, march
-from toolkit.volume.space import Space
-from toolkit.volume.topology import VOXELS
+from fieldfuse.evaluate.selftest.case import Measure, absolute, case, not_finite, relative
+from fieldfuse.evaluate.selftest.rays import lattice_grid, random_rays, unit
+from fieldfuse.render.march import MarchGrid, march
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import VOXELS
 
 GROUP = "rays with a background"
 

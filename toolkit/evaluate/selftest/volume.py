@@ -7,9 +7,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from toolkit.evaluate.selftest.case import Measure, absolute, case, not_finite, refused
-from toolkit.evaluate.selftest.lookup import scattered_blocks
-from toolkit.volume.topology import BLOCK, KEY_HIGH, KEY_LOW, VOXELS, Topology
+from fieldfuse.evaluate.selftest.case import Measure, absolute, case, not_finite, refused
+from fieldfuse.evaluate.selftest.lookup import scattered_blocks
+from fieldfuse.volume.topology import BLOCK, KEY_HIGH, KEY_LOW, VOXELS, Topology
 
 GROUP = "volume"
 Key = tuple[int, int, int]
@@ -20,7 +20,7 @@ def grid_errors(operations: list[tuple[str, list[Key]]], capacity: int = 4) -> d
 
     New blocks must be zero, also those whose slot was used before; values must survive growth and the erasing of others.
     """
-    from toolkit.volume.grid import BlockGrid
+    from fieldfuse.volume.grid import BlockGrid
 
     model: dict[Key, float] = {}
     wrong = {"blocks": 0.0, "values": 0.0, "slots": 0.0, "order": 0.0}
@@ -152,7 +152,7 @@ def _sorted(keys: Tensor) -> Tensor:
 
 @case(GROUP, "200,000 blocks", slow=True)
 def many_blocks(folder: Path) -> list[Measure]:
-    from toolkit.volume.grid import BlockGrid
+    from fieldfuse.volume.grid import BlockGrid
 
     line = torch.arange(-29, 30)
     keys = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1).view(-1, 3)

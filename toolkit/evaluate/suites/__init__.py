@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from toolkit.errors import InputError
-from toolkit.evaluate.suites import dtu, llff, nerf_synthetic, posed, scannet
-from toolkit.evaluate.suites.base import Suite
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.suites import dtu, llff, nerf_synthetic, posed, scannet
+from fieldfuse.evaluate.suites.base import Suite
 
 SUITES: dict[str, Suite] = {one.SUITE.name: one.SUITE for one in (nerf_synthetic, dtu, scannet, llff, posed)}
 

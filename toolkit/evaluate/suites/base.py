@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.capture.detect import detect_kind
-from toolkit.capture.listing import natural_key
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
+from fieldfuse.capture.detect import detect_kind
+from fieldfuse.capture.listing import natural_key
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
 
 PAPER = "NeRFusion (CVPR 2022)"
 SCENE_MARKS = ("transforms*.json", "poses_bounds.npy", "cameras*.npz", "pose", "sparse", "cameras.txt", "frame-*.pose.txt", "seq-01")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from toolkit.capture.types import Capture
-from toolkit.evaluate.suites.base import Suite, Variant, split
+from fieldfuse.capture.types import Capture
+from fieldfuse.evaluate.suites.base import Suite, Variant, split
 
 TRAIN = (25, 21, 33, 22, 14, 15, 26, 30, 31, 35, 34, 43, 46, 29, 16, 36)
 TEST = (32, 24, 23, 44)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from toolkit.evaluate.suites.base import Suite, Variant, every
+from fieldfuse.evaluate.suites.base import Suite, Variant, every
 
 SUITE = Suite(
     name="llff",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from toolkit.evaluate.suites.base import Suite, Variant, own_split
+from fieldfuse.evaluate.suites.base import Suite, Variant, own_split
 
 SUITE = Suite(
     name="nerf-synthetic",

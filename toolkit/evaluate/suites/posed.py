@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from toolkit.capture.types import Capture
-from toolkit.evaluate.suites.base import Suite, Variant, every
+from fieldfuse.capture.types import Capture
+from fieldfuse.evaluate.suites.base import Suite, Variant, every
 
 
 def pick(capture: Capture) -> Capture:

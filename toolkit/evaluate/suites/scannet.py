@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from toolkit.capture.listing import read_text
-from toolkit.capture.types import Capture
-from toolkit.errors import InputError
-from toolkit.evaluate.suites.base import Suite, Variant, every, split
+from fieldfuse.capture.listing import read_text
+from fieldfuse.capture.types import Capture
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate.suites.base import Suite, Variant, every, split
 
 LISTS = ("train.txt", "test.txt")
 SCENES = (

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from toolkit.errors import InputError
-from toolkit.evaluate import words
-from toolkit.evaluate.suites.base import PAPER, Suite, summary
-from toolkit.files import atomic_path
+from fieldfuse.errors import InputError
+from fieldfuse.evaluate import words
+from fieldfuse.evaluate.suites.base import PAPER, Suite, summary
+from fieldfuse.files import atomic_path
 
 MEASURES = ("psnr", "ssim", "lpips")
 DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3}

@@ -7,8 +7,8 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel, pieces, power_of_two
-from toolkit.volume.topology import VOXELS
+from fieldfuse.gpu import kernel, pieces, power_of_two
+from fieldfuse.volume.topology import VOXELS
 
 TILE = 128  # voxels of a block at a time: two of its layers …
 SLOPES = 64  # … and where the kernel's gradient is summed

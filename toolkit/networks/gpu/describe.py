@@ -9,8 +9,8 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel, pieces
-from toolkit.networks.gpu.matching import CHANNELS, COLOURS, corners, lens
+from fieldfuse.gpu import kernel, pieces
+from fieldfuse.networks.gpu.matching import CHANNELS, COLOURS, corners, lens
 
 BLOCK = 32  # pixels whose neighbours or channels are looked at together
 GROUPS = (CHANNELS - COLOURS) // 9  # of 3×3 neighbours, the n-th of them n pixels apart

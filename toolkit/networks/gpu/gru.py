@@ -7,10 +7,10 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel, pieces, power_of_two
-from toolkit.networks.gpu.volumes import tanh
-from toolkit.networks.lattice import LatentVolume, LocalVolume
-from toolkit.volume.topology import VOXELS
+from fieldfuse.gpu import kernel, pieces, power_of_two
+from fieldfuse.networks.gpu.volumes import tanh
+from fieldfuse.networks.lattice import LatentVolume, LocalVolume
+from fieldfuse.volume.topology import VOXELS
 
 BLOCK = 64  # rows at a time
 

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from toolkit.gpu import sent
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.gpu.observe import Observer
-from toolkit.networks.gpu.volumes import settle
-from toolkit.networks.lattice import Lattice, LocalVolume
-from toolkit.networks.local import LocalReconstruction
-from toolkit.networks.sweep import Sweep
-from toolkit.networks.unproject import EncodedView
-from toolkit.volume.topology import Topology
+from fieldfuse.gpu import sent
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.gpu.observe import Observer
+from fieldfuse.networks.gpu.volumes import settle
+from fieldfuse.networks.lattice import Lattice, LocalVolume
+from fieldfuse.networks.local import LocalReconstruction
+from fieldfuse.networks.sweep import Sweep
+from fieldfuse.networks.unproject import EncodedView
+from fieldfuse.volume.topology import Topology
 
 
 def local_volume(

@@ -16,7 +16,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel, pieces, power_of_two, sent
+from fieldfuse.gpu import kernel, pieces, power_of_two, sent
 
 CHANNELS = 21  # of a descriptor, colours first
 COLOURS = 3

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel, pieces
-from toolkit.networks.gpu import matching
-from toolkit.networks.gpu.matching import corners, table_of
+from fieldfuse.gpu import kernel, pieces
+from fieldfuse.networks.gpu import matching
+from fieldfuse.networks.gpu.matching import corners, table_of
 
 
 @kernel("likely", "inverses", "out")

@@ -15,9 +15,9 @@ import triton.language as tl
 from numpy.typing import NDArray
 from torch import Tensor
 
-from toolkit.gpu import kernel, pieces, power_of_two, sent
-from toolkit.networks.gpu.lookup import corners
-from toolkit.networks.gpu.reading import local, sighted
+from fieldfuse.gpu import kernel, pieces, power_of_two, sent
+from fieldfuse.networks.gpu.lookup import corners
+from fieldfuse.networks.gpu.reading import local, sighted
 
 BLOCK = 32
 PART = 128  # corners of a block that are looked at at once

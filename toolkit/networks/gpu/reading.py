@@ -12,8 +12,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel, pieces, sent
-from toolkit.networks.gpu import matching
+from fieldfuse.gpu import kernel, pieces, sent
+from fieldfuse.networks.gpu import matching
 
 BLOCK = 128
 TILE = (16, 32)  # rays and planes at once

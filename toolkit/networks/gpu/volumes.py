@@ -10,9 +10,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from toolkit.gpu import kernel, pieces, power_of_two
-from toolkit.networks.local import CHANGE, INSIDE
-from toolkit.volume.topology import VOXELS, Topology
+from fieldfuse.gpu import kernel, pieces, power_of_two
+from fieldfuse.networks.local import CHANGE, INSIDE
+from fieldfuse.volume.topology import VOXELS, Topology
 
 BLOCK = 64  # rows at a time
 

@@ -8,13 +8,13 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from toolkit.camera import Intrinsics, Similarity
-from toolkit.capture.prepare import WHITE, prepare_views
-from toolkit.capture.types import Capture
-from toolkit.config import CaptureSettings
-from toolkit.errors import InputError
-from toolkit.poses.overlap import guessed_depth
-from toolkit.training.nerfusion.samples import Pictures
+from fieldfuse.camera import Intrinsics, Similarity
+from fieldfuse.capture.prepare import WHITE, prepare_views
+from fieldfuse.capture.types import Capture
+from fieldfuse.config import CaptureSettings
+from fieldfuse.errors import InputError
+from fieldfuse.poses.overlap import guessed_depth
+from fieldfuse.training.nerfusion.samples import Pictures
 
 KEPT = 48  # decoded frames a scene
 

@@ -15,10 +15,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import nn
 
-from toolkit.errors import InputError, first_line
-from toolkit.files import atomic_path
-from toolkit.training.nerfusion.average import Average
-from toolkit.training.nerfusion.caution import Caution
+from fieldfuse.errors import InputError, first_line
+from fieldfuse.files import atomic_path
+from fieldfuse.training.nerfusion.average import Average
+from fieldfuse.training.nerfusion.caution import Caution
 
 Tensor = torch.Tensor
 MODEL, FIRST, SECOND, COUNT, AVERAGE = "model.", "adam.first.", "adam.second.", "adam.step.", "average."

@@ -11,8 +11,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from toolkit.errors import InputError, first_line
-from toolkit.files import atomic_path
+from fieldfuse.errors import InputError, first_line
+from fieldfuse.files import atomic_path
 
 # Panels of the picture: title, columns drawn in it (a column that no row has is left out), and whether the axis is logarithmic.
 PANELS: tuple[tuple[str, tuple[str, ...], bool], ...] = (

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import torch
 import torch.distributed as dist
 
-from toolkit.errors import InputError
+from fieldfuse.errors import InputError
 
 
 @dataclass(frozen=True)

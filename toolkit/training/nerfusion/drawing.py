@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from toolkit.errors import InputError
-from toolkit.training.nerfusion.region import draw_voxel, lattice_resolution, region_around, surface_points
-from toolkit.training.nerfusion.samples import Sample, TrainingScene, choose_views
-from toolkit.training.nerfusion.settings import PictureSettings, VolumeSettings
+from fieldfuse.errors import InputError
+from fieldfuse.training.nerfusion.region import draw_voxel, lattice_resolution, region_around, surface_points
+from fieldfuse.training.nerfusion.samples import Sample, TrainingScene, choose_views
+from fieldfuse.training.nerfusion.settings import PictureSettings, VolumeSettings
 
 Tensor = torch.Tensor
 

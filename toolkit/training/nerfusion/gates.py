@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import nn
 
-from toolkit.networks.gru import FusionGRU
-from toolkit.networks.model import NerfusionModel
-from toolkit.training.nerfusion.health import saturation
+from fieldfuse.networks.gru import FusionGRU
+from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.training.nerfusion.health import saturation
 
 Tensor = torch.Tensor
 

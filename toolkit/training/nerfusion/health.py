@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import torch
 
-from toolkit.training.nerfusion.losses import Traced, decibels, mean_likelihood
-from toolkit.training.nerfusion.rays import TargetRays
+from fieldfuse.training.nerfusion.losses import Traced, decibels, mean_likelihood
+from fieldfuse.training.nerfusion.rays import TargetRays
 
 Tensor = torch.Tensor
 ALIVE = 0.1  # spatial deviation of features below this means that the encoder tells places no longer apart

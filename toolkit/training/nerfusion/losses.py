@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import torch
 
-from toolkit.render.composite import ray_sum
-from toolkit.training.nerfusion.rays import TargetRays
+from fieldfuse.render.composite import ray_sum
+from fieldfuse.training.nerfusion.rays import TargetRays
 
 Tensor = torch.Tensor
 WIDTH = 0.03  # relative: how close to the true distance a weight counts as right

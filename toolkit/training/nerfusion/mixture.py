@@ -9,16 +9,16 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from toolkit.errors import InputError
-from toolkit.training.nerfusion.datasets.dtu import dtu_scene, dtu_scenes
-from toolkit.training.nerfusion.datasets.scanned_objects import scanned_object_folders, scanned_object_scene
-from toolkit.training.nerfusion.datasets.scannet import scannet_folders, scannet_scene
-from toolkit.training.nerfusion.datasets.synthetic import synthetic_folders, synthetic_scene
-from toolkit.training.nerfusion.drawing import draw_sample
-from toolkit.training.nerfusion.procedural import BANKS, ProceduralScene
-from toolkit.training.nerfusion.samples import Sample, TrainingScene
-from toolkit.training.nerfusion.settings import SourceSettings, TrainSettings
-from toolkit.training.nerfusion.shards import ShardScene, shard_files
+from fieldfuse.errors import InputError
+from fieldfuse.training.nerfusion.datasets.dtu import dtu_scene, dtu_scenes
+from fieldfuse.training.nerfusion.datasets.scanned_objects import scanned_object_folders, scanned_object_scene
+from fieldfuse.training.nerfusion.datasets.scannet import scannet_folders, scannet_scene
+from fieldfuse.training.nerfusion.datasets.synthetic import synthetic_folders, synthetic_scene
+from fieldfuse.training.nerfusion.drawing import draw_sample
+from fieldfuse.training.nerfusion.procedural import BANKS, ProceduralScene
+from fieldfuse.training.nerfusion.samples import Sample, TrainingScene
+from fieldfuse.training.nerfusion.settings import SourceSettings, TrainSettings
+from fieldfuse.training.nerfusion.shards import ShardScene, shard_files
 
 SCENE, SAMPLE = 1, 2  # streams of random numbers
 TRIES = 8  # scenes in a row that may turn out unusable before that is an error

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from toolkit.camera import Array
+from fieldfuse.camera import Array
 
 Clearance = Callable[[Array], Array]  # (N, 3) points → (N,) distance to the nearest surface
 ROOM_FOR_A_CAMERA = 0.12  # of the distance to the focus: cameras keep this far from surfaces

@@ -8,15 +8,15 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from toolkit.camera import Array, Intrinsics
-from toolkit.effects import transfer
-from toolkit.errors import InputError
-from toolkit.simulate.eye import eye_of, take, take_all
-from toolkit.simulate.materials import TextureBank, texture_bank
-from toolkit.simulate.procedural import random_scene
-from toolkit.simulate.scene import EDGE_SIDE
-from toolkit.training.nerfusion.paths import around, hand_held
-from toolkit.training.nerfusion.samples import Pictures
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.effects import transfer
+from fieldfuse.errors import InputError
+from fieldfuse.simulate.eye import eye_of, take, take_all
+from fieldfuse.simulate.materials import TextureBank, texture_bank
+from fieldfuse.simulate.procedural import random_scene
+from fieldfuse.simulate.scene import EDGE_SIDE
+from fieldfuse.training.nerfusion.paths import around, hand_held
+from fieldfuse.training.nerfusion.samples import Pictures
 
 OBJECTS = ("table", "table", "thin", "sphere")
 ROOMS = ("room",) * 5 + ("table",) * 4 + ("thin", "corridor", "corridor", "street", "wall")

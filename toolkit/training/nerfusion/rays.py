@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
-from toolkit.gpu import sent
-from toolkit.training.nerfusion.samples import Pictures
+from fieldfuse.gpu import sent
+from fieldfuse.training.nerfusion.samples import Pictures
 
 Tensor = torch.Tensor
 HIDDEN = 0.05  # relative: what lies this much behind what a picture shows is not shown by it

@@ -13,18 +13,18 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from toolkit.camera import Array
-from toolkit.capture.detect import read_source
-from toolkit.capture.prepare import prepare_views
-from toolkit.capture.types import Views
-from toolkit.config import CaptureSettings
-from toolkit.errors import InputError
-from toolkit.keyframes import select_keyframes
-from toolkit.poses.scene import Scene, describe_scene
-from toolkit.training.nerfusion.region import lattice_resolution
-from toolkit.training.nerfusion.samples import Pictures, Sample, view_distance
-from toolkit.training.nerfusion.settings import TrainSettings
-from toolkit.training.start import make_space
+from fieldfuse.camera import Array
+from fieldfuse.capture.detect import read_source
+from fieldfuse.capture.prepare import prepare_views
+from fieldfuse.capture.types import Views
+from fieldfuse.config import CaptureSettings
+from fieldfuse.errors import InputError
+from fieldfuse.keyframes import select_keyframes
+from fieldfuse.poses.scene import Scene, describe_scene
+from fieldfuse.training.nerfusion.region import lattice_resolution
+from fieldfuse.training.nerfusion.samples import Pictures, Sample, view_distance
+from fieldfuse.training.nerfusion.settings import TrainSettings
+from fieldfuse.training.start import make_space
 
 MOST_KEY_FRAMES = 40
 

@@ -1,4 +1,4 @@
-"""The loop over key frames with gradients: one volume a level, as `toolkit.fusion` keeps them at inference, but as ordinary values.
+"""The loop over key frames with gradients: one volume a level, as `fieldfuse.fusion` keeps them at inference, but as ordinary values.
 
 Each finer lattice works only in the cells that the coarser global volume does not see through, and starts there from what the coarser
 one knows. What is taken over from a coarser level is not differentiated: each level has its own loss.
@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import torch
 
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume, cells
-from toolkit.networks.model import NerfusionModel
-from toolkit.networks.refine import adopt, children, solid_cells, split_volume, surface_cells
-from toolkit.networks.sweep import Sweep
-from toolkit.networks.unproject import EncodedView
-from toolkit.volume.topology import VOXELS
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.lattice import LatentVolume, Lattice, LocalVolume, cells
+from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.networks.refine import adopt, children, solid_cells, split_volume, surface_cells
+from fieldfuse.networks.sweep import Sweep
+from fieldfuse.networks.unproject import EncodedView
+from fieldfuse.volume.topology import VOXELS
 
 Tensor = torch.Tensor
 

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from toolkit.camera import Array
-from toolkit.training.nerfusion.samples import Pictures
-from toolkit.volume.space import Space
+from fieldfuse.camera import Array
+from fieldfuse.training.nerfusion.samples import Pictures
+from fieldfuse.volume.space import Space
 
 Tensor = torch.Tensor
 SHELL = 1.0  # width of the contracted shell, as fits use it

@@ -9,9 +9,9 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from toolkit.camera import Array
-from toolkit.errors import InputError
-from toolkit.volume.space import Space
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError
+from fieldfuse.volume.space import Space
 
 Tensor = torch.Tensor
 SWEET = (0.2, 0.6)  # how different neighbours of a key frame are (see `view_distance`); around an object that is 6° to 17° of parallax

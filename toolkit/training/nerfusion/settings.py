@@ -11,8 +11,8 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from toolkit.config import refuse_traps
-from toolkit.errors import InputError, brief, first_line
+from fieldfuse.config import refuse_traps
+from fieldfuse.errors import InputError, brief, first_line
 
 LEAST_SIDE = 16  # pixels; sides are rounded to multiples of 8, and less than one would be no picture
 KINDS = ("procedural", "shards", "scannet", "dtu", "scanned_objects", "synthetic")

@@ -15,10 +15,10 @@ import torch.nn.functional as F
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from toolkit.camera import Array, checked_pose
-from toolkit.errors import InputError, first_line
-from toolkit.files import atomic_path
-from toolkit.training.nerfusion.samples import Pictures
+from fieldfuse.camera import Array, checked_pose
+from fieldfuse.errors import InputError, first_line
+from fieldfuse.files import atomic_path
+from fieldfuse.training.nerfusion.samples import Pictures
 
 FORMAT = "fieldfuse-shard-1"
 

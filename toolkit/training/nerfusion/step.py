@@ -8,19 +8,19 @@ from dataclasses import dataclass, field
 
 import torch
 
-from toolkit.gpu import sent
-from toolkit.networks.lattice import LatentVolume, Lattice, LocalVolume
-from toolkit.networks.matching import SIDE
-from toolkit.networks.model import NerfusionModel
-from toolkit.render.fused import GAMMA, make_field
-from toolkit.training.nerfusion.health import feature_deviation, rendering_health
-from toolkit.training.nerfusion.losses import Traced, annealed, rendering_loss
-from toolkit.training.nerfusion.rays import TargetRays, in_sight, random_rays
-from toolkit.training.nerfusion.recurrence import Recurrence
-from toolkit.training.nerfusion.samples import Pictures, Sample
-from toolkit.training.nerfusion.settings import TrainSettings
-from toolkit.training.nerfusion.tracing import trace
-from toolkit.training.nerfusion.witnessed import cameras_of, sweeps_of
+from fieldfuse.gpu import sent
+from fieldfuse.networks.lattice import LatentVolume, Lattice, LocalVolume
+from fieldfuse.networks.matching import SIDE
+from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.render.fused import GAMMA, make_field
+from fieldfuse.training.nerfusion.health import feature_deviation, rendering_health
+from fieldfuse.training.nerfusion.losses import Traced, annealed, rendering_loss
+from fieldfuse.training.nerfusion.rays import TargetRays, in_sight, random_rays
+from fieldfuse.training.nerfusion.recurrence import Recurrence
+from fieldfuse.training.nerfusion.samples import Pictures, Sample
+from fieldfuse.training.nerfusion.settings import TrainSettings
+from fieldfuse.training.nerfusion.tracing import trace
+from fieldfuse.training.nerfusion.witnessed import cameras_of, sweeps_of
 
 Tensor = torch.Tensor
 LOCAL, FUSED = "local", "fused"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from toolkit.gpu import sent
-from toolkit.render.differentiable import render_with_gradients
-from toolkit.render.field import Field
-from toolkit.training.nerfusion.losses import Traced
-from toolkit.training.nerfusion.rays import TargetRays
+from fieldfuse.gpu import sent
+from fieldfuse.render.differentiable import render_with_gradients
+from fieldfuse.render.field import Field
+from fieldfuse.training.nerfusion.losses import Traced
+from fieldfuse.training.nerfusion.rays import TargetRays
 
 Tensor = torch.Tensor
 THRESHOLD = 1e-3  # samples of smaller weight are not decoded; they keep their gradient as obstacles

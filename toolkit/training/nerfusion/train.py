@@ -10,21 +10,21 @@ from typing import Any
 
 import torch
 
-from toolkit.errors import InputError
-from toolkit.networks.model import NerfusionModel
-from toolkit.networks.weights import SHIPPED, config_from, load_model, save_model
-from toolkit.progress import SILENT, Progress
-from toolkit.training.nerfusion.average import Average
-from toolkit.training.nerfusion.caution import MOST, Caution, where_not_finite
-from toolkit.training.nerfusion.checkpoint import checkpoint_settings, checkpoints, load_caution, load_checkpoint, save_checkpoint
-from toolkit.training.nerfusion.curve import Curve
-from toolkit.training.nerfusion.distributed import Crew
-from toolkit.training.nerfusion.gates import GateWatch
-from toolkit.training.nerfusion.mixture import Mixture
-from toolkit.training.nerfusion.real import Case, load_cases
-from toolkit.training.nerfusion.settings import TrainSettings, train_settings_dict
-from toolkit.training.nerfusion.step import Outcome, Stepper, seeded
-from toolkit.training.nerfusion.validate import validate
+from fieldfuse.errors import InputError
+from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.networks.weights import SHIPPED, config_from, load_model, save_model
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.training.nerfusion.average import Average
+from fieldfuse.training.nerfusion.caution import MOST, Caution, where_not_finite
+from fieldfuse.training.nerfusion.checkpoint import checkpoint_settings, checkpoints, load_caution, load_checkpoint, save_checkpoint
+from fieldfuse.training.nerfusion.curve import Curve
+from fieldfuse.training.nerfusion.distributed import Crew
+from fieldfuse.training.nerfusion.gates import GateWatch
+from fieldfuse.training.nerfusion.mixture import Mixture
+from fieldfuse.training.nerfusion.real import Case, load_cases
+from fieldfuse.training.nerfusion.settings import TrainSettings, train_settings_dict
+from fieldfuse.training.nerfusion.step import Outcome, Stepper, seeded
+from fieldfuse.training.nerfusion.validate import validate
 
 WEIGHTS = "weights.safetensors"
 BETAS = (0.9, 0.999)

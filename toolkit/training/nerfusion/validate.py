@@ -12,17 +12,17 @@ import cv2
 import numpy as np
 import torch
 
-from toolkit.camera import Array
-from toolkit.errors import OutputError
-from toolkit.files import atomic_path
-from toolkit.networks.lattice import LatentVolume
-from toolkit.networks.model import NerfusionModel
-from toolkit.training.nerfusion.health import relative_depth_error
-from toolkit.training.nerfusion.losses import Traced, depth_likelihood, psnr
-from toolkit.training.nerfusion.rays import TargetRays, picture_rays
-from toolkit.training.nerfusion.real import Case
-from toolkit.training.nerfusion.step import background_of, begin, render_volume
-from toolkit.training.nerfusion.witnessed import cameras_of, sweeps_of
+from fieldfuse.camera import Array
+from fieldfuse.errors import OutputError
+from fieldfuse.files import atomic_path
+from fieldfuse.networks.lattice import LatentVolume
+from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.training.nerfusion.health import relative_depth_error
+from fieldfuse.training.nerfusion.losses import Traced, depth_likelihood, psnr
+from fieldfuse.training.nerfusion.rays import TargetRays, picture_rays
+from fieldfuse.training.nerfusion.real import Case
+from fieldfuse.training.nerfusion.step import background_of, begin, render_volume
+from fieldfuse.training.nerfusion.witnessed import cameras_of, sweeps_of
 
 Tensor = torch.Tensor
 CHUNK = 4096  # rays at a time

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from toolkit.networks.cameras import Cameras
-from toolkit.networks.matching import SIDE, describe
-from toolkit.networks.sweep import Sweep, compare, decide
-from toolkit.networks.witness import certain, evidence, witness
-from toolkit.training.nerfusion.samples import Pictures, Sample
+from fieldfuse.networks.cameras import Cameras
+from fieldfuse.networks.matching import SIDE, describe
+from fieldfuse.networks.sweep import Sweep, compare, decide
+from fieldfuse.networks.witness import certain, evidence, witness
+from fieldfuse.training.nerfusion.samples import Pictures, Sample
 
 Tensor = torch.Tensor
 

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import Array, Intrinsics, checked_pose, invert
-from toolkit.capture.calibration import from_matrix
-from toolkit.capture.listing import assemble, natural_key, picture_header, read_text, require_folder
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError, first_line
-from toolkit.training.nerfusion.captured import CapturedScene
-from toolkit.training.nerfusion.datasets.folders import listed
+from fieldfuse.camera import Array, Intrinsics, checked_pose, invert
+from fieldfuse.capture.calibration import from_matrix
+from fieldfuse.capture.listing import assemble, natural_key, picture_header, read_text, require_folder
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError, first_line
+from fieldfuse.training.nerfusion.captured import CapturedScene
+from fieldfuse.training.nerfusion.datasets.folders import listed
 
 MILLIMETRES = 1 / 200
 FULL, CROP = (1600, 1200), (80, 44)  # size of the originals; where the 640×512 picture begins in the halved original

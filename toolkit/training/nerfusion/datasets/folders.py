@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from toolkit.capture.listing import natural_key, read_text, require_folder
-from toolkit.errors import InputError
+from fieldfuse.capture.listing import natural_key, read_text, require_folder
+from fieldfuse.errors import InputError
 
 
 def scene_folders(root: Path | str, is_scene: Callable[[Path], bool], what: str, inside: tuple[str, ...] = ()) -> list[Path]:

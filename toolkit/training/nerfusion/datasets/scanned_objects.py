@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.camera import checked_pose
-from toolkit.capture.calibration import from_matrix
-from toolkit.capture.listing import assemble, files_in, picture_header, pictures_in, read_matrix, require_folder, same_count
-from toolkit.capture.prepare import WHITE
-from toolkit.capture.types import Capture, Frame
-from toolkit.errors import InputError
-from toolkit.training.nerfusion.captured import CapturedScene
-from toolkit.training.nerfusion.datasets.folders import scene_folders
+from fieldfuse.camera import checked_pose
+from fieldfuse.capture.calibration import from_matrix
+from fieldfuse.capture.listing import assemble, files_in, picture_header, pictures_in, read_matrix, require_folder, same_count
+from fieldfuse.capture.prepare import WHITE
+from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.errors import InputError
+from fieldfuse.training.nerfusion.captured import CapturedScene
+from fieldfuse.training.nerfusion.datasets.folders import scene_folders
 
 
 def _is_scene(path: Path) -> bool:

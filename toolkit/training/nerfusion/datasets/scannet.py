@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from toolkit.capture.scannet import looks_exported, packed, read_scannet
-from toolkit.errors import InputError
-from toolkit.training.nerfusion.captured import CapturedScene
-from toolkit.training.nerfusion.datasets.folders import listed, scene_folders
+from fieldfuse.capture.scannet import looks_exported, packed, read_scannet
+from fieldfuse.errors import InputError
+from fieldfuse.training.nerfusion.captured import CapturedScene
+from fieldfuse.training.nerfusion.datasets.folders import listed, scene_folders
 
 LISTS = ("scannetv2_train.txt", "train.txt")
 

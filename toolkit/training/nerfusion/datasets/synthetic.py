@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from toolkit.capture.blender import looks_like_blender, read_blender
-from toolkit.training.nerfusion.captured import CapturedScene
-from toolkit.training.nerfusion.datasets.folders import scene_folders
+from fieldfuse.capture.blender import looks_like_blender, read_blender
+from fieldfuse.training.nerfusion.captured import CapturedScene
+from fieldfuse.training.nerfusion.datasets.folders import scene_folders
 
 
 def synthetic_folders(root: Path | str) -> list[Path]:
