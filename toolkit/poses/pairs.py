@@ -15,6 +15,9 @@ from fieldfuse.camera import Array
 COARSE = 256  # features of the largest scale looked at for each picture
 RATIO = 0.85  # of the angle to the best and to the second best match
 MIN_COMMON = 4  # coarse matches that hint at overlap
+# Frames of a video from one to the other of a pair. Tracks go on from pair to pair: with all of 1 to 10, poses are as good, and matching
+# takes half as long again (docs/measured/performance.md).
+STEPS = (1, 2, 3, 5, 7, 10, 20, 40, 80, 160)
 LOOP_GAP = 20  # frames apart before a pair counts as a loop
 
 
@@ -28,9 +31,8 @@ def pairs_with(some: list[int], count: int) -> list[tuple[int, int]]:
     return sorted({(min(i, j), max(i, j)) for i in some for j in range(count) if i != j})
 
 
-def sequential_pairs(count: int, overlap: int = 10, quadratic: int = 4) -> list[tuple[int, int]]:
-    """Each frame with the next `overlap`, then with those 2·overlap, 4·overlap, … (`quadratic` doublings) later."""
-    steps = list(range(1, overlap + 1)) + [overlap * 2**k for k in range(1, quadratic + 1)]
+def sequential_pairs(count: int, steps: tuple[int, ...] = STEPS) -> list[tuple[int, int]]:
+    """Each frame with those `steps` later."""
     return [(i, i + step) for i in range(count) for step in steps if i + step < count]
 
 
@@ -80,7 +82,7 @@ def similar_pairs(sketches: list[Array], each: int = 20, tick: Callable[[], None
             tick()
         for j in range(i + 1, count):
             scores[i, j] = scores[j, i] = common(sketches[i], sketches[j])
-    pairs = set(sequential_pairs(count, overlap=2, quadratic=0))
+    pairs = set(sequential_pairs(count, (1, 2)))
     for i in range(count):
         best = np.argsort(-scores[i], kind="stable")[:each]
         pairs |= {(min(i, int(j)), max(i, int(j))) for j in best if scores[i, j] >= MIN_COMMON}
