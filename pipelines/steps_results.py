@@ -11,11 +11,12 @@ import numpy as np
 
 from fieldfuse.errors import InputError
 from fieldfuse.files import write_json
-from fieldfuse.pipelines.job import Job, set_seeds
+from fieldfuse.memory_limits import require_pictures, require_scores
+from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.kept import EVALUATION, MATCHED, NOTES, TIMELINE, read_export_facts, read_kept
 from fieldfuse.pipelines.rendered import Pictures, depth_steps, load_pictures, save_pictures, to_picture, write_pngs
-from fieldfuse.pipelines.room import require_pictures, require_scores
 from fieldfuse.pipelines.steps_capture import last_of, pixel_state
+from fieldfuse.steps import set_seeds
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Capture, Views
@@ -190,7 +191,7 @@ def fit_left_out(job: Job) -> LeftOut | None:
 
 def render_test_views(job: Job, field: Field, views: Views, scene: Scene) -> Pictures:
     """The field's pictures at the held-out views."""
-    from fieldfuse.evaluate.observed import training_psnr
+    from fieldfuse.evaluation.observed import training_psnr
     from fieldfuse.render.image import make_renderer, render_view
 
     kept = job.folder / "renders" / "field.safetensors"
@@ -267,9 +268,9 @@ def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, sc
 
 def score_pictures(job: Job, views: Views, pictures: dict[str, Pictures]) -> dict[str, Any]:
     """The same metrics for field and TSDF, beside those of the nearest training picture."""
-    from fieldfuse.evaluate.baseline import nearest_image_scores
-    from fieldfuse.evaluate.observed import seen_share
-    from fieldfuse.evaluate.score import score_views
+    from fieldfuse.evaluation.baseline import nearest_image_scores
+    from fieldfuse.evaluation.observed import seen_share
+    from fieldfuse.evaluation.score import score_views
 
     path = job.folder / "evaluation.json"
 

@@ -217,9 +217,9 @@ def put_report(
     seconds: float,
 ) -> dict[str, Any]:
     """Write report.json and report.html; `seconds` is what this command took so far, reused stages count as they took."""
-    from fieldfuse.evaluate.failure import failures
-    from fieldfuse.evaluate.pictures import method_pictures, moving_pictures
-    from fieldfuse.evaluate.report import report_data, write_report
+    from fieldfuse.evaluation.failure import failures
+    from fieldfuse.evaluation.pictures import method_pictures, moving_pictures
+    from fieldfuse.evaluation.report import report_data, write_report
 
     notes = export_facts["notes"] if export_facts else []
     began, told = time.monotonic(), None if job.plan is None else job.plan.told(job)

@@ -39,7 +39,7 @@ def test_the_contracts_are_kept(copy: Path) -> None:
     [
         ("fieldfuse/camera.py", "from fieldfuse.render import march", "One direction of flow"),
         ("fieldfuse/files.py", "import fieldfuse.camera", "One direction of flow"),
-        ("fieldfuse/evaluate/__init__.py", "import fieldfuse.pipelines.doctor", "One direction of flow"),
+        ("fieldfuse/evaluation/__init__.py", "import fieldfuse.pipelines.doctor", "One direction of flow"),
         ("fieldfuse/training/__init__.py", "import open3d", "needs no Open3D"),
         ("fieldfuse/capture/__init__.py", "import pycolmap", "needs no Open3D"),
         ("fieldfuse/volume/topology.py", "from fieldfuse.volume import grid", "needs no Open3D"),

@@ -165,6 +165,7 @@ class Settings:
 # Flags of the command line that have a home in a group: both names work in --set.
 SHORT_NAMES = {
     "effects": "effects.mode",
+    "poses": "poses.source",
     "image_size": "capture.image_size",
     "holdout": "capture.holdout",
     "budget": "fit.budget",
@@ -288,7 +289,7 @@ def load_settings(
     if preset not in CHOICES["preset"]:
         raise InputError(f"there is no preset {preset!r}; known are {', '.join(CHOICES['preset'])}")
     config: DictConfig = OmegaConf.structured(Settings)
-    source = resources.files("configs").joinpath(f"{preset}.yaml")
+    source = resources.files("fieldfuse.configs").joinpath(f"{preset}.yaml")
     layers = [(f"configs/{preset}.yaml", _read_yaml(source.read_text(encoding="utf-8"), f"configs/{preset}.yaml"))]
     if stored is not None:
         layers.append(("run.json", _flatten(stored, "run.json")))
