@@ -15,7 +15,6 @@ names that `--set` has: the short ones as keywords (`image_size=320`), all of th
 
 from __future__ import annotations
 
-import copy
 import logging
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -342,7 +341,6 @@ def load(
     *,
     workdir: Path | str | None = None,
     progress: Listener = None,
-    settings: Mapping[str, Any] | Settings | None = None,
     **options: Any,
 ) -> Scene:
     """Read a capture, find or check its poses, estimate what camera and light did to its images, and prepare them.
@@ -351,8 +349,8 @@ def load(
         source: a video, a folder of images, or a capture of any known layout.
         workdir: where frames of a video and structure from motion's database go; None: a temporary folder that goes with the scene.
         progress: called with stage, done, total and a remark, and asks to stop by returning False; or True for a bar on the terminal.
-        settings, options: `image_size`, `holdout`, `poses` ("auto", "given", "sfm"), `effects` ("auto", "off"), `seed`, `threads`,
-            `preset`, ….
+        options: `image_size`, `holdout`, `poses` ("auto", "given", "sfm"), `effects` ("auto", "off"), `seed`, `threads`, `preset`, …, and
+            `settings` for those with full names.
 
     Raises:
         InputError: the source or a setting is not usable.
@@ -368,7 +366,7 @@ def load(
     path = Path(source)
     if not path.exists():
         raise InputError(f"{path} does not exist; give a video, a folder of images, or a capture folder")
-    chosen = copy.deepcopy(settings) if isinstance(settings, Settings) else _settings({**(settings or {}), **options})
+    chosen = _settings(options)
     chosen.device = steps.choose_device(chosen.device, chosen.engine)
     files = tempfile.TemporaryDirectory(prefix="fieldfuse-") if workdir is None else None
     folder = Path(files.name if files is not None else workdir or ".")
@@ -537,9 +535,14 @@ def _settings(options: Mapping[str, Any]) -> Settings:
     Raises:
         InputError: there is no such setting, or its value does not fit.
     """
-    given = dict(options)
+    given = _flat(options)
     preset = given.pop("preset", "balanced")
     return load_settings(preset, flags=given)
+
+
+def _flat(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Keywords, and by their full names those in `settings`."""
+    return {**(options.get("settings") or {}), **{name: value for name, value in options.items() if name != "settings"}}
 
 
 def _changed(settings: Settings, options: Mapping[str, Any], allowed: tuple[str, ...]) -> Settings:
@@ -549,7 +552,7 @@ def _changed(settings: Settings, options: Mapping[str, Any], allowed: tuple[str,
         InputError: a setting that decides the scene, or one that is not usable.
     """
     before = settings_dict(settings)
-    made = load_settings(settings.preset, flags=dict(options), stored=before)
+    made = load_settings(settings.preset, flags=_flat(options), stored=before)
     after = settings_dict(made)
     fixed = sorted(name for name in after if after[name] != before[name] and name not in allowed)
     if fixed:

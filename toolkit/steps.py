@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import random
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -43,19 +44,33 @@ def set_seeds(seed: int) -> None:
     cv2.setRNGSeed(seed % 2**31)
 
 
+class _Generators:
+    """The state of the global random generators before the first of several threads seeded them, given back by the last."""
+
+    lock, inside = threading.Lock(), 0
+    before: tuple[Any, ...] = ()
+
+
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
     """Generators seeded inside, and as they were afterwards (but OpenCV's, whose state cannot be read)."""
     import torch
 
-    before, numbers = random.getstate(), np.random.get_state()
-    with torch.random.fork_rng():
+    with _Generators.lock:
+        _Generators.inside += 1
+        if _Generators.inside == 1:
+            _Generators.before = random.getstate(), np.random.get_state(), torch.get_rng_state()
         set_seeds(seed)
-        try:
-            yield
-        finally:
-            random.setstate(before)
-            np.random.set_state(numbers)
+    try:
+        yield
+    finally:
+        with _Generators.lock:
+            _Generators.inside -= 1
+            if _Generators.inside == 0:
+                python, numbers, tensors = _Generators.before
+                random.setstate(python)
+                np.random.set_state(numbers)
+                torch.set_rng_state(tensors)
 
 
 def choose_device(wanted: str, engine: str = "auto") -> str:
