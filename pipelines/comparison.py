@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fieldfuse.pipelines.fit_files import fit_matched
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.steps_compare import Compared, common_voxel, depths_of_test_views, working_meshes
 from fieldfuse.pipelines.steps_network import DIRECT
-from fieldfuse.pipelines.steps_results import fit_matched
 from fieldfuse.pipelines.summary import base_data, warnings_of
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from fieldfuse.effects.correct import Corrections
 from fieldfuse.files import write_json
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.kept import EFFECTS, read_kept
-from fieldfuse.pipelines.steps_capture import pixel_state
+from fieldfuse.pipelines.source_state import pixel_state
 from fieldfuse.steps import apply_effects, looks_for_effects, set_seeds
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ import numpy as np
 from fieldfuse import __version__
 from fieldfuse.config import settings_dict
 from fieldfuse.files import write_json
+from fieldfuse.pipelines.fit_files import fit_left_out, fit_matched, fit_notes
 from fieldfuse.pipelines.folder import command_line
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.rendered import Pictures, depth_step
 from fieldfuse.pipelines.steps_effects import effects_part, effects_warnings, moved_cameras, moved_depth
-from fieldfuse.pipelines.steps_results import fit_left_out, fit_matched, fit_notes
 from fieldfuse.pipelines.textured import TSDF_TEXTURE
 
 if TYPE_CHECKING:

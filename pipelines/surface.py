@@ -14,11 +14,11 @@ from fieldfuse.camera import Array, Similarity
 from fieldfuse.errors import InputError
 from fieldfuse.export.field_surface import Originals, at_most, surface_of_field, whole_mesh
 from fieldfuse.memory_limits import require_pictures
+from fieldfuse.pipelines.fit_files import fit_left_out
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.page import NAME, PAGE, put_page
 from fieldfuse.pipelines.pictures import camera_of, orbit_cameras, pictures
 from fieldfuse.pipelines.rendered import Pictures, to_picture
-from fieldfuse.pipelines.steps_results import fit_left_out
 from fieldfuse.pipelines.summary import put_cameras
 from fieldfuse.pipelines.taken import MESHES, SURFACES, TEXTURE, missing_originals, needs_originals
 from fieldfuse.pipelines.textured import TEXTURED, put_textured
