@@ -147,6 +147,16 @@ def test_demo_and_test_share_the_steps_in_order(tmp_path: Path) -> None:
     assert "constraint constraints.txt" in demo
 
 
+@needs_make
+def test_hooks_of_commits_run_what_lint_runs(tmp_path: Path) -> None:
+    text = (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8")
+    targets = re.findall(r"entry: make --silent (\w+)$", text, re.MULTILINE)
+    done = make("--dry-run", "lint", f"VENV={tmp_path / 'none'}").stdout
+    assert len(targets) == text.count("- id:") == 3
+    for target, tool in zip(targets, ("ruff check", "bin/mypy", "lint-imports"), strict=True):
+        assert tool in done and tool in make("--dry-run", target, f"VENV={tmp_path / 'none'}").stdout
+
+
 def libraries(python: str, path: str) -> subprocess.CompletedProcess[str]:
     script = str(ROOT / ".ci" / "system_libraries.sh")
     return subprocess.run(
