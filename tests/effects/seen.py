@@ -19,7 +19,6 @@ def made(
     pose_error: float = 0.0,
     noise: float = 0.1,
     points: int = 420,
-    far: float = 0.0,
     gain: Array | None = None,
     corner: float = 1.0,
 ) -> Sightings:
@@ -28,13 +27,11 @@ def made(
     Args:
         rows: seconds of a step that reading takes; the hand turns some degrees a step.
         pose_error: radians, deviation of the given poses' turns.
-        noise: pixels. far: share of the points at 1000 units.
+        noise: pixels.
         gain: (FRAMES, 3). corner: of a vignetting.
     """
     rng = np.random.default_rng(seed)
     cloud = rng.uniform([-2.5, -1.6, 2.2], [2.5, 1.6, 6.0], (points, 3))
-    away = rng.uniform(0, 1, points) < far
-    cloud[away] *= 1000 / cloud[away, 2:]
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     poses[:, :3, 3] = np.stack([np.linspace(-0.6, 0.6, FRAMES), 0.1 * np.sin(np.arange(FRAMES)), 0.02 * np.arange(FRAMES)], axis=1)
     steps = np.concatenate([rng.normal(0, 0.05, (FRAMES, 3)), np.tile([0.09, 0.0, 0.0], (FRAMES, 1))], axis=1)

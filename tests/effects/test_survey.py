@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fieldfuse.effects import background, geometry, light, motion_blur, view_dependence
+from fieldfuse.effects import geometry, light, motion_blur
 from fieldfuse.effects.adjust import LENS, POSES, ROWS, adjust, predict, residuals, rotation, scatter, vectors
 from fieldfuse.effects.paid import Paid
 from fieldfuse.effects.refine import believed, refined_poses
@@ -38,7 +38,6 @@ def test_nothing_is_found_where_nothing_is(seed: int) -> None:
         ("poses", {"pose_error": 0.004}, 4),
         ("exposure", {"gain": drift(3)}, 5),
         ("vignetting", {"corner": 0.6}, 4),
-        ("background", {"far": 0.1}, 5),
     ],
 )
 def test_each_effect_alone_is_found_and_nothing_else(effect: str, arguments: dict, seed: int) -> None:
@@ -168,18 +167,6 @@ def test_adjusting_points_alone_lowers_the_residual_to_the_noise() -> None:
     assert fitted.scatter < 0.25
 
 
-def test_neighbours_that_change_together_speak_for_view_dependence() -> None:
-    rng = np.random.default_rng(2)
-    frame, place = np.repeat(np.arange(10), 150), rng.uniform(0, 200, (1500, 2))
-    noise = rng.normal(0, 0.03, 1500)
-    alone = view_dependence.evidence(noise, frame, place)
-    spot = 0.2 * np.exp(-(((place - 100) / 30) ** 2).sum(1))
-    together = view_dependence.evidence(noise + spot, frame, place)
-    assert not alone.found and together.found, (alone.reason, together.reason)
-    few = view_dependence.evidence(noise[:5], frame[:5], place[:5])
-    assert not few.found and "too few" in few.reason
-
-
 def test_frames_that_are_less_sharp_than_others_are_told() -> None:
     rng = np.random.default_rng(3)
     frame, point = (index.ravel() for index in np.meshgrid(np.arange(12), np.arange(200)))
@@ -195,8 +182,6 @@ def test_too_little_to_tell() -> None:
     seen = made(12, points=20)
     found = look(seen)
     assert found.there == frozenset() and all("too few" in finding.reason for finding in found.findings.values())
-    empty = background.evidence(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros(0), 1.0)
-    assert not empty.found
 
 
 def test_readout_is_told_in_shares_of_a_step() -> None:
