@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fieldfuse.effects import geometry, light, motion_blur
-from fieldfuse.effects.adjust import LENS, POSES, ROWS, adjust, predict, residuals, rotation, scatter, vectors
+from fieldfuse.effects.adjust import LENS, POSES, ROWS, adjust, predict, residuals, scatter
 from fieldfuse.effects.paid import Paid
 from fieldfuse.effects.refine import believed, refined_poses
 from fieldfuse.effects.survey import ORDER, _lens, _poses, _rows, look
@@ -115,7 +115,7 @@ def test_refined_poses_stay_where_the_given_ones_are(seed: int) -> None:
 
     def cost(step: np.ndarray) -> float:
         """Of all poses turned about their middle by `step[:3]` and moved by `step[3:]`."""
-        turn, moved = rotation(step[None, :3])[0], poses.copy()
+        turn, moved = Rotation.from_rotvec(step[None, :3]).as_matrix()[0], poses.copy()
         moved[:, :3, :3] = turn @ poses[:, :3, :3]
         moved[:, :3, 3] = (poses[:, :3, 3] - centre) @ turn.T + centre + step[3:]
         return belief.cost(moved)
@@ -140,12 +140,6 @@ def test_depths_do_not_drift_where_a_lens_is_a_little_off(seed: int) -> None:
     refined = refined_poses(seen, np.ones(FRAMES, dtype=bool), frozenset({POSES})).poses
     assert np.median(depths(alone) / exact) > 1.028
     assert abs(np.median(depths(refined) / exact) - 1) < 0.02
-
-
-def test_turns_become_vectors_and_back() -> None:
-    turns = np.random.default_rng(0).normal(0, 0.6, (50, 3))
-    turns[0] = 0
-    np.testing.assert_allclose(vectors(rotation(turns)), turns, atol=1e-12)
 
 
 def test_held_out_frames_move_nothing_of_the_others() -> None:
