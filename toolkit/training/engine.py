@@ -11,7 +11,6 @@ from typing import Protocol
 
 import torch
 
-from fieldfuse import libraries
 from fieldfuse.config import Settings
 from fieldfuse.gpu import runs_kernels
 from fieldfuse.networks.decoder import Deferred
@@ -141,4 +140,3 @@ def warm_up(settings: Settings, progress: Progress) -> None:
     if not warm.ready(*kind):
         progress.update(0, 1, "compiling the fast engine, once on this machine, about half a minute")
         warm.run(*kind)
-        libraries.let_go()  # what was read to load kernels
