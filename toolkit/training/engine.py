@@ -13,7 +13,7 @@ import torch
 
 from fieldfuse.config import Settings
 from fieldfuse.gpu import runs_kernels
-from fieldfuse.networks.decoder import Deferred
+from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.progress import Progress
 from fieldfuse.render.field import Field
 from fieldfuse.render.rays import render_rays
