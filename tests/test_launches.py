@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from fieldfuse import gpu
-from fieldfuse.networks.store import _Slots
+from fieldfuse.nerfusion.store import _Slots
 
 
 class Jitted:

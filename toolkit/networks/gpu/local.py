@@ -10,13 +10,13 @@ import numpy as np
 from torch import Tensor
 
 from fieldfuse.gpu import sent
-from fieldfuse.networks.cameras import Cameras
+from fieldfuse.nerfusion.cameras import Cameras
+from fieldfuse.nerfusion.extras.plane_sweep import Sweep
+from fieldfuse.nerfusion.lattice import Lattice, LocalVolume
+from fieldfuse.nerfusion.unproject import EncodedView
+from fieldfuse.nerfusion.volume_net import LocalReconstruction
 from fieldfuse.networks.gpu.observe import Observer
 from fieldfuse.networks.gpu.volumes import settle
-from fieldfuse.networks.lattice import Lattice, LocalVolume
-from fieldfuse.networks.local import LocalReconstruction
-from fieldfuse.networks.sweep import Sweep
-from fieldfuse.networks.unproject import EncodedView
 from fieldfuse.volume.topology import Topology
 
 
