@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import subprocess
 from pathlib import Path
@@ -56,7 +57,7 @@ def test_every_page_is_in_the_index() -> None:
 
 
 def test_pages_that_the_code_names_exist() -> None:
-    for folder in ("toolkit", "pipelines", "configs", "scripts", "tests"):
+    for folder in ("toolkit", "pipelines", "configs", "benchmarks", "tests"):
         for path in sorted((ROOT / folder).rglob("*")):
             if path.suffix in (".py", ".yaml", ".j2", ".js", ".html"):
                 for page in re.findall(r"\bdocs/[\w/]+\.md", path.read_text(encoding="utf-8")):
@@ -75,8 +76,26 @@ def test_commands_and_options_exist(page: Path) -> None:
         for word in words:
             if word.startswith("--") and not word.endswith(".sh"):
                 assert word.split("=")[0].rstrip(",;.)") in known, line
+    for name, rest in re.findall(r"python -m benchmarks\.(\w+)([^\n`|#]*)", text):
+        options = {option for parameter in benchmark(name).params for option in parameter.opts}
+        assert {word.split("=")[0] for word in rest.split() if word.startswith("--")} <= options, f"{name}{rest}"
     for name in re.findall(r"`make ([a-z]+)`", text):
         assert f"\n{name}:" in (ROOT / "Makefile").read_text(encoding="utf-8"), name
+
+
+def benchmark(name: str) -> typer.core.TyperCommand:
+    """Its command line."""
+    command = typer.main.get_command(importlib.import_module(f"benchmarks.{name}").app)
+    assert isinstance(command, typer.core.TyperCommand)
+    return command
+
+
+def test_every_benchmark_is_in_the_docs() -> None:
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    names = [path.stem for path in (ROOT / "benchmarks").glob("*.py") if "\napp = application(" in path.read_text(encoding="utf-8")]
+    assert len(names) > 8
+    for name in names:
+        assert f"python -m benchmarks.{name}" in text, name
 
 
 def test_every_command_is_in_the_readme() -> None:
@@ -101,7 +120,7 @@ def test_settings_that_the_docs_name_exist() -> None:
 
 
 def test_places_in_the_tree_exist() -> None:
-    for place in re.findall(r"`((?:toolkit|pipelines|configs)/[\w./]*)`", (ROOT / "README.md").read_text(encoding="utf-8")):
+    for place in re.findall(r"`((?:toolkit|pipelines|configs|benchmarks)/[\w./]*)`", (ROOT / "README.md").read_text(encoding="utf-8")):
         assert (ROOT / place).exists(), place
 
 

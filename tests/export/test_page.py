@@ -16,7 +16,7 @@ import torch
 
 from fieldfuse.camera import Array
 from fieldfuse.errors import InputError
-from fieldfuse.evaluate.speed_state import around, lens
+from fieldfuse.evaluate.sphere import around, lens
 from fieldfuse.export.page import Tour, corner_densities, decoder_blocks, page, require_page, write_page
 from fieldfuse.networks.decoder import Deferred, make_decoder
 from fieldfuse.render.bake import BakedField, bake

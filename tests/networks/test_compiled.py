@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from fieldfuse.evaluate.speed import pinned
+from benchmarks.timing import pinned
 from fieldfuse.networks import compiled
 from fieldfuse.networks.cameras import Cameras
 from fieldfuse.networks.matching import LARGE, SMALL, distribution, semi_global

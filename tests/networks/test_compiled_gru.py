@@ -9,7 +9,7 @@ import pytest
 import torch
 from numba import njit
 
-from fieldfuse.evaluate.speed import pinned
+from benchmarks.timing import pinned
 from fieldfuse.networks import compiled_gru, model
 from fieldfuse.networks.lattice import LatentVolume, LocalVolume
 from fieldfuse.volume.topology import Topology

@@ -18,8 +18,8 @@ from fieldfuse.capture.views_file import load_views
 from fieldfuse.evaluate.baseline import nearest_image_scores
 from fieldfuse.evaluate.geometry import read_mesh
 from fieldfuse.evaluate.images import psnr
-from fieldfuse.evaluate.speed_state import around
-from fieldfuse.evaluate.speed_state import lens as around_lens
+from fieldfuse.evaluate.sphere import around
+from fieldfuse.evaluate.sphere import lens as around_lens
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.cli import app
 from fieldfuse.pipelines.pictures import camera_of
