@@ -19,7 +19,7 @@ from fieldfuse.capture.detect import FILMS
 from fieldfuse.capture.listing import natural_key
 from fieldfuse.capture.sens import is_sens
 from fieldfuse.errors import FieldfuseError, InputError, Interrupted, first_line
-from fieldfuse.evaluate import words
+from fieldfuse.evaluation import words
 from fieldfuse.files import read_json, remove
 from fieldfuse.pipelines.console import ConsoleProgress, make_progress
 from fieldfuse.pipelines.job import read_settings

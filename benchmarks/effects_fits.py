@@ -19,9 +19,9 @@ from fieldfuse.config import Settings
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.effects.decide import asleep, choose_field, decide
 from fieldfuse.effects.survey import Survey
-from fieldfuse.evaluate.affine import right_half_psnr
-from fieldfuse.evaluate.images import psnr
-from fieldfuse.evaluate.score import RenderedView, as_photo, entry, mean
+from fieldfuse.evaluation.affine import right_half_psnr
+from fieldfuse.evaluation.images import psnr
+from fieldfuse.evaluation.score import RenderedView, as_photo, entry, mean
 from fieldfuse.poses.scene import describe_scene
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.image import make_renderer, render_view

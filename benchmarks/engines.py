@@ -18,12 +18,12 @@ import typer
 from benchmarks.experiment import Experiment, Row, application, chosen, markdown, numbers, program, section, show
 from benchmarks.ground import Ground, measured, opened
 from fieldfuse.camera import Array, Intrinsics
-from fieldfuse.config import CHOICES, Settings
-from fieldfuse.pipelines.job import check_engine
+from fieldfuse.config import ENGINES, Settings
 from fieldfuse.pipelines.options import Config, Device, ImageSize, Out, Pairs, Quiet, Seed, Source, Threads, gather
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import make_renderer, render_view
+from fieldfuse.steps import check_engine
 from fieldfuse.training.engine import chosen_engine, fit_device, make_engine
 from fieldfuse.training.guided import fit_guided
 from fieldfuse.training.rays import PixelPool
@@ -49,7 +49,7 @@ def engines(
     quiet: Quiet = False,
 ) -> None:
     """Held-out quality of fits by each engine, and the time of a render of 640×480 pixels."""
-    seconds, names = numbers(budgets, "--budgets"), chosen(engines, CHOICES["engine"], "--engines")
+    seconds, names = numbers(budgets, "--budgets"), chosen(engines, ENGINES, "--engines")
     options = gather(None, config, pairs, image_size=image_size, seed=seed, threads=threads, device=device)
     with opened(source, out, options, quiet) as ready:
         settings, progress = ready.job.settings, ready.job.progress

@@ -71,7 +71,7 @@ class Experiment:
             InputError: the file of an earlier call is damaged.
             Interrupted: the user asked to stop; rows that are finished are in the files.
         """
-        from fieldfuse.evaluate.machine import machine
+        from fieldfuse.evaluation.machine import machine
 
         began = time.monotonic()
         rows = self.earlier(out, progress)

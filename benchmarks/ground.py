@@ -16,7 +16,7 @@ from fieldfuse.capture.subset import limited
 from fieldfuse.capture.types import Capture, Views
 from fieldfuse.config import Settings, settings_dict
 from fieldfuse.effects.correct import Corrections
-from fieldfuse.evaluate.score import score_views
+from fieldfuse.evaluation.score import score_views
 from fieldfuse.files import fingerprint
 from fieldfuse.networks.model import NerfusionModel
 from fieldfuse.pipelines.console import make_progress

@@ -26,12 +26,13 @@ from fieldfuse.networks.lattice import Lattice
 from fieldfuse.networks.model import NerfusionModel
 from fieldfuse.networks.weights import SHIPPED, load_model
 from fieldfuse.pipelines.console import make_progress
-from fieldfuse.pipelines.job import choose_device, set_threads
+from fieldfuse.pipelines.job import set_threads
 from fieldfuse.pipelines.options import Device, Quiet, Seed, Threads
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.simulate.materials import texture_bank
 from fieldfuse.simulate.procedural import random_scene
 from fieldfuse.simulate.scene import Scene
+from fieldfuse.steps import choose_device
 from fieldfuse.training.nerfusion.paths import hand_held
 from fieldfuse.volume.space import Space
 

@@ -12,13 +12,13 @@ from itertools import pairwise
 from typing import Any
 
 from benchmarks.experiment import Row, markdown
-from fieldfuse.evaluate import words
-from fieldfuse.evaluate.budget import AGREES
-from fieldfuse.evaluate.compare import compare_data, matching_line
-from fieldfuse.evaluate.compare import table as compared
-from fieldfuse.evaluate.page import short_name
-from fieldfuse.evaluate.tradeoff import METHODS, Point, in_order, pareto, points_of
-from fieldfuse.evaluate.tradeoff_text import front_sentence, sentence, setting_text, steps
+from fieldfuse.evaluation import words
+from fieldfuse.evaluation.budget import AGREES
+from fieldfuse.evaluation.compare import compare_data, matching_line
+from fieldfuse.evaluation.compare import table as compared
+from fieldfuse.evaluation.page import short_name
+from fieldfuse.evaluation.tradeoff import METHODS, Point, in_order, pareto, points_of
+from fieldfuse.evaluation.tradeoff_text import front_sentence, sentence, setting_text, steps
 
 HEAD = ("capture", "views", "pixels", "how", "PSNR", "SSIM", "LPIPS", "nearest image", "field made in", "peak memory", "whole run")
 PLAIN = ("images", "frames", "photos")

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 
 from benchmarks.timing import Case, compare, pinned
-from fieldfuse.evaluate.sphere import around, lens, sphere_field, sphere_pixels
+from fieldfuse.evaluation.sphere import around, lens, sphere_field, sphere_pixels
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_image import BakedRenderer
 from fieldfuse.render.compiled import CompiledRenderer

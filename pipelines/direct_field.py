@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from fieldfuse.steps import network_weights
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Views
@@ -31,18 +32,11 @@ class DirectField:
     voxel_size: float
 
 
-def weights_of(settings: Settings) -> Path:
-    """The file of the networks that the settings name, else the shipped one."""
-    from fieldfuse.training.from_network import SHIPPED
-
-    return Path(settings.network.weights) if settings.network.weights else SHIPPED
-
-
 def weights_state(settings: Settings) -> str:
     """Changes with the weights, so that results of earlier ones are not reused."""
     from fieldfuse.files import fingerprint
 
-    return fingerprint(weights_of(settings))
+    return fingerprint(network_weights(settings))
 
 
 def training_key_frames(views: Views, scene: Scene, settings: Settings) -> KeyFrames:
@@ -81,7 +75,7 @@ def direct_field(
         keys = KeyFrames(keys.indices[kept], keys.neighbours[kept])
     options = NetworkOptions.of(settings.network)
     options = replace(options, voxels=(options.voxels or voxels_to_median(views, options.measured)) / voxel_factor)
-    model = load_networks(weights_of(settings), settings.device)
+    model = load_networks(network_weights(settings), settings.device)
     inference = Inference(model, views, scene, keys, settings.field.background, options)
     for _ in inference.frames(progress):
         pass

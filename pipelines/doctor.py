@@ -23,7 +23,7 @@ PACKAGES = (
     "fast-simplification",
     "typer",
     "rich",
-    "omegaconf",
+    "pydantic",
     "matplotlib",
     "safetensors",
     "pillow",
@@ -236,7 +236,7 @@ def _xfeat() -> Check:
 
 
 def _lpips() -> Check:
-    from fieldfuse.evaluate.perceptual import lpips_available
+    from fieldfuse.evaluation.perceptual import lpips_available
 
     if lpips_available():
         return Check("lpips", OK, "weights installed")

@@ -39,7 +39,7 @@ def test_the_contracts_are_kept(copy: Path) -> None:
     [
         ("fieldfuse/camera.py", "from fieldfuse.render import march", "One direction of flow"),
         ("fieldfuse/files.py", "import fieldfuse.camera", "One direction of flow"),
-        ("fieldfuse/evaluate/__init__.py", "import fieldfuse.pipelines.doctor", "One direction of flow"),
+        ("fieldfuse/evaluation/__init__.py", "import fieldfuse.pipelines.doctor", "One direction of flow"),
         ("fieldfuse/pipelines/doctor.py", "import benchmarks.timing", "imports no benchmark"),
         ("fieldfuse/training/__init__.py", "import open3d", "needs no Open3D"),
         ("fieldfuse/capture/__init__.py", "import pycolmap", "needs no Open3D"),
@@ -50,7 +50,7 @@ def test_a_wrong_import_is_told(copy: Path, module: str, line: str, contract: st
     path = copy / module
     path.write_text(f"{path.read_text(encoding='utf-8')}\n{line}\n", encoding="utf-8")
     done = lint_imports(copy)
-    broken = [text for text in done.stdout.splitlines() if text.endswith("BROKEN")]
+    broken = [text for text in done.stdout.splitlines() if " BROKEN" in text]
     assert done.returncode == 1
     assert any(contract in text for text in broken), done.stdout
 

@@ -11,7 +11,7 @@ import pytest
 from benchmarks import speed_cases
 from benchmarks.speed import fit_curves, growth, table, tsdf_frames
 from benchmarks.timing import Case, Timed, compare, exponent
-from fieldfuse.evaluate.sphere import CHANNELS, around, lens, sphere_field, sphere_pixels
+from fieldfuse.evaluation.sphere import CHANNELS, around, lens, sphere_field, sphere_pixels
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_image import BakedRenderer
 from fieldfuse.training.fused import FusedOptimiser

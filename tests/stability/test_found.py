@@ -19,9 +19,9 @@ from fieldfuse.capture.types import Capture
 from fieldfuse.config import load_settings
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.errors import InputError
-from fieldfuse.evaluate.compare_truth import find_truth
-from fieldfuse.evaluate.selftest.edit import small_field
-from fieldfuse.evaluate.selftest.fits import scene_of
+from fieldfuse.evaluation.compare_truth import find_truth
+from fieldfuse.evaluation.selftest.edit import small_field
+from fieldfuse.evaluation.selftest.fits import scene_of
 from fieldfuse.export.mesh import mesh_facts
 from fieldfuse.files import read_json, write_json
 from fieldfuse.pipelines.console import ConsoleProgress

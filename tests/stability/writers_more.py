@@ -22,11 +22,11 @@ from fieldfuse.capture.photos import read_photos
 from fieldfuse.capture.select import select_frames
 from fieldfuse.capture.video import read_video
 from fieldfuse.config import CaptureSettings, Settings
-from fieldfuse.evaluate.compare_page import write_comparison
-from fieldfuse.evaluate.pictures import write_picture, write_strips
-from fieldfuse.evaluate.selftest.data import texture
-from fieldfuse.evaluate.selftest.edit import small_field
-from fieldfuse.evaluate.tradeoff_page import write_tradeoff
+from fieldfuse.evaluation.compare_page import write_comparison
+from fieldfuse.evaluation.pictures import write_picture, write_strips
+from fieldfuse.evaluation.selftest.data import texture
+from fieldfuse.evaluation.selftest.edit import small_field
+from fieldfuse.evaluation.tradeoff_page import write_tradeoff
 from fieldfuse.export.page import Tour, write_page
 from fieldfuse.networks.weights import save_model
 from fieldfuse.pipelines.folder import RunFolder
@@ -45,8 +45,8 @@ from fieldfuse.training.nerfusion.curve import Curve
 from fieldfuse.training.nerfusion.shards import write_shard
 from fieldfuse.training.nerfusion.train import make_model
 from tests.capture.layouts import write_record3d, write_sens
-from tests.evaluate.test_compare_page import made, pictures
-from tests.evaluate.test_tradeoff import ladder
+from tests.evaluation.test_compare_page import made, pictures
+from tests.evaluation.test_tradeoff import ladder
 from tests.simulate.test_simulate import SMALL
 from tests.training.nerfusion.tiny import tiny_settings
 
@@ -135,9 +135,9 @@ ELSEWHERE = {
     "toolkit/poses/sfm.py": "as above",
     "toolkit/poses/child.py": "as above",
     "toolkit/poses/worker.py": "as above",
-    "toolkit/evaluate/budget.py": "a cache: what cannot be written is not remembered",
+    "toolkit/evaluation/budget.py": "a cache: what cannot be written is not remembered",
     "toolkit/simulate/demo.py": "one video, for people, through `atomic_path`",
-    "toolkit/evaluate/tradeoff_plots.py": "draws into memory",
-    "toolkit/evaluate/plots.py": "draws into memory",
+    "toolkit/evaluation/tradeoff_plots.py": "draws into memory",
+    "toolkit/evaluation/plots.py": "draws into memory",
     "pipelines/doctor.py": "a probe in a temporary folder",
 }

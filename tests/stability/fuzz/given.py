@@ -15,7 +15,7 @@ from fieldfuse.camera import Intrinsics
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import FieldfuseError
-from fieldfuse.evaluate.compare_truth import find_truth, true_depths
+from fieldfuse.evaluation.compare_truth import find_truth, true_depths
 from fieldfuse.files import write_json
 from fieldfuse.simulate.mesh_scene import load_mesh_scene
 from fieldfuse.simulate.seen import Rays
@@ -59,7 +59,7 @@ def make_meshes(root: Path) -> None:
 
 def read_meshes(root: Path, number: int) -> None:
     """Each file as a mesh and as a scene to film, with a few rays."""
-    from fieldfuse.evaluate.geometry import read_mesh, surface_points  # here, for workers that read other things: it brings Open3D
+    from fieldfuse.evaluation.geometry import read_mesh, surface_points  # here, for workers that read other things: it brings Open3D
 
     directions = torch.nn.functional.normalize(torch.tensor([[0.1, 0.1, -1.0], [0.0, 0.2, -1.0]]), dim=1)
     rays = Rays(torch.tensor([[0.0, 0.0, 3.0]]), directions, 0.01)
@@ -86,7 +86,7 @@ def make_truth(root: Path) -> None:
 
 def read_truth(root: Path, number: int) -> None:
     """Depth of one view and points of the surface."""
-    from fieldfuse.evaluate.geometry import read_mesh, surface_points
+    from fieldfuse.evaluation.geometry import read_mesh, surface_points
 
     capture = open_capture(root)
     truth = find_truth(capture)

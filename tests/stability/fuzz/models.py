@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from fieldfuse.camera import Intrinsics
-from fieldfuse.evaluate import budget
-from fieldfuse.evaluate.selftest.edit import small_field
+from fieldfuse.evaluation import budget
+from fieldfuse.evaluation.selftest.edit import small_field
 from fieldfuse.files import write_json
 from fieldfuse.networks.model import ModelConfig, NerfusionModel
 from fieldfuse.networks.weights import load_model, save_model
