@@ -16,8 +16,8 @@ import typer
 from benchmarks.experiment import Experiment, Row, application, markdown, program, section, show
 from benchmarks.few_views import ALL, counts_of
 from benchmarks.ground import Inferred, opened
-from fieldfuse.networks.gru import RunningMean
-from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.nerfusion.gru import RunningMean
+from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.pipelines.options import Config, ImageSize, Out, Pairs, Quiet, Seed, Source, gather
 from fieldfuse.training.from_network import NetworkOptions, load_networks
 

@@ -19,7 +19,7 @@ from benchmarks.experiment import Experiment, Row, application, chosen, markdown
 from benchmarks.ground import Ground, Inferred, Opened, measured, opened
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation.baseline import nearest_image_scores
-from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.pipelines.options import Config, ImageSize, Out, Pairs, Quiet, Seed, Source, gather
 from fieldfuse.render.field import Field
 from fieldfuse.training.from_network import NetworkOptions, load_networks

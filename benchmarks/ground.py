@@ -18,7 +18,7 @@ from fieldfuse.config import Settings, settings_dict
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.evaluation.score import score_views
 from fieldfuse.files import fingerprint
-from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.direct_field import training_key_frames, weights_state
 from fieldfuse.pipelines.job import Job, open_job

@@ -12,7 +12,7 @@ from fieldfuse.steps import network_weights
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Views
     from fieldfuse.config import Settings
-    from fieldfuse.keyframes import KeyFrames
+    from fieldfuse.nerfusion.keyframes import KeyFrames
     from fieldfuse.poses.scene import Scene
     from fieldfuse.progress import Progress
     from fieldfuse.render.field import Field
@@ -41,7 +41,7 @@ def weights_state(settings: Settings) -> str:
 
 def training_key_frames(views: Views, scene: Scene, settings: Settings) -> KeyFrames:
     """Key frames among the training views, as a run chooses them but for sharpness."""
-    from fieldfuse.keyframes import select_keyframes
+    from fieldfuse.nerfusion.keyframes import select_keyframes
 
     train = np.flatnonzero(~np.asarray(views.test))
     return select_keyframes(
@@ -66,7 +66,7 @@ def direct_field(
         InputError: there is no training view, or no weights.
         Interrupted: the user asked to stop.
     """
-    from fieldfuse.keyframes import KeyFrames
+    from fieldfuse.nerfusion.keyframes import KeyFrames
     from fieldfuse.training.from_network import Inference, NetworkOptions, load_networks, voxels_to_median
 
     keys = training_key_frames(views, scene, settings)
