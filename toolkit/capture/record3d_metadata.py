@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from fieldfuse.camera import Array, Intrinsics, checked_pose, world_from_opengl
+from fieldfuse.camera import Array, Intrinsics, world_from_opengl
 from fieldfuse.capture.calibration import from_matrix
-from fieldfuse.capture.listing import fitted
 from fieldfuse.capture.lzfse import MOST_PIXELS
 from fieldfuse.capture.nerf_json import MAX_SIDE, number
-from fieldfuse.capture.quaternion import rigid
+from fieldfuse.capture.poses import checked_pose, rigid
+from fieldfuse.capture.sizes import fitted
 from fieldfuse.errors import InputError
 
 LENS, POSE = 4, 7  # numbers of a frame: fx, fy, cx, cy; qx, qy, qz, qw, x, y, z

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from fieldfuse.camera import PoseNotes
 from fieldfuse.capture.headers import orientation_of, read_bytes, read_header
 from fieldfuse.capture.images import EXIF_TURNS
-from fieldfuse.capture.listing import LYING, PICTURES, counted, picture_header
+from fieldfuse.capture.listing import PICTURES, counted
+from fieldfuse.capture.poses import PoseNotes
+from fieldfuse.capture.sizes import LYING, picture_header
 from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
 
