@@ -191,8 +191,9 @@ def undistort_maps(intrinsics: Intrinsics, width: int, height: int) -> tuple[Int
     return target, *resample_maps(intrinsics, target)
 
 
-def pinhole_share(intrinsics: Intrinsics, across: int = 64) -> float:
+def pinhole_share(intrinsics: Intrinsics) -> float:
     """Share of a distorted image's pixels that the pinhole image of the same size and focal length shows."""
+    across = 64
     height = max(2, round(across * intrinsics.height / intrinsics.width))
     seen = np.zeros((height, across), dtype=bool)
     fine = intrinsics.pinhole().scaled(4 * across, 4 * height)

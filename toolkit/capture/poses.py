@@ -18,6 +18,7 @@ from fieldfuse.errors import InputError
 
 FARTHEST = 1e12  # of a camera from the origin, in any unit: geocentric millimetres stay below 1e10
 RIGID = 1e-14  # how far RᵀR of a rotation in float64 is from the identity by rounding alone
+TOLERANCE = 0.005  # how far RᵀR may be from 1 anywhere: what single precision and printed digits leave
 ROUNDED = 0.04  # how far R'R may be from 1 where poses are read leniently: numbers of two digits
 _lenient: ContextVar[PoseNotes | None] = ContextVar("lenient poses", default=None)
 
@@ -67,13 +68,13 @@ def reads_leniently() -> bool:
     return _lenient.get() is not None
 
 
-def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
+def checked_pose(pose: Array, where: str) -> Array:
     """A rigid float64 (4, 4) pose, re-orthonormalised where it is off, or a clear refusal.
 
     What is rigid to the last digits stays as it is: a pose that was written and read back is the same pose. See `lenient_poses`.
 
     Raises:
-        InputError: wrong shape, not finite, singular, mirrored, not rigid (beyond `tolerance`) or astronomically far away.
+        InputError: wrong shape, not finite, singular, mirrored, not rigid (beyond `TOLERANCE`) or astronomically far away.
     """
     notes = _lenient.get()
     try:
@@ -92,15 +93,15 @@ def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
     least = 1e-6 if notes is None else 1e-6 * np.abs(rotation).max() ** 3  # where scale is taken out, a small one is no fault
     if not abs(size) > least:
         return _unusable(f"{where}: the pose's rotation is singular; remove this frame or correct it", notes)
-    if notes is not None and size > 0 and not off <= tolerance:
+    if notes is not None and size > 0 and not off <= TOLERANCE:
         rotation, off = _unscaled(rotation, off, notes)
     if size < 0:
         raise InputError(
             f"{where}: the pose mirrors space (its rotation has determinant < 0); its axis convention is not what this kind of capture uses"
         )
-    if notes is not None and tolerance < off <= ROUNDED:
+    if notes is not None and TOLERANCE < off <= ROUNDED:
         notes.rounding.append(float(off))
-    elif not off <= tolerance:  # NaN, too
+    elif not off <= TOLERANCE:  # NaN, too
         why = f"its rotation is sheared or its axes differ in length: R'R is {off:.2g} off 1"
         return _unusable(f"{where}: the pose is not rigid ({why}); correct it", notes)
     checked_place(pose[:3, 3], where)

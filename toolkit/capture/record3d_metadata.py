@@ -21,14 +21,14 @@ TURNED = 0.02  # radians by which a first frame is turned whose pose is not simp
 SAME_SHAPE = 0.02  # difference of two aspect ratios
 
 
-def number_of(data: dict[str, Any], key: str, where: str, most: float = MAX_SIDE) -> int | None:
-    """`data[key]` as a whole number from 1 to `most`, None when absent.
+def number_of(data: dict[str, Any], key: str, where: str) -> int | None:
+    """`data[key]` as a whole number from 1 to `MAX_SIDE`, None when absent.
 
     Raises:
         InputError: something else stands there.
     """
     value = number(data, key, where)
-    if value is not None and not (1 <= value <= most and value == int(value)):
+    if value is not None and not (1 <= value <= MAX_SIDE and value == int(value)):
         raise InputError(f"{where}: {key!r} is {value:g}, which cannot be; export the recording again")
     return None if value is None else int(value)
 

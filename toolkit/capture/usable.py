@@ -16,7 +16,7 @@ from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
 
 MOST_BAD = 0.2  # share of the frames that may be left out; with more of them something is wrong with the capture
-LEAST = 3  # frames that have to stay
+MIN_FRAMES = 3  # frames that have to stay
 BESIDE = ("transforms", "blender", "colmap", "llff")  # kinds whose images may be photos as a camera wrote them
 NAMED = 3  # frames that a remark names
 
@@ -37,7 +37,7 @@ def without(capture: Capture, bad: Mapping[str, str], refusal: str | None = None
     lost = len(bad)
     total = len(kept) + lost
     first = next(iter(bad.values()))
-    if lost > MOST_BAD * total or len(kept) < LEAST:
+    if lost > MOST_BAD * total or len(kept) < MIN_FRAMES:
         raise InputError(refusal or (f"{first} ({lost} of {total} frames are like this)" if lost > 1 else first))
     names = ", ".join(list(bad)[:NAMED]) + (", …" if lost > NAMED else "")
     cause = first.rsplit("; ", 1)[0]
