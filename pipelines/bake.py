@@ -55,8 +55,8 @@ def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: floa
     import numpy as np
     import torch
 
-    from fieldfuse.evaluate.images import psnr
-    from fieldfuse.evaluate.score import as_photo
+    from fieldfuse.evaluation.images import psnr
+    from fieldfuse.evaluation.score import as_photo
     from fieldfuse.pipelines.baking import default_place, write
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.job import open_job

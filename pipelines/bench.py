@@ -11,7 +11,7 @@ from fieldfuse.pipelines.bench_suite import add_suites
 from fieldfuse.pipelines.options import Quiet, Threads
 
 if TYPE_CHECKING:
-    from fieldfuse.evaluate.speed import Case
+    from fieldfuse.evaluation.speed import Case
 
 app = typer.Typer(help="Benchmarks on this machine.", no_args_is_help=True, add_completion=False, rich_markup_mode=None)
 PARTS = ("step", "growth", "render", "threads", "order", "lookup", "convolution", "keyframe", "tsdf", "jobs")
@@ -68,8 +68,8 @@ def measure(parts: tuple[str, ...], threads: int | None, repetitions: int, budge
     import os
     import time
 
-    from fieldfuse.evaluate import speed_cases, speed_growth, speed_jobs
-    from fieldfuse.evaluate.speed import machine
+    from fieldfuse.evaluation import speed_cases, speed_growth, speed_jobs
+    from fieldfuse.evaluation.speed import machine
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.job import set_threads
 
@@ -110,7 +110,7 @@ def measure(parts: tuple[str, ...], threads: int | None, repetitions: int, budge
 def growth(cases: list[Case]) -> dict[str, float]:
     """Exponent of the processor time a unit over the size (the lattice's side, or what the case names), for each kind of case that was
     measured at several sizes."""
-    from fieldfuse.evaluate.speed import exponent
+    from fieldfuse.evaluation.speed import exponent
 
     out = {}
     for name in dict.fromkeys(case.name for case in cases):
@@ -126,7 +126,7 @@ def show(data: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from fieldfuse.evaluate.words import counted
+    from fieldfuse.evaluation.words import counted
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("what", "size", "a unit, processor", "wall", "times faster", "than"):

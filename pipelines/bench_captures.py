@@ -66,7 +66,7 @@ def captures(
     reused.
     """
     from fieldfuse.errors import InputError
-    from fieldfuse.evaluate.captures_table import captures_table
+    from fieldfuse.evaluation.captures_table import captures_table
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.job import read_settings
 
@@ -238,8 +238,8 @@ def facts(report: dict[str, Any]) -> dict[str, Any]:
 def put(found: Sequence[Path], rows: dict[str, list[dict[str, Any]]], plan: Plan) -> dict[str, Any]:
     """Write what there is so far, in the order of the folder."""
     from fieldfuse import __version__
-    from fieldfuse.evaluate.captures_table import captures_table
-    from fieldfuse.evaluate.speed import machine
+    from fieldfuse.evaluation.captures_table import captures_table
+    from fieldfuse.evaluation.speed import machine
     from fieldfuse.files import atomic_path, write_json
     from fieldfuse.pipelines.folder import command_line
 
@@ -258,7 +258,7 @@ def put(found: Sequence[Path], rows: dict[str, list[dict[str, Any]]], plan: Plan
 
 def said(row: dict[str, Any]) -> str:
     """A run in a few words."""
-    from fieldfuse.evaluate.words import decimal
+    from fieldfuse.evaluation.words import decimal
 
     return f"{row['state']}: {row['error']}" if row["error"] else f"{decimal(row['psnr'])} dB, {row['registered']} of {row['total']} frames"
 

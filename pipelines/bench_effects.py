@@ -35,9 +35,9 @@ def effects(
     """Film sixty small captures with known effects, look for effects in each, and count what was found."""
     import time
 
-    from fieldfuse.evaluate.effects_bench import confusion, look_at
-    from fieldfuse.evaluate.effects_plan import FIRST_DRIFTING, FIRST_SEED, plan
-    from fieldfuse.evaluate.effects_plan import drifting as plan_drifting
+    from fieldfuse.evaluation.effects_bench import confusion, look_at
+    from fieldfuse.evaluation.effects_plan import FIRST_DRIFTING, FIRST_SEED, plan
+    from fieldfuse.evaluation.effects_plan import drifting as plan_drifting
     from fieldfuse.files import write_json
     from fieldfuse.pipelines.console import make_progress
 
@@ -52,7 +52,7 @@ def effects(
     with progress.listening():
         progress.begin("effects")
         if against:
-            from fieldfuse.evaluate.effects_fits import compared
+            from fieldfuse.evaluation.effects_fits import compared
 
             data = compared(planned[::every], folder, seconds, against, progress)
         else:
@@ -108,7 +108,7 @@ def by_hand(
     import time
 
     from fieldfuse.errors import InputError
-    from fieldfuse.evaluate.effects_switch import SWITCHES, switched
+    from fieldfuse.evaluation.effects_switch import SWITCHES, switched
     from fieldfuse.files import write_json
     from fieldfuse.pipelines.console import make_progress
 

@@ -26,8 +26,8 @@ def engines(
     quiet: Quiet = False,
 ) -> None:
     """Held-out quality of fits by each engine, and the time of a picture of 640×480 pixels."""
-    from fieldfuse.evaluate.engines import engine_rows, engine_table
-    from fieldfuse.pipelines.job import check_engine
+    from fieldfuse.evaluation.engines import engine_rows, engine_table
+    from fieldfuse.steps import check_engine
 
     seconds, names = numbers(budgets, "budgets"), named(engines)
     options = gather(None, config, pairs, image_size=image_size, seed=seed, threads=threads, device=device)
@@ -50,11 +50,11 @@ def named(text: str) -> list[str]:
     Raises:
         InputError: something is no engine.
     """
-    from fieldfuse.config import CHOICES
+    from fieldfuse.config import ENGINES
     from fieldfuse.errors import InputError
 
     parts = [part.strip() for part in text.split(",") if part.strip()]
     for part in parts or [""]:
-        if part not in CHOICES["engine"]:
-            raise InputError(f"--engines {text!r}: there is no {part!r}; known are {', '.join(CHOICES['engine'])}")
+        if part not in ENGINES:
+            raise InputError(f"--engines {text!r}: there is no {part!r}; known are {', '.join(ENGINES)}")
     return parts

@@ -36,12 +36,13 @@ def keyframes(
 
     import torch
 
-    from fieldfuse.evaluate.key_frames import NEAR, key_frame_rates, walk
-    from fieldfuse.evaluate.speed import machine
+    from fieldfuse.evaluation.key_frames import NEAR, key_frame_rates, walk
+    from fieldfuse.evaluation.speed import machine
     from fieldfuse.files import write_json
-    from fieldfuse.fusion import FusionOptions
+    from fieldfuse.nerfusion.fusion import FusionOptions
     from fieldfuse.pipelines.console import make_progress
-    from fieldfuse.pipelines.job import choose_device, set_threads
+    from fieldfuse.pipelines.job import set_threads
+    from fieldfuse.steps import choose_device
 
     threads = threads or os.cpu_count() or 1
     set_threads(threads)
@@ -68,7 +69,7 @@ def show(rows: list[dict[str, Any]], about: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from fieldfuse.evaluate.words import counted
+    from fieldfuse.evaluation.words import counted
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     columns = [name for name in TITLES if name in rows[0]]

@@ -15,7 +15,7 @@ from fieldfuse.pipelines.options import Device, ImageSize, Json, Out, Pairs, Pre
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Views
-    from fieldfuse.evaluate.suites.base import Suite, Variant
+    from fieldfuse.evaluation.suites.base import Suite, Variant
     from fieldfuse.pipelines.job import Job
     from fieldfuse.pipelines.rendered import Pictures
     from fieldfuse.poses.scene import Scene
@@ -90,7 +90,7 @@ def bench_suite(
         InputError: no such scene or variant.
     """
     from fieldfuse.errors import FieldfuseError, Interrupted, OutputError
-    from fieldfuse.evaluate.suites import suite_of
+    from fieldfuse.evaluation.suites import suite_of
 
     suite = suite_of(name)
     if options["flags"].get("image_size") is None:
@@ -116,8 +116,8 @@ def run_variant(suite: Suite, variant: Variant, source: Path, place: Path, optio
     """One scene in one variant: a run's own stages on the frames that the protocol picks."""
     import numpy as np
 
-    from fieldfuse.evaluate.compare_score import compare_views
-    from fieldfuse.evaluate.report import plain
+    from fieldfuse.evaluation.compare_score import compare_views
+    from fieldfuse.evaluation.report import plain
     from fieldfuse.pipelines.job import open_job
     from fieldfuse.pipelines.steps_capture import find_camera_poses, find_capture, make_views, measure_scene
     from fieldfuse.pipelines.steps_results import fit_radiance_field, render_test_views
@@ -188,8 +188,8 @@ def put(suite: Suite, rows: list[dict[str, Any]], out: Path, options: dict[str, 
     """Write what there is so far."""
     from fieldfuse import __version__
     from fieldfuse.config import settings_dict
-    from fieldfuse.evaluate.suites.base import PAPER
-    from fieldfuse.evaluate.suites.tables import suite_table
+    from fieldfuse.evaluation.suites.base import PAPER
+    from fieldfuse.evaluation.suites.tables import suite_table
     from fieldfuse.files import atomic_path, write_json
     from fieldfuse.pipelines.folder import command_line
     from fieldfuse.pipelines.job import read_settings
@@ -216,7 +216,7 @@ def put(suite: Suite, rows: list[dict[str, Any]], out: Path, options: dict[str, 
 def _machine(settings: Any) -> dict[str, Any]:
     import os
 
-    from fieldfuse.evaluate.speed import machine
+    from fieldfuse.evaluation.speed import machine
 
     about = machine(settings.threads or os.cpu_count() or 1)
     return {**about, "device": settings.device, "measured": time.strftime("%Y-%m-%d %H:%M")}

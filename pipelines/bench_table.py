@@ -22,7 +22,7 @@ def table(
     ] = None,
 ) -> None:
     """Put measured tables into a Markdown page, between marks, so that no number in it is typed."""
-    from fieldfuse.evaluate.suites.tables import put_between_marks
+    from fieldfuse.evaluation.suites.tables import put_between_marks
 
     for title, text in sections(files, name, data):
         put_between_marks(into, title, text)
@@ -35,13 +35,13 @@ def sections(files: list[Path], name: str | None, data: Path | None) -> list[tup
         InputError: a file holds no results, or there is one name for several tables.
     """
     from fieldfuse.errors import InputError
-    from fieldfuse.evaluate.run_table import is_report, run_table
+    from fieldfuse.evaluation.run_table import is_report, run_table
     from fieldfuse.pipelines.kept import ANY, read_kept
 
     held = [(path, read_kept(path, ANY)) for path in files]
     planned = [found for _, found in held if isinstance(found, dict) and isinstance(found.get("budget"), dict)]
     if planned and len(planned) == len(held):
-        from fieldfuse.evaluate.budget_table import budget_table
+        from fieldfuse.evaluation.budget_table import budget_table
 
         return [(name or "total-budget", _whole(files[0], lambda: budget_table(planned, _commands(planned, data))))]
     if all(is_report(found) for _, found in held):
@@ -58,12 +58,12 @@ def sections(files: list[Path], name: str | None, data: Path | None) -> list[tup
 
 def _table(path: Path, measured: Any, title: str, data: Path | None) -> str:
     """The Markdown of one file's content."""
-    from fieldfuse.evaluate.captures_table import captures_table
-    from fieldfuse.evaluate.compare_table import compare_table
-    from fieldfuse.evaluate.suites import suite_of
-    from fieldfuse.evaluate.suites.tables import suite_table
-    from fieldfuse.evaluate.tradeoff_page import tradeoff_data
-    from fieldfuse.evaluate.tradeoff_table import tradeoff_table
+    from fieldfuse.evaluation.captures_table import captures_table
+    from fieldfuse.evaluation.compare_table import compare_table
+    from fieldfuse.evaluation.suites import suite_of
+    from fieldfuse.evaluation.suites.tables import suite_table
+    from fieldfuse.evaluation.tradeoff_page import tradeoff_data
+    from fieldfuse.evaluation.tradeoff_table import tradeoff_table
     from fieldfuse.pipelines.kept import TRADEOFF, fitting
 
     found = {**measured, "command": _commands([measured], data)[0]}
@@ -79,7 +79,7 @@ def _table(path: Path, measured: Any, title: str, data: Path | None) -> str:
 
 
 def _commands(measured: list[Any], data: Path | None) -> list[str]:
-    from fieldfuse.evaluate.suites.tables import portable
+    from fieldfuse.evaluation.suites.tables import portable
 
     return [portable(str(one["command"]), data and data.resolve()) for one in measured]
 

@@ -83,7 +83,7 @@ def compare_run(target: Path, out: Path | None, options: dict[str, Any], depth: 
         InputError: no test views, or depth that the capture does not bring.
     """
     from fieldfuse.errors import InputError
-    from fieldfuse.evaluate.compare_truth import find_truth
+    from fieldfuse.evaluation.compare_truth import find_truth
     from fieldfuse.pipelines.comparison import put_comparison
     from fieldfuse.pipelines.job import open_job
     from fieldfuse.pipelines.reconstruct import BEFORE, FOR_FIELD, RESULTS, stand
@@ -108,7 +108,7 @@ def compare_run(target: Path, out: Path | None, options: dict[str, Any], depth: 
 
 def show(data: dict[str, Any], folder: Path, quiet: bool, as_json: bool) -> None:
     """The result on stdout: JSON, or the table and where the page is."""
-    from fieldfuse.evaluate.compare_text import comparison_text
+    from fieldfuse.evaluation.compare_text import comparison_text
     from fieldfuse.pipelines.console import columns
 
     if as_json:

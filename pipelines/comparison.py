@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fieldfuse.pipelines.fit_files import fit_matched
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.steps_compare import Compared, common_voxel, depths_of_test_views, working_meshes
 from fieldfuse.pipelines.steps_network import DIRECT
-from fieldfuse.pipelines.steps_results import fit_matched
 from fieldfuse.pipelines.summary import base_data, warnings_of
 
 if TYPE_CHECKING:
     from fieldfuse.camera import Array
     from fieldfuse.capture.types import Views
-    from fieldfuse.evaluate.compare_meshes import MeshPictures
+    from fieldfuse.evaluation.compare_meshes import MeshPictures
 
 SHOWN_VIEWS = 8
 DEPTH_ERROR_TOP = 0.05  # share of the median depth that gets the brightest colour of a depth error
@@ -46,9 +46,9 @@ def put_comparison(
     job: Job, all_of_it: Compared, found: dict[str, Any], mesh_facts: dict[str, Any] | None, seconds: float
 ) -> dict[str, Any]:
     """Write compare.json and compare.html; answers the former."""
-    from fieldfuse.evaluate.compare import compare_data
-    from fieldfuse.evaluate.compare_page import write_comparison
-    from fieldfuse.evaluate.pictures import method_pictures
+    from fieldfuse.evaluation.compare import compare_data
+    from fieldfuse.evaluation.compare_page import write_comparison
+    from fieldfuse.evaluation.pictures import method_pictures
 
     views, scene = all_of_it.views, all_of_it.scene
     exact = depths_of_test_views(all_of_it)
@@ -132,8 +132,8 @@ def depth_in_fit(job: Job, views: Views) -> tuple[tuple[str, ...], str]:
 
 def shown_meshes(job: Job, all_of_it: Compared) -> list[MeshPictures]:
     """Pictures of the meshes from outside, and from a test view."""
-    from fieldfuse.evaluate.compare_meshes import cut_box, from_outside, mesh_pictures
-    from fieldfuse.pipelines.surface import at_most
+    from fieldfuse.evaluation.compare_meshes import cut_box, from_outside, mesh_pictures
+    from fieldfuse.export.field_surface import at_most
 
     meshes, truth = working_meshes(job, all_of_it)
     if not meshes:

@@ -227,7 +227,7 @@ def make_progress(quiet: bool = False, stream: IO[str] | None = None) -> Console
 
 def show_table(data: dict[str, Any], stream: IO[str] | None = None) -> None:
     """The report's numbers as one table."""
-    from fieldfuse.evaluate.table import WIDEST, table  # rich and the metrics are needed only here
+    from fieldfuse.evaluation.table import WIDEST, table  # rich and the metrics are needed only here
 
     stream = stream or sys.stdout
     stream.write(str(table(data, min(columns(stream) or WIDEST, WIDEST))).rstrip() + "\n")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from fieldfuse.steps import network_weights
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Views
@@ -30,18 +31,11 @@ class DirectField:
     voxel_size: float
 
 
-def weights_of(settings: Settings) -> Path:
-    """The file of the networks that the settings name, else the shipped one."""
-    from fieldfuse.training.from_network import SHIPPED
-
-    return Path(settings.network.weights) if settings.network.weights else SHIPPED
-
-
 def weights_state(settings: Settings) -> str:
     """Changes with the weights, so that results of earlier ones are not reused."""
     from fieldfuse.files import fingerprint
 
-    return fingerprint(weights_of(settings))
+    return fingerprint(network_weights(settings))
 
 
 def direct_field(
@@ -57,8 +51,8 @@ def direct_field(
         InputError: there is no training view, or no weights.
         Interrupted: the user asked to stop.
     """
-    from fieldfuse.evaluate.few_views import Ground
-    from fieldfuse.keyframes import KeyFrames
+    from fieldfuse.evaluation.few_views import Ground
+    from fieldfuse.nerfusion.keyframes import KeyFrames
     from fieldfuse.training.from_network import Inference, NetworkOptions, load_networks, voxels_to_median
 
     keys = Ground(views, scene, settings).keys()
@@ -67,7 +61,7 @@ def direct_field(
         keys = KeyFrames(keys.indices[kept], keys.neighbours[kept])
     options = NetworkOptions.of(settings.network)
     options = replace(options, voxels=(options.voxels or voxels_to_median(views, options.measured)) / voxel_factor)
-    model = load_networks(weights_of(settings), settings.device)
+    model = load_networks(network_weights(settings), settings.device)
     inference = Inference(model, views, scene, keys, settings.field.background, options)
     for _ in inference.frames(progress):
         pass

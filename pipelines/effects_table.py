@@ -57,7 +57,7 @@ def show(data: dict[str, Any]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from fieldfuse.evaluate.words import significant
+    from fieldfuse.evaluation.words import significant
 
     console = Console(highlight=False)
     if not console.is_terminal:

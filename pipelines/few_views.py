@@ -14,7 +14,7 @@ from fieldfuse.pipelines.options import Config, ImageSize, Out, Pairs, Quiet, Se
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Capture
     from fieldfuse.effects.correct import Corrections
-    from fieldfuse.evaluate.few_views import Ground
+    from fieldfuse.evaluation.few_views import Ground
     from fieldfuse.pipelines.job import Job
 
 ALL = "all"
@@ -39,7 +39,7 @@ def few_views(
     Rows that OUT/few_views.json has already are not measured again, so an interrupted table goes on when the command is repeated. With
     other settings, or after the capture has changed, all are.
     """
-    from fieldfuse.evaluate.few_views import few_views_rows, few_views_table
+    from fieldfuse.evaluation.few_views import few_views_rows, few_views_table
     from fieldfuse.training.from_network import load_networks
 
     seconds, measured = numbers(budgets, "budgets"), part_of(starts)
@@ -70,7 +70,7 @@ def ablations(
     quiet: Quiet = False,
 ) -> None:
     """Direct inference with parts of the trained networks switched off: variance, direction code, GRU, pruning, second colours."""
-    from fieldfuse.evaluate.few_views import ablation_rows, ablation_table
+    from fieldfuse.evaluation.few_views import ablation_rows, ablation_table
     from fieldfuse.training.from_network import load_networks
 
     count = None if views == ALL else int(numbers(views, "views")[0])
@@ -106,7 +106,7 @@ def part_of(text: str) -> list[str]:
         InputError: something is none of the starts.
     """
     from fieldfuse.errors import InputError
-    from fieldfuse.evaluate.few_views import STARTS
+    from fieldfuse.evaluation.few_views import STARTS
 
     parts = [part.strip() for part in text.split(",") if part.strip()]
     for part in parts:
@@ -155,7 +155,7 @@ def ground_of(job: Job, posed: Capture, count: int | None, corrections: Correcti
     """The capture with `count` of its training views (None: all), as a run would prepare it."""
     from fieldfuse.capture.prepare import prepare_views
     from fieldfuse.capture.subset import limited
-    from fieldfuse.evaluate.few_views import Ground
+    from fieldfuse.evaluation.few_views import Ground
     from fieldfuse.poses.scene import describe_scene
 
     some = limited(posed, job.settings.capture.holdout, count)
@@ -189,7 +189,7 @@ def rows_of(job: Job, state: str) -> list[dict[str, Any]]:
 
 def keep_rows(job: Job, name: str, rows: list[dict[str, Any]], table: str, **more: str) -> None:
     from fieldfuse.config import settings_dict
-    from fieldfuse.evaluate.speed import machine
+    from fieldfuse.evaluation.speed import machine
     from fieldfuse.files import atomic_path, write_json
 
     about = {"source": str(job.source), "machine": machine(1), "settings": settings_dict(job.settings), **more, "rows": rows}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -16,10 +15,11 @@ from fieldfuse.pipelines.console import ConsoleProgress
 from fieldfuse.pipelines.folder import RunFolder, is_run_folder
 from fieldfuse.pipelines.stages import Stages
 from fieldfuse.pipelines.thread_limits import THREAD_VARIABLES
+from fieldfuse.steps import choose_device
 
 if TYPE_CHECKING:
     from fieldfuse.effects.correct import Corrections
-    from fieldfuse.keyframes import KeyFrames
+    from fieldfuse.nerfusion.keyframes import KeyFrames
     from fieldfuse.pipelines.steps_network import NetworkField
     from fieldfuse.pipelines.total_budget import TotalBudget
     from fieldfuse.poses.points import Features
@@ -186,51 +186,3 @@ def set_threads(threads: int | None) -> None:
     if threads is not None:
         torch.set_num_threads(threads)
         cv2.setNumThreads(threads)
-
-
-def choose_device(wanted: str, engine: str = "auto") -> str:
-    """`auto` → `cuda` when there is one, else `cpu`.
-
-    Raises:
-        InputError: `cuda` is asked for and there is none, or an engine that cannot run on the device.
-    """
-    device = _device(wanted)
-    check_engine(engine, device)
-    return device
-
-
-def check_engine(engine: str, device: str) -> None:
-    """Refuse the engine for CUDA where its kernels cannot run.
-
-    Raises:
-        InputError: saying why.
-    """
-    import torch
-
-    from fieldfuse.gpu import runs_kernels
-
-    if engine == "triton" and not runs_kernels(torch.device(device)):
-        why = "Triton for it is not installed, or it is too old" if device == "cuda" else f"the device is {device!r}"
-        raise InputError(f"engine is 'triton', which runs on CUDA alone, and {why}; leave --engine at auto")
-
-
-def _device(wanted: str) -> str:
-    import torch
-
-    if wanted == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if wanted == "cuda" and not torch.cuda.is_available():
-        raise InputError("device is 'cuda' but torch finds no CUDA device here; use --device cpu or install torch with CUDA")
-    return wanted
-
-
-def set_seeds(seed: int) -> None:
-    """Seed every generator in use; called at the start of each stage that draws, so reused stages before it change nothing."""
-    import cv2
-    import numpy as np
-    import torch
-
-    random.seed(seed)
-    np.random.seed(seed % 2**32)
-    torch.manual_seed(seed)
-    cv2.setRNGSeed(seed % 2**31)

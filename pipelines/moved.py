@@ -9,8 +9,8 @@ from typing import Any
 
 from fieldfuse.files import read_json, write_json
 from fieldfuse.pipelines.folder import STAGES, RunFolder
+from fieldfuse.pipelines.source_state import source_state
 from fieldfuse.pipelines.stages import read_record, stage_key
-from fieldfuse.pipelines.steps_capture import source_state
 
 KEEPERS = {"capture": "capture.json", "frames": "frames/capture.json"}  # stage → its file that says where pictures lie
 

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 from fieldfuse.pipelines.console import ConsoleProgress
 from fieldfuse.pipelines.job import Job, open_job
 from fieldfuse.pipelines.steps_capture import choose_frames, choose_keyframes, find_camera_poses, find_capture, make_views, measure_scene
-from fieldfuse.pipelines.steps_effects import find_effects, refine
+from fieldfuse.pipelines.steps_effects import find_effects
 from fieldfuse.pipelines.steps_network import make_network_field, render_network_views, uses_network
 from fieldfuse.pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views, score_pictures, wants_tsdf
 from fieldfuse.pipelines.steps_stereo import reuse_matched
 from fieldfuse.pipelines.summary import put_report, summarise_poses
 from fieldfuse.pipelines.taken import TEXTURE, require_originals
 from fieldfuse.pipelines.textured import TSDF_TEXTURE, texture_tsdf
+from fieldfuse.steps import refined
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Capture, Views
@@ -60,7 +61,7 @@ def stand(job: Job) -> tuple[Capture, PoseResult, Capture, Scene, Views]:
     poses = find_camera_poses(job, capture)
     posed = limited(poses.apply(capture), job.settings.capture.holdout, job.settings.views.limit)
     job.corrections = corrections = find_effects(job, posed)
-    poses, posed = refine(poses, corrections), corrections.on_capture(posed)
+    poses, posed = refined(poses, corrections), corrections.on_capture(posed)
     scene = measure_scene(job, posed)
     return capture, poses, posed, scene, make_views(job, posed, scene, corrections)
 

@@ -16,12 +16,12 @@ from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture import nerf_json
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json, remove
+from fieldfuse.memory_limits import require_pictures
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.job import Job, open_job
 from fieldfuse.pipelines.pictures import Camera, camera_of, orbit_cameras, pictures
 from fieldfuse.pipelines.reconstruct import BEFORE, stand
 from fieldfuse.pipelines.rendered import file_name, write_png
-from fieldfuse.pipelines.room import require_pictures
 from fieldfuse.pipelines.steps_results import fit_radiance_field
 
 if TYPE_CHECKING:

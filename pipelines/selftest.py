@@ -10,7 +10,7 @@ import typer
 from fieldfuse.pipelines.options import Json, Quiet, Threads
 
 if TYPE_CHECKING:
-    from fieldfuse.evaluate.selftest.case import Measure, Outcome
+    from fieldfuse.evaluation.selftest.case import Measure, Outcome
 
 
 def selftest(
@@ -51,7 +51,7 @@ def run(fast: bool, only: str | None, quiet: bool) -> list[Outcome]:
     import numpy as np
 
     from fieldfuse.errors import InputError
-    from fieldfuse.evaluate.selftest.case import all_cases, run_cases
+    from fieldfuse.evaluation.selftest.case import all_cases, run_cases
 
     chosen = [case for case in all_cases() if not (fast and case.slow) and (only is None or only.lower() in case.title.lower())]
     if not chosen:

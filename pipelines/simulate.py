@@ -63,7 +63,7 @@ def find_scene(name: str) -> Path:
     path = Path(name)
     if path.is_file():
         return path
-    folder = resources.files("configs").joinpath("scenes")
+    folder = resources.files("fieldfuse.configs").joinpath("scenes")
     known = sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
     if name in known:
         return Path(str(folder.joinpath(f"{name}.yaml")))

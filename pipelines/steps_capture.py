@@ -2,43 +2,33 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fieldfuse.errors import InputError
-from fieldfuse.files import fingerprint, read_json, write_json
-from fieldfuse.pipelines.job import Job, set_seeds
-from fieldfuse.pipelines.room import require_file
+from fieldfuse.files import read_json, write_json
+from fieldfuse.memory_limits import require_file
+from fieldfuse.pipelines.job import Job
+from fieldfuse.pipelines.source_state import pixel_state, source_state
+from fieldfuse.steps import camera_poses, key_frames, needs_frames, prepared, read_capture, set_seeds, uses_given_poses, write_frames
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Capture, Frame, Views
     from fieldfuse.effects.correct import Corrections
-    from fieldfuse.keyframes import KeyFrames
+    from fieldfuse.nerfusion.keyframes import KeyFrames
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene
-
-MAX_LISTED = 200_000  # files of a source that are looked at for changes
 
 
 def find_capture(job: Job) -> Capture:
     """Detect what the source is, read what it says, look at every picture once (at those that `choose_frames` writes, then)."""
-    from fieldfuse.capture import open_capture
-    from fieldfuse.capture.checks import check_capture
-    from fieldfuse.capture.convert import to_convert
     from fieldfuse.capture.photos import with_unposed
     from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
-    from fieldfuse.poses.check_given import best_fitting
 
     path = job.folder / "capture.json"
     masks = job.settings.capture.masks
     state = source_state(job.source, job.folder.path)
-
-    def make() -> Capture:
-        capture = open_capture(job.source, masks, best_fitting)
-        return capture if to_convert(capture) else check_capture(capture, job.progress)
 
     def save(capture: Capture) -> list[Path]:
         write_json(path, capture_to_dict(capture))
@@ -46,7 +36,7 @@ def find_capture(job: Job) -> Capture:
 
     found = job.stages.run(
         "capture",
-        make=make,
+        make=lambda: read_capture(job.source, job.settings, job.progress),
         save=save,
         load=lambda: capture_from_dict(read_json(path)),
         uses=state if masks == "auto" else [state, masks],
@@ -56,21 +46,16 @@ def find_capture(job: Job) -> Capture:
 
 def choose_frames(job: Job, capture: Capture) -> Capture:
     """Pictures of a video or a film, and JPEGs of HEIF and mirrored pictures; other captures pass as they are."""
-    from fieldfuse.capture.convert import convert_pictures, to_convert
-    from fieldfuse.capture.select import select_frames
     from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
 
-    video = capture.filmed
-    if not video and not to_convert(capture):
+    if not needs_frames(capture):
         return capture
     folder = job.folder / "frames"
     path = folder / "capture.json"
 
     def make() -> Capture:
         set_seeds(job.settings.seed)
-        if not video:
-            return convert_pictures(capture, job.folder.path, job.settings.threads or os.cpu_count() or 1, job.progress)
-        return select_frames(capture, job.folder.path, job.settings.capture, job.progress)
+        return write_frames(capture, job.folder.path, job.settings, job.progress)
 
     def save(chosen: Capture) -> list[Path]:
         write_json(path, capture_to_dict(chosen))
@@ -82,7 +67,7 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
         make=make,
         save=save,
         load=lambda: at_home(capture_from_dict(read_json(path)), folder),
-        uses=job.settings.capture.max_frames if video else pixel_state(capture),
+        uses=job.settings.capture.max_frames if capture.filmed else pixel_state(capture),
         after=["capture"],
         in_place=True,
     )
@@ -111,21 +96,16 @@ def last_of(job: Job, *names: str) -> list[str]:
 def find_camera_poses(job: Job, capture: Capture) -> PoseResult:
     """Poses that the capture brings, as its images confirm them, or structure from motion."""
     from fieldfuse.poses.check_given import VERSION as CHECKED
-    from fieldfuse.poses.check_given import check_given
-    from fieldfuse.poses.given import given_poses
     from fieldfuse.poses.job import VERSION
     from fieldfuse.poses.result import PoseResult
-    from fieldfuse.poses.sfm import find_poses
 
     settings = job.settings
-    given = settings.poses.source == "given" or (settings.poses.source == "auto" and capture.posed)
+    given = uses_given_poses(capture, settings)
     path = job.folder / "poses.json"
 
     def make() -> PoseResult:
-        if given:
-            return check_given(capture, given_poses(capture), settings.poses.convention, job.progress, job.features)
         set_seeds(settings.seed)
-        return find_poses(capture, job.folder.path, settings.poses, settings.seed, settings.threads, job.progress)
+        return camera_poses(capture, job.folder.path, settings, job.progress, job.features)
 
     def save(result: PoseResult) -> list[Path]:
         write_json(path, result.to_dict())
@@ -180,30 +160,12 @@ def choose_keyframes(job: Job, scene: Scene, views: Views) -> KeyFrames:
     """Key frames among the training views and their neighbours, as indices into the training views; the file has their names."""
     import numpy as np
 
-    from fieldfuse.capture.subset import sharpness
-    from fieldfuse.keyframes import KeyFrames, select_keyframes
+    from fieldfuse.nerfusion.keyframes import KeyFrames
 
     if job.keys is not None:
         return job.keys
     path = job.folder / "keyframes.json"
-    settings = job.settings.keyframes
-    train = np.flatnonzero(~np.asarray(views.test))
-    names = [views.names[int(index)] for index in train]
-
-    def make() -> KeyFrames:
-        if len(train) == 0:
-            return KeyFrames(np.zeros(0, np.int64), np.zeros((0, 0), np.int64))
-        clear = np.array([sharpness(views.images[int(index)]) for index in train])
-        cameras = [views.intrinsics[int(index)] for index in train]
-        return select_keyframes(
-            views.world_from_camera[train],
-            cameras,
-            scene.median_depth,
-            method=settings.method,
-            most=settings.most,
-            every=settings.every,
-            sharpness=clear,
-        )
+    names = [views.names[int(index)] for index in np.flatnonzero(~np.asarray(views.test))]
 
     def save(keys: KeyFrames) -> list[Path]:
         chosen = [names[int(index)] for index in keys.indices]
@@ -218,13 +180,20 @@ def choose_keyframes(job: Job, scene: Scene, views: Views) -> KeyFrames:
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{path} does not fit the views of this run; remove it and run the command again") from error
 
-    job.keys = job.stages.run("keyframes", make=make, save=save, load=load, uses=asdict(settings), after=["scene", "views"], version=2)
+    job.keys = job.stages.run(
+        "keyframes",
+        make=lambda: key_frames(views, scene, job.settings),
+        save=save,
+        load=load,
+        uses=asdict(job.settings.keyframes),
+        after=["scene", "views"],
+        version=2,
+    )
     return job.keys
 
 
 def make_views(job: Job, posed: Capture, scene: Scene, corrections: Corrections | None = None) -> Views:
     """Pictures undistorted and resized once, in the working frame, test views marked, with `corrections` of colour."""
-    from fieldfuse.capture.prepare import prepare_views
     from fieldfuse.capture.views_file import load_views, save_views
 
     path = job.folder / "views.safetensors"
@@ -235,60 +204,15 @@ def make_views(job: Job, posed: Capture, scene: Scene, corrections: Corrections 
 
     settings = job.settings.capture
 
-    def make() -> Views:
-        views = prepare_views(posed, scene.working_from_input, settings, job.progress)
-        return views if corrections is None else corrections.on_views(views)
-
     def load() -> Views:
         require_file(path, f"the prepared pictures of {posed.root}")
         return load_views(path)
 
     return job.stages.run(
         "views",
-        make=make,
+        make=lambda: prepared(posed, scene, job.settings, job.progress, corrections),
         save=save,
         load=load,
         uses=[settings.image_size, settings.holdout, limit_of(job), pixel_state(posed)],
         after=last_of(job, "poses", "effects", "scene"),
     )
-
-
-# ------------------------------------------------------------------------------------------------- what files say
-
-
-def source_state(source: Path, without: Path) -> str:
-    """Hash of names, sizes and times of all files of the source, wherever it lies; `without` (the run's own folder) does not count."""
-    from fieldfuse.capture.replica import camera_file, looks_like_replica
-
-    if source.is_file() and source.suffix.lower() != ".json":
-        return fingerprint(_state(source, source.parent))
-    root = source.parent if source.is_file() else source
-    beside = camera_file(root) if looks_like_replica(root) else None  # one for all scenes, in the folder above
-    outside = [] if beside is None or beside.parent == root else [_state(beside, beside.parent)]
-    return fingerprint(source.name if source.is_file() else "", [_state(path, root) for path in _files(root, without)], *outside)
-
-
-def _files(root: Path, without: Path) -> Iterable[Path]:
-    found: list[Path] = []
-    for folder, folders, files in os.walk(os.path.realpath(root)):  # as `without` is named
-        folders[:] = sorted(name for name in folders if Path(folder, name) != without and not name.startswith("."))
-        found += [Path(folder, name) for name in sorted(files) if not name.startswith(".")]
-        if len(found) > MAX_LISTED:
-            break
-    return found[:MAX_LISTED]
-
-
-def pixel_state(capture: Capture) -> str:
-    """Hash of the files that hold the capture's pictures; those in its folder are the same ones wherever that lies."""
-    paths = {path for frame in capture.frames for path in (frame.image, frame.depth, frame.mask, frame.confidence) if path is not None}
-    return fingerprint([_state(path, capture.root) for path in sorted(paths)])
-
-
-def _state(path: Path, root: Path) -> list[Any]:
-    """Its name below `root` (in full, if it lies elsewhere), size and time."""
-    name = next((path.relative_to(base).as_posix() for base in (root, root.resolve()) if path.is_relative_to(base)), str(path))
-    try:
-        stat = path.stat()
-    except OSError:
-        return [name, None]
-    return [name, stat.st_size, stat.st_mtime_ns]

@@ -11,15 +11,15 @@ import numpy as np
 
 from fieldfuse.errors import InputError
 from fieldfuse.files import write_json
+from fieldfuse.memory_limits import require_meshes, require_scores
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.kept import COMPARED, read_kept
 from fieldfuse.pipelines.rendered import Pictures
-from fieldfuse.pipelines.room import require_meshes, require_scores
 
 if TYPE_CHECKING:
     from fieldfuse.camera import Array
     from fieldfuse.capture.types import Capture, Views
-    from fieldfuse.evaluate.compare_truth import GroundTruth
+    from fieldfuse.evaluation.compare_truth import GroundTruth
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene
     from fieldfuse.render.field import Field
@@ -69,11 +69,11 @@ def choose_surfaces(wanted: str, posed: Capture, truth: GroundTruth | None) -> l
 def not_fitted(job: Job, views: Views, scene: Scene) -> dict[str, Pictures]:
     """The networks' field without any fitting, as a method of its own; nothing without weights, where it is not wanted
     (`init=classical`), and where it is the field itself (`--no-finetune`)."""
-    from fieldfuse.pipelines.direct_field import weights_of
     from fieldfuse.pipelines.steps_network import make_network_field, render_network_views
+    from fieldfuse.steps import network_weights
 
     settings = job.settings
-    if settings.field.init == "classical" or not settings.fit.finetune or not weights_of(settings).is_file():
+    if settings.field.init == "classical" or not settings.fit.finetune or not network_weights(settings).is_file():
         return {}
     return {"direct": render_network_views(job, make_network_field(job, views, scene), views, scene, keep=True)}
 
@@ -102,8 +102,8 @@ def measure(job: Job, all_of_it: Compared) -> dict[str, Any]:
 
 def score_methods(job: Job, all_of_it: Compared) -> dict[str, Any]:
     """Method → scores, against the exact depth when the capture brings it, else against the sensor's."""
-    from fieldfuse.evaluate.compare_score import compare_views
-    from fieldfuse.evaluate.report import plain
+    from fieldfuse.evaluation.compare_score import compare_views
+    from fieldfuse.evaluation.report import plain
 
     views = all_of_it.views
     indices = np.flatnonzero(views.test)
@@ -123,7 +123,7 @@ def depths_of_test_views(all_of_it: Compared) -> list[Array | None] | None:
 
 def exact_depths_of(all_of_it: Compared, indices: Array) -> list[Array | None] | None:
     """The exact depth of the views at `indices`, None when the capture brings none."""
-    from fieldfuse.evaluate.compare_truth import true_depths
+    from fieldfuse.evaluation.compare_truth import true_depths
 
     truth, views = all_of_it.truth, all_of_it.views
     if truth is None or not truth.depths:
@@ -133,7 +133,7 @@ def exact_depths_of(all_of_it: Compared, indices: Array) -> list[Array | None] |
 
 def measure_matching(job: Job, all_of_it: Compared) -> dict[str, Any] | None:
     """How good the depth by matching of the training views is, against the exact depth or the sensor's; None without either."""
-    from fieldfuse.evaluate.compare_stereo import matched_depth_scores
+    from fieldfuse.evaluation.compare_stereo import matched_depth_scores
     from fieldfuse.pipelines.steps_stereo import match_pictures
 
     if "tsdf_stereo" not in all_of_it.pictures:
@@ -152,7 +152,7 @@ def mesh_files(job: Job, methods: Mapping[str, Any]) -> dict[str, Path]:
 
 def working_meshes(job: Job, all_of_it: Compared) -> tuple[dict[str, Mesh], Mesh | None]:
     """The methods' meshes that have triangles, and the true one, in the working frame."""
-    from fieldfuse.evaluate.geometry import read_mesh
+    from fieldfuse.evaluation.geometry import read_mesh
 
     to_working = all_of_it.scene.working_from_input
     meshes = {}
@@ -173,7 +173,7 @@ def common_voxel(all_of_it: Compared) -> float:
 
 def measure_meshes(job: Job, all_of_it: Compared) -> dict[str, Any]:
     """`geometry` by method in the input's unit, and `seen_share` of the true surface; both None without a true mesh."""
-    from fieldfuse.evaluate.geometry import geometry_metrics, seen_surface
+    from fieldfuse.evaluation.geometry import geometry_metrics, seen_surface
     from fieldfuse.tsdf.mesh import Mesh
 
     job.progress.update(1, 2, "meshes")

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fieldfuse import steps
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.files import write_json
-from fieldfuse.pipelines.job import Job, set_seeds
+from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.kept import EFFECTS, read_kept
-from fieldfuse.pipelines.steps_capture import pixel_state
+from fieldfuse.pipelines.source_state import pixel_state
+from fieldfuse.steps import apply_effects, looks_for_effects, set_seeds
 
 if TYPE_CHECKING:
-    from fieldfuse.camera import Array
     from fieldfuse.capture.types import Capture
-    from fieldfuse.poses.result import PoseResult
 
 NAME = "effects.json"
 SEES = {
@@ -27,28 +27,14 @@ SEES = {
 
 def find_effects(job: Job, posed: Capture) -> Corrections:
     """What is to be corrected; `effects.json` tells the evidence, the decisions and what they cost. With `effects: off` nothing is read."""
-    from fieldfuse.effects.decide import asleep, choose_field, decide
-
-    settings, field = job.settings.effects, job.settings.field
-    for wish, names in (("on", settings.on), ("off", settings.off)):
-        if "background" in names and field.background == "auto":
-            field.background = wish
-    if asleep(settings) or _did_without(job):
+    settings = job.settings
+    if not looks_for_effects(settings) or _did_without(job):
         return Corrections()
     path = job.folder / NAME
-    holdout = job.settings.capture.holdout
 
     def make() -> dict[str, Any]:
-        from fieldfuse.capture.prepare import held_out
-        from fieldfuse.training.trial import Trial
-
-        def trials(capture: Capture, validation: Array) -> Trial:
-            job.progress.update(0, 1, "trying what was found in short fits")
-            set_seeds(job.settings.seed)
-            return Trial(capture, validation, job.settings, job.progress)
-
-        set_seeds(job.settings.seed)
-        return decide(posed, held_out(posed, holdout), settings, job.progress, trials=trials).to_dict()
+        set_seeds(settings.seed)
+        return steps.find_effects(posed, settings, job.progress)
 
     def save(data: dict[str, Any]) -> list[Path]:
         write_json(path, data)
@@ -59,13 +45,11 @@ def find_effects(job: Job, posed: Capture) -> Corrections:
         make=make,
         save=save,
         load=lambda: read_kept(path, EFFECTS),
-        uses=[asdict(settings), holdout, [frame.name for frame in posed.frames], pixel_state(posed)],
+        uses=[asdict(settings.effects), settings.capture.holdout, [frame.name for frame in posed.frames], pixel_state(posed)],
         after=["poses"],
         version=4,
     )
-    corrections = Corrections.from_dict(data.get("corrections", {}) if isinstance(data, dict) else {})
-    choose_field(field, data["effects"], settings.off)
-    return corrections
+    return apply_effects(data, settings)
 
 
 def _did_without(job: Job) -> bool:
@@ -73,19 +57,6 @@ def _did_without(job: Job) -> bool:
     for it. Work on it goes on from there."""
     scene = job.stages.record("scene")
     return scene is not None and "effects" not in scene.after and "scene" in job.stages.trusted and job.stages.usable("scene")
-
-
-def refine(poses: PoseResult, corrections: Corrections) -> PoseResult:
-    """The poses with what was refined; they are what is exported."""
-    import numpy as np
-
-    from fieldfuse.effects.correct import bent
-
-    if not corrections.geometric:
-        return poses
-    cameras = poses.intrinsics if corrections.lens is None else [bent(camera, corrections.lens) for camera in poses.intrinsics]
-    moved = [corrections.poses.get(name, pose) for name, pose in zip(poses.names, poses.world_from_camera, strict=True)]
-    return replace(poses, intrinsics=cameras, world_from_camera=np.array(moved))
 
 
 def effects_part(job: Job, background: bool | None) -> dict[str, Any] | None:

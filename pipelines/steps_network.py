@@ -11,11 +11,12 @@ import numpy as np
 
 from fieldfuse.errors import InputError
 from fieldfuse.files import fingerprint, write_json
-from fieldfuse.pipelines.job import Job, set_seeds
+from fieldfuse.memory_limits import require_pictures
+from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.kept import NETWORK, read_kept
 from fieldfuse.pipelines.rendered import Pictures, depth_steps, load_pictures, save_pictures, to_picture, write_png, write_pngs
-from fieldfuse.pipelines.room import require_pictures
 from fieldfuse.pipelines.steps_capture import choose_keyframes
+from fieldfuse.steps import direct_inference, require_weights, set_seeds, starts_from_networks
 from fieldfuse.tone import exposed
 
 if TYPE_CHECKING:
@@ -44,8 +45,6 @@ def uses_network(job: Job, views: Views) -> bool:
     Raises:
         InputError: the settings contradict each other.
     """
-    from fieldfuse.training.start import FEW_VIEWS
-
     settings = job.settings
     if settings.field.init == "classical" and not settings.fit.finetune:
         raise InputError("without fine-tuning the networks' field is the result, so init cannot be 'classical'; drop one of the two")
@@ -58,32 +57,24 @@ def uses_network(job: Job, views: Views) -> bool:
         return False  # the seconds of the whole run are planned, and the networks' are not among them
     if not settings.fit.finetune:
         return True
-    # With few views the networks' start won by up to 3 dB on validation captures, with many it is not needed (docs/measured/few_views.md).
-    return int(np.count_nonzero(~np.asarray(views.test))) < FEW_VIEWS
+    return starts_from_networks(views, settings)
 
 
 def make_network_field(job: Job, views: Views, scene: Scene) -> NetworkField:
     """The stage `network`: what a fit can start from; made once a command."""
     from fieldfuse.render.field import Field
-    from fieldfuse.training.from_network import SHIPPED, NetworkOptions
 
     if job.network is not None:
         return job.network
     keys = choose_keyframes(job, scene, views)
     settings = job.settings
-    options = NetworkOptions.of(settings.network)
     path, about = job.folder / "network.safetensors", job.folder / "network.json"
-    weights = Path(settings.network.weights) if settings.network.weights else SHIPPED
-    if not weights.is_file():
-        raise InputError(f"there are no trained networks at {weights}; leave network.weights out for the shipped ones")
+    weights = require_weights(settings)
 
     def make() -> NetworkField:
-        from fieldfuse.training.from_network import Inference, load_networks
-
         set_seeds(settings.seed)
         start = time.monotonic()
-        model = load_networks(weights, settings.device)
-        inference = Inference(model, views, scene, keys, settings.field.background, options)
+        inference = direct_inference(views, scene, keys, settings)
         first = _stream(job, inference, start)
         field = inference.field()
         facts = {
@@ -132,7 +123,7 @@ def preview(inference: Inference, frame: int) -> Any:
     """(H, 3 · W, 3) uint8: the newest key frame's photo, the field of all key frames so far from there, and its depth."""
     import cv2
 
-    from fieldfuse.evaluate.pictures import depth_picture, depth_range
+    from fieldfuse.evaluation.pictures import depth_picture, depth_range
     from fieldfuse.render.image import make_renderer, render_view
 
     camera, photo = inference.train.intrinsics[frame], inference.train.images[frame]

@@ -11,11 +11,14 @@ import numpy as np
 
 from fieldfuse.errors import InputError
 from fieldfuse.files import write_json
-from fieldfuse.pipelines.job import Job, set_seeds
-from fieldfuse.pipelines.kept import EVALUATION, MATCHED, NOTES, TIMELINE, read_export_facts, read_kept
+from fieldfuse.memory_limits import require_pictures, require_scores
+from fieldfuse.pipelines.fit_files import FIT_MATCHED, FIT_NOTES, LEFT_OUT
+from fieldfuse.pipelines.job import Job
+from fieldfuse.pipelines.kept import EVALUATION, MATCHED, TIMELINE, read_export_facts, read_kept
 from fieldfuse.pipelines.rendered import Pictures, depth_steps, load_pictures, save_pictures, to_picture, write_pngs
-from fieldfuse.pipelines.room import require_pictures, require_scores
-from fieldfuse.pipelines.steps_capture import last_of, pixel_state
+from fieldfuse.pipelines.source_state import pixel_state
+from fieldfuse.pipelines.steps_capture import last_of
+from fieldfuse.steps import set_seeds
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Capture, Views
@@ -74,9 +77,6 @@ def fuse_tsdf(job: Job, posed: Capture, scene: Scene, views: Views, name: str = 
 
 
 GONE = "of an earlier field, and removed: {}; `fieldfuse export {} --formats …` makes of this one what the run is not asked for"
-FIT_NOTES = "fit_notes.json"  # what a reader of the numbers has to know of the fit; there only when there is something
-LEFT_OUT = "left_out.safetensors"  # pixels that the fit did without, since they show what moves; there only when they were looked for
-FIT_MATCHED = "fit_matched.json"  # what the fit's quick matching found; there only when it was made
 NO_MATCHING = {"auto": "sensor", "any": "any", "sensor": "sensor"}  # `fit.depth_from` of a fit that goes on
 GENTLE, GENTLEST = 30.0, 0.3  # seconds from which on it begins with steps as large as any fit's, and the least share of them
 Fitted = tuple["Field", list[dict[str, Any]]]
@@ -168,29 +168,9 @@ def going_on(fit: FitSettings) -> FitSettings:
     return replace(fit, depth_from=NO_MATCHING.get(fit.depth_from, "off"), moving="off", **rates)
 
 
-def fit_notes(job: Job) -> list[str]:
-    """What the fit of this run's field had to say."""
-    record = job.stages.records.get("field")
-    return list(read_kept(job.folder / FIT_NOTES, NOTES)) if record is not None and FIT_NOTES in record.outputs else []
-
-
-def fit_matched(job: Job) -> dict[str, Any] | None:
-    """What this run's fit found by matching pictures before it began: pictures, long side, share of pixels with depth, seconds."""
-    record = job.stages.records.get("field")
-    return read_kept(job.folder / FIT_MATCHED, MATCHED) if record is not None and FIT_MATCHED in record.outputs else None
-
-
-def fit_left_out(job: Job) -> LeftOut | None:
-    """The pixels that this run's fit did without, since they show what moves; None: they were not looked for."""
-    from fieldfuse.stereo.left_out import load_left_out
-
-    record = job.stages.records.get("field")
-    return load_left_out(job.folder / LEFT_OUT) if record is not None and LEFT_OUT in record.outputs else None
-
-
 def render_test_views(job: Job, field: Field, views: Views, scene: Scene) -> Pictures:
     """The field's pictures at the held-out views."""
-    from fieldfuse.evaluate.observed import training_psnr
+    from fieldfuse.evaluation.observed import training_psnr
     from fieldfuse.render.image import make_renderer, render_view
 
     kept = job.folder / "renders" / "field.safetensors"
@@ -267,9 +247,9 @@ def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, sc
 
 def score_pictures(job: Job, views: Views, pictures: dict[str, Pictures]) -> dict[str, Any]:
     """The same metrics for field and TSDF, beside those of the nearest training picture."""
-    from fieldfuse.evaluate.baseline import nearest_image_scores
-    from fieldfuse.evaluate.observed import seen_share
-    from fieldfuse.evaluate.score import score_views
+    from fieldfuse.evaluation.baseline import nearest_image_scores
+    from fieldfuse.evaluation.observed import seen_share
+    from fieldfuse.evaluation.score import score_views
 
     path = job.folder / "evaluation.json"
 

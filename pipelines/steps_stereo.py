@@ -87,7 +87,7 @@ def exact_depths(posed: Capture, scene: Scene, views: Views) -> list[StereoDepth
     Raises:
         InputError: a training picture has none.
     """
-    from fieldfuse.evaluate.compare_truth import find_truth, true_depths
+    from fieldfuse.evaluation.compare_truth import find_truth, true_depths
     from fieldfuse.stereo.match import StereoDepth
 
     truth = find_truth(posed)

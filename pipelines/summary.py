@@ -14,11 +14,11 @@ import numpy as np
 from fieldfuse import __version__
 from fieldfuse.config import settings_dict
 from fieldfuse.files import write_json
+from fieldfuse.pipelines.fit_files import fit_left_out, fit_matched, fit_notes
 from fieldfuse.pipelines.folder import command_line
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.rendered import Pictures, depth_step
 from fieldfuse.pipelines.steps_effects import effects_part, effects_warnings, moved_cameras, moved_depth
-from fieldfuse.pipelines.steps_results import fit_left_out, fit_matched, fit_notes
 from fieldfuse.pipelines.textured import TSDF_TEXTURE
 
 if TYPE_CHECKING:
@@ -217,9 +217,9 @@ def put_report(
     seconds: float,
 ) -> dict[str, Any]:
     """Write report.json and report.html; `seconds` is what this command took so far, reused stages count as they took."""
-    from fieldfuse.evaluate.failure import failures
-    from fieldfuse.evaluate.pictures import method_pictures, moving_pictures
-    from fieldfuse.evaluate.report import report_data, write_report
+    from fieldfuse.evaluation.failure import failures
+    from fieldfuse.evaluation.pictures import method_pictures, moving_pictures
+    from fieldfuse.evaluation.report import report_data, write_report
 
     notes = export_facts["notes"] if export_facts else []
     began, told = time.monotonic(), None if job.plan is None else job.plan.told(job)

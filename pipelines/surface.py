@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fieldfuse import memory
-from fieldfuse.camera import Array, Intrinsics, Similarity
+from fieldfuse.camera import Array, Similarity
 from fieldfuse.errors import InputError
+from fieldfuse.export.field_surface import Originals, at_most, surface_of_field, whole_mesh
+from fieldfuse.memory_limits import require_pictures
+from fieldfuse.pipelines.fit_files import fit_left_out
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.page import NAME, PAGE, put_page
 from fieldfuse.pipelines.pictures import camera_of, orbit_cameras, pictures
 from fieldfuse.pipelines.rendered import Pictures, to_picture
-from fieldfuse.pipelines.room import PICTURE_BYTES, SURFACE_BYTES, pixels, require_pictures
-from fieldfuse.pipelines.steps_results import fit_left_out
 from fieldfuse.pipelines.summary import put_cameras
-from fieldfuse.pipelines.taken import MESHES, SURFACES, TEXTURE, as_taken, missing_originals, needs_originals
+from fieldfuse.pipelines.taken import MESHES, SURFACES, TEXTURE, missing_originals, needs_originals
 from fieldfuse.pipelines.textured import TEXTURED, put_textured
 from fieldfuse.tone import exposed
 
@@ -32,19 +32,11 @@ if TYPE_CHECKING:
     from fieldfuse.stereo.match import StereoDepth
     from fieldfuse.tsdf.fuse import Points
     from fieldfuse.tsdf.mesh import Mesh
-    from fieldfuse.tsdf.volume import TsdfVolume
 
-SMALL_PART = 0.002  # components of a mesh with less than this share of its area are specks
 MOST_TRIANGLES = 2_000_000
-RENDERED_SIDE = 400  # pixels; pictures tell what is finer (`export.mesh_size`), and rendering it takes long
 MOST_SPARSE = 20_000  # points that go with exported cameras
 VIDEO_SIDE = 640
 FPS = 30
-
-
-def spread(count: int, most: int) -> list[int]:
-    """At most `most` of `count` indices, evenly spread."""
-    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, most))}) if count and most else []
 
 
 def fuse_training_frames(
@@ -72,7 +64,7 @@ def fuse_training_frames(
         shown = views.subset(np.flatnonzero(~views.test))
         volume = fuse_stereo(shown, depths, settings.voxel_size, settings.depth_max, carve=not exact, progress=job.progress)
     fused = time.monotonic() - start
-    mesh = volume.mesh().cleaned(min_area_share=SMALL_PART).smoothed(job.settings.export.smooth)
+    mesh = whole_mesh(volume, job.settings.export.smooth)
     write_surface(folder, scene, mesh, volume.points(), views.exposure)
     found = Pictures()
     lenses = [views.intrinsics[index] for index in np.flatnonzero(views.test)]
@@ -189,12 +181,12 @@ def export_surface(
     """
     from fieldfuse.export.mesh import mesh_facts, write_mesh
 
-    volume = _volume_of(job, field, posed, scene, views)
+    volume = surface_of_field(field, views, scene, job.settings, Originals(posed, job.corrections), job.progress)
     memory.give_back()  # what pictures and depth maps took
     input_from_working = scene.working_from_input.inverse()
     exposure = views.exposure
     written = [put_points(folder / "points.ply", volume.points(), input_from_working, exposure)] if "points" in formats else []
-    whole = volume.mesh().cleaned(min_area_share=SMALL_PART).smoothed(job.settings.export.smooth)
+    whole = whole_mesh(volume, job.settings.export.smooth)
     del volume
     mesh = whole.decimated(MOST_TRIANGLES).transformed(input_from_working)
     mesh = replace(mesh, colours=exposed(mesh.colours, exposure))
@@ -211,55 +203,3 @@ def export_surface(
         except InputError as error:
             notes.append(f"the texture was left out: {error}")
     return facts, written
-
-
-def _volume_of(job: Job, field: Field, posed: Capture, scene: Scene, views: Views) -> TsdfVolume:
-    """The field's depth at the training cameras, polished, made to agree, and fused."""
-    from fieldfuse.export.surface import field_volume
-    from fieldfuse.render.image import make_renderer, render_view
-    from fieldfuse.stereo.polish import Polisher
-    from fieldfuse.stereo.settle import settled
-
-    train = np.flatnonzero(~views.test)  # held-out pictures are not looked at
-    shown, cameras = finer_views(job, posed, views, train)
-    chosen = spread(len(shown), job.settings.export.mesh_views)
-    lenses = [cameras[index] for index in chosen]
-    require_pictures(lenses, kept=True, advice="lower export.mesh_views or export.mesh_size", each=SURFACE_BYTES)
-    view = make_renderer(field, job.settings.engine)
-    polisher = Polisher(shown, cameras, scene.near, scene.far, scene.median_depth)
-    seen = shown.subset(np.array(chosen))
-    fit = job.settings.fit
-    measured = seen.depths if fit.depth > 0 and fit.depth_from != "off" else []
-    return field_volume(
-        lambda lens, pose: render_view(field, at_most(lens, RENDERED_SIDE), pose, view),
-        shown.world_from_camera[chosen],
-        lenses,
-        region=scene.surface_box(),
-        polish=[partial(polisher.polished, index, measured=measured[at] if measured else None) for at, index in enumerate(chosen)],
-        settle=lambda reliable, opaque, told: settled(
-            reliable, opaque, told, seen, lenses, scene.median_depth, measured, progress=job.progress
-        ),
-        progress=job.progress,
-    )
-
-
-def finer_views(job: Job, posed: Capture, views: Views, train: Array) -> tuple[Views, list[Intrinsics]]:
-    """The views `train` with their pictures as they were taken, and the cameras of depth maps for them, `export.mesh_size` at most.
-
-    Where there is too little memory for that, pictures stay as large as the fit has them.
-    """
-    side, shown = job.settings.export.mesh_size, views.subset(train)
-    lenses, images = as_taken(job, posed, train, shown, side)
-    rendered = min(1.0, job.settings.export.mesh_views / max(len(lenses), 1))
-    wanted = int((PICTURE_BYTES + SURFACE_BYTES * rendered) * sum(map(pixels, lenses)))
-    if lenses != shown.intrinsics and memory.bounded(wanted) < wanted:
-        lenses, images = shown.intrinsics, shown.images
-    return replace(shown, images=list(images), intrinsics=lenses), [at_most(lens, side) for lens in lenses]
-
-
-def at_most(lens: Intrinsics, long_side: int) -> Intrinsics:
-    """The camera, made smaller if its long side is larger; sides stay even, as video needs."""
-    factor = min(1.0, long_side / max(lens.width, lens.height))
-    if factor == 1.0:
-        return lens
-    return lens.scaled(*(max(2, round(side * factor / 2) * 2) for side in (lens.width, lens.height)))

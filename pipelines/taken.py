@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.errors import InputError
+from fieldfuse.export.field_surface import Originals
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Capture, Views
@@ -33,10 +33,10 @@ def needs_originals(job: Job, formats: Iterable[str]) -> list[tuple[str, set[str
 
 
 def missing_originals(job: Job, posed: Capture, views: Views, side: int) -> str | None:
-    """A sentence when `as_taken` could not read the training pictures, since they are gone."""
+    """A sentence when `Originals.at` could not read the training pictures, since they are gone."""
     train = np.flatnonzero(~views.test)
     shown = views.subset(train)
-    if as_taken(job, posed, train, shown, side)[0] == shown.intrinsics:
+    if Originals(posed).at(train, shown, side)[0] == shown.intrinsics:
         return None  # the run has them
     lost = next((path for index in train if not (path := posed.frames[index].image).is_file()), None)
     if lost is None:
@@ -55,28 +55,3 @@ def require_originals(job: Job, posed: Capture, views: Views) -> None:
         if gone := missing_originals(job, posed, views, side):
             job.folder.restore()
             raise InputError(WITHOUT.format(gone, ",".join(name for name in formats if name not in SURFACES)))
-
-
-def as_taken(job: Job, posed: Capture, indices: Array, shown: Views, side: int) -> tuple[list[Intrinsics], Iterable[Array]]:
-    """Cameras and pictures of the frames `indices`, which are the views `shown`: as large as they were taken, up to `side` pixels along
-    the long side, corrected as those of the fit, and read one at a time; those of the fit where the originals are no larger."""
-    from fieldfuse.capture.prepare import pictures_at, target_size
-    found = job.corrections
-    lenses = []
-    for index, small in zip(indices, shown.intrinsics, strict=True):
-        taken = posed.frames[index].intrinsics
-        size = (small.width, small.height) if taken is None else target_size(taken.width, taken.height, side)
-        lenses.append(small.scaled(*size) if max(size) > max(small.width, small.height) else small)
-    if all(lens == small for lens, small in zip(lenses, shown.intrinsics, strict=True)):
-        return lenses, shown.images
-
-    def read() -> Iterator[Array]:
-        import cv2
-
-        for lens, name, (_, picture) in zip(lenses, shown.names, pictures_at(posed, indices, side), strict=True):
-            if picture.shape[:2] != (lens.height, lens.width):
-                picture = cv2.resize(picture, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-            tone = None if found is None else found.tone(name)
-            yield picture if tone is None else tone.undone(picture, lens)[0]
-
-    return lenses, read()

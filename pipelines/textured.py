@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fieldfuse.pipelines.taken import as_taken
+from fieldfuse.export.field_surface import Originals
 from fieldfuse.tone import exposed
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def texture_tsdf(job: Job, posed: Capture, scene: Scene, views: Views) -> None:
     path = job.folder / "tsdf" / TEXTURED
 
     def make() -> Path:
-        from fieldfuse.evaluate.geometry import read_mesh
+        from fieldfuse.evaluation.geometry import read_mesh
 
         mesh = read_mesh(path.with_name("mesh.ply")).transformed(scene.working_from_input)
         return put_textured(job, path, mesh.with_normals(), posed, scene, views)
@@ -48,7 +48,7 @@ def put_textured(job: Job, path: Path, mesh: Mesh, posed: Capture, scene: Scene,
     thin = mesh.decimated(TRIANGLES)
     train = np.flatnonzero(~views.test)
     shown = views.subset(train)
-    lenses, images = as_taken(job, posed, train, shown, job.settings.export.texture_size)
+    lenses, images = Originals(posed, job.corrections).at(train, shown, job.settings.export.texture_size)
     cameras = (lenses, shown.world_from_camera, shown.valid, shown.weight)
     atlas, texture = textured(thin, images, *cameras, largest=largest, progress=job.progress)
     write_textured(path, thin, atlas, exposed(texture, views.exposure), scene.working_from_input)

@@ -15,7 +15,7 @@ import psutil
 
 from fieldfuse.config import EXPORTS, settings_dict
 from fieldfuse.errors import FieldfuseError
-from fieldfuse.evaluate import budget as model
+from fieldfuse.evaluation import budget as model
 from fieldfuse.files import fingerprint, read_json, write_json
 from fieldfuse.pipelines.page import PAGE
 from fieldfuse.pipelines.taken import TEXTURE
@@ -58,7 +58,7 @@ class TotalBudget:
 
     def choose_pictures(self, job: Job, capture: Capture) -> None:
         """Decide picture size and a video's frames; predict every stage."""
-        from fieldfuse.evaluate.budget_probe import self_test
+        from fieldfuse.evaluation.budget_probe import self_test
 
         settings = job.settings
         threads = settings.threads or psutil.cpu_count() or 1

@@ -134,7 +134,7 @@ def tradeoff_run(
 
 def axes_here(settings: Any) -> tuple[list[str], dict[str, str]]:
     """The axes that can be varied, and for the others why not."""
-    from fieldfuse.evaluate.tradeoff import AXES
+    from fieldfuse.evaluation.tradeoff import AXES
     from fieldfuse.training.from_network import SHIPPED
 
     why_not = {}
@@ -148,7 +148,7 @@ def axes_here(settings: Any) -> tuple[list[str], dict[str, str]]:
 
 def put(job: Any, swept: Any, capture: Any, poses: Any, scene: Any, views: Any, refused: list[str]) -> dict[str, Any]:
     """Write what is known so far into the run's folder."""
-    from fieldfuse.evaluate.tradeoff_page import write_tradeoff
+    from fieldfuse.evaluation.tradeoff_page import write_tradeoff
     from fieldfuse.pipelines.comparison import machine
     from fieldfuse.pipelines.summary import base_data, warnings_of
 
@@ -183,8 +183,8 @@ def unbounded(command: str) -> str:
 
 def show(data: dict[str, Any], folder: Path, quiet: bool, as_json: bool) -> None:
     """The result on stdout: JSON, or the sentences and where the page is."""
-    from fieldfuse.evaluate.tradeoff import points_of
-    from fieldfuse.evaluate.tradeoff_text import front_sentence, sentence, steps
+    from fieldfuse.evaluation.tradeoff import points_of
+    from fieldfuse.evaluation.tradeoff_text import front_sentence, sentence, steps
 
     if as_json:
         sys.stdout.write(writer.dumps(data, indent=1) + "\n")

@@ -52,7 +52,7 @@ def row_of(ground: Ground, spec: dict[str, Any], one: dict[str, Any]) -> dict[st
     """Scores of one result at the test views, beside what it cost."""
     import numpy as np
 
-    from fieldfuse.evaluate.compare_score import compare_views
+    from fieldfuse.evaluation.compare_score import compare_views
 
     indices = np.flatnonzero(ground.views.test)
     pictures, seconds = [], []
@@ -81,7 +81,7 @@ def row_of(ground: Ground, spec: dict[str, Any], one: dict[str, Any]) -> dict[st
 def main(path: str) -> int:
     """Measure the job in the file, write its answer beside it; 0 when there is one."""
     from fieldfuse.errors import FieldfuseError
-    from fieldfuse.evaluate.report import plain
+    from fieldfuse.evaluation.report import plain
     from fieldfuse.files import read_json, write_json
     from fieldfuse.poses.worker import die_with_parent
 

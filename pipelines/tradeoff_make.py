@@ -58,7 +58,7 @@ def open_ground(folder: Path, settings: Settings, share: float) -> Ground:
     """
     from fieldfuse.capture.storage import capture_from_dict
     from fieldfuse.capture.views_file import load_views
-    from fieldfuse.evaluate.compare_truth import find_truth, true_depths
+    from fieldfuse.evaluation.compare_truth import find_truth, true_depths
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene
     from fieldfuse.progress import SILENT

@@ -79,7 +79,7 @@ def lens_of(fov: float, aspect: float, long_side: int) -> Intrinsics:
 
 def picture(rendered: Any, what: str) -> Array:
     """(H, W, 3) uint8 of what was asked for."""
-    from fieldfuse.evaluate.pictures import depth_picture, depth_range
+    from fieldfuse.evaluation.pictures import depth_picture, depth_range
 
     if what == DEPTH:
         return depth_picture(rendered.depth, depth_range([rendered.depth]))

@@ -40,7 +40,7 @@ def test_the_contracts_are_kept(copy: Path) -> None:
     [
         ("fieldfuse/camera.py", "from fieldfuse.render import march", "One direction of flow"),
         ("fieldfuse/files.py", "import fieldfuse.camera", "One direction of flow"),
-        ("fieldfuse/evaluate/__init__.py", "import fieldfuse.pipelines.doctor", "One direction of flow"),
+        ("fieldfuse/evaluation/__init__.py", "import fieldfuse.pipelines.doctor", "One direction of flow"),
         ("fieldfuse/training/__init__.py", "import open3d", "needs no Open3D"),
         ("fieldfuse/capture/__init__.py", "import pycolmap", "needs no Open3D"),
         ("fieldfuse/volume/topology.py", "from fieldfuse.volume import grid", "needs no Open3D"),
@@ -50,7 +50,7 @@ def test_a_wrong_import_is_told(copy: Path, module: str, line: str, contract: st
     path = copy / module
     path.write_text(f"{path.read_text(encoding='utf-8')}\n{line}\n", encoding="utf-8")
     done = lint_imports(copy)
-    broken = [text for text in done.stdout.splitlines() if text.endswith("BROKEN")]
+    broken = [text for text in done.stdout.splitlines() if " BROKEN" in text]
     assert done.returncode == 1
     assert any(contract in text for text in broken), done.stdout
 
@@ -76,7 +76,7 @@ def test_only_the_poses_child_imports_pycolmap() -> None:
 def test_the_layers_name_only_what_may_exist() -> None:
     parser = configparser.ConfigParser()
     parser.read(ROOT / "setup.cfg", encoding="utf-8")
-    layers = parser["importlinter:contract:flow"]["layers"].replace("|", " ").split()
+    layers = parser["importlinter:contract:flow"]["layers"].replace("|", " ").replace(":", " ").split()
     required = [name for name in layers if not name.startswith("(")]
     places = [ROOT / "toolkit" / name for name in required]
     beside = ("pipelines", "configs")
@@ -84,19 +84,18 @@ def test_the_layers_name_only_what_may_exist() -> None:
     assert not missing
 
 
-# Commands whose steps still import each other inside functions; what is gone from here must not come back.
-CIRCLES = (
-    """job moved steps_capture steps_effects steps_network steps_results steps_stereo surface summary pictures page baking taken textured
-    total_budget""",
-    "live visitor",
-    "cli bench_captures",
-)
+# Run as a program, it is the process of one of its runs; what is gone from here must not come back.
+CIRCLES = ("cli bench_captures",)
 
 
 def imports(name: str, path: Path, modules: dict[str, Path]) -> set[str]:
-    """The modules among `modules` that this one imports, anywhere in it."""
+    """The modules among `modules` that this one imports, anywhere in it, but for types alone."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            node.body.clear()
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

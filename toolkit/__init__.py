@@ -1,3 +1,46 @@
-"""Fieldfuse: NeRFusion-style radiance fields on sparse voxel blocks, with a TSDF baseline beside them."""
+"""Fieldfuse: NeRFusion-style radiance fields on sparse voxel blocks, with a TSDF baseline beside them. See `fieldfuse.api`."""
 
-__version__ = "0.1.0"
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.2.0"
+
+if TYPE_CHECKING:
+    from fieldfuse.api import Camera, Field, Mesh, Points, Render, Scene, Scores, Surface, evaluate, fit, fuse_tsdf, infer, load
+    from fieldfuse.errors import FieldfuseError, InputError, Interrupted, OutputError, PoseError
+
+_ERRORS = ("FieldfuseError", "InputError", "Interrupted", "OutputError", "PoseError")
+__all__ = [
+    "Camera",
+    "Field",
+    "FieldfuseError",
+    "InputError",
+    "Interrupted",
+    "Mesh",
+    "OutputError",
+    "Points",
+    "PoseError",
+    "Render",
+    "Scene",
+    "Scores",
+    "Surface",
+    "evaluate",
+    "fit",
+    "fuse_tsdf",
+    "infer",
+    "load",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """What is asked for is imported then: `import fieldfuse` alone is quick."""
+    from importlib import import_module
+
+    if name in __all__:
+        return getattr(import_module("fieldfuse.errors" if name in _ERRORS else "fieldfuse.api"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -16,7 +16,7 @@ from fieldfuse.effects.correct import Corrections, bent, correctable
 from fieldfuse.effects.decide import CLIPS, DIMMEST, room_for_light
 from fieldfuse.effects.sightings import Sightings
 from fieldfuse.errors import InputError
-from fieldfuse.evaluate.score import score_views
+from fieldfuse.evaluation.score import score_views
 from fieldfuse.render.image import Rendered
 from fieldfuse.tone import Tone
 from fieldfuse.training.rays import PixelPool

@@ -16,14 +16,14 @@ import torch
 
 from fieldfuse.camera import Array
 from fieldfuse.errors import InputError
-from fieldfuse.evaluate.speed_state import around, lens
+from fieldfuse.evaluation.speed_state import around, lens
 from fieldfuse.export.page import Tour, corner_densities, decoder_blocks, page, require_page, write_page
-from fieldfuse.networks.decoder import Deferred, make_decoder
+from fieldfuse.nerfusion.decoder import Deferred, make_decoder
 from fieldfuse.render.bake import BakedField, bake
 from fieldfuse.render.bake_image import BakedRenderer
 from fieldfuse.tone import brighter, decode, encode
-from tests.evaluate.browser import open_page
-from tests.evaluate.driven import Driven, driven, until
+from tests.evaluation.browser import open_page
+from tests.evaluation.driven import Driven, driven, until
 from tests.render.made import coloured_field, random_field
 
 WIDTH, HEIGHT = 48, 36

@@ -13,12 +13,12 @@ from safetensors.numpy import save_file
 
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
-from fieldfuse.evaluate.compare_truth import GroundTruth
+from fieldfuse.evaluation.compare_truth import GroundTruth
 from fieldfuse.export.mesh import write_mesh
 from fieldfuse.files import read_json, write_json
 from fieldfuse.pipelines.steps_compare import choose_surfaces
 from fieldfuse.tsdf.mesh import Mesh
-from tests.evaluate.browser import embedded_pictures, open_page
+from tests.evaluation.browser import embedded_pictures, open_page
 from tests.pipelines.made import call
 from tests.pipelines.short import steady
 from tests.pipelines.test_matched import CAMERA, make_corner

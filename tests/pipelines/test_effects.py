@@ -19,7 +19,7 @@ from fieldfuse.config import load_settings
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.effects.decide import Decided, asleep, decide, wish
 from fieldfuse.errors import InputError
-from fieldfuse.evaluate.effects_truth import known_light
+from fieldfuse.evaluation.effects_truth import known_light
 from fieldfuse.pipelines.kept import EFFECTS, fitting
 from fieldfuse.pipelines.steps_effects import moved_cameras
 from fieldfuse.simulate.settings import scene_file

@@ -215,8 +215,8 @@ def test_lists_of_numbers() -> None:
 
 def test_engines_are_measured_side_by_side(room: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each engine fits within the same seconds, and pictures of its field are timed."""
-    monkeypatch.setattr("fieldfuse.evaluate.engines.PICTURE", (96, 72))
-    monkeypatch.setattr("fieldfuse.evaluate.engines.STEPS", 2)
+    monkeypatch.setattr("fieldfuse.evaluation.engines.PICTURE", (96, 72))
+    monkeypatch.setattr("fieldfuse.evaluation.engines.STEPS", 2)
     with clocked(lambda: time.process_time):  # what else the machine does is not counted
         answer = call(
             *(capsys, "bench", "engines", room, "--out", tmp_path / "engines", "--budgets", "1", "--engines", "auto,torch"),

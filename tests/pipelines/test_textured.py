@@ -12,13 +12,12 @@ import trimesh
 
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.errors import InputError
+from fieldfuse.export.field_surface import Originals
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.job import open_job
 from fieldfuse.pipelines.options import gather
 from fieldfuse.pipelines.reconstruct import stand
-from fieldfuse.pipelines.surface import finer_views
-from fieldfuse.pipelines.taken import as_taken
 from fieldfuse.tone import Tone
 from tests.pipelines.made import CAMERA, call, make_room, said
 from tests.pipelines.short import ALONE, steady
@@ -56,7 +55,7 @@ def test_pictures_are_as_large_as_they_were_taken(run: Path, side: int, expected
         _, _, posed, _, views = stand(job)
         train = np.flatnonzero(~views.test)
         shown = views.subset(train)
-        lenses, pictures = as_taken(job, posed, train, shown, side)
+        lenses, pictures = Originals(posed, job.corrections).at(train, shown, side)
         found = list(pictures)
     assert len(found) == len(lenses) == len(train)
     if expected is None:
@@ -75,9 +74,9 @@ def test_large_pictures_are_corrected_as_those_of_the_fit(run: Path) -> None:
     with open_job(run / "room", run / "other", gather(None, None, None, image_size=48), make_progress(True)) as job:
         _, _, posed, _, views = stand(job)
         shown = views.subset([1])
-        plain = next(iter(as_taken(job, posed, np.array([1]), shown, 1280)[1]))
+        plain = next(iter(Originals(posed, job.corrections).at(np.array([1]), shown, 1280)[1]))
         job.corrections = Corrections({views.names[1]: (1.5, 1.0, 0.8)})
-        corrected = next(iter(as_taken(job, posed, np.array([1]), shown, 1280)[1]))
+        corrected = next(iter(Originals(posed, job.corrections).at(np.array([1]), shown, 1280)[1]))
     assert np.array_equal(corrected, Tone((1.5, 1.0, 0.8)).undone(plain, TAKEN)[0])
     assert (corrected[..., 0] < plain[..., 0]).mean() > 0.9 and np.array_equal(corrected[..., 1], plain[..., 1])
 
@@ -86,12 +85,12 @@ def test_a_mesh_is_made_of_pictures_as_they_were_taken_where_there_is_room(run: 
     with open_job(run / "room", run / "other", gather(None, None, ["export.mesh_size=128"], image_size=48), make_progress(True)) as job:
         _, _, posed, _, views = stand(job)
         train = np.flatnonzero(~views.test)
-        shown, cameras = finer_views(job, posed, views, train)
+        shown, cameras = Originals(posed, job.corrections).finer(views, train, job.settings.export)
         assert {picture.shape for picture in shown.images} == {(96, 128, 3)}
         assert {(camera.width, camera.height) for camera in cameras} == {(128, 96)}
         assert shown.names == [views.names[index] for index in train]
         monkeypatch.setattr("fieldfuse.memory.available", lambda: 130 * 2**20)
-        shown, cameras = finer_views(job, posed, views, train)
+        shown, cameras = Originals(posed, job.corrections).finer(views, train, job.settings.export)
         assert {picture.shape for picture in shown.images} == {(36, 48, 3)} and {camera.width for camera in cameras} == {48}
 
 
@@ -99,7 +98,7 @@ def test_a_mesh_is_made_of_pictures_as_they_were_taken_where_there_is_room(run: 
 def test_a_size_of_nothing_is_refused(tmp_path: Path, capsys: Capsys, name: str) -> None:
     make_room(tmp_path / "room", 4)
     answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", "--set", f"export.{name}=0")
-    assert answer.code == 2 and f"export.{name} is 0; it must be a positive number" in answer.sentence()
+    assert answer.code == 2 and f"export.{name} is 0; it must be greater than 0" in answer.sentence()
 
 
 def test_a_mesh_stays_when_its_texture_cannot_be_made(

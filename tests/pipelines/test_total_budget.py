@@ -14,7 +14,7 @@ import psutil
 import pytest
 
 from fieldfuse.config import EXPORTS, load_settings
-from fieldfuse.evaluate import budget as model
+from fieldfuse.evaluation import budget as model
 from fieldfuse.files import read_json, write_json
 from fieldfuse.pipelines.total_budget import LONGEST_START, TotalBudget
 from tests.pipelines.made import call, make_room

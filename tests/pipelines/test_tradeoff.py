@@ -9,7 +9,7 @@ import pytest
 
 from fieldfuse.config import Settings
 from fieldfuse.errors import InputError
-from fieldfuse.evaluate.tradeoff import MEASURES, checked_row, points_of, series
+from fieldfuse.evaluation.tradeoff import MEASURES, checked_row, points_of, series
 from fieldfuse.files import read_json, write_json
 from fieldfuse.pipelines import tradeoff_child
 from fieldfuse.pipelines.direct_field import direct_field
@@ -110,7 +110,7 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, capsys: Capsys, monkey
     assert short["rows"] == [] and short["left_out"] == ["field-1s-seed0", "tsdf-seed0"]  # nothing fits into a second
     monkeypatch.setattr("fieldfuse.pipelines.tradeoff_sweep.run_child", surfaces_here)
     monkeypatch.setattr("fieldfuse.poses.worker.die_with_parent", lambda: None)
-    monkeypatch.setattr("fieldfuse.evaluate.tradeoff_page.MEASURES", {"psnr": MEASURES["psnr"]})  # all plots: tests/evaluate
+    monkeypatch.setattr("fieldfuse.evaluation.tradeoff_page.MEASURES", {"psnr": MEASURES["psnr"]})  # all plots: tests/evaluation
     answer = call(capsys, *command)
     assert answer.code == 0, answer.err
     data = json.loads(answer.out)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import torch
 
-from fieldfuse.evaluate.speed_state import sphere_field
-from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.evaluation.speed_state import sphere_field
+from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.field import Field
 from fieldfuse.training.levels import all_places, first_field
 from fieldfuse.volume.host import TorchHost

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.evaluate.selftest.case import Measure, Outcome, all_cases, run_cases
+from fieldfuse.evaluation.selftest.case import Measure, Outcome, all_cases, run_cases
 
 
 def replace_part(page: Path, name: str, lines: list[str]) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from fieldfuse.evaluate.selftest import compositing, lookup, rays
-from fieldfuse.evaluate.selftest.case import Case, Measure, absolute, all_cases, by_size, not_finite, refused, relative, run_case
+from fieldfuse.evaluation.selftest import compositing, lookup, rays
+from fieldfuse.evaluation.selftest.case import Case, Measure, absolute, all_cases, by_size, not_finite, refused, relative, run_case
 from fieldfuse.render import march as marching
 from fieldfuse.render.composite import exclusive_sum
 from tests.pipelines.made import call

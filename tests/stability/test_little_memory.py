@@ -11,7 +11,7 @@ from fieldfuse import memory
 from fieldfuse.camera import Similarity
 from fieldfuse.config import PosesSettings, TsdfSettings
 from fieldfuse.errors import InputError
-from fieldfuse.evaluate.selftest.fits import texture, views_of
+from fieldfuse.evaluation.selftest.fits import texture, views_of
 from fieldfuse.pipelines import room
 from fieldfuse.poses import sfm
 from fieldfuse.stereo.match import stereo_depths

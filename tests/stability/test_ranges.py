@@ -12,12 +12,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fieldfuse.camera import FISHEYE, OPENCV, Intrinsics, lens_limit
-from fieldfuse.evaluate.depth import depth_metrics
-from fieldfuse.evaluate.images import psnr, ssim
-from fieldfuse.evaluate.selftest import compositing, edit, lookup, metrics, network, place, rays, rays_background, volume
-from fieldfuse.evaluate.selftest.cameras import LENS, POSE, lens_errors, of_fov, projection_errors
-from fieldfuse.evaluate.selftest.case import by_size
-from fieldfuse.evaluate.selftest.compositing_more import distortion_errors
+from fieldfuse.evaluation.depth import depth_metrics
+from fieldfuse.evaluation.images import psnr, ssim
+from fieldfuse.evaluation.selftest import compositing, edit, lookup, metrics, network, place, rays, rays_background, volume
+from fieldfuse.evaluation.selftest.cameras import LENS, POSE, lens_errors, of_fov, projection_errors
+from fieldfuse.evaluation.selftest.case import by_size
+from fieldfuse.evaluation.selftest.compositing_more import distortion_errors
 from fieldfuse.volume.topology import Topology
 
 QUICK = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])

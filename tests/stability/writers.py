@@ -22,10 +22,10 @@ from fieldfuse.camera import Intrinsics, Similarity
 from fieldfuse.capture.types import Views
 from fieldfuse.capture.views_file import save_views
 from fieldfuse.errors import OutputError
-from fieldfuse.evaluate.report import write_report
-from fieldfuse.evaluate.selftest.data import poses, texture
-from fieldfuse.evaluate.selftest.edit import small_field
-from fieldfuse.evaluate.selftest.place_files import ball
+from fieldfuse.evaluation.report import write_report
+from fieldfuse.evaluation.selftest.data import poses, texture
+from fieldfuse.evaluation.selftest.edit import small_field
+from fieldfuse.evaluation.selftest.place_files import ball
 from fieldfuse.export.cameras import write_cameras
 from fieldfuse.export.mesh import write_mesh
 from fieldfuse.export.points import write_points

@@ -22,12 +22,17 @@ from fieldfuse.capture.photos import read_photos
 from fieldfuse.capture.select import select_frames
 from fieldfuse.capture.video import read_video
 from fieldfuse.config import CaptureSettings, Settings
-from fieldfuse.evaluate.compare_page import write_comparison
-from fieldfuse.evaluate.selftest.data import texture
-from fieldfuse.evaluate.selftest.edit import small_field
-from fieldfuse.evaluate.tradeoff_page import write_tradeoff
+from fieldfuse.evaluation.compare_page import write_comparison
+from fieldfuse.evaluation.selftest.data import texture
+from fieldfuse.evaluation.selftest.edit import small_field
+from fieldfuse.evaluation.tradeoff_page import write_tradeoff
 from fieldfuse.export.page import Tour, write_page
-from fieldfuse.networks.weights import save_model
+from fieldfuse.nerfusion.training.caution import Caution
+from fieldfuse.nerfusion.training.checkpoint import save_checkpoint
+from fieldfuse.nerfusion.training.curve import Curve
+from fieldfuse.nerfusion.training.shards import write_shard
+from fieldfuse.nerfusion.training.train import make_model
+from fieldfuse.nerfusion.weights import save_model
 from fieldfuse.pipelines.folder import RunFolder
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_file import write_baked
@@ -38,16 +43,11 @@ from fieldfuse.simulate.simulate import simulate
 from fieldfuse.stereo.left_out import LeftOut, save_left_out
 from fieldfuse.stereo.maps import save_stereo
 from fieldfuse.stereo.match import StereoDepth
-from fieldfuse.training.nerfusion.caution import Caution
-from fieldfuse.training.nerfusion.checkpoint import save_checkpoint
-from fieldfuse.training.nerfusion.curve import Curve
-from fieldfuse.training.nerfusion.shards import write_shard
-from fieldfuse.training.nerfusion.train import make_model
 from tests.capture.layouts import write_record3d, write_sens
-from tests.evaluate.test_compare_page import made, pictures
-from tests.evaluate.test_tradeoff import ladder
+from tests.evaluation.test_compare_page import made, pictures
+from tests.evaluation.test_tradeoff import ladder
+from tests.nerfusion.training.tiny import tiny_settings
 from tests.simulate.test_simulate import SMALL
-from tests.training.nerfusion.tiny import tiny_settings
 
 Write = Callable[[Path], object]
 
@@ -131,13 +131,13 @@ ELSEWHERE = {
     "toolkit/poses/job.py": "as above",
     "toolkit/poses/sfm.py": "as above",
     "toolkit/poses/child.py": "as above",
-    "toolkit/evaluate/suites/tables.py": "a page of the documentation, for people who measure, through `atomic_path`",
-    "toolkit/evaluate/effects_plan.py": "for people who measure effects: captures in a folder of their own",
-    "toolkit/evaluate/effects_truth.py": "the same, one picture at a time through atomic_path",
+    "toolkit/evaluation/suites/tables.py": "a page of the documentation, for people who measure, through `atomic_path`",
+    "toolkit/evaluation/effects_plan.py": "for people who measure effects: captures in a folder of their own",
+    "toolkit/evaluation/effects_truth.py": "the same, one picture at a time through atomic_path",
     "toolkit/poses/worker.py": "as above",
-    "toolkit/evaluate/budget.py": "a cache: what cannot be written is not remembered",
+    "toolkit/evaluation/budget.py": "a cache: what cannot be written is not remembered",
     "toolkit/simulate/demo.py": "one video, for people, through `atomic_path`",
-    "toolkit/evaluate/tradeoff_plots.py": "draws into memory",
-    "toolkit/evaluate/plots.py": "draws into memory",
+    "toolkit/evaluation/tradeoff_plots.py": "draws into memory",
+    "toolkit/evaluation/plots.py": "draws into memory",
     "pipelines/doctor.py": "a probe in a temporary folder",
 }

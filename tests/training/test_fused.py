@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture.types import Views
-from fieldfuse.networks.decoder import Deferred
-from fieldfuse.networks.encoding import spherical_harmonics
+from fieldfuse.nerfusion.decoder import Deferred
+from fieldfuse.nerfusion.encoding import spherical_harmonics
 from fieldfuse.render.compiled import CompiledRenderer, decoder_arrays
 from fieldfuse.render.kernels_decode import RAYS, decode, layers_of
 from fieldfuse.render.rays import render_rays

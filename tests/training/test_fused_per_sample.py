@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from fieldfuse.networks.decoder import PerSample
-from fieldfuse.networks.encoding import positional
+from fieldfuse.nerfusion.decoder import PerSample
+from fieldfuse.nerfusion.encoding import positional
 from fieldfuse.render import kernels_net
 from fieldfuse.render.compiled_per_sample import PerSampleRenderer, net_arrays, write_back
 from fieldfuse.render.field import Field
@@ -142,7 +142,7 @@ def test_gradients_agree(shell: float, seed: int, threads: int, rates: Rates, ev
     exact = exact_gradients(field, weighed(pool, picks), rates)
     with monkeypatch.context() as patch:
         # In float32 the reference's own angles are off by 1e-5.
-        patch.setattr("fieldfuse.networks.decoder.positional", lambda values, count: positional(values.double(), count).float())
+        patch.setattr("fieldfuse.nerfusion.decoder.positional", lambda values, count: positional(values.double(), count).float())
         reference = torch_gradients(field, weighed(pool, picks), rates)
     compiled = gradients(FusedPerSampleOptimiser(field, pool, threads=threads), picks, monkeypatch, rates)
     names = ["density_rows", "feature_rows", *(name for name, _ in field.decoder.named_parameters())]

@@ -11,7 +11,7 @@ import torch
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture.types import Views
 from fieldfuse.effects.correct import Corrections
-from fieldfuse.evaluate.score import score_views
+from fieldfuse.evaluation.score import score_views
 from fieldfuse.render.image import Rendered
 from fieldfuse.tone import Tone
 from fieldfuse.training.sample import Sample

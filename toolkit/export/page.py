@@ -24,8 +24,8 @@ from fieldfuse import __version__
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.errors import InputError
 from fieldfuse.files import atomic_path
-from fieldfuse.networks.decoder import Deferred
-from fieldfuse.networks.encoding import BEHIND, DIRECTION, SH
+from fieldfuse.nerfusion.decoder import Deferred
+from fieldfuse.nerfusion.encoding import BEHIND, DIRECTION, SH
 from fieldfuse.render.bake import BakedField
 from fieldfuse.render.bake_kernels import CORNERS, FINER
 from fieldfuse.render.field import Field

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from fieldfuse.errors import InputError
-from fieldfuse.networks.decoder import Deferred
+from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render import kernels as K
 from fieldfuse.render.bake_kernels import CORNERS, FINER, LEVELS, Baked
 from fieldfuse.render.compiled import FARTHEST, chessboard_distance, decoder_arrays

@@ -19,7 +19,7 @@ from safetensors.numpy import save
 from fieldfuse.camera import Similarity
 from fieldfuse.errors import InputError, OutputError, all_lines, first_line
 from fieldfuse.files import atomic_path
-from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.nerfusion.encoding import DIRECTION
 from fieldfuse.render import kernels as K
 from fieldfuse.render.bake import BakedField
 from fieldfuse.render.bake_kernels import CORNERS, FINER, LEVELS, Baked

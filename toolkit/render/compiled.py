@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numba import njit
 
-from fieldfuse.networks.decoder import Deferred
+from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render import kernels as K
 from fieldfuse.render.composite import STOP, THRESHOLD
 from fieldfuse.render.field import Field

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numba import njit
 
-from fieldfuse.networks.decoder import FREQUENCIES, PerSample
-from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.nerfusion.decoder import FREQUENCIES, PerSample
+from fieldfuse.nerfusion.encoding import DIRECTION
 from fieldfuse.render import kernels as K
 from fieldfuse.render.compiled import PIECE, make_space, make_volume
 from fieldfuse.render.composite import STOP

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from fieldfuse.networks.encoding import SH
+from fieldfuse.nerfusion.encoding import SH
 from fieldfuse.render.kernels import LEAF, ONE, OPTIONS, START, ZERO, Decoder, F, aligned
 from fieldfuse.render.kernels_matrix import LANES, product
 

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from fieldfuse.networks.decoder import FREQUENCIES
-from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.nerfusion.decoder import FREQUENCIES
+from fieldfuse.nerfusion.encoding import DIRECTION
 from fieldfuse.render import kernels as K
 from fieldfuse.render.kernels_decode import rectify, sigmoid
 from fieldfuse.render.kernels_lookup import gather_feature

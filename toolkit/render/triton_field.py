@@ -6,8 +6,8 @@ import torch
 import torch.nn.functional as F
 import triton
 
-from fieldfuse.networks.decoder import Deferred
-from fieldfuse.networks.encoding import DIRECTION, spherical_harmonics
+from fieldfuse.nerfusion.decoder import Deferred
+from fieldfuse.nerfusion.encoding import DIRECTION, spherical_harmonics
 from fieldfuse.render.field import Field
 from fieldfuse.render.march import BRICK
 from fieldfuse.render.rays import RayValues

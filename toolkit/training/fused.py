@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from fieldfuse import memory
-from fieldfuse.networks.decoder import Deferred
-from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.nerfusion.decoder import Deferred
+from fieldfuse.nerfusion.encoding import DIRECTION
 from fieldfuse.render import kernels as K
 from fieldfuse.render.compiled import decoder_arrays, make_space, make_volume, render_pass
 from fieldfuse.render.composite import STOP, THRESHOLD

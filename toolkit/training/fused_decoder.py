@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numba import njit
 
-from fieldfuse.networks.decoder import Deferred
+from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render import kernels as K
 from fieldfuse.render.kernels_decode import RAYS, Layers, rays_of, whole_lanes
 from fieldfuse.render.kernels_matrix import add_outer, product

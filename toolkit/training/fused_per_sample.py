@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from fieldfuse.networks.decoder import PerSample
-from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.nerfusion.decoder import PerSample
+from fieldfuse.nerfusion.encoding import DIRECTION
 from fieldfuse.render.compiled_per_sample import net_arrays, render_pass, turn, write_back
 from fieldfuse.render.composite import STOP
 from fieldfuse.render.field import Field

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from fieldfuse.networks.decoder import FREQUENCIES
+from fieldfuse.nerfusion.decoder import FREQUENCIES
 from fieldfuse.render import kernels as K
 from fieldfuse.render.kernels_matrix import add_outer, product
 from fieldfuse.render.kernels_net import BATCH, SAMPLES, Net, Tape, decode_colours, make_tape

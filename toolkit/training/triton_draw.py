@@ -5,7 +5,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from fieldfuse.networks.encoding import SH
+from fieldfuse.nerfusion.encoding import SH
 from fieldfuse.render.triton_march import C_BEHIND, C_COUNTS, C_JITTER, C_RED, C_TARGET
 from fieldfuse.training.importance import TILE, TOP
 

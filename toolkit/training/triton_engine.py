@@ -12,9 +12,9 @@ import math
 import torch
 import triton
 
-from fieldfuse.gpu import OTHERS_GO_ON
-from fieldfuse.networks.decoder import Deferred
-from fieldfuse.networks.encoding import DIRECTION, spherical_harmonics
+from fieldfuse.backends.dispatch import OTHERS_GO_ON
+from fieldfuse.nerfusion.decoder import Deferred
+from fieldfuse.nerfusion.encoding import DIRECTION, spherical_harmonics
 from fieldfuse.render.field import Field
 from fieldfuse.render.march import BRICK
 from fieldfuse.render.triton_field import Tables, TritonRenderer, buffers_for, launch_composite, launch_walk

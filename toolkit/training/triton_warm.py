@@ -7,7 +7,7 @@ import torch
 
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture.types import Views
-from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.progress import Progress
 from fieldfuse.render.triton_field import TritonRenderer
 from fieldfuse.render.triton_march import RAYS

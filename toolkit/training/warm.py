@@ -7,7 +7,7 @@ import torch
 
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture.types import Views
-from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.compiled import CompiledRenderer
 from fieldfuse.render.compiled_per_sample import PerSampleRenderer
 from fieldfuse.training.fused import FusedOptimiser

@@ -15,17 +15,17 @@ from fieldfuse.camera import Intrinsics
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import FieldfuseError
-from fieldfuse.evaluate.compare_truth import find_truth, true_depths
+from fieldfuse.evaluation.compare_truth import find_truth, true_depths
 from fieldfuse.files import write_json
+from fieldfuse.nerfusion.training.captured import CapturedScene
+from fieldfuse.nerfusion.training.datasets.dtu import dtu_scene, dtu_scenes
+from fieldfuse.nerfusion.training.datasets.scanned_objects import scanned_object_folders, scanned_object_scene
+from fieldfuse.nerfusion.training.datasets.scannet import scannet_folders, scannet_scene
+from fieldfuse.nerfusion.training.datasets.synthetic import synthetic_folders, synthetic_scene
 from fieldfuse.simulate.mesh_scene import load_mesh_scene
 from fieldfuse.simulate.seen import Rays
-from fieldfuse.training.nerfusion.captured import CapturedScene
-from fieldfuse.training.nerfusion.datasets.dtu import dtu_scene, dtu_scenes
-from fieldfuse.training.nerfusion.datasets.scanned_objects import scanned_object_folders, scanned_object_scene
-from fieldfuse.training.nerfusion.datasets.scannet import scannet_folders, scannet_scene
-from fieldfuse.training.nerfusion.datasets.synthetic import synthetic_folders, synthetic_scene
 from tests.capture.layouts import LAYOUTS
-from tests.training.nerfusion import layouts
+from tests.nerfusion.training import layouts
 
 MESHES = ("ascii.ply", "binary.ply", "coloured.ply", "model.obj", "model.mtl", "picture.png", "model.glb", "model.gltf")
 TRUTH = ("ground_truth/cameras.json", "ground_truth/0.safetensors", "ground_truth/mesh.ply")
@@ -59,7 +59,7 @@ def make_meshes(root: Path) -> None:
 
 def read_meshes(root: Path, number: int) -> None:
     """Each file as a mesh and as a scene to film, with a few rays."""
-    from fieldfuse.evaluate.geometry import read_mesh, surface_points  # here, for workers that read other things: it brings Open3D
+    from fieldfuse.evaluation.geometry import read_mesh, surface_points  # here, for workers that read other things: it brings Open3D
 
     directions = torch.nn.functional.normalize(torch.tensor([[0.1, 0.1, -1.0], [0.0, 0.2, -1.0]]), dim=1)
     rays = Rays(torch.tensor([[0.0, 0.0, 3.0]]), directions, 0.01)
@@ -86,7 +86,7 @@ def make_truth(root: Path) -> None:
 
 def read_truth(root: Path, number: int) -> None:
     """Depth of one view and points of the surface."""
-    from fieldfuse.evaluate.geometry import read_mesh, surface_points
+    from fieldfuse.evaluation.geometry import read_mesh, surface_points
 
     capture = open_capture(root)
     truth = find_truth(capture)

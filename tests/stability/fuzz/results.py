@@ -89,7 +89,7 @@ def make_results(root: Path) -> None:
 
 def _report(root: Path) -> dict[str, Any]:
     """What `fieldfuse.pipelines.summary` gathers of the files in `root`."""
-    from fieldfuse.evaluate.report import report_data
+    from fieldfuse.evaluation.report import report_data
     from fieldfuse.pipelines import kept
 
     scores = kept.read_kept(root / "evaluation.json", kept.EVALUATION)
@@ -117,9 +117,9 @@ def _report(root: Path) -> dict[str, Any]:
 def read_results(root: Path, number: int) -> None:
     """What the report and `info` make of them."""
     from fieldfuse.effects.correct import Corrections
-    from fieldfuse.evaluate.page import render_page
-    from fieldfuse.evaluate.pictures import Pictures
-    from fieldfuse.evaluate.table import table
+    from fieldfuse.evaluation.page import render_page
+    from fieldfuse.evaluation.pictures import Pictures
+    from fieldfuse.evaluation.table import table
     from fieldfuse.pipelines.effects_table import effects_facts
 
     data = _report(root)
@@ -133,9 +133,9 @@ def read_results(root: Path, number: int) -> None:
 
 def make_measured(root: Path) -> None:
     """What `tradeoff`, `compare`, the benchmarks and runs of a total budget leave."""
-    from fieldfuse.evaluate.compare import compare_data
-    from fieldfuse.evaluate.suites import SUITES
-    from fieldfuse.evaluate.tradeoff_page import csv_text, tradeoff_data
+    from fieldfuse.evaluation.compare import compare_data
+    from fieldfuse.evaluation.suites import SUITES
+    from fieldfuse.evaluation.tradeoff_page import csv_text, tradeoff_data
 
     wanted = {"iterations": 10.0, "voxel_size": 1.0, "views": 1.0, "samples": 4, "precision": "float16", "decoder": "deferred"}
     numbers = {"seconds_per_view": 0.2, "peak_memory_mb": 600.0, "memory_mb": 200.0, "disk_bytes": 2_000_000, "ssim": 0.7, "lpips": 0.3}
@@ -190,10 +190,10 @@ def make_measured(root: Path) -> None:
 
 def read_measured(root: Path, number: int) -> None:
     """What the commands that go on from them, or show them, make of each; the worker judges the first that fails."""
-    from fieldfuse.evaluate.compare import compare_data
-    from fieldfuse.evaluate.compare_text import comparison_text
-    from fieldfuse.evaluate.few_views import few_views_table
-    from fieldfuse.evaluate.tradeoff_page import tradeoff_data
+    from fieldfuse.evaluation.compare import compare_data
+    from fieldfuse.evaluation.compare_text import comparison_text
+    from fieldfuse.evaluation.few_views import few_views_table
+    from fieldfuse.evaluation.tradeoff_page import tradeoff_data
     from fieldfuse.pipelines import kept
     from fieldfuse.pipelines.bench_table import sections
     from fieldfuse.pipelines.tradeoff_sweep import rows_at

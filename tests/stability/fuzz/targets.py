@@ -24,7 +24,7 @@ from fieldfuse.capture.types import Capture, Views
 from fieldfuse.capture.video import iterate_video, read_video
 from fieldfuse.capture.views_file import load_views, save_views
 from fieldfuse.config import CaptureSettings, load_settings
-from fieldfuse.evaluate.selftest.edit import aimed_rays, small_field
+from fieldfuse.evaluation.selftest.edit import aimed_rays, small_field
 from fieldfuse.files import read_json, write_json
 from fieldfuse.poses.given import given_poses
 from fieldfuse.render.field import Field

@@ -1,0 +1,119 @@
+"""The quick self-test behind `fieldfuse.evaluation.budget`: a few seconds that tell what a unit of each kind of work takes here."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import torch
+
+from fieldfuse.config import Settings
+from fieldfuse.evaluation.budget import KINDS, Speed
+from fieldfuse.evaluation.speed_state import around, lens, sphere_field, sphere_pixels
+
+SECONDS = 0.4  # for each kind, after a first call that does not count
+SIDE = 128  # voxels and pixels a side of what is rendered and fitted
+RAYS = 1024
+
+
+def self_test(settings: Settings) -> Speed:
+    """Units of every kind in seconds: a megapixel decoded, a picture's features found and matched, a ray rendered, a ray fitted, a
+    megapixel scored."""
+    from fieldfuse.progress import SILENT
+    from fieldfuse.stereo import quick
+    from fieldfuse.training import depth_start
+    from fieldfuse.training.engine import warm_up
+
+    warm_up(settings, SILENT)
+    quick.warm_up()
+    depth_start.warm_up()
+    makers: dict[str, Callable[[], tuple[Callable[[], object], float]]] = {
+        "decode": _decode,
+        "features": _features,
+        "ray": _ray,
+        "fit": _fit,
+        "score": _score,
+    }
+    units = {}
+    for kind in KINDS:
+        work, amount = makers[kind]()
+        units[kind] = _each(work) / amount
+    return Speed(units)
+
+
+def _each(work: Callable[[], object]) -> float:
+    """Seconds of one call, the mean over `SECONDS`: other load on the machine counts as it comes."""
+    work()
+    start, count = time.perf_counter(), 0
+    while count == 0 or time.perf_counter() - start < SECONDS:
+        work()
+        count += 1
+    return (time.perf_counter() - start) / count
+
+
+def texture(height: int, width: int) -> np.ndarray:
+    """(height, width, 3) uint8 with detail at several scales, as a photo has."""
+    generator = np.random.default_rng(0)
+    out = np.zeros((height, width, 3))
+    for step in (4, 8, 16, 64):
+        noise = generator.random((height // step + 1, width // step + 1, 3))
+        out += cv2.resize(noise, (width, height), interpolation=cv2.INTER_CUBIC) / 4
+    return np.clip(out * 255, 0, 255).astype(np.uint8)
+
+
+def _decode() -> tuple[Callable[[], object], float]:
+    _, data = cv2.imencode(".jpg", texture(480, 640))
+
+    def work() -> None:
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        assert picture is not None
+        cv2.resize(picture, (320, 240), interpolation=cv2.INTER_AREA)
+
+    return work, 640 * 480 / 1e6
+
+
+def _features() -> tuple[Callable[[], object], float]:
+    from fieldfuse.poses.points import FEATURES, mutual_matches
+
+    grey = cv2.cvtColor(texture(480, 640), cv2.COLOR_RGB2GRAY)
+    finder = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.02)
+
+    def work() -> None:
+        _, found = finder.detectAndCompute(grey, None)
+        unit = found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)
+        for _ in range(3):  # as many pairs as there are for each picture
+            mutual_matches(unit, unit)
+
+    return work, 1.0
+
+
+def _ray() -> tuple[Callable[[], object], float]:
+    from fieldfuse.render.image import make_renderer, render_view
+
+    field = sphere_field(SIDE)
+    view, pose, camera = make_renderer(field), around()[0], lens(SIDE, SIDE)
+    return lambda: render_view(field, camera, pose, view), float(SIDE * SIDE)
+
+
+def _fit() -> tuple[Callable[[], object], float]:
+    from fieldfuse.training.fused import FusedOptimiser
+    from fieldfuse.training.step import Rates
+
+    engine, rates = FusedOptimiser(sphere_field(SIDE), sphere_pixels(), 0), Rates(0.01, 0.01, 0.001, 0.01, 0.01)
+    return lambda: engine.step(RAYS, rates), float(RAYS)
+
+
+def _score() -> tuple[Callable[[], object], float]:
+    from fieldfuse.evaluation.images import lpips, psnr, ssim
+
+    generator = np.random.default_rng(0)
+    first, second = (generator.integers(0, 256, (120, 160, 3), dtype=np.uint8) for _ in range(2))
+
+    def work() -> None:
+        for measure in (psnr, ssim, lpips):
+            measure(first, second, None)
+
+    with torch.no_grad():
+        return work, 120 * 160 / 1e6

@@ -1,0 +1,158 @@
+"""The report of a run: `report.json` with keys that others rely on, and a self-contained `report.html` for people."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fieldfuse import __version__
+from fieldfuse.errors import InputError
+from fieldfuse.evaluation.pictures import Pictures
+from fieldfuse.evaluation.words import SCORE
+from fieldfuse.files import atomic_path, write_json
+
+JSON = "report.json"
+HTML = "report.html"
+
+# Always there, null when not known.
+CAPTURE = ("kind", "frames", "width", "height")
+POSES = ("source", "registered", "total", "models")
+STAGE = ("name", "seconds", "peak_memory_mb", "cached")
+FIELD = ("voxel_size", "blocks", "voxels", "bytes")
+POINT = ("seconds", "psnr")
+SFM_NOTE = (
+    "Camera poses were computed from all pictures, test views included; "
+    "the colours of test views were never shown to anything that fits appearance."
+)
+
+
+def plain(value: Any) -> Any:
+    """`value` as JSON data: NumPy becomes Python, paths and other objects text, what is not finite null."""
+    if value is None or isinstance(value, (bool, str)):
+        return value
+    if isinstance(value, np.bool_):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, dict):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [plain(entry) for entry in value]
+    return str(value)
+
+
+def _part(value: Any, keys: tuple[str, ...], name: str) -> dict[str, Any]:
+    """A dict with all of `keys` first (null when missing), then whatever else it holds.
+
+    Raises:
+        InputError: it is not a dict.
+    """
+    if value is None:
+        value = {}
+    if not isinstance(value, dict):
+        raise InputError(f"the report's part {name!r} is a {type(value).__name__}; it must be a table of names and values")
+    return {**dict.fromkeys(keys), **value}
+
+
+def _parts(value: Any, keys: tuple[str, ...], name: str) -> list[dict[str, Any]]:
+    if not isinstance(value, (list, type(None))):
+        raise InputError(f"the report's part {name!r} is a {type(value).__name__}; it must be a list")
+    return [_part(entry, keys, name) for entry in value or []]
+
+
+def _exports(entries: list[dict[str, Any]], folder: Path | None) -> list[dict[str, Any]]:
+    """Exports with their path relative to the report's folder, and their size when the file is there; a path elsewhere is kept as it is."""
+    out = []
+    for entry in entries:
+        entry = dict(entry)
+        if folder is not None and entry["path"]:
+            path = folder / str(entry["path"])
+            try:
+                entry["path"] = path.resolve().relative_to(folder.resolve()).as_posix()
+                entry["bytes"] = path.stat().st_size if entry["bytes"] is None and path.is_file() else entry["bytes"]
+            except (OSError, ValueError):
+                pass
+        out.append(entry)
+    return out
+
+
+def report_data(data: dict[str, Any], folder: Path | None = None) -> dict[str, Any]:
+    """`data` in the fixed form of `report.json`, plain JSON. Applying it twice changes nothing.
+
+    Raises:
+        InputError: a part is not of the form that `write_report` describes.
+    """
+    data = plain(data)
+    if not isinstance(data, dict):
+        raise InputError(f"a report is made of a table of names and values, not of a {type(data).__name__}")
+    evaluation = _part(data.get("evaluation"), ("field", "tsdf"), "evaluation")
+    for method in ("field", "tsdf", "network"):
+        if evaluation.get(method) is not None:
+            evaluation[method] = _part(evaluation[method], SCORE, f"evaluation.{method}")
+    floor = data.get("baseline") or evaluation.get("nearest_image")
+    evaluation["nearest_image"] = None if floor is None else _part(floor, ("views", "psnr"), "baseline")
+    poses = _part(data.get("poses"), POSES, "poses")
+    notes = [str(note) for note in data.get("notes") or []]
+    if poses["source"] == "sfm" and (evaluation["field"] or evaluation["tsdf"]) and SFM_NOTE not in notes:
+        notes.append(SFM_NOTE)
+    exports = data.get("exports")
+    if isinstance(exports, str):
+        exports = [exports]
+    if isinstance(exports, list):
+        exports = [{"path": entry} if isinstance(entry, str) else entry for entry in exports]
+    known = {
+        "version": data.get("version") or __version__,
+        "command": data.get("command"),
+        "source": data.get("source"),
+        "created": data.get("created"),
+        "seconds_total": data.get("seconds_total"),
+        "warnings": [str(warning) for warning in data.get("warnings") or []],
+        "notes": notes,
+        "capture": _part(data.get("capture"), CAPTURE, "capture"),
+        "poses": poses,
+        "scene": data.get("scene"),
+        "field": _part(data.get("field"), FIELD, "field"),
+        "evaluation": evaluation,
+        "timeline": _parts(data.get("timeline"), POINT, "timeline"),
+        "stages": _parts(data.get("stages"), STAGE, "stages"),
+        "exports": _exports(_parts(exports, ("path", "bytes"), "exports"), folder),
+        "settings": data.get("settings") or {},
+    }
+    return {**known, **{key: value for key, value in data.items() if key not in known and key != "baseline"}}
+
+
+def write_report(folder: Path | str, data: dict[str, Any], pictures: Pictures | None = None) -> tuple[Path, Path]:
+    """Write `report.json` and `report.html` into `folder`.
+
+    Args:
+        folder: the run's folder; exports are linked relative to it.
+        data: all parts are optional, extra keys are kept in the JSON. `version`, `command`, `source`, `created` (text), `seconds_total`;
+            `warnings`, `notes` (lists of sentences); `capture` {kind, frames, width, height}; `poses` {source, registered, total, models,
+            missing}; `scene` {metric, …}; `field` {voxel_size, blocks, voxels, bytes}; `evaluation` {field, tsdf} as `score_views` answers;
+            `baseline` as `nearest_image_scores` answers (in the JSON it is `evaluation.nearest_image`); `timeline` [{seconds, psnr}];
+            `stages` [{name, seconds, peak_memory_mb, cached}]; `exports` [{path, bytes, facts}] or paths; `settings` (nested plain data).
+        pictures: as `method_pictures` answers; None: none.
+
+    Returns:
+        the paths of the JSON and of the HTML file.
+
+    Raises:
+        InputError: a part has another form.
+        OutputError: the folder is not writable or the disk is full.
+    """
+    from fieldfuse.evaluation.page import render_page  # the template engine and the plots are needed only here
+
+    folder = Path(folder)
+    whole = report_data(data, folder)
+    html = render_page(whole, pictures or Pictures())
+    write_json(folder / JSON, whole)
+    with atomic_path(folder / HTML) as temporary:
+        temporary.write_text(html, encoding="utf-8")
+    return folder / JSON, folder / HTML

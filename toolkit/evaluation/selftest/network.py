@@ -1,0 +1,178 @@
+"""Networks: encodings, decoders, block convolution and aggregation over views, at the edges of their range."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from fieldfuse.evaluation.selftest import reference
+from fieldfuse.evaluation.selftest.case import Measure, absolute, by_size, case, not_finite
+from fieldfuse.evaluation.selftest.lookup import lattice, scattered_blocks
+from fieldfuse.nerfusion.aggregate import aggregate, evidence
+from fieldfuse.nerfusion.block_conv import block_conv3d
+from fieldfuse.nerfusion.decoder import make_decoder
+from fieldfuse.nerfusion.encoding import positional, spherical_harmonics
+from fieldfuse.volume.topology import Topology
+
+GROUP = "networks"
+
+
+def _directions() -> Tensor:
+    axes = torch.cat([torch.eye(3), -torch.eye(3)])
+    tiny = torch.nn.functional.normalize(torch.tensor([[1.0, 1e-20, -1e-30], [1e-8, 1.0, 1e-8]]), dim=1)
+    return torch.cat([axes, tiny, torch.nn.functional.normalize(torch.randn(200, 3), dim=1)])
+
+
+@case(GROUP, "encodings of directions and features against float64")
+def encodings(folder: Path) -> list[Measure]:
+    directions = _directions()
+    basis = spherical_harmonics(directions.double())
+    share = 4 * math.pi * (basis[8:].T @ basis[8:]) / 200  # orthonormal up to the noise of 200 directions
+    values = torch.cat([torch.linspace(-1, 1, 101), torch.tensor([0.0, -0.0, 1e-30])])[:, None]
+    exact = []
+    for value in values[:, 0].double().tolist():
+        angles = [2**k * math.pi * value for k in range(5)]
+        exact.append([value, *map(math.sin, angles), *map(math.cos, angles)])
+    large = positional(torch.tensor([[1e4], [3e7], [-1e30]]), 5)
+    return [
+        Measure("harmonics", absolute(spherical_harmonics(directions), basis), 5e-7),
+        Measure("harmonics that are not orthonormal", absolute(share, torch.eye(basis.shape[1])), 0.6),
+        Measure("sines and cosines", absolute(positional(values, 5), exact), 1e-5),
+        Measure("of huge features: beyond [-1, 1] or not finite", not_finite(large) + float((large[:, 1:].abs() > 1).sum()), 0.0),
+    ]
+
+
+@case(GROUP, "decoders on huge, tiny and zero features, in float32 and under autocast")
+def decoders(folder: Path) -> list[Measure]:
+    out = []
+    directions = _directions()
+    for kind in ("deferred", "per_sample"):
+        torch.manual_seed(3)
+        net = make_decoder(kind, 8, 32)
+        for parameter in net.parameters():
+            parameter.data.add_(0.1 * torch.randn(parameter.shape))
+        double = make_decoder(kind, 8, 32).double()
+        double.load_state_dict({name: value.double() for name, value in net.state_dict().items()})
+        worst, wrong = 0.0, 0.0
+        for size in (0.0, 1e-20, 1.0, 1e4):
+            features = (torch.randn(len(directions), 8) * size).requires_grad_(True)
+            got = net(features, directions)
+            exact = double(features.double(), directions.double())
+            got, exact = (got, exact) if kind == "deferred" else (got[1], exact[1])
+            got.sum().backward()
+            assert features.grad is not None
+            # Features of 1e4 turn by thousands of periods in the paper's encoding: only finiteness can be asked for there.
+            worst = max(worst, absolute(got, exact) if size <= 1 else 0.0)
+            wrong += not_finite(got, features.grad) + float(((got < 0) | (got > 1)).sum())
+            for reduced in (torch.bfloat16, torch.float16):
+                with torch.autocast("cpu", dtype=reduced):
+                    low = net(features.detach(), directions)
+                low = low if kind == "deferred" else low[1]
+                wrong += not_finite(low.float())
+                if size <= 1:
+                    name = f"{kind}, features ×{size:g}, {str(reduced)[6:]}"
+                    out.append(Measure(name, absolute(low.float(), exact), 8 * float(torch.finfo(reduced).eps)))
+        out.append(Measure(f"{kind}: colour", worst, 5e-6))
+        out.append(Measure(f"{kind}: not finite or outside [0, 1]", wrong, 0.0))
+    return out
+
+
+def convolution_errors(topology: Topology, occupied: Tensor, seed: int) -> dict[str, float]:
+    """Errors of a block convolution and of its input's gradient against dictionaries of voxels."""
+    generator = torch.Generator().manual_seed(seed)
+    rows = torch.randn(topology.zero_row, 2, generator=generator)
+    rows[~occupied] = 0
+    weight, bias = torch.randn(3, 2, 3, 3, 3, generator=generator), torch.randn(3, generator=generator)
+    pull = torch.randn(topology.zero_row, 3, generator=generator)
+    places = [tuple(place) for place in lattice(topology).tolist()]
+    held = occupied.tolist()
+    values = {place: row for place, row, one in zip(places, rows.double().tolist(), held, strict=True) if one}
+    pulls = {place: row for place, row, one in zip(places, pull.double().tolist(), held, strict=True) if one}
+    pick = occupied.nonzero().squeeze(1)[:: max(1, int(occupied.sum()) // 60)].tolist()
+    exact = [reference.convolution(values, weight.double().tolist(), bias.double().tolist(), places[row]) for row in pick]
+    turned = weight.double().flip(2, 3, 4).transpose(0, 1).tolist()
+    back = [reference.convolution(pulls, turned, [0.0, 0.0], places[row]) for row in pick]
+    leaf = rows.clone().requires_grad_(True)
+    out = block_conv3d(leaf, topology, weight, bias, occupied)
+    (out * pull).sum().backward()
+    assert leaf.grad is not None
+    out = out.detach()
+    return {
+        "value": by_size(out[pick], exact) if pick else 0.0,
+        "gradient": by_size(leaf.grad[pick], back) if pick else 0.0,
+        "values at empty voxels": float(out[~occupied].abs().sum()),
+        "values that are not finite": not_finite(out, leaf.grad),
+    }
+
+
+@case(GROUP, "block convolution: touching, lonely and empty blocks")
+def convolution(folder: Path) -> list[Measure]:
+    out = []
+    for name, topology, share in (
+        ("touching", scattered_blocks(8, 1, 1), 0.4),
+        ("lonely", Topology(torch.tensor([[0, 0, 0], [900, -900, 7]])), 1.0),
+        ("empty", scattered_blocks(3, 2), 0.0),
+    ):
+        occupied = torch.rand(topology.zero_row, generator=torch.Generator().manual_seed(2)) < share
+        for what, error in convolution_errors(topology, occupied, 3).items():
+            out.append(Measure(f"{name}: {what}", error, 2e-6 if what in ("value", "gradient") else 0.0))
+    topology = scattered_blocks(8, 1, 1)
+    rows, weight = torch.randn(topology.zero_row, 4), torch.randn(4, 4, 3, 3, 3) * 0.1
+    exact = block_conv3d(rows.double(), topology, weight.double())
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        low = block_conv3d(rows, topology, weight)
+    out.append(Measure("under bfloat16 autocast, by the largest", by_size(low.float(), exact), 4 * float(torch.finfo(torch.bfloat16).eps)))
+    none = Topology(torch.zeros((0, 3), dtype=torch.int32))
+    out.append(Measure("rows of no blocks", float(len(block_conv3d(torch.zeros(1, 4), none, weight)) - 1), 0.0))
+    return out
+
+
+def aggregation_errors(values: Tensor, visible: Tensor) -> dict[str, float]:
+    """Mean and variance over views against sums of float64 numbers, by the size of the values."""
+    leaf = values.clone().requires_grad_(True)
+    mean, variance, count = aggregate(leaf, visible)
+    (mean.sum() + variance.sum()).backward()
+    assert leaf.grad is not None
+    mean, variance = mean.detach(), variance.detach()
+    wide = values.double()
+    means, variances = torch.zeros(values.shape[1:], dtype=torch.float64), torch.zeros(values.shape[1:], dtype=torch.float64)
+    for voxel in range(values.shape[1]):
+        seen = wide[visible[:, voxel], voxel]
+        means[voxel] = seen.sum(0) / len(seen)
+        variances[voxel] = ((seen - means[voxel]) ** 2).sum(0) / len(seen)
+    read = evidence(mean, variance, count, torch.full((values.shape[1],), 3.0), torch.zeros(values.shape[1]))
+    size = float(wide.abs().max())
+    rounding = 1e-6 * variances + (3e-7 * size) ** 2 + 4e-7 * size * variances.sqrt()  # of the values themselves, carried on
+    return {
+        "mean, by the largest value": absolute(mean, means) / size,
+        "variance, beyond the rounding of its inputs": float(((variance.double() - variances).abs() / rounding).max()),
+        "variance seen once that is not zero": float(variance[count == 1].abs().sum()),
+        "negative variances": float((variance < 0).sum()),
+        "values that are not finite": not_finite(mean, variance, read, leaf.grad),
+    }
+
+
+@case(GROUP, "aggregation: one view, identical views, mean 1e4 with variance 1e-4")
+def aggregation(folder: Path) -> list[Measure]:
+    torch.manual_seed(5)
+    one = torch.zeros(3, 40, dtype=torch.bool)
+    one[1] = True
+    some = torch.rand(3, 40) < 0.6
+    some[0] |= ~some.any(0)
+    every = torch.ones(3, 40, dtype=torch.bool)
+    sets = {
+        "seen once": (torch.randn(3, 40, 4), one),
+        "identical": (torch.randn(1, 40, 4).expand(3, 40, 4).contiguous(), every),
+        "mean 1e4, variance 1e-4": (1e4 + 1e-2 * torch.randn(3, 40, 4), every),
+        "tiny": (torch.randn(3, 40, 4) * 1e-18, some),
+        "some unseen": (torch.randn(3, 40, 4), some),
+    }
+    bounds = {"mean, by the largest value": 1e-6, "variance, beyond the rounding of its inputs": 1.0}
+    out = []
+    for name, (values, visible) in sets.items():
+        for what, error in aggregation_errors(values, visible).items():
+            out.append(Measure(f"{name}: {what}", error, bounds.get(what, 0.0)))
+    return out

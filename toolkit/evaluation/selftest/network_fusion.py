@@ -1,0 +1,154 @@
+"""Networks, recurrent fusion: against sums in float64, over ten thousand frames, and where gates, volumes and weights are at their ends."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from fieldfuse.evaluation.selftest.case import Measure, absolute, by_size, case, not_finite
+from fieldfuse.nerfusion.gru import LEAST, FusionGRU, RunningMean
+from fieldfuse.nerfusion.training.health import saturation
+from fieldfuse.volume.topology import Topology
+
+GROUP = "networks"
+SIZE = 512  # corners of one block
+
+
+def one_block() -> tuple[Topology, Tensor, Tensor]:
+    """A block, which of its corners are inside, and the same with the zero row, (513, 1)."""
+    inside = torch.rand(SIZE) < 0.2
+    return Topology(torch.zeros((1, 3), dtype=torch.int64)), inside, torch.cat([inside, inside.new_zeros(1)])[:, None]
+
+
+def recurrence_errors(frames: int) -> dict[str, float]:
+    """Run the recurrence over random frames, every hundredth a thousand times as large, and look at what comes out."""
+    topology, inside, mask = one_block()
+    gru, mean = FusionGRU(4, 8), RunningMean()
+    state, average = torch.zeros(SIZE + 1, 4), torch.zeros(SIZE + 1, 4)
+    count = torch.zeros(SIZE)
+    largest, wrong = 0.0, 0.0
+    with torch.no_grad():
+        for frame in range(frames):
+            raw = torch.randn(SIZE + 1, 4) * (1e3 if frame % 100 == 99 else 1.0) * mask
+            local, weight = torch.tanh(raw), torch.rand(SIZE) * inside * (0 if frame % 50 == 49 else 1)
+            state = gru(state, count, local, raw, weight, topology, inside) * mask
+            average = mean(average, count, local, raw, weight, topology, inside) * mask
+            count += weight
+            largest = max(largest, float(state.abs().max()), float(average.abs().max()))
+            wrong += not_finite(state, average)
+    return {"state beyond ±1": max(0.0, largest - 1), "values that are not finite": wrong}
+
+
+@case(GROUP, "recurrent fusion: 200 frames stay bounded")
+def recurrence(folder: Path) -> list[Measure]:
+    return [Measure(name, error, 1e-6 if name.startswith("state") else 0.0) for name, error in recurrence_errors(200).items()]
+
+
+@case(GROUP, "recurrent fusion: 10,000 frames stay bounded", slow=True)
+def long_recurrence(folder: Path) -> list[Measure]:
+    return [Measure(name, error, 1e-6 if name.startswith("state") else 0.0) for name, error in recurrence_errors(10_000).items()]
+
+
+@case(GROUP, "recurrent fusion: ten frames against weighted means and float64, gradients too")
+def recurrence_exact(folder: Path) -> list[Measure]:
+    """With gates that say nothing the state is the weighted mean of the frames: its value and its slopes are known in closed form."""
+    topology, inside, mask = one_block()
+    frames = 10
+    raw, weight = torch.randn(frames, SIZE + 1, 4) * mask, (torch.rand(frames, SIZE) * 0.9 + 0.1) * inside
+    wide = torch.tanh(raw.double())
+    share = weight.double() / weight.double().sum(0).clamp_min(1e-30)
+    exact = (wide[:, :-1] * share[:, :, None]).sum(0)
+    slope = (1 - wide[:, :-1] ** 2) * share[:, :, None]
+    out = []
+    silent = FusionGRU(4, 8)
+    for gate in (silent.update, silent.reset, silent.candidate):
+        for parameter in list(gate.parameters())[-2:]:
+            parameter.data.zero_()
+    for name, fusion in (("silent gates", silent), ("running mean", RunningMean())):
+        leaf = raw.clone().requires_grad_(True)
+        state = _run(fusion, leaf, weight, topology, inside, mask)
+        state.sum().backward()
+        assert leaf.grad is not None
+        out.append(Measure(f"{name}: value", absolute(state[:-1][inside], exact[inside]), 1e-6))
+        out.append(Measure(f"{name}: gradient, by the largest", by_size(leaf.grad[:, :-1][:, inside], slope[:, inside]), 5e-6))
+    gru = FusionGRU(4, 8)
+    double = FusionGRU(4, 8).double()
+    double.load_state_dict({key: value.double() for key, value in gru.state_dict().items()})
+    leaf, twin = raw.clone().requires_grad_(True), raw.double().requires_grad_(True)
+    state, truth = _run(gru, leaf, weight, topology, inside, mask), _run(double, twin, weight.double(), topology, inside, mask)
+    state.sum().backward()
+    truth.sum().backward()
+    assert leaf.grad is not None and twin.grad is not None
+    out.append(Measure("open gates: value", absolute(state, truth), 2e-6))
+    out.append(Measure("open gates: gradient, by the largest", by_size(leaf.grad, twin.grad), 1e-5))
+    weights = zip(gru.parameters(), double.parameters(), strict=True)
+    out.append(Measure("open gates: gradient of the weights, by the largest", max(by_size(a.grad, b.grad) for a, b in weights), 1e-5))
+    return out
+
+
+def _run(fusion: FusionGRU | RunningMean, raw: Tensor, weight: Tensor, topology: Topology, inside: Tensor, mask: Tensor) -> Tensor:
+    """(frames, 513, C), (frames, 512) → the state after all of them."""
+    state, count = torch.zeros_like(raw[0]), torch.zeros_like(weight[0])
+    for frame, one in zip(raw, weight, strict=True):
+        state = fusion(state, count, torch.tanh(frame), frame, one, topology, inside) * mask
+        count = count + one
+    return state
+
+
+@case(GROUP, "recurrent fusion: first frame, saturated gates, the same frame twice, an empty local volume, weights from 0 to 1e6")
+def recurrence_edges(folder: Path) -> list[Measure]:
+    topology, inside, mask = one_block()
+    gru, mean = FusionGRU(4, 8), RunningMean()
+    none, once = torch.zeros(SIZE), inside.float()
+    raw = (torch.randn(SIZE + 1, 4) * mask).requires_grad_(True)
+    first = gru(torch.zeros(SIZE + 1, 4), none, torch.tanh(raw), raw, once, topology, inside)
+    first[:-1][inside].sum().backward()
+    assert raw.grad is not None
+    held = torch.full((SIZE + 1, 4), 0.5) * mask
+    large = (torch.full((SIZE + 1, 4), 1e4) * mask).requires_grad_(True)
+    saturated = gru(held, once, torch.tanh(large), large, once, topology, inside)
+    saturated.sum().backward()
+    assert large.grad is not None
+    nothing = torch.zeros(SIZE + 1, 4)
+    empty = gru(held, once, nothing, nothing, none, topology, torch.zeros(SIZE, dtype=torch.bool))
+    value = torch.tanh(raw.detach()) * mask
+    twice = mean(mean(torch.zeros(SIZE + 1, 4), none, value, value, once, topology, inside), once, value, value, once, topology, inside)
+    # A key frame that sees nothing weighs LEAST, not zero: what was known hardly changes, and where nothing was, it counts.
+    unseen = mean(held, once, value, value, none, topology, inside)
+    drift = LEAST / (LEAST + 1)
+    heavy = [module(held, once, value, raw.detach(), once * 1e6, topology, inside) for module in (gru, mean)]
+    return [
+        Measure("values that are not finite", not_finite(first, saturated, empty, raw.grad, large.grad, unseen, *heavy), 0.0),
+        Measure("first frame without a gradient", float(raw.grad[:-1][inside].abs().sum() == 0), 0.0),
+        Measure("mean of the same frame twice", absolute(twice, value), 2e-7),
+        Measure("known by a frame that weighs nothing", absolute(unseen, (1 - drift) * held.double() + drift * value.double()), 1e-6),
+        Measure("mean with a frame of a million", absolute(heavy[1], value), 3e-6),
+        Measure("state beyond ±1", max(0.0, *(float(state.detach().abs().max()) - 1 for state in (*heavy, saturated))), 1e-6),
+    ]
+
+
+@case(GROUP, "recurrent fusion: stuck gates are reported, open ones pass a gradient")
+def stuck_gates(folder: Path) -> list[Measure]:
+    """A gate at its end passes hardly any gradient: what counts is that its share is measured and shown (`GateWatch`)."""
+    topology = Topology(torch.zeros((1, 3), dtype=torch.int64))
+    inside, once = torch.ones(SIZE, dtype=torch.bool), torch.ones(SIZE)
+    out = []
+    for name, bias, wanted in (("open", 0.0, 0.0), ("stuck", 1e3, 1.0), ("shut", -1e3, 1.0)):
+        torch.manual_seed(0)
+        gru = FusionGRU(4, 8)
+        seen: list[float] = []
+        hook = gru.update.register_forward_hook(lambda module, given, answer, seen=seen: seen.append(saturation(torch.sigmoid(answer))))
+        last = [parameter for key, parameter in gru.update.named_parameters() if key.endswith("bias")][-1]
+        last.data.fill_(bias)
+        raw = torch.randn(SIZE + 1, 4).requires_grad_(True)
+        state = gru(torch.full((SIZE + 1, 4), 0.3), once, torch.tanh(raw), raw, once, topology, inside)
+        state[:-1].sum().backward()
+        hook.remove()
+        assert raw.grad is not None
+        out.append(Measure(f"{name}: share of saturated gates, off by", abs(seen[0] - wanted), 0.05))
+        out.append(Measure(f"{name}: values that are not finite", not_finite(state, raw.grad), 0.0))
+        if name == "open":
+            out.append(Measure("open: no gradient", float(raw.grad.abs().sum() == 0), 0.0))
+    return out

@@ -1,0 +1,253 @@
+"""Marching through a bounded lattice against brute force: every lattice plane that a ray crosses, sorted, in float64."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from fieldfuse.evaluation.selftest import reference
+from fieldfuse.evaluation.selftest.case import Measure, case, not_finite
+from fieldfuse.render.march import MarchGrid, march
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
+
+GROUP = "rays"
+ROUNDING = 2e-3  # of a voxel: how far float32 may move a sample over a border
+SPLIT = 1e-2  # of a step: how well the samples' intervals must tile what they cover
+BOUNDS = {
+    "samples where nothing is occupied": 0.0,
+    "samples told to be in another voxel": 0.0,
+    "gap or overlap between samples, in steps": SPLIT,
+    "gap at the ends of what is occupied, in steps": 1.0 + SPLIT,
+    "length in occupied voxels, in steps a piece": 1.0 + SPLIT,
+    "values that are not finite": 0.0,
+}
+
+
+def lattice_grid(resolution: int, share: float, seed: int = 0, half: float = 1.0, shell: float = 0.0) -> MarchGrid:
+    """A lattice round the origin with `share` of its voxels occupied."""
+    generator = torch.Generator().manual_seed(seed)
+    line = torch.arange(resolution // BLOCK)
+    topology = Topology(torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1).view(-1, 3))
+    occupied = torch.rand(topology.zero_row, generator=generator) < share
+    return MarchGrid(Space((0.0, 0.0, 0.0), half, shell), resolution, topology, occupied)
+
+
+def march_errors(
+    grid: MarchGrid, origins: Tensor, directions: Tensor, near: float = 0.0, fine: int = 4, jitter: Tensor | None = None
+) -> dict[str, float]:
+    """Samples along (B, 3) rays against the exact pieces of these rays that lie in occupied voxels (no contraction)."""
+    half, voxel = grid.space.half, grid.voxel
+    samples = march(grid, origins, directions, near, fine, jitter)
+    slots = {tuple(key): slot for slot, key in enumerate(grid.topology.keys.tolist())}
+    occupied = grid.occupied.tolist()
+    step = voxel * (BLOCK // 2) / fine  # normalised units
+    worst = dict.fromkeys(BOUNDS, 0.0)
+    worst["values that are not finite"] = not_finite(samples.distance, samples.length, samples.inside)
+    of_ray: dict[int, list[tuple[float, float, int]]] = {}
+    for ray, distance, length, cell in zip(
+        samples.ray.tolist(), samples.distance.double().tolist(), samples.length.double().tolist(), samples.cell.tolist(), strict=True
+    ):
+        of_ray.setdefault(ray, []).append((distance / half, length, cell))
+    for ray, (o, d) in enumerate(zip(origins.double().tolist(), directions.double().tolist(), strict=True)):
+        origin = (o[0] / half, o[1] / half, o[2] / half)
+        pieces = []
+        for start, stop, (x, y, z) in reference.crossings(origin, (d[0], d[1], d[2]), (-1.0, -1.0, -1.0), voxel, grid.resolution):
+            row = slots[x >> 3, y >> 3, z >> 3] * VOXELS + ((z & 7) * BLOCK + (y & 7)) * BLOCK + (x & 7)
+            if occupied[row] and stop > near / half:
+                pieces.append((max(start, near / half), stop, row))
+        speed = math.dist((0, 0, 0), d)
+        _compare(worst, pieces, of_ray.get(ray, []), step, voxel, speed)
+    return worst
+
+
+def _compare(
+    worst: dict[str, float],
+    pieces: list[tuple[float, float, int]],
+    samples: list[tuple[float, float, int]],
+    step: float,
+    voxel: float,
+    speed: float,
+) -> None:
+    """One ray: its occupied pieces (in, out, row) and its samples (distance, length, row), all in normalised units."""
+    slack = ROUNDING * voxel / speed
+    joined: list[list[float]] = []
+    for start, stop, _ in pieces:
+        if joined and start - joined[-1][1] < slack:
+            joined[-1][1] = stop
+        else:
+            joined.append([start, stop])
+    for distance, _, cell in samples:
+        near_by = [row for start, stop, row in pieces if start - slack <= distance <= stop + slack]
+        worst["samples where nothing is occupied"] += not near_by
+        worst["samples told to be in another voxel"] += bool(near_by) and cell not in near_by
+    solid = [piece for piece in joined if piece[1] - piece[0] > 2 * slack]
+    covered = sum(length for _, length, _ in samples) / speed
+    exact = sum(stop - start for start, stop in joined)
+    if joined:
+        share = abs(covered - exact) * speed / (step * len(joined))
+        worst["length in occupied voxels, in steps a piece"] = max(worst["length in occupied voxels, in steps a piece"], share)
+    for start, stop in solid:
+        inside = [(t, length) for t, length, _ in samples if start - slack <= t <= stop + slack]
+        marks = [start] + [t for t, _ in inside] + [stop]
+        ends = max(marks[1] - start, stop - marks[-2]) if inside else stop - start
+        key = "gap at the ends of what is occupied, in steps"
+        worst[key] = max(worst[key], ends * speed / step)
+        for (t, length), (following, other) in pairwise(inside):
+            key = "gap or overlap between samples, in steps"
+            worst[key] = max(worst[key], abs((following - t) * speed - 0.5 * (length + other)) / step)
+
+
+def measures(errors: dict[str, float]) -> list[Measure]:
+    return [Measure(name, errors[name], bound) for name, bound in BOUNDS.items()]
+
+
+def unit(directions: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(directions.double(), dim=1).float()
+
+
+def random_rays(count: int, seed: int, away: float = 3.0, spread: float = 0.6) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    origins = unit(torch.randn(count, 3, generator=generator)) * away
+    return origins, unit(torch.randn(count, 3, generator=generator) * spread - origins)
+
+
+@case(GROUP, "random rays through half-empty blocks")
+def random_half_empty(folder: Path) -> list[Measure]:
+    return measures(march_errors(lattice_grid(32, 0.5, 1), *random_rays(60, 2), fine=8))
+
+
+@case(GROUP, "random rays through full blocks: nothing lost or doubled at borders")
+def random_full(folder: Path) -> list[Measure]:
+    return measures(march_errors(lattice_grid(64, 1.0), *random_rays(60, 3)))
+
+
+@case(GROUP, "jittered lattices of steps")
+def jittered(folder: Path) -> list[Measure]:
+    """A ray's first step begins up to a whole step before the lattice: its first sample lies at most half a step outside."""
+    grid = lattice_grid(32, 0.7, 5)
+    origins, directions = random_rays(40, 4)
+    samples = march(grid, origins, directions, jitter=torch.linspace(0, 0.999, 40))
+    outside = (origins[samples.ray] + samples.distance[:, None] * directions[samples.ray]).abs().amax(1) - 1
+    return [
+        Measure("first sample before the lattice, in steps", float(outside.max()) / grid.voxel, 0.5),
+        *measures(march_errors(grid, origins, directions, jitter=torch.linspace(0, 0.49, 40))),
+    ]
+
+
+@case(GROUP, "parallel to faces, both ways along each axis")
+def parallel(folder: Path) -> list[Measure]:
+    axes = torch.cat([torch.eye(3), -torch.eye(3)]).repeat_interleave(4, 0)
+    offset = torch.rand(24, 3, generator=torch.Generator().manual_seed(0)) * 1.8 - 0.9
+    return measures(march_errors(lattice_grid(32, 0.6, 6), -3 * axes + offset * (axes == 0), axes))
+
+
+@case(GROUP, "along edges of voxels and blocks, and through corners")
+def edges_and_corners(folder: Path) -> list[Measure]:
+    grid = lattice_grid(32, 1.0)
+    voxel = grid.voxel
+    along = [
+        (torch.eye(3)[i], torch.tensor([j * voxel, k * voxel, k * voxel]) * (torch.eye(3)[i] == 0))
+        for i in range(3)
+        for j, k in ((0, 8), (3, -8), (0, 0))
+    ]
+    origins = [place - 3 * axis for axis, place in along]
+    directions = [axis for axis, _ in along]
+    for x in (-1.0, 1.0):
+        for y in (-1.0, 1.0):
+            directions += [torch.tensor([x, y, 1.0]), torch.tensor([x, y, 0.0])]
+            origins += [-2 * directions[-2], -2 * directions[-1]]
+    return measures(march_errors(grid, torch.stack(origins), unit(torch.stack(directions))))
+
+
+@case(GROUP, "starting inside, on a face, on a corner")
+def starting_inside(folder: Path) -> list[Measure]:
+    starts = torch.tensor(
+        [[0.0, 0, 0], [0.31, -0.2, 0.77], [1.0, 0.1, 0.2], [-1.0, 0.1, 0.2], [0.25, 0.25, -1.0], [1.0, 1.0, 1.0], [-1.0, -1.0, -1.0]]
+    )
+    aims = unit(torch.randn(6, 3, generator=torch.Generator().manual_seed(3)))
+    origins, directions = starts.repeat_interleave(6, 0), aims.repeat(len(starts), 1)
+    return measures(march_errors(lattice_grid(32, 0.8, 2), origins, directions))
+
+
+@case(GROUP, "pointing away, missing by a hair, no ray at all")
+def missing(folder: Path) -> list[Measure]:
+    grid = lattice_grid(32, 1.0)
+    origins, directions = random_rays(50, 9)
+    hair = torch.tensor([[-3.0, 1.0001, 0], [-3.0, 0, -1.0001], [1.0001, 3.0, 0.5]])
+    ahead = torch.tensor([[1.0, 0, 0], [1.0, 0, 0], [0, -1.0, 0]])
+    none = torch.zeros((0, 3))
+    return [
+        Measure("samples behind the start", float(len(march(grid, origins, -directions))), 0.0),
+        Measure("samples of rays that miss", float(len(march(grid, hair, ahead))), 0.0),
+        Measure("samples without rays", float(len(march(grid, none, none))), 0.0),
+    ]
+
+
+@case(GROUP, "directions with zero, negative zero and tiny components")
+def zero_components(folder: Path) -> list[Measure]:
+    tiny = [0.0, -0.0, 1e-45, -1e-38, 1e-20, -1e-12, 1e-9, 1.1e-9, 1e-6]
+    directions = torch.tensor([[1.0, a, b] for a in tiny for b in tiny[::2]])
+    origins = torch.tensor([[-2.0, 0.11, -0.37]]).repeat(len(directions), 1)
+    return measures(march_errors(lattice_grid(32, 0.6, 8), origins, unit(directions)))
+
+
+@case(GROUP, "grazing the outer faces")
+def grazing(folder: Path) -> list[Measure]:
+    offsets = [1 - 1e-3, 1 - 1e-5, -1 + 1e-3, -1 + 1e-5, -1.0]
+    origins = torch.tensor([[-3.0, offset, 0.2] for offset in offsets] + [[0.4, -3.0, offset] for offset in offsets])
+    directions = torch.tensor([[1.0, 0, 0]] * len(offsets) + [[0, 1.0, 0]] * len(offsets))
+    tilted = unit(directions + torch.tensor([0.0, 0, 1e-4]))
+    grid = lattice_grid(32, 1.0)
+    return measures(march_errors(grid, torch.cat([origins, origins]), torch.cat([directions, tilted])))
+
+
+@case(GROUP, "tiny and huge extents")
+def extents(folder: Path) -> list[Measure]:
+    worst = dict.fromkeys(BOUNDS, 0.0)
+    for half in (1e-6, 1e-3, 1e3, 1e6):
+        origins, directions = random_rays(20, 11)
+        errors = march_errors(lattice_grid(32, 0.7, 3, half), origins * half, directions)
+        worst = {name: max(worst[name], errors[name]) for name in worst}
+    return measures(worst)
+
+
+@case(GROUP, "8³ to 256³ voxels")
+def resolutions(folder: Path) -> list[Measure]:
+    worst = dict.fromkeys(BOUNDS, 0.0)
+    for resolution in (8, 16, 128, 256):
+        errors = march_errors(lattice_grid(resolution, 0.9, 4), *random_rays(8, resolution))
+        worst = {name: max(worst[name], errors[name]) for name in worst}
+    return measures(worst)
+
+
+@case(GROUP, "nothing nearer than `near`")
+def nearest(folder: Path) -> list[Measure]:
+    grid = lattice_grid(32, 1.0)
+    origins, directions = random_rays(30, 6, away=0.5)
+    samples = march(grid, origins, directions, 0.4)
+    early = (0.4 - samples.distance).clamp_min(0).max() / grid.voxel
+    return [Measure("before it, in voxels", float(early), 0.5 + ROUNDING), *measures(march_errors(grid, origins, directions, 0.4))]
+
+
+@case(GROUP, "from 1e2 to 1e5 half sizes away")
+def far_away(folder: Path) -> list[Measure]:
+    """float32 places the samples of a ray that starts 1e5 away only to 0.008: what is stopped in all must still be right."""
+    out = []
+    for away, steps in ((1e2, 1.0), (1e3, 1.0), (1e5, 2.0)):
+        grid = lattice_grid(32, 1.0)
+        origins, directions = random_rays(40, 5, away, 0.3)
+        samples = march(grid, origins, directions)
+        covered = torch.zeros(40, dtype=torch.float64).index_add_(0, samples.ray, samples.length.double())
+        exact = [
+            sum(b - a for a, b, _ in reference.crossings(tuple(o), tuple(d), (-1.0, -1.0, -1.0), grid.voxel, 32)) * math.dist((0, 0, 0), d)
+            for o, d in zip(origins.double().tolist(), directions.double().tolist(), strict=True)
+        ]
+        worst = (covered - torch.tensor(exact, dtype=torch.float64)).abs().max() / (grid.voxel)
+        out.append(Measure(f"length from {away:g} away, in steps", float(worst), steps + SPLIT))
+        out.append(Measure(f"not finite from {away:g} away", not_finite(samples.distance, samples.length, samples.inside), 0.0))
+    return out

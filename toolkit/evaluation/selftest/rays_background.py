@@ -1,0 +1,138 @@
+"""Marching through contracted space, where a lattice ends at infinity: order, finiteness, and how well its steps cover a ray."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from fieldfuse.evaluation.selftest.case import Measure, absolute, case, not_finite, relative
+from fieldfuse.evaluation.selftest.rays import lattice_grid, random_rays, unit
+from fieldfuse.render.march import MarchGrid, march
+from fieldfuse.volume.space import Space
+from fieldfuse.volume.topology import VOXELS
+
+GROUP = "rays with a background"
+
+
+def contracted(point: Tensor, shell: float) -> Tensor:
+    """(N, 3) float64 normalised points, contracted: y where max|y| ≤ 1, else (1 + b − b / n) · y / n."""
+    size = point.abs().amax(1, keepdim=True).clamp_min(1)
+    return point * ((1 + shell - shell / size) / size)
+
+
+def background_errors(grid: MarchGrid, origins: Tensor, directions: Tensor, near: float = 0.0) -> dict[str, float]:
+    """Samples of a full lattice with a shell, against where a float64 ray lies at their distances and how long it is there."""
+    space = grid.space
+    samples = march(grid, origins, directions, near)
+    place = origins.double()[samples.ray] + samples.distance.double()[:, None] * directions.double()[samples.ray]
+    lattice = (contracted(place / space.half, space.shell) + space.extent) / grid.voxel
+    slot, local = samples.cell // VOXELS, samples.cell % VOXELS
+    corner = grid.topology.keys[slot].long() * 8 + torch.stack([local % 8, local // 8 % 8, local // 64], 1)
+    told = corner + samples.inside.double()
+    same = samples.ray[1:] == samples.ray[:-1]
+    covered = torch.zeros(len(origins), dtype=torch.float64).index_add_(0, samples.ray, samples.length.double())
+    return {
+        "sample's voxel against its distance, in voxels": float((told - lattice).abs().amax(1).max()),
+        "widest gap between samples, in voxels": float((told[1:] - told[:-1])[same].norm(dim=1).max()),
+        "samples out of order": float((samples.distance[1:] < samples.distance[:-1])[same].sum()),
+        "samples of empty voxels": float((~grid.occupied[samples.cell]).sum()),
+        "length along the ray, relative": relative(covered, _lengths(grid, origins, directions, near), 0.1),
+        "values that are not finite": not_finite(samples.distance, samples.length, samples.inside),
+        "lengths that are not positive": float((samples.length <= 0).sum()),
+    }
+
+
+def _lengths(grid: MarchGrid, origins: Tensor, directions: Tensor, near: float) -> Tensor:
+    """(B,) contracted length of each ray from `near` to infinity: a polyline through 200,000 points, closer where it bends."""
+    space = grid.space
+    share = torch.linspace(0, 1, 200_001, dtype=torch.float64)[:-1]
+    scale = space.half * (1 + float((origins.double() / space.half).norm(dim=1).max()))
+    distance = near + scale * share / (1 - share)
+    out = []
+    for origin, direction in zip(origins.double(), directions.double(), strict=True):
+        line = contracted((origin + distance[:, None] * direction) / space.half, space.shell)
+        out.append(line.diff(dim=0).norm(dim=1).sum())
+    return torch.stack(out)
+
+
+BOUNDS = {
+    "sample's voxel against its distance, in voxels": 1.0,
+    "widest gap between samples, in voxels": 2.0,
+    "samples out of order": 0.0,
+    "samples of empty voxels": 0.0,
+    "length along the ray, relative": 0.03,
+    "values that are not finite": 0.0,
+    "lengths that are not positive": 0.0,
+}
+
+
+def measures(errors: dict[str, float]) -> list[Measure]:
+    return [Measure(name, errors[name], bound) for name, bound in BOUNDS.items()]
+
+
+@case(GROUP, "from inside and from outside the region")
+def inside_and_outside(folder: Path) -> list[Measure]:
+    grid = lattice_grid(256, 1.0, shell=1.0)
+    origins, directions = random_rays(12, 3)
+    more, ways = random_rays(12, 4, away=0.4)
+    return measures(background_errors(grid, torch.cat([origins, more]), torch.cat([directions, ways])))
+
+
+@case(GROUP, "along axes and diagonals, away from the region")
+def axes_and_away(folder: Path) -> list[Measure]:
+    grid = lattice_grid(256, 1.0, shell=1.0)
+    directions = unit(torch.tensor([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0], [1.0, 1.0, 0], [-1.0, 1.0, 1.0], [1.0, 1e-9, -1e-20]]))
+    origins = torch.cat([torch.zeros(6, 3), 0.9 * directions, -3 * directions])
+    return measures(background_errors(grid, origins, directions.repeat(3, 1)))
+
+
+@case(GROUP, "thin and thick shells, small and large regions, from inside")
+def shells(folder: Path) -> list[Measure]:
+    worst = dict.fromkeys(BOUNDS, 0.0)
+    for shell, half in ((0.5, 1e-3), (1.0, 1e4), (2.0, 5.0)):
+        origins, directions = random_rays(8, 7, away=0.5)
+        errors = background_errors(lattice_grid(256, 1.0, 1, half, shell), origins * half, directions, 0.05 * half)
+        worst = {name: max(worst[name], errors[name]) for name in worst}
+    return measures(worst)
+
+
+@case(GROUP, "starting 5 and 10 half sizes away")
+def far_start(folder: Path) -> list[Measure]:
+    grid = lattice_grid(256, 1.0, shell=1.0)
+    out = []
+    for away in (5.0, 10.0):
+        origins, directions = random_rays(10, 8, away)
+        samples = march(grid, origins, directions)
+        crossing = torch.zeros(10, dtype=torch.int64).index_add_(0, samples.ray, (samples.distance - away).abs().lt(1).long())
+        out.append(Measure(f"rays from {away:g} away without a sample near the region", float((crossing == 0).sum()), 0.0))
+        out.append(Measure(f"not finite from {away:g} away", not_finite(samples.distance, samples.length, samples.inside), 0.0))
+    return out
+
+
+@case(GROUP, "contraction and its inverse, and gradients at its seams")
+def contraction(folder: Path) -> list[Measure]:
+    generator = torch.Generator().manual_seed(0)
+    out = []
+    for shell in (0.25, 1.0, 3.0):
+        space = Space((0.0, 0.0, 0.0), 1.0, shell)
+        size = 10 ** (torch.rand(4000, 1, generator=generator, dtype=torch.float64) * 8 - 4)
+        points = unit(torch.randn(4000, 3, generator=generator)).double() * size
+        wanted = contracted(points, shell)
+        got = space.contract(points.float())
+        near = points.abs().amax(1) < 100
+        out.append(Measure(f"contracted, shell {shell:g}", absolute(got, wanted), 1e-6 * (1 + shell)))
+        back = space.expand(space.contract(points[near]))
+        away = (back - points[near]).abs().amax(1) / points[near].abs().amax(1)
+        out.append(Measure(f"there and back within 100 half sizes, shell {shell:g}, relative", float(away.max()), 1e-9))
+        out.append(Measure(f"outside the lattice, shell {shell:g}", float((got.abs().amax(1) - 1 - shell).clamp_min(0).max()), 0.0))
+        seams = torch.tensor([[1.0, 1.0, 1.0], [1.0, -1.0, 0], [1.0, 0, 0], [0, 0, 0], [1e-30, 0, 0], [3e38, 1, 1]], requires_grad=True)
+        space.contract(seams).sum().backward()
+        assert seams.grad is not None
+        out.append(Measure(f"gradients at seams that are not finite, shell {shell:g}", not_finite(seams.grad), 0.0))
+        inner = torch.tensor([[0.2, -0.7, 0.99]], dtype=torch.float64, requires_grad=True)
+        outer = torch.tensor([[1.7, -0.4, 0.3], [-9.0, 2.0, 40.0]], dtype=torch.float64, requires_grad=True)
+        good = all(torch.autograd.gradcheck(space.contract, (leaf,), raise_exception=False) for leaf in (inner, outer))
+        out.append(Measure(f"gradcheck failures, shell {shell:g}", float(not good), 0.0))
+    return out
