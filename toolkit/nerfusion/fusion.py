@@ -21,9 +21,9 @@ from fieldfuse.errors import InputError
 from fieldfuse.gpu import asks_freely, sent
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.cull import all_blocks, block_balls, visible_at_once, visible_blocks
-from fieldfuse.nerfusion.extras.keyframe_depth import Brought, KeySweeps, Recent, picture, sensed, together
+from fieldfuse.nerfusion.extras.keyframe_depth import Brought, KeyframeDepth, Recent, picture, sensed, together
 from fieldfuse.nerfusion.extras.matching import SIDE, SIDE_WITHIN
-from fieldfuse.nerfusion.extras.plane_sweep import Empty, Sweep
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, Empty
 from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice
 from fieldfuse.nerfusion.model import NerfusionModel
@@ -50,7 +50,7 @@ class FusionOptions:
         gamma: coarse cells in which exp(−optical thickness) exceeds this are not looked at finer.
         prune_every: key frames after which blocks without such cells are forgotten.
         measured: the depth that a sensor measured for key frames goes into their sweep, where there is one (not in the paper).
-        precision: of the networks' arithmetic (`networks.precision`).
+        precision: of the networks' arithmetic (`nerfusion.precision`).
     """
 
     levels: int = 2
@@ -134,24 +134,24 @@ class Fusion:
         views: Sequence[EncodedView],
         cameras: Cameras,
         depth: Tensor | None = None,
-        swept: Sweep | None = None,
+        distribution: DepthDistribution | None = None,
         meanwhile: Callable[[], None] | None = None,
     ) -> None:
         """Fuse one key frame (first) and its neighbours.
 
         Args:
             depth: (H, W) of the key frame where a sensor measured it, working units.
-            swept: of the key frame, where it was made already (`KeySweeps`), depth and all; None: made here.
+            distribution: of the key frame's depth, where it was made already (`KeyframeDepth`); None: made here.
             meanwhile: called once a device of its own has been asked the last question, so that what it does delays no answer.
         """
         options = self.options
         topology, finer = self._visible(cameras), None
         bounded = options.near > 0 or math.isfinite(options.far)
-        if swept is None and bounded:
-            swept = self.model.sweep(views, cameras, options.near, options.far, depth, self.empty)
+        if distribution is None and bounded:
+            distribution = self.model.sweep_planes(views, cameras, options.near, options.far, depth, self.empty)
         for level, store in enumerate(self.stores):
             wanted = None if finer is None else finer.known
-            local = self.model.local_volume(views, cameras, store.lattice, topology, wanted, options.near, options.far, swept)
+            local = self.model.local_volume(views, cameras, store.lattice, topology, wanted, options.near, options.far, distribution)
             if meanwhile is not None and level + 1 == options.levels:
                 meanwhile()
             before, seen = store.part(local.topology, finer), local.known
@@ -251,8 +251,8 @@ def fuse_views(
 
     Args:
         empty: see `Fusion`.
-        witnesses: of each key frame, other ones (places among them, `key_sweeps.beside`) that its sweep is held against (not in the paper);
-            needs a nearest or a farthest depth, and goes without `empty` (docs/measured/few_views.md, "Within silhouettes").
+        witnesses: of each key frame, other ones (places among them, `keyframe_depth.overlapping`) that its depth distribution is checked
+            against (not in the paper); needs a nearest or a farthest depth, and goes without `empty` (docs/measured/few_views.md, "Within silhouettes").
 
     Raises:
         InputError: no key frames, or a lattice that does not fit the options.
@@ -267,7 +267,7 @@ def fuse_views(
     side = None if witnesses is not None else SIDE if empty is None else SIDE_WITHIN
     encoded = _Pictures(model, views, side, fusion.options.precision)
     near, far, measured = fusion.options.near, fusion.options.far, fusion.options.measured
-    sweeps = None if witnesses is None else KeySweeps(views, key_frames, witnesses, near, far, measured, model.device, encoded.brought)
+    sweeps = None if witnesses is None else KeyframeDepth(views, key_frames, witnesses, near, far, measured, model.device, encoded.brought)
     groups = [together(int(key), neighbours) for key, neighbours in zip(key_frames.indices, key_frames.neighbours, strict=True)]
     for done, key in enumerate(key_frames.indices):
         progress.check()
@@ -275,10 +275,10 @@ def fuse_views(
         group = encoded(groups[done:])
         encode_seconds = time.perf_counter() - begin
         depth = sensed(views, int(key), model.device) if measured else None
-        swept = None if sweeps is None else sweeps(done)
+        distribution = None if sweeps is None else sweeps(done)
         with computing(fusion.options.precision, model.device):
             cameras, coming = Cameras.together([camera for _, camera in group]), partial(encoded.prepare, groups[done + 1 :])
-            fusion.add([view for view, _ in group], cameras, depth, swept, coming)
+            fusion.add([view for view, _ in group], cameras, depth, distribution, coming)
         if (done + 1) % fusion.options.prune_every == 0:
             fusion.prune()
         seconds = time.perf_counter() - begin

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d
 from fieldfuse.nerfusion.compiled_gru import Step
 from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
-from fieldfuse.nerfusion.volume_net import CHANGE, INSIDE, held
+from fieldfuse.nerfusion.volume_net import CHANGE, INSIDE, bounded
 from fieldfuse.volume.topology import Topology
 
 LEAST = 1e-3  # of a local volume's weight
@@ -88,7 +88,7 @@ class FusionGRU(nn.Module):
         known = torch.cat([known, known.new_full((1,), -torch.inf)])[:, None]
         update, reset = self._gates(both, topology, inside)
         z, r = torch.sigmoid(update - known), torch.sigmoid(reset)
-        candidate = torch.tanh(raw + held(self.candidate(_beside(r * state, local), topology, inside)))
+        candidate = torch.tanh(raw + bounded(self.candidate(_beside(r * state, local), topology, inside)))
         return torch.lerp(state, candidate, z)
 
     def compiled(self, part: LatentVolume, local: LocalVolume) -> tuple[Tensor, Tensor]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from fieldfuse.nerfusion.volume_net import COLOUR_SCALE, INSIDE, within
+from fieldfuse.nerfusion.volume_net import COLOUR_SCALE, INSIDE, soft_bound
 
 START = -0.5  # log optical thickness of a voxel on the surface at the start
 SCALE = 3.0  # the density output's gain
@@ -53,5 +53,5 @@ class FieldHead(nn.Module):
         return self._thickness(latent, self.body(latent))
 
     def _thickness(self, latent: Tensor, hidden: Tensor) -> Tensor:
-        learned = within(self.density(hidden).squeeze(1), CHANGE)
+        learned = soft_bound(self.density(hidden).squeeze(1), CHANGE)
         return START + SCALE * (learned + self.steep * latent[:, INSIDE])

@@ -30,8 +30,8 @@ from fieldfuse.nerfusion.cull import all_blocks, block_balls, visible_blocks
 from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.nerfusion.direction import DirectionCode
 from fieldfuse.nerfusion.encoder import DEEPEST, STRIDE, ImageEncoder, Sampled, padded
-from fieldfuse.nerfusion.extras.matching import SIDE, describe
-from fieldfuse.nerfusion.extras.plane_sweep import Empty, Sighted, Sweep, sweep
+from fieldfuse.nerfusion.extras.matching import SIDE, patch_descriptors
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, Empty, SdfEstimate, sweep_planes
 from fieldfuse.nerfusion.gru import FusionGRU, RunningMean, mean_gate
 from fieldfuse.nerfusion.head import FieldHead
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume, empty_volume, rows_of
@@ -39,7 +39,7 @@ from fieldfuse.nerfusion.pyramid import Pyramid, levelled, middles, sizes_of
 from fieldfuse.nerfusion.recorded import Recorded
 from fieldfuse.nerfusion.refine import least_thickness, surface_cells, with_blocks
 from fieldfuse.nerfusion.unproject import COLOURED, EncodedView, look_up, project
-from fieldfuse.nerfusion.volume_net import INSIDE, LocalReconstruction, colour_latent, inside_latent
+from fieldfuse.nerfusion.volume_net import INSIDE, LocalReconstruction, colour_latent, sdf_latent
 from fieldfuse.volume.topology import VOXELS, Topology
 
 CHUNK = 2**15  # voxels at a time: what the views show of them is many times larger than what is kept
@@ -108,14 +108,14 @@ class NerfusionModel(nn.Module):
         """
         given = images, cameras.intrinsics, cameras.size, cameras.world_from_camera
         if self._repeats(images):
-            features, colours, described = self._recorded(partial(self._shown, side=side), (side, self._state()), *given)
+            features, colours, descriptors = self._recorded(partial(self._shown, side=side), (side, self._state()), *given)
         else:
-            features, colours, described = self._shown(*given, side=side)
+            features, colours, descriptors = self._shown(*given, side=side)
         height, width = (length + -length % DEEPEST for length in images.shape[2:])
         sizes, fine = sizes_of(height // STRIDE, width // STRIDE, LEVELS), sizes_of(height, width, COLOUR_LEVELS)
         return [
             EncodedView(Pyramid(feature, sizes, STRIDE), Pyramid(colour, fine, 1), of)
-            for feature, colour, of in zip(features, colours, described, strict=True)
+            for feature, colour, of in zip(features, colours, descriptors, strict=True)
         ]
 
     def _shown(self, images: Tensor, intrinsics: Tensor, size: Tensor, poses: Tensor, side: int | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -123,13 +123,13 @@ class NerfusionModel(nn.Module):
         cameras = Cameras(intrinsics, size, poses)
         maps = self.sample(*self.encoder.maps(images)).float()  # variances are looked for in them
         whole = padded((images - 0.5) * COLOUR_GAIN)
-        described = images.new_zeros((len(images), 0, 0, 0)) if side is None else describe(images, side)
+        descriptors = images.new_zeros((len(images), 0, 0, 0)) if side is None else patch_descriptors(images, side)
         features, colours = levelled(maps, LEVELS), levelled(whole, COLOUR_LEVELS)
         if self.direction is not None:
             pixels = middles(sizes_of(maps.shape[2], maps.shape[3], LEVELS), STRIDE, features.device, features.dtype)
             codes = self.direction(torch.stack([cameras.directions(index, pixels) for index in range(len(images))]))
             features = torch.cat([features, codes.to(features.dtype)], 2)
-        return features.contiguous(), colours.contiguous(), described
+        return features.contiguous(), colours.contiguous(), descriptors
 
     def _repeats(self, images: Tensor) -> bool:
         """Whether encoding such pictures is worth recording: hundreds of launches, of which the processor makes one that way."""
@@ -140,7 +140,7 @@ class NerfusionModel(nn.Module):
         """Where parameters of encoding lie, which recordings read there; all are moved together."""
         return tuple(next(part.parameters()).data_ptr() for part in (self.encoder, self.sample, self.direction) if part is not None)
 
-    def sweep(
+    def sweep_planes(
         self,
         views: Sequence[EncodedView],
         cameras: Cameras,
@@ -148,10 +148,10 @@ class NerfusionModel(nn.Module):
         far: float,
         depth: Tensor | None = None,
         empty: Empty | None = None,
-    ) -> Sweep:
+    ) -> DepthDistribution:
         """Where along the pixels of the key frame (first) the surface is likely to be, its measured `depth` (H, W) and what is known to be
         `empty` included; asked once for all lattices. Not differentiable."""
-        return sweep([view.described for view in views], cameras, near, far, depth, empty)
+        return sweep_planes([view.descriptors for view in views], cameras, near, far, depth, empty)
 
     def local_volume(
         self,
@@ -162,7 +162,7 @@ class NerfusionModel(nn.Module):
         wanted: Tensor | None = None,
         near: float = 0.0,
         far: float = math.inf,
-        swept: Sweep | None = None,
+        distribution: DepthDistribution | None = None,
     ) -> LocalVolume:
         """The local volume of a key frame and its neighbours (section 3.1). Any number of views ≥ 1, the neighbours in any order.
 
@@ -180,16 +180,16 @@ class NerfusionModel(nn.Module):
             keys = all_blocks(lattice, cameras.intrinsics.device)
             keys = keys[visible_blocks(*block_balls(lattice, keys), cameras[0], near, far)]
             topology = Topology(keys, bounds=lattice.bounds(keys.device))
-        if swept is None:
+        if distribution is None:
             bounded = near > 0 or math.isfinite(far)
-            swept = self.sweep(views, cameras, *((near, far) if bounded else _depths(lattice, topology, cameras)))
-        if self._on_device(views, swept):
+            distribution = self.sweep_planes(views, cameras, *((near, far) if bounded else _depths(lattice, topology, cameras)))
+        if self._on_device(views, distribution):
             from fieldfuse.networks.gpu.local import local_volume
 
             numbers = TRUNCATION, HIDDEN, BLIND, COLOUR_GAIN, COLOURED, FREE
             sizes = self.config.sampled, self.config.variance, self.config.channels
-            return local_volume(self.local, views, cameras, lattice, topology, wanted, near, far, swept, numbers, sizes)
-        where, projected, starts, counts, weights = self._seen(views, cameras, lattice, topology, wanted, near, far, swept)
+            return local_volume(self.local, views, cameras, lattice, topology, wanted, near, far, distribution, numbers, sizes)
+        where, projected, starts, counts, weights = self._seen(views, cameras, lattice, topology, wanted, near, far, distribution)
         topology, where = _without_empty_blocks(topology, where)
         config, size = self.config, topology.zero_row
         count = torch.zeros(size, device=topology.device).index_copy(0, where, counts)
@@ -206,10 +206,10 @@ class NerfusionModel(nn.Module):
         raw = start.index_copy(0, place, self.local(latent[place], start[place], busy, count[place[:-1]] > 0))
         return LocalVolume(lattice, topology, torch.tanh(raw), count, raw, weight, busy, among)
 
-    def _on_device(self, views: Sequence[EncodedView], swept: Sweep) -> bool:
+    def _on_device(self, views: Sequence[EncodedView], distribution: DepthDistribution) -> bool:
         """Whether kernels on CUDA make local volumes."""
         wide = self.config.hidden in (16, 32) and self.config.channels > INSIDE
-        return not torch.is_grad_enabled() and wide and gpu.fits(swept.table, *(view.features.rows for view in views))
+        return not torch.is_grad_enabled() and wide and gpu.fits(distribution.table, *(view.features.rows for view in views))
 
     def _seen(
         self,
@@ -220,12 +220,12 @@ class NerfusionModel(nn.Module):
         wanted: Tensor | None,
         near: float,
         far: float,
-        swept: Sweep,
+        distribution: DepthDistribution,
     ) -> tuple[Tensor, ...]:
         """`_observe` of all corners that are `wanted`, None: of all."""
         rows = torch.arange(topology.zero_row, device=topology.device) if wanted is None else wanted.nonzero().view(-1)
         few = CHUNK if asks_freely(rows.device) else AT_ONCE
-        parts = [self._observe(views, cameras, lattice, topology, part, near, far, swept) for part in rows.split(few)]
+        parts = [self._observe(views, cameras, lattice, topology, part, near, far, distribution) for part in rows.split(few)]
         return tuple(torch.cat(values) for values in zip(*parts, strict=True))
 
     def _observe(
@@ -237,7 +237,7 @@ class NerfusionModel(nn.Module):
         rows: Tensor,
         near: float,
         far: float,
-        swept: Sweep,
+        distribution: DepthDistribution,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Of the corners `rows`: those that the key frame sees, their evidence projected to few channels, what latents start from (mean
         colour, distance behind the surface), view count and weight."""
@@ -249,18 +249,18 @@ class NerfusionModel(nn.Module):
             x, y, z = contracted.abs().unbind(1)
             across, along, up = (side + 1.01 * lattice.voxel for side in lattice.space.box)
             seen = seen & (x <= across) & (y <= along) & (z <= up)
-        sighted = swept.look(points, TRUNCATION * size)
-        kept = (seen & (sighted.open > HIDDEN)).nonzero().view(-1)
+        sighted = distribution.look(points, TRUNCATION * size)
+        kept = (seen & (sighted.visibility > HIDDEN)).nonzero().view(-1)
         rows, points, projection, sighted = rows[kept], points[kept], projection[kept], sighted[kept]
         visible = projection.visible
         footprint = torch.exp((torch.log(projection.footprint) * visible).sum(0) / visible.sum(0).clamp_min(1))
         step = footprint * direction_spread(points, cameras.positions, visible)
         mean, variance, count = aggregate(look_up(views, projection, step), visible, self.config.variance)
         cues = agreement(variance, count, (slice(self.config.sampled), slice(-2 * COLOURS, -COLOURS)))
-        swept_cues = torch.stack([sighted.signed, sighted.open, sighted.sure], 1)
+        swept_cues = torch.stack([sighted.expected_sdf, sighted.visibility, sighted.confidence], 1)
         projected = torch.relu(self.local.project(torch.cat([evidence(mean, variance, count, footprint, step), cues, swept_cues], 1)))
         colour = colour_latent((mean[:, -COLOURS:] / COLOUR_GAIN + 0.5).clamp(0, 1))
-        start = torch.cat([colour, inside_latent(sighted.signed)[:, None]], 1)
+        start = torch.cat([colour, sdf_latent(sighted.expected_sdf)[:, None]], 1)
         return rows, projected, start, count.to(torch.float32), _weight(sighted)
 
     def start(self, lattice: Lattice) -> LatentVolume:
@@ -332,12 +332,12 @@ class NerfusionModel(nn.Module):
 @lru_cache(maxsize=4)
 def _latent_of(signed: float) -> float:
     """`inside_latent` of one number."""
-    return float(inside_latent(torch.tensor([signed])))
+    return float(sdf_latent(torch.tensor([signed])))
 
 
-def _weight(sighted: Sighted) -> Tensor:
+def _weight(sighted: SdfEstimate) -> Tensor:
     """How much a key frame can say of voxels: little of what is hidden, and where the pictures fit at no depth better than at others."""
-    return sighted.open.clamp_min(HIDDEN) * (BLIND + (1 - BLIND) * sighted.sure)
+    return sighted.visibility.clamp_min(HIDDEN) * (BLIND + (1 - BLIND) * sighted.confidence)
 
 
 def _depths(lattice: Lattice, topology: Topology, cameras: Cameras) -> tuple[float, float]:

@@ -20,11 +20,11 @@ COLOURED = 0.35  # of a voxel's side: with a whole one pictures of fern and of a
 @dataclass(frozen=True)
 class EncodedView:
     """What is looked up of a view: `features` (image features and direction codes), `colours` (RGB in [−2, 2]), and what it is compared
-    with others by (`matching.describe`)."""
+    with others by (`matching.patch_descriptors`)."""
 
     features: Pyramid
     colours: Pyramid
-    described: Tensor
+    descriptors: Tensor
 
 
 @dataclass(frozen=True)

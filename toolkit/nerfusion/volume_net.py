@@ -17,20 +17,20 @@ MOST = 0.93  # latent colours are kept inside this, so that tanh is not driven t
 CHANGE = 0.5  # most that networks may add to the distance behind the surface, before tanh: free space of which the sweep is sure stays so
 
 
-def within(learned: Tensor, most: float) -> Tensor:
+def soft_bound(learned: Tensor, most: float) -> Tensor:
     """What is learned, kept within ± `most` without a kink."""
     return most * torch.tanh(learned / most)
 
 
-def held(learned: Tensor) -> Tensor:
+def bounded(learned: Tensor) -> Tensor:
     """(N, channels) learned additions to a latent; that to the distance behind the surface is kept within ± `CHANGE`.
 
     Without it networks paint pictures right before the cameras of key frames, which explains neighbouring views just as well as surfaces.
     """
-    return torch.cat([learned[:, :INSIDE], within(learned[:, INSIDE : INSIDE + 1], CHANGE), learned[:, INSIDE + 1 :]], 1)
+    return torch.cat([learned[:, :INSIDE], soft_bound(learned[:, INSIDE : INSIDE + 1], CHANGE), learned[:, INSIDE + 1 :]], 1)
 
 
-def inside_latent(signed: Tensor) -> Tensor:
+def sdf_latent(signed: Tensor) -> Tensor:
     """(N,) signed distances in [−1, 1], positive in front of the surface → p with tanh p = −signed, within what `MOST` allows."""
     return torch.atanh((-signed).clamp(-MOST, MOST))
 
@@ -76,7 +76,7 @@ class LocalReconstruction(nn.Module):
         Returns:
             (M · 512 + 1, channels), zero where nothing is seen.
         """
-        return held(self.learned(rows, topology, seen)) + start
+        return bounded(self.learned(rows, topology, seen)) + start
 
     def learned(self, rows: Tensor, topology: Topology, seen: Tensor) -> Tensor:
         """(M · 512 + 1, channels) what the convolutions give, before it is `held` and added to the start."""

@@ -19,9 +19,9 @@ from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.types import Views
 from fieldfuse.gpu import asks_freely
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.extras.cross_view_consistency import Witness, alone, evidence, witness
-from fieldfuse.nerfusion.extras.matching import describe
-from fieldfuse.nerfusion.extras.plane_sweep import Compared, Sweep, compare, decide
+from fieldfuse.nerfusion.extras.cross_view_consistency import CrossView, consistency, cross_view, own_estimate
+from fieldfuse.nerfusion.extras.matching import patch_descriptors
+from fieldfuse.nerfusion.extras.plane_sweep import CostVolume, DepthDistribution, cost_volume, to_probability
 from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.poses.overlap import overlap, parallax
 
@@ -34,7 +34,7 @@ KEPT_PICTURES = 48  # on a device of its own, as bytes
 T = TypeVar("T")
 
 
-def beside(keys: KeyFrames, world_from_camera: Array, intrinsics: Sequence[Intrinsics], depth: float) -> list[list[int]]:
+def overlapping(keys: KeyFrames, world_from_camera: Array, intrinsics: Sequence[Intrinsics], depth: float) -> list[list[int]]:
     """For each key frame its witnesses, as places in `keys.indices`: those that overlap most.
 
     Args:
@@ -51,7 +51,7 @@ def beside(keys: KeyFrames, world_from_camera: Array, intrinsics: Sequence[Intri
     return [[int(other) for other in row if common[at, other] > LEAST_OVERLAP] for at, row in enumerate(order)]
 
 
-class KeySweeps:
+class KeyframeDepth:
     """Call with a place in `keys.indices` for the sweep of that key frame."""
 
     def __init__(
@@ -67,7 +67,7 @@ class KeySweeps:
     ) -> None:
         """
         Args:
-            witnesses: for each key frame, as `beside` gives them; none: its sweep alone.
+            witnesses: for each key frame, as `overlapping` gives them; none: its sweep alone.
             near, far: depths along z, working units; one of them known.
             measured: the depth that a sensor measured goes into a key frame's sweep.
             pictures: gives a view's picture (1, 3, H, W) on the device; None: it is brought there.
@@ -81,17 +81,17 @@ class KeySweeps:
         self.near, self.far, self.measured, self.device = near, far, measured, device
         self._picture = pictures or (lambda index: picture(views, index, device))
         self._described: Recent[Tensor] = Recent(KEPT_DESCRIPTORS)
-        self._made: Recent[tuple[Compared | None, Witness, Tensor]] = Recent(KEPT)
+        self._made: Recent[tuple[CostVolume | None, CrossView, Tensor]] = Recent(KEPT)
 
-    def __call__(self, at: int) -> Sweep:
-        compared, says, surface = self._made.get(at, self._make)
-        if compared is None:
-            compared, says, surface = self._make(at)
-        said = evidence(compared, [self._made.get(other, self._make)[1] for other in self.witnesses[at]], surface)
-        self._made.put(at, (None, says, surface))  # a key frame is fused once, and goes on as a witness
-        return decide(compared, self._depth(at), said)
+    def __call__(self, at: int) -> DepthDistribution:
+        costs, log_odds, surface = self._made.get(at, self._make)
+        if costs is None:
+            costs, log_odds, surface = self._make(at)
+        correction = consistency(costs, [self._made.get(other, self._make)[1] for other in self.witnesses[at]], surface)
+        self._made.put(at, (None, log_odds, surface))  # a key frame is fused once, and goes on as a witness
+        return to_probability(costs, self._depth(at), correction)
 
-    def _make(self, at: int) -> tuple[Compared, Witness, Tensor]:
+    def _make(self, at: int) -> tuple[CostVolume, CrossView, Tensor]:
         """What the pictures say alone, what this key frame says of others' surfaces, and the places it is sure of."""
         group = together(int(self.keys.indices[at]), self.keys.neighbours[at])
         poses = self.views.world_from_camera[group]
@@ -99,15 +99,15 @@ class KeySweeps:
         new = [index for index in group if index not in self._described]
         if len(new) > 1 and not asks_freely(torch.device(self.device)) and len({self.views.images[index].shape for index in new}) == 1:
             # Together they take as many launches as one.
-            for index, made in zip(new, describe(torch.cat([self._picture(index) for index in new])), strict=True):
+            for index, made in zip(new, patch_descriptors(torch.cat([self._picture(index) for index in new])), strict=True):
                 self._described.put(index, made)
-        compared = compare([self._described.get(index, self._describe) for index in group], cameras, self.near, self.far)
-        says, surface = alone(compared)
+        costs = cost_volume([self._described.get(index, self._describe) for index in group], cameras, self.near, self.far)
+        log_odds, surface = own_estimate(costs)
         depth = self._depth(at)
-        return compared, says if depth is None else witness(decide(compared, depth)), surface
+        return costs, log_odds if depth is None else cross_view(to_probability(costs, depth)), surface
 
     def _describe(self, index: int) -> Tensor:
-        return describe(self._picture(index))[0]
+        return patch_descriptors(self._picture(index))[0]
 
     def _depth(self, at: int) -> Tensor | None:
         return sensed(self.views, int(self.keys.indices[at]), self.device) if self.measured else None

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.extras.plane_sweep import Sweep
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume, cells
 from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.nerfusion.refine import adopt, children, solid_cells, split_volume, surface_cells
@@ -49,12 +49,12 @@ class Recurrence:
         return cls(tuple(volumes), near, far, gamma, most)
 
     def add(
-        self, model: NerfusionModel, views: Sequence[EncodedView], cameras: Cameras, swept: Sweep | None = None
+        self, model: NerfusionModel, views: Sequence[EncodedView], cameras: Cameras, distribution: DepthDistribution | None = None
     ) -> tuple[Recurrence, LocalVolume]:
         """The state after one more key frame, and its local volume on the coarsest lattice. `swept`: its sweep; None: made here, alone."""
-        if swept is None:
-            swept = model.sweep(views, cameras, self.near, self.far)
-        local = model.local_volume(views, cameras, self.volumes[0].lattice, near=self.near, far=self.far, swept=swept)
+        if distribution is None:
+            distribution = model.sweep_planes(views, cameras, self.near, self.far)
+        local = model.local_volume(views, cameras, self.volumes[0].lattice, near=self.near, far=self.far, distribution=distribution)
         volumes = [model.fuse(self.volumes[0], local)]
         newest = local
         for before in self.volumes[1:]:
@@ -64,7 +64,7 @@ class Recurrence:
                 volumes += self.volumes[len(volumes) :]
                 break
             state = adopt(before, finer)
-            closer = model.local_volume(views, cameras, finer.lattice, finer.topology, finer.known, self.near, self.far, swept)
+            closer = model.local_volume(views, cameras, finer.lattice, finer.topology, finer.known, self.near, self.far, distribution)
             volumes.append(model.fuse(state, closer))
             newest = closer
         return Recurrence(tuple(volumes), self.near, self.far, self.gamma, self.most), local
