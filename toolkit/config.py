@@ -60,6 +60,7 @@ class NetworkSettings:
     weights: str | None = None  # file of trained networks; None: the shipped ones
     voxels: float | None = None  # finest ones to the median depth; None: 48, or more: a voxel to some pixels there
     levels: int = 2  # lattices, each of half the voxel size of the one before; 1: the paper's single one
+    gamma: float = 0.95  # voxels with exp(−optical thickness) above it are pruned; the paper's 0.6 cuts holes where networks are in doubt
     depth_from: str = "sensor"  # sensor (if the capture has one; the paper has none) | off
     agreement: bool = True  # key frames' plane sweeps are held against each other, but where there is alpha (not in the paper)
     recolour: bool = True  # colours of the result are looked up again in the training pictures, on finer lattices (not in the paper)
@@ -79,6 +80,7 @@ class FieldSettings:
     background: str = "auto"  # auto | on | off: contract what lies outside the region of interest
     resolution: int | None = None  # voxels along the longest side of the volume; None: by preset and picture size
     init: str = "auto"  # auto (network: few training views) | network | classical
+    start_resolution: int = 32  # voxels a side at which the networks' field enters a fit: what few images tell is smooth first
 
     @property
     def width(self) -> int:
@@ -90,6 +92,8 @@ class FieldSettings:
 class FitSettings:
     finetune: bool = True  # False: the networks' field is the result, nothing is fitted
     budget: float | None = None  # seconds; None: by preset
+    iterations: int | None = None  # at most; None: as many as the budget has (the paper: 25,000)
+    split_every: int | None = None  # iterations from one prune-and-split to the next (the paper: 10,000); None: as the validation views say
     max_rays: int = 4096  # rays a step at most, which the fifth level reaches; many small steps beat few large ones
     rate_density: float = 0.15
     rate_feature: float = 0.05
@@ -186,7 +190,7 @@ EFFECTS = (
     "depth_offset",
 )
 CHOICES = {
-    "preset": ("fast", "balanced", "quality"),
+    "preset": ("fast", "balanced", "quality", "paper"),
     "engine": ("auto", "numba", "triton", "torch"),
     "device": ("auto", "cpu", "cuda"),
     "capture.masks": ("auto", "inverted", "off"),
@@ -359,6 +363,8 @@ def _check_ranges(settings: Settings) -> None:
         "capture.image_size": settings.capture.image_size,
         "fit.budget": settings.fit.budget,
         "fit.passes": settings.fit.passes,
+        "fit.iterations": settings.fit.iterations,
+        "fit.split_every": settings.fit.split_every,
         "fit.max_rays": settings.fit.max_rays,
         "poses.image_size": settings.poses.image_size,
         "poses.max_features": settings.poses.max_features,
@@ -366,6 +372,7 @@ def _check_ranges(settings: Settings) -> None:
         "field.channels": settings.field.channels,
         "field.hidden": settings.field.hidden,
         "field.resolution": settings.field.resolution,
+        "field.start_resolution": settings.field.start_resolution,
         "capture.max_frames": settings.capture.max_frames,
         "tsdf.voxel_size": settings.tsdf.voxel_size,
         "tsdf.depth_max": settings.tsdf.depth_max,
@@ -396,6 +403,8 @@ def _check_ranges(settings: Settings) -> None:
         raise InputError(f"seed is {brief(str(settings.seed))}; it must be less than {2**31}")
     if settings.field.channels < 3:
         raise InputError(f"field.channels is {settings.field.channels}; at least 3 are needed, since the first three stand for a colour")
+    if not 0 < settings.network.gamma < 1:
+        raise InputError(f"network.gamma is {settings.network.gamma:g}; it must lie between 0 and 1")
     if not 1 <= settings.network.levels <= 4:
         raise InputError(f"network.levels is {settings.network.levels}; it must lie between 1 and 4")
     if settings.capture.image_size is not None and settings.capture.image_size < 16:

@@ -305,7 +305,7 @@ def test_a_local_volume(shell: float, variance: bool, count: int, monkeypatch: p
                 on_device(patch)
                 topology = Topology(keys, bounds=space.bounds("cpu"))
                 quick = model.local_volume(views, seen_by, space, topology, wanted, 0.1, 4.0, distribution)
-                assert quick.busy.blocks == slow.busy.blocks > 0
+                assert quick.near_surface.blocks == slow.near_surface.blocks > 0
                 same(quick, slow, ("rows", "count", "raw", "weight"))
 
 

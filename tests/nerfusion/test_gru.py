@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 
+from fieldfuse.nerfusion.extras.known_terms import colour_latent, sdf_latent
 from fieldfuse.nerfusion.gru import FusionGRU, RunningMean
 from fieldfuse.nerfusion.head import FieldHead
-from fieldfuse.nerfusion.volume_net import LocalReconstruction, colour_latent, sdf_latent
+from fieldfuse.nerfusion.volume_net import LocalReconstruction
 from fieldfuse.volume.topology import Topology
 from tests.nerfusion.test_block_conv import cube, dense_of, rows_of
 

@@ -24,11 +24,12 @@ from fieldfuse.nerfusion.cull import all_blocks, block_balls, visible_at_once, v
 from fieldfuse.nerfusion.extras.keyframe_depth import Brought, KeyframeDepth, Recent, picture, sensed, together
 from fieldfuse.nerfusion.extras.matching import SIDE, SIDE_WITHIN
 from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, Empty
+from fieldfuse.nerfusion.extras.two_lattices import children, split_volume
 from fieldfuse.nerfusion.keyframes import KeyFrames
-from fieldfuse.nerfusion.lattice import LatentVolume, Lattice
+from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, merged
 from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.nerfusion.precision import FLOAT32, computing
-from fieldfuse.nerfusion.refine import children, merged, solid_cells, split_volume
+from fieldfuse.nerfusion.prune import solid_cells
 from fieldfuse.nerfusion.store import GlobalStore
 from fieldfuse.nerfusion.unproject import EncodedView
 from fieldfuse.progress import SILENT, Progress
@@ -252,7 +253,8 @@ def fuse_views(
     Args:
         empty: see `Fusion`.
         witnesses: of each key frame, other ones (places among them, `keyframe_depth.overlapping`) that its depth distribution is checked
-            against (not in the paper); needs a nearest or a farthest depth, and goes without `empty` (docs/measured/few_views.md, "Within silhouettes").
+            against (not in the paper); needs a nearest or a farthest depth, and goes without `empty` (docs/measured/few_views.md,
+            "Within silhouettes").
 
     Raises:
         InputError: no key frames, or a lattice that does not fit the options.

@@ -9,8 +9,8 @@ from torch import Tensor
 from fieldfuse import gpu
 from fieldfuse.camera import Array
 from fieldfuse.gpu import asks_freely, sent
-from fieldfuse.nerfusion.lattice import LatentVolume, Lattice
-from fieldfuse.nerfusion.refine import adopt, part
+from fieldfuse.nerfusion.extras.two_lattices import adopt
+from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, part
 from fieldfuse.volume.topology import VOXELS, Topology
 
 CODE = np.array([1, 2**21, 2**42], np.int64)  # keys of lattices are small

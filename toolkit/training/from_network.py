@@ -75,7 +75,7 @@ class NetworkOptions:
         """As the settings say."""
         measured = settings.depth_from == "sensor"
         switches = {"measured": measured, "agreement": settings.agreement, "recolour": settings.recolour}
-        return cls(settings.voxels, settings.levels, **switches, precision=settings.precision)
+        return cls(settings.voxels, settings.levels, settings.gamma, **switches, precision=settings.precision)
 
 
 def load_networks(path: Path | str | None = None, device: torch.device | str = "cpu") -> NerfusionModel:

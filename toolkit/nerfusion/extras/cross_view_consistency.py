@@ -133,10 +133,10 @@ def consistency(costs: CostVolume, witnesses: Sequence[CrossView], surface: Tens
     """(D, h, w) that `to_probability` takes from the cost, in any order of the witnesses; None without any.
 
     Args:
-        surface: (N, 3) points that `compared` alone is sure of (`confident_points`). A witness is believed as far as it confirms them on average:
-            where poses are off, key frames look through each other's surfaces. None: every witness is believed.
+        surface: (N, 3) `confident_points` of `costs` alone. Another key frame counts as far as it confirms them on average: where poses
+            are off, key frames look through each other's surfaces. None: all count in full.
 
-    Witnesses are asked at every `SPACING`-th pixel either way; between planes nothing can be left out, surfaces are thinner.
+    They are read at every `SPACING`-th pixel either way; between planes nothing can be left out, surfaces are thinner.
     """
     if not witnesses:
         return None

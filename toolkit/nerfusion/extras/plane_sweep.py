@@ -53,6 +53,11 @@ class SdfEstimate:
     visibility: Tensor
     confidence: Tensor
 
+    @property
+    def stacked(self) -> Tensor:
+        """(N, 3) all three."""
+        return torch.stack([self.expected_sdf, self.visibility, self.confidence], 1)
+
     def __getitem__(self, kept: Tensor) -> SdfEstimate:
         """The voxels at `kept`."""
         return SdfEstimate(self.expected_sdf[kept], self.visibility[kept], self.confidence[kept])

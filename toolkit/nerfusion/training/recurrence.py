@@ -13,9 +13,10 @@ import torch
 
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution
+from fieldfuse.nerfusion.extras.two_lattices import adopt, children, split_volume, surface_cells
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume, cells
 from fieldfuse.nerfusion.model import NerfusionModel
-from fieldfuse.nerfusion.refine import adopt, children, solid_cells, split_volume, surface_cells
+from fieldfuse.nerfusion.prune import solid_cells
 from fieldfuse.nerfusion.unproject import EncodedView
 from fieldfuse.volume.topology import VOXELS
 
