@@ -20,18 +20,17 @@ from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError
 from fieldfuse.gpu import asks_freely, sent
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.cull import all_blocks, block_balls, visible_at_once, visible_blocks
+from fieldfuse.nerfusion.cull import all_blocks, block_balls, depth_range, visible_at_once, visible_blocks
 from fieldfuse.nerfusion.extras.keyframe_depth import Brought, KeyframeDepth, Recent, picture, sensed, together
 from fieldfuse.nerfusion.extras.matching import SIDE, SIDE_WITHIN
 from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, Empty
-from fieldfuse.nerfusion.extras.two_lattices import children, split_volume
+from fieldfuse.nerfusion.extras.two_lattices import allowed_cells, split_volume
 from fieldfuse.nerfusion.keyframes import KeyFrames
-from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, merged
+from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume, merged
 from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.nerfusion.precision import FLOAT32, computing
-from fieldfuse.nerfusion.prune import solid_cells
-from fieldfuse.nerfusion.store import GlobalStore
-from fieldfuse.nerfusion.unproject import EncodedView
+from fieldfuse.nerfusion.store import GlobalStore, ValueStore
+from fieldfuse.nerfusion.unproject import EncodedView, KeyFrame
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
@@ -107,6 +106,46 @@ def fusion_lattice(space: Space, voxel_size: float, levels: int) -> Lattice:
     return Lattice(space, resolution)
 
 
+def fuse_key_frame(
+    model: NerfusionModel,
+    frame: KeyFrame,
+    stores: Sequence[GlobalStore | ValueStore],
+    topology: Topology | None,
+    chosen: Callable[[LatentVolume, Tensor], Tensor],
+    meanwhile: Callable[[], None] | None = None,
+) -> LocalVolume:
+    """One step of the loop, in inference and training alike: V = J(…), H' = GRU(H, V) on the coarsest lattice, then on finer ones.
+
+    Args:
+        stores: the global volumes, coarsest first; changed.
+        topology: blocks of the coarsest lattice to work on; None: those in the key frame's frustum.
+        chosen: (volume, (M · 512,) bool corners that the key frame sees) → (M · 512,) bool cells to work on finer (not in the paper).
+        meanwhile: see `Fusion.add`.
+
+    Returns:
+        the local volume on the coarsest lattice.
+    """
+    coarsest: LocalVolume | None = None
+    finer: LatentVolume | None = None
+    for level, store in enumerate(stores):
+        wanted, limits = None if finer is None else finer.known, (frame.near, frame.far)
+        local = model.local_volume(frame.views, frame.cameras, store.lattice, topology, wanted, *limits, frame.distribution)
+        coarsest = coarsest or local
+        if meanwhile is not None and level + 1 == len(stores):
+            meanwhile()
+        before, seen = store.part(local.topology, finer), local.known
+        after = model.fuse_part(before, local)
+        store.write(after, seen)
+        if level + 1 < len(stores):
+            with torch.no_grad():  # each lattice is trained by its own loss
+                # What was known before but is not seen now still makes cells whole.
+                here = merged(before, after, seen)
+                finer = split_volume(here, chosen(here, seen))
+            topology = finer.topology
+    assert coarsest is not None
+    return coarsest
+
+
 class Fusion:
     """The global volumes of all levels, and one step of the loop."""
 
@@ -145,24 +184,15 @@ class Fusion:
             distribution: of the key frame's depth, where it was made already (`KeyframeDepth`); None: made here.
             meanwhile: called once a device of its own has been asked the last question, so that what it does delays no answer.
         """
-        options = self.options
-        topology, finer = self._visible(cameras), None
-        bounded = options.near > 0 or math.isfinite(options.far)
-        if distribution is None and bounded:
-            distribution = self.model.sweep_planes(views, cameras, options.near, options.far, depth, self.empty)
-        for level, store in enumerate(self.stores):
-            wanted = None if finer is None else finer.known
-            local = self.model.local_volume(views, cameras, store.lattice, topology, wanted, options.near, options.far, distribution)
-            if meanwhile is not None and level + 1 == options.levels:
-                meanwhile()
-            before, seen = store.part(local.topology, finer), local.known
-            after = self.model.fuse_part(before, local)
-            store.write(after, seen)
-            if level + 1 < options.levels:
-                # What was known before but is not seen now still makes cells whole.
-                here = merged(before, after, seen)
-                finer = split_volume(here, self.model.surface_cells(here, seen, options.gamma))
-                topology = finer.topology
+        options, model = self.options, self.model
+        topology = self._visible(cameras)
+        if distribution is None:
+            bounded = options.near > 0 or math.isfinite(options.far)
+            limits = (options.near, options.far) if bounded else depth_range(self.stores[0].lattice, topology, cameras)
+            distribution = model.sweep_planes(views, cameras, *limits, depth, self.empty)
+        frame = KeyFrame(views, cameras, options.near, options.far, distribution)
+        chosen = partial(model.surface_cells, gamma=options.gamma)
+        fuse_key_frame(model, frame, self.stores, topology, chosen, meanwhile)
 
     def _visible(self, cameras: Cameras) -> Topology:
         """Blocks of the coarsest lattice in the frustum of the key frame."""
@@ -186,8 +216,7 @@ class Fusion:
         if level == 0:
             return torch.ones(fine.zero_row, dtype=torch.bool, device=fine.device)
         coarse = self.stores[level - 1].volume()
-        kept = solid_cells(coarse, self.model.thickness(coarse), self.options.gamma)
-        return children(coarse.topology, kept, fine)
+        return allowed_cells(coarse, self.model.thickness(coarse), self.options.gamma, fine)
 
     def prune(self) -> None:
         """Forget blocks of the finer levels in which no cell is allowed any more."""

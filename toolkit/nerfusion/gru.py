@@ -93,7 +93,7 @@ class FusionGRU(nn.Module):
         return torch.lerp(state, candidate, z)
 
     def compiled(self, part: LatentVolume, local: LocalVolume) -> tuple[Tensor, Tensor]:
-        """The running mean on all rows of `part` (the global volume on the local one's blocks) and `forward` on those of blocks near surfaces,
+        """The running mean on all rows of `part` (the global volume on the local one's blocks) and `forward` on blocks near surfaces,
         without gradients, by kernels (float32; convolutions in what autocast says).
 
         Returns:

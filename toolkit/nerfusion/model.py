@@ -37,13 +37,14 @@ from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, Empty, swe
 from fieldfuse.nerfusion.extras.two_lattices import surface_cells
 from fieldfuse.nerfusion.gru import FusionGRU, RunningMean, mean_gate
 from fieldfuse.nerfusion.head import FieldHead
-from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume, empty_volume, some_blocks, with_blocks, without_empty_blocks
+from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume, empty_volume, some_blocks, without_empty_blocks
 from fieldfuse.nerfusion.prune import least_thickness
 from fieldfuse.nerfusion.pyramid import Pyramid, levelled, middles, sizes_of
 from fieldfuse.nerfusion.recorded import Recorded, addresses, worth_recording
+from fieldfuse.nerfusion.store import ValueStore
 from fieldfuse.nerfusion.unproject import COLOURED, EncodedView, KeyFrame, look_up, project, scales
 from fieldfuse.nerfusion.volume_net import LocalReconstruction
-from fieldfuse.volume.topology import VOXELS, Topology
+from fieldfuse.volume.topology import Topology
 
 CHUNK = 2**15  # voxels at a time: what the views show of them is many times larger than what is cached
 AT_ONCE = 2**19  # where there is memory for that: 0.4 kB a voxel and view
@@ -232,14 +233,9 @@ class NerfusionModel(nn.Module):
 
         Blocks keep their slots; new ones come after them.
         """
-        state, slots = with_blocks(state, local.topology.keys)
-        place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
-        zero = state.rows.new_zeros((1, state.rows.shape[1]))
-        part = replace(state, topology=local.topology, rows=torch.cat([state.rows[place], zero]), count=state.count[place])
-        after = self.fuse_part(part, local)
-        changed = local.known.nonzero().view(-1)
-        rows = state.rows.index_copy(0, place[changed], after.rows[changed].to(state.rows.dtype))
-        return replace(state, rows=rows, count=state.count.index_copy(0, place[changed], after.count[changed]))
+        store = ValueStore(state)
+        store.write(self.fuse_part(store.part(local.topology), local), local.known)
+        return store.volume()
 
     def fuse_part(self, part: LatentVolume, local: LocalVolume) -> LatentVolume:
         """One step of the recurrence on the blocks of a local volume alone: `part` is the global volume there."""

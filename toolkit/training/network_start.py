@@ -43,7 +43,7 @@ def widened(decoder: Deferred, hidden: int, generator: torch.Generator) -> Defer
 
 
 def network_start(made: Field, views: Views, scene: Scene, settings: Settings) -> Field:
-    """The first field of a fit, at `field.start_resolution` voxels a side (the fit's finest, when that is less), from the networks' field `made`.
+    """The first field of a fit, at `field.start_resolution` voxels a side (the fit's finest, when that is less), from the networks'.
 
     With the deferred decoder and as many features as the networks have, features and decoder come along; otherwise geometry alone.
 

@@ -1,9 +1,9 @@
-"""Key frames as each other's witnesses: where one says that there is surface, those beside it must not see through (not in the paper).
+"""Cross-view consistency of key frames' depth: where one has surface, others must not see through (not in the paper; `network.agreement`).
 
-A sweep of three views is led astray where they show no texture or repeat, but not all key frames are in the same way. A point along a pixel
-of one key frame is seen by another one as surface, as free space in front of it, or not at all since something hides it, each with a
-likelihood that the other's sweep tells. Surface there speaks for the plane, free space against it, and what is hidden for neither. What the
-witnesses say on average goes into the cost before it is smoothed, so that it spreads over a surface as what the pictures say does.
+Three views are led astray where they show no texture or repeat, but not all key frames are in the same way. For another key frame a point
+along a pixel is surface, free space, or hidden behind something, each with a likelihood from its own depth distribution. Surface speaks for
+the plane, free space against it, hidden for neither. The mean log odds of the other key frames go into the cost volume before it is
+smoothed, so that they spread over a surface as the images' costs do.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.matching import LARGE, SMALL, TEMPERATURE
 from fieldfuse.nerfusion.extras.plane_sweep import PEAK, CostVolume, DepthDistribution, to_probability
 
-FOR = 4.0  # times as likely as where it is hidden, where the witness is sure of surface
-AGAINST = 0.1  # times as likely where it is sure of free space: it may err
-SHARE = 0.3  # of the mean logarithm that is taken from the cost
+FOR = 4.0  # odds of surface where another key frame is sure of surface, against 1 where the point is hidden from it
+AGAINST = 0.1  # odds where it is sure of free space: it may err
+SHARE = 0.3  # of the mean log odds that is subtracted from the cost
 ABOUT = 2  # planes on either side within which surface counts, the last of them by half
 SURE = 0.7  # of the likelihood within some planes about one depth
-BELIEVED = 1.0  # mean logarithm from which on a witness is believed in full; its most is 1.4
-SPACING = 2  # of the pixels that ask
+BELIEVED = 1.0  # mean log odds from which on another key frame counts in full; they are 1.4 at most
+SPACING = 2  # of the pixels that are checked
 
 
 @dataclass(frozen=True)
 class CrossView:
-    """What a sweep says for and against surface.
+    """Evidence of one key frame for and against surface.
 
     Attributes:
         camera: one.
-        log_odds: (D, h, w) over inverse depths, farthest first: logarithm of how much likelier surface is than without this witness.
+        log_odds: (D, h, w) over inverse depths, farthest first: logarithm of how much likelier surface is than without this key frame.
         lowest, step: inverse depth of the first entry, and between entries.
     """
 
@@ -55,7 +55,7 @@ class CrossView:
         return self._numbers[0]
 
     def log_odds_at(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, 3) points of the working frame → (N,) what is said, 0 where the witness does not look, and (N,) bool where it does."""
+        """(N, 3) points of the working frame → (N,) log odds, 0 outside of the image, and (N,) bool, inside of it."""
         if compiled.fits(points, self.log_odds):
             pose, lens = self.camera.world_from_camera[0], self.camera.lens(0)
             return compiled_witness.ask(points, self.log_odds, pose, lens, self.lowest, self.step)
@@ -72,7 +72,7 @@ class CrossView:
 
 
 def cross_view(distribution: DepthDistribution) -> CrossView:
-    """What others may ask a key frame, from its sweep."""
+    """A key frame's evidence for others, from its depth distribution."""
     if gpu.fits(distribution.table):
         from fieldfuse.networks.gpu import reading
 
@@ -86,9 +86,9 @@ def cross_view(distribution: DepthDistribution) -> CrossView:
 
 @torch.no_grad()
 def confident_points(costs: CostVolume, distribution: DepthDistribution) -> Tensor:
-    """(N, 3) of the working frame: the likeliest places of pixels along which `swept`, made of `compared`, is sure of one depth.
+    """(N, 3) of the working frame: the likeliest points of pixels along which `distribution`, made of `costs`, is sure of one depth.
 
-    On CUDA all pixels, with places that are not numbers, which no witness sees, for those that are not: how many there are is not asked.
+    On CUDA all pixels, with points that are not numbers, which no key frame sees, for those that are not: their number is not asked of the device.
     """
     if gpu.fits(distribution.table):
         from fieldfuse.networks.gpu import reading
@@ -102,7 +102,7 @@ def confident_points(costs: CostVolume, distribution: DepthDistribution) -> Tens
 
 
 def own_estimate(costs: CostVolume) -> tuple[CrossView, Tensor]:
-    """The `cross_view` that a key frame's pictures alone make it, and the places that they are `confident_points` of."""
+    """A key frame's `cross_view` by its own images alone, and its `confident_points`."""
     if costs.empty is None and gpu.fits(costs.cost):
         return _alone_on_device(costs)
     distribution = to_probability(costs)
@@ -122,7 +122,7 @@ def _alone_on_device(costs: CostVolume) -> tuple[CrossView, Tensor]:
 
 
 def reliability(one: CrossView, surface: Tensor) -> float:
-    """In [0, 1]: how far a witness is to be believed, by what it says of places that another one is sure of; 1 if it sees none of them."""
+    """In [0, 1]: how much a key frame counts, by its log odds at another one's `confident_points` (N, 3); 1 if it sees none of them."""
     correction, seen = one.log_odds_at(surface)
     count = int(seen.sum())
     return 1.0 if count == 0 else min(1.0, max(0.0, float(correction.sum()) / count / BELIEVED))
@@ -130,7 +130,7 @@ def reliability(one: CrossView, surface: Tensor) -> float:
 
 @torch.no_grad()
 def consistency(costs: CostVolume, witnesses: Sequence[CrossView], surface: Tensor | None = None) -> Tensor | None:
-    """(D, h, w) that `to_probability` takes from the cost, in any order of the witnesses; None without any.
+    """(D, h, w) that `to_probability` subtracts from the cost, in any order of the other key frames; None without any.
 
     Args:
         surface: (N, 3) `confident_points` of `costs` alone. Another key frame counts as far as it confirms them on average: where poses
@@ -148,6 +148,16 @@ def consistency(costs: CostVolume, witnesses: Sequence[CrossView], surface: Tens
     rays = F.interpolate(costs.rays.T.view(1, 3, height, width), coarse, mode="bilinear").view(3, -1).T.contiguous()
     mean = SHARE * _mean(rays, costs.inverses, costs.camera.positions[0], witnesses, surface)
     return F.interpolate(mean.view(1, *coarse, planes).permute(0, 3, 1, 2), (height, width), mode="bilinear")[0]
+
+
+def all_consistent(volumes: Sequence[CostVolume]) -> list[DepthDistribution]:
+    """The depth distribution of each of some key frames, checked against all others."""
+    own = [own_estimate(costs) for costs in volumes]
+    made = []
+    for number, (costs, (_, surface)) in enumerate(zip(volumes, own, strict=True)):
+        others = [view for k, (view, _) in enumerate(own) if k != number]
+        made.append(to_probability(costs, correction=consistency(costs, others, surface)))
+    return made
 
 
 def _mean(rays: Tensor, inverses: Tensor, origin: Tensor, witnesses: Sequence[CrossView], surface: Tensor | None) -> Tensor:

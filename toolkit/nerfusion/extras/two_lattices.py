@@ -73,3 +73,8 @@ def children(coarse: Topology, kept: Tensor, fine: Topology) -> Tensor:
     for axis in (1, 2, 3):
         cube = cube.repeat_interleave(2, axis)
     return cube.reshape(-1)
+
+
+def allowed_cells(coarse: LatentVolume, thickness: Tensor, gamma: float, fine: Topology) -> Tensor:
+    """(M' · 512,) bool, cells of `fine` whose parents are not see-through; `thickness` (M · 512 + 1,) is the coarse volume's."""
+    return children(coarse.topology, solid_cells(coarse, thickness, gamma), fine)

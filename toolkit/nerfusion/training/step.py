@@ -16,10 +16,9 @@ from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.nerfusion.training.health import feature_deviation, rendering_health
 from fieldfuse.nerfusion.training.rays import TargetRays, in_sight, random_rays
 from fieldfuse.nerfusion.training.recurrence import Recurrence
-from fieldfuse.nerfusion.training.samples import Pictures, Sample
+from fieldfuse.nerfusion.training.samples import Pictures, Sample, cameras_of, keyframe_distributions
 from fieldfuse.nerfusion.training.settings import TrainSettings
 from fieldfuse.nerfusion.training.tracing import trace
-from fieldfuse.nerfusion.training.witnessed import cameras_of, keyframe_distributions
 from fieldfuse.render.fused import GAMMA, make_field
 
 Tensor = torch.Tensor

@@ -21,8 +21,8 @@ from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.nerfusion.training.health import relative_depth_error
 from fieldfuse.nerfusion.training.rays import TargetRays, picture_rays
 from fieldfuse.nerfusion.training.real import Case
+from fieldfuse.nerfusion.training.samples import cameras_of, keyframe_distributions
 from fieldfuse.nerfusion.training.step import background_of, begin, render_volume
-from fieldfuse.nerfusion.training.witnessed import cameras_of, keyframe_distributions
 
 Tensor = torch.Tensor
 CHUNK = 4096  # rays at a time

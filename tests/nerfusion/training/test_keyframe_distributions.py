@@ -14,8 +14,8 @@ from fieldfuse.nerfusion.extras.plane_sweep import cost_volume, to_probability
 from fieldfuse.nerfusion.training.distributed import Crew
 from fieldfuse.nerfusion.training.mixture import Mixture
 from fieldfuse.nerfusion.training.procedural import ProceduralScene
+from fieldfuse.nerfusion.training.samples import cameras_of, keyframe_distributions
 from fieldfuse.nerfusion.training.train import Trainer
-from fieldfuse.nerfusion.training.witnessed import cameras_of, keyframe_distributions
 from fieldfuse.simulate.eye import take, take_all
 from tests.nerfusion.training.tiny import tiny_settings
 
