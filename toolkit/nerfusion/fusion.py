@@ -21,10 +21,11 @@ from fieldfuse.errors import InputError
 from fieldfuse.gpu import asks_freely, sent
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.cull import all_blocks, block_balls, depth_range, visible_at_once, visible_blocks
-from fieldfuse.nerfusion.extras.keyframe_depth import Brought, KeyframeDepth, Recent, picture, sensed, together
+from fieldfuse.nerfusion.extras.keyframe_depth import KeyframeDepth
 from fieldfuse.nerfusion.extras.matching import SIDE, SIDE_WITHIN
 from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, Empty
 from fieldfuse.nerfusion.extras.two_lattices import allowed_cells, split_volume
+from fieldfuse.nerfusion.images import ImageCache, Recent, image_of, sensor_depth, with_neighbours
 from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume, merged
 from fieldfuse.nerfusion.model import NerfusionModel
@@ -230,7 +231,7 @@ class _Pictures:
     def __init__(self, model: NerfusionModel, views: Views, side: int | None, precision: str) -> None:
         self.model, self.views, self.side, self.precision = model, views, side, precision
         self.ahead = 1 if asks_freely(model.device) else AHEAD
-        self.brought = None if self.ahead == 1 else Brought(views, model.device)
+        self.brought = None if self.ahead == 1 else ImageCache(views, model.device)
         self._kept: Recent[tuple[EncodedView, Cameras]] = Recent(KEPT_PICTURES if self.ahead == 1 else KEPT_ON_DEVICE)
 
     def __call__(self, groups: Sequence[Sequence[int]]) -> list[tuple[EncodedView, Cameras]]:
@@ -260,7 +261,7 @@ class _Pictures:
         views, device = self.views, self.model.device
         lenses = [views.intrinsics[index] for index in indices]
         cameras = Cameras.of(lenses, views.world_from_camera[list(indices)], device)
-        pictures = [picture(views, index, device) if self.brought is None else self.brought(index) for index in indices]
+        pictures = [image_of(views, index, device) if self.brought is None else self.brought(index) for index in indices]
         images = pictures[0] if len(pictures) == 1 else torch.cat(pictures)
         with computing(self.precision, device):
             encoded = self.model.encode(images, cameras, self.side)
@@ -299,13 +300,13 @@ def fuse_views(
     encoded = _Pictures(model, views, side, fusion.options.precision)
     near, far, measured = fusion.options.near, fusion.options.far, fusion.options.measured
     sweeps = None if witnesses is None else KeyframeDepth(views, key_frames, witnesses, near, far, measured, model.device, encoded.brought)
-    groups = [together(int(key), neighbours) for key, neighbours in zip(key_frames.indices, key_frames.neighbours, strict=True)]
+    groups = [with_neighbours(int(key), neighbours) for key, neighbours in zip(key_frames.indices, key_frames.neighbours, strict=True)]
     for done, key in enumerate(key_frames.indices):
         progress.check()
         begin = time.perf_counter()
         group = encoded(groups[done:])
         encode_seconds = time.perf_counter() - begin
-        depth = sensed(views, int(key), model.device) if measured else None
+        depth = sensor_depth(views, int(key), model.device) if measured else None
         distribution = None if sweeps is None else sweeps(done)
         with computing(fusion.options.precision, model.device):
             cameras, coming = Cameras.together([camera for _, camera in group]), partial(encoded.prepare, groups[done + 1 :])

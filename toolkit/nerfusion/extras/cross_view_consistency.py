@@ -88,7 +88,7 @@ def cross_view(distribution: DepthDistribution) -> CrossView:
 def confident_points(costs: CostVolume, distribution: DepthDistribution) -> Tensor:
     """(N, 3) of the working frame: the likeliest points of pixels along which `distribution`, made of `costs`, is sure of one depth.
 
-    On CUDA all pixels, with points that are not numbers, which no key frame sees, for those that are not: their number is not asked of the device.
+    On CUDA all pixels, with points that are not numbers, which no key frame sees, for the others: their number is not read back.
     """
     if gpu.fits(distribution.table):
         from fieldfuse.networks.gpu import reading
@@ -129,7 +129,7 @@ def reliability(one: CrossView, surface: Tensor) -> float:
 
 
 @torch.no_grad()
-def consistency(costs: CostVolume, witnesses: Sequence[CrossView], surface: Tensor | None = None) -> Tensor | None:
+def consistency(costs: CostVolume, others: Sequence[CrossView], surface: Tensor | None = None) -> Tensor | None:
     """(D, h, w) that `to_probability` subtracts from the cost, in any order of the other key frames; None without any.
 
     Args:
@@ -138,15 +138,15 @@ def consistency(costs: CostVolume, witnesses: Sequence[CrossView], surface: Tens
 
     They are read at every `SPACING`-th pixel either way; between planes nothing can be left out, surfaces are thinner.
     """
-    if not witnesses:
+    if not others:
         return None
     planes, height, width = costs.cost.shape
     coarse = [-(-side // SPACING) for side in (height, width)]
-    if gpu.fits(costs.rays, *[one.log_odds for one in witnesses]):
-        mean = _mean_on_device(costs, (height, width), (coarse[0], coarse[1]), witnesses, surface)
+    if gpu.fits(costs.rays, *[one.log_odds for one in others]):
+        mean = _mean_on_device(costs, (height, width), (coarse[0], coarse[1]), others, surface)
         return F.interpolate(mean[None].permute(0, 3, 1, 2), (height, width), mode="bilinear")[0]
     rays = F.interpolate(costs.rays.T.view(1, 3, height, width), coarse, mode="bilinear").view(3, -1).T.contiguous()
-    mean = SHARE * _mean(rays, costs.inverses, costs.camera.positions[0], witnesses, surface)
+    mean = SHARE * _mean(rays, costs.inverses, costs.camera.positions[0], others, surface)
     return F.interpolate(mean.view(1, *coarse, planes).permute(0, 3, 1, 2), (height, width), mode="bilinear")[0]
 
 
@@ -160,29 +160,29 @@ def all_consistent(volumes: Sequence[CostVolume]) -> list[DepthDistribution]:
     return made
 
 
-def _mean(rays: Tensor, inverses: Tensor, origin: Tensor, witnesses: Sequence[CrossView], surface: Tensor | None) -> Tensor:
-    """(P, D) what witnesses that look there say in the mean, each by how far it is believed (`credit`), along rays (P, 3) at (D,)."""
-    volumes = [one.log_odds for one in witnesses]
-    beliefs = [1.0 if surface is None else reliability(one, surface) for one in witnesses]
+def _mean(rays: Tensor, inverses: Tensor, origin: Tensor, others: Sequence[CrossView], surface: Tensor | None) -> Tensor:
+    """(P, D) mean log odds of those that see there, each by its `reliability`, along rays (P, 3) at inverse depths (D,)."""
+    volumes = [one.log_odds for one in others]
+    beliefs = [1.0 if surface is None else reliability(one, surface) for one in others]
     if compiled.fits(rays, inverses, *volumes):
         asked = compiled_witness.Question(rays, inverses, origin)
-        for one, belief in zip(witnesses, beliefs, strict=True):
+        for one, belief in zip(others, beliefs, strict=True):
             asked.put(one.log_odds, one.camera.world_from_camera[0], one.camera.lens(0), one.lowest, one.step, belief)
         return asked.mean()
     points = (rays[:, None] / inverses[:, None] + origin).reshape(-1, 3)
     total, count = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
-    for one, belief in zip(witnesses, beliefs, strict=True):
+    for one, belief in zip(others, beliefs, strict=True):
         correction, seen = one.log_odds_at(points)
         total, count = total + belief * correction, count + seen
     return (total / count.clamp_min(1)).view(len(rays), -1)
 
 
 def _mean_on_device(
-    costs: CostVolume, grid: tuple[int, int], coarse: tuple[int, int], witnesses: Sequence[CrossView], surface: Tensor | None
+    costs: CostVolume, grid: tuple[int, int], coarse: tuple[int, int], others: Sequence[CrossView], surface: Tensor | None
 ) -> Tensor:
-    """(h', w', D): a share of the mean, without waiting for CUDA: how far witnesses are believed stays there."""
+    """(h', w', D): a share of the mean, without waiting for CUDA: reliabilities stay there."""
     from fieldfuse.networks.gpu import reading
 
-    asked = reading.Asked(witnesses)
+    asked = reading.Asked(others)
     sums = None if surface is None else asked.confirmed(surface)
     return asked.mean(costs.rays, costs.inverses, costs.camera, grid, coarse, sums, BELIEVED, SHARE)
