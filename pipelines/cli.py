@@ -5,7 +5,6 @@ Exit codes: 0 done; 1 something unexpected, with a log file; 2 bad input, settin
 
 from __future__ import annotations
 
-import atexit
 import inspect
 import os
 import signal
@@ -20,15 +19,9 @@ from fieldfuse import __version__
 from fieldfuse.errors import FieldfuseError, Interrupted
 from fieldfuse.pipelines import (
     bake,
-    bench,
-    bench_captures,
-    bench_effects,
-    bench_engines,
-    bench_keyframes,
     compare,
     evaluate,
     export,
-    few_views,
     finetune,
     info,
     poses,
@@ -84,10 +77,10 @@ def doctor(json: Json = False) -> None:
         raise typer.Exit(1)
 
 
-def main() -> None:
+def main(commands: typer.Typer = app) -> None:
     """Entry point of the command line."""
     try:
-        app()
+        commands()
     except Interrupted as error:
         _fail(f"{error}", STOPPED)
     except FieldfuseError as error:
@@ -102,36 +95,25 @@ def main() -> None:
         _fail(f"something unexpected went wrong ({type(error).__name__}); {place}", 1, error)
 
 
-def program() -> None:
+def program(commands: typer.Typer = app) -> None:
     """The command line as a process of its own: while it ends, one more Ctrl-C changes nothing."""
-    interrupted = True
+    stopped = True
     try:
-        main()
-        interrupted = False
-    except KeyboardInterrupt:  # it came when `main` was ending already
-        pass
+        with suppress(KeyboardInterrupt):  # it came when `main` was ending already
+            main(commands)
+            stopped = False
     except SystemExit as end:
-        interrupted = end.code == STOPPED
-        if not interrupted:
+        stopped = end.code == STOPPED
+        if not stopped:
             raise
     finally:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
-    if interrupted:
-        _leave(STOPPED)
-
-
-def _leave(code: int) -> None:
-    """End here, after what is registered for the end (temporary folders, processes of ours).
-
-    After a Ctrl-C the interpreter cannot be trusted to end with the code that it is told: CPython ends `python -m` by the signal when code
-    was being made from text (every dataclass is), and Open3D, interrupted while it loads, ends the process with 1.
-    """
-    atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError):  # closed by whoever read it
-            stream.flush()
-    os._exit(code)
+    if stopped:
+        # If the signal came while code was made from text (every dataclass is), CPython ends `python -m` by it, unless other text is
+        # evaluated afterwards.
+        eval("0")  # noqa: S307
+        sys.exit(STOPPED)
 
 
 def _fail(text: str, code: int, error: BaseException | None = None) -> None:
@@ -159,17 +141,8 @@ for _command in (
     simulate.simulate,
 ):
     app.command()(_command)
-bench.app.command("captures")(bench_captures.captures)
-bench.app.command("effects")(bench_effects.effects)
-bench.app.command("effects-by-hand")(bench_effects.by_hand)
-bench.app.command("few-views")(few_views.few_views)
-bench.app.command("ablations")(few_views.ablations)
-bench.app.command("engines")(bench_engines.engines)
-bench.app.command("keyframes")(bench_keyframes.keyframes)
-for _list in (app, bench.app):
-    for _entry in _list.registered_commands:  # in the list of commands their first sentences are wrapped like this, and cut off otherwise
-        _entry.short_help = " ".join((_entry.help or inspect.getdoc(_entry.callback) or "").partition("\n\n")[0].split())
-app.add_typer(bench.app, name="bench")
+for _entry in app.registered_commands:  # in the list of commands their first sentences are wrapped like this, and cut off otherwise
+    _entry.short_help = " ".join((_entry.help or inspect.getdoc(_entry.callback) or "").partition("\n\n")[0].split())
 
 
 if __name__ == "__main__":

@@ -23,7 +23,6 @@ from fieldfuse.capture.select import select_frames
 from fieldfuse.capture.video import read_video
 from fieldfuse.config import CaptureSettings, Settings
 from fieldfuse.evaluation.compare_page import write_comparison
-from fieldfuse.evaluation.pictures import write_picture, write_strips
 from fieldfuse.evaluation.selftest.data import texture
 from fieldfuse.evaluation.selftest.edit import small_field
 from fieldfuse.evaluation.tradeoff_page import write_tradeoff
@@ -114,8 +113,6 @@ def more_writers(place: Path) -> dict[str, Write]:
         "save_stereo": lambda folder: save_stereo(folder / "depths.safetensors", ["a"], [StereoDepth(depth, depth, camera)]),
         "write_comparison": lambda folder: write_comparison(folder, made(), shown, meshes, 0.075),
         "write_tradeoff": lambda folder: write_tradeoff(folder, tradeoff),
-        "write_strips": lambda folder: write_strips(folder, shown),
-        "write_picture": lambda folder: write_picture(folder / "a.png", texture(0, 48, 64)),
         "simulate": filmed,
         "select_frames": lambda folder: select_frames(film, folder / f"video{next(numbers)}", CaptureSettings(max_frames=4)),
         "select_frames, a scan": lambda folder: select_frames(scan, folder / f"scan{next(numbers)}", CaptureSettings(max_frames=4)),
@@ -134,9 +131,6 @@ ELSEWHERE = {
     "toolkit/poses/job.py": "as above",
     "toolkit/poses/sfm.py": "as above",
     "toolkit/poses/child.py": "as above",
-    "toolkit/evaluation/suites/tables.py": "a page of the documentation, for people who measure, through `atomic_path`",
-    "toolkit/evaluation/effects_plan.py": "for people who measure effects: captures in a folder of their own",
-    "toolkit/evaluation/effects_truth.py": "the same, one picture at a time through atomic_path",
     "toolkit/poses/worker.py": "as above",
     "toolkit/evaluation/budget.py": "a cache: what cannot be written is not remembered",
     "toolkit/simulate/demo.py": "one video, for people, through `atomic_path`",

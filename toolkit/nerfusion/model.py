@@ -22,8 +22,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from fieldfuse import gpu
-from fieldfuse.gpu import asks_freely
+from fieldfuse.backends import dispatch
+from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.nerfusion.aggregate import CUES, FLAGS, aggregate, agreement, evidence
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.compiled import fits
@@ -167,7 +167,7 @@ class NerfusionModel(nn.Module):
             sizes = self.config.sampled, self.config.variance, self.config.channels
             return local_volume(self.local, views, cameras, lattice, topology, wanted, near, far, distribution, numbers, sizes)
         rows = torch.arange(topology.zero_row, device=topology.device) if wanted is None else wanted.nonzero().view(-1)
-        chunks = rows.split(CHUNK if asks_freely(rows.device) else AT_ONCE)
+        chunks = rows.split(CHUNK if is_cpu(rows.device) else AT_ONCE)
         parts = [self._unproject(frame, lattice, topology, chunk) for chunk in chunks]
         indices, projected, starts, counts, weights = (torch.cat(values) for values in zip(*parts, strict=True))
         topology, indices = without_empty_blocks(topology, indices)
@@ -207,7 +207,8 @@ class NerfusionModel(nn.Module):
     def _on_device(self, frame: KeyFrame) -> bool:
         """Whether kernels on CUDA make local volumes."""
         wide = self.config.hidden in (16, 32) and self.config.channels > known_terms.INSIDE
-        return not torch.is_grad_enabled() and wide and gpu.fits(frame.distribution.table, *(view.features.rows for view in frame.views))
+        tables = [frame.distribution.table, *(view.features.rows for view in frame.views)]
+        return not torch.is_grad_enabled() and wide and dispatch.can_use_triton(*tables)
 
     def sweep_planes(
         self,
@@ -240,7 +241,7 @@ class NerfusionModel(nn.Module):
     def fuse_part(self, part: LatentVolume, local: LocalVolume) -> LatentVolume:
         """One step of the recurrence on the blocks of a local volume alone: `part` is the global volume there."""
         known = part.rows, part.count, local.rows, local.raw
-        if isinstance(self.fusion, FusionGRU) and not torch.is_grad_enabled() and (fits(*known) or gpu.fits(*known)):
+        if isinstance(self.fusion, FusionGRU) and not torch.is_grad_enabled() and (fits(*known) or dispatch.can_use_triton(*known)):
             rows, count = self.fusion.compiled(part, local)
             return replace(part, rows=rows, count=count)
         inside = local.known
@@ -258,7 +259,7 @@ class NerfusionModel(nn.Module):
 
     def surface_cells(self, volume: LatentVolume, seen: Tensor, gamma: float) -> Tensor:
         """`two_lattices.surface_cells` of the head's thickness."""
-        if not torch.is_grad_enabled() and self.config.channels > known_terms.INSIDE and gpu.fits(volume.rows):
+        if not torch.is_grad_enabled() and self.config.channels > known_terms.INSIDE and dispatch.can_use_triton(volume.rows):
             from fieldfuse.networks.gpu import volumes
 
             return volumes.surface_cells(volume.topology, volume.rows, volume.count, seen, self.to_field, least_thickness(gamma))
@@ -266,7 +267,7 @@ class NerfusionModel(nn.Module):
 
     def thickness(self, volume: LatentVolume) -> Tensor:
         """(M · 512 + 1,) the first of what `head` gives, alone."""
-        if not asks_freely(volume.rows.device):
+        if not is_cpu(volume.rows.device):
             mask = torch.cat([volume.known, volume.known.new_zeros(1)])
             return torch.where(mask, self.to_field.thickness(volume.rows).float(), 0.0)
         known = volume.known.nonzero().view(-1)

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from fieldfuse.gpu import OTHERS_GO_ON
+from fieldfuse.backends.dispatch import OTHERS_GO_ON
 
 MOST = 4  # recordings that are kept
 RECORDED = 2**23  # numbers in images up to which encoding them is recorded on CUDA: recordings keep the memory that they need

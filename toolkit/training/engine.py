@@ -11,9 +11,8 @@ from typing import Protocol
 
 import torch
 
-from fieldfuse import libraries
+from fieldfuse.backends.dispatch import choose_engine
 from fieldfuse.config import Settings
-from fieldfuse.gpu import runs_kernels
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.progress import Progress
 from fieldfuse.render.field import Field
@@ -95,11 +94,8 @@ class TorchEngine(Optimiser):
 
 
 def chosen_engine(settings: Settings, device: torch.device) -> str:
-    """numba, triton or torch: the first runs on the CPU, the second on CUDA and where a ray is decoded once."""
-    if device.type == "cpu":
-        return "torch" if settings.engine == "torch" else "numba"
-    fast = settings.engine in ("auto", "triton") and settings.field.decoder == "deferred" and runs_kernels(device)
-    return "triton" if fast else "torch"
+    """numba, triton or torch: the backend of a fit with these settings on `device`."""
+    return choose_engine(settings.engine, settings.field.decoder, device)
 
 
 def make_engine(settings: Settings, field: Field, pool: PixelPool) -> Engine:
@@ -141,4 +137,3 @@ def warm_up(settings: Settings, progress: Progress) -> None:
     if not warm.ready(*kind):
         progress.update(0, 1, "compiling the fast engine, once on this machine, about half a minute")
         warm.run(*kind)
-        libraries.let_go()  # what was read to load kernels

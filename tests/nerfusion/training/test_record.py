@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -29,16 +30,16 @@ def test_shipped_settings_load(path: Path) -> None:
     [
         ({"stage": {"step": 3}}, "step"),
         ({"loss": {"rays": "many"}}, "many"),
-        ({"loss": {"rays": 0}}, "at least 1"),
+        ({"loss": {"rays": 0}}, "greater than 0"),
         ({"volume": {"region": [0.9, 0.1]}}, "lower and an upper"),
         ({"sources": [{"kind": "dtu"}]}, "path"),
-        ({"sources": [{"kind": "imagenet", "path": "x"}]}, "known are"),
+        ({"sources": [{"kind": "imagenet", "path": "x"}]}, r"sources\[0\].kind is 'imagenet'; it must be one of"),
         ({"sources": [{"weight": 0.0}]}, "weight"),
         ({"optimiser": {"rate": -1.0}}, "rate"),
         ({"record": {"validate_every": 0}}, "validate_every is 0"),
         ({"record": {"health_every": 0}}, "health_every is 0"),
         ({"pictures": {"long_side": [2, 3]}}, "at least 16"),
-        ({"stage": {"steps": -5}}, "0 or more"),
+        ({"stage": {"steps": -5}}, "at least 0"),
     ],
 )
 def test_wrong_settings_are_named(data: dict[str, object], words: str) -> None:
@@ -91,12 +92,10 @@ def test_smoothing_is_a_trailing_mean() -> None:
 
 
 def test_the_command_trains_stops_and_goes_on(tmp_path: Path) -> None:
-    from omegaconf import OmegaConf
-
     from fieldfuse.pipelines.cli import app
 
     config, out = tmp_path / "tiny.yaml", tmp_path / "out"
-    OmegaConf.save(OmegaConf.create(SMALL), config)
+    config.write_text(json.dumps(SMALL))
     run = CliRunner().invoke(app, ["train", "--config", str(config), "--out", str(out), "--steps", "1", "--threads", "1"])
     assert run.exit_code == 0 and "weights.safetensors (1 steps)" in run.output, run.output
     more = CliRunner().invoke(app, ["train", "--config", str(config), "--out", str(out), "--steps", "2", "--resume", "--quiet"])
@@ -112,14 +111,12 @@ def test_the_command_trains_stops_and_goes_on(tmp_path: Path) -> None:
 
 
 def test_a_training_that_is_stopped_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from omegaconf import OmegaConf
-
     from fieldfuse.errors import Interrupted
     from fieldfuse.pipelines.cli import app
     from fieldfuse.pipelines.console import ConsoleProgress
 
     config = tmp_path / "tiny.yaml"
-    OmegaConf.save(OmegaConf.create(SMALL), config)
+    config.write_text(json.dumps(SMALL))
     monkeypatch.setattr(ConsoleProgress, "stopping", lambda self: True)
     stopped = CliRunner().invoke(app, ["train", "--config", str(config), "--out", str(tmp_path / "out"), "--quiet"])
     assert isinstance(stopped.exception, Interrupted) and "after 1 steps; go on with --resume" in str(stopped.exception)

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
 from fieldfuse.nerfusion import compiled, compiled_witness
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.matching import LARGE, SMALL, TEMPERATURE
@@ -73,7 +73,7 @@ class CrossView:
 
 def cross_view(distribution: DepthDistribution) -> CrossView:
     """A key frame's evidence for others, from its depth distribution."""
-    if gpu.fits(distribution.table):
+    if dispatch.can_use_triton(distribution.table):
         from fieldfuse.networks.gpu import reading
 
         return CrossView(distribution.camera, reading.says(distribution.table, FOR, AGAINST, ABOUT), distribution.lowest, distribution.step)
@@ -90,7 +90,7 @@ def confident_points(costs: CostVolume, distribution: DepthDistribution) -> Tens
 
     On CUDA all pixels, with points that are not numbers, which no key frame sees, for the others: their number is not read back.
     """
-    if gpu.fits(distribution.table):
+    if dispatch.can_use_triton(distribution.table):
         from fieldfuse.networks.gpu import reading
 
         return reading.surest(distribution.table, costs.rays, costs.inverses, costs.camera.positions[0], SURE)
@@ -103,7 +103,7 @@ def confident_points(costs: CostVolume, distribution: DepthDistribution) -> Tens
 
 def own_estimate(costs: CostVolume) -> tuple[CrossView, Tensor]:
     """A key frame's `cross_view` by its own images alone, and its `confident_points`."""
-    if costs.empty is None and gpu.fits(costs.cost):
+    if costs.empty is None and dispatch.can_use_triton(costs.cost):
         return _alone_on_device(costs)
     distribution = to_probability(costs)
     return cross_view(distribution), confident_points(costs, distribution)
@@ -142,7 +142,7 @@ def consistency(costs: CostVolume, others: Sequence[CrossView], surface: Tensor 
         return None
     planes, height, width = costs.cost.shape
     coarse = [-(-side // SPACING) for side in (height, width)]
-    if gpu.fits(costs.rays, *[one.log_odds for one in others]):
+    if dispatch.can_use_triton(costs.rays, *[one.log_odds for one in others]):
         mean = _mean_on_device(costs, (height, width), (coarse[0], coarse[1]), others, surface)
         return F.interpolate(mean[None].permute(0, 3, 1, 2), (height, width), mode="bilinear")[0]
     rays = F.interpolate(costs.rays.T.view(1, 3, height, width), coarse, mode="bilinear").view(3, -1).T.contiguous()

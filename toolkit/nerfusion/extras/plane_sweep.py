@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
 from fieldfuse.nerfusion import compiled
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.matching import COLOUR_GAIN, LARGE, SMALL, TEMPERATURE, UNKNOWN, difference, smoothed_softmax, together
@@ -87,7 +87,7 @@ class DepthDistribution:
         if compiled.fits(points, truncation, self.table):
             pose, lens = self.camera.world_from_camera[0], self.camera.lens(0)
             return SdfEstimate(*compiled.look(points, truncation, self.table, pose, lens, self.lowest, self.step).T)
-        if gpu.fits(points, truncation, self.table):
+        if dispatch.can_use_triton(points, truncation, self.table):
             from fieldfuse.networks.gpu import reading
 
             return SdfEstimate(*reading.look(points, truncation, self.table, self.camera, self.lowest, self.step))
@@ -164,7 +164,7 @@ def _compared(descriptors: Sequence[Tensor], cameras: Cameras, near: float, far:
     lowest, step = float(first), float(second - first)
     spacing = SPACING if empty is None else WITHIN
     shape = _shape(descriptors[0], spacing)
-    if gpu.fits(cameras.intrinsics, *descriptors):
+    if dispatch.can_use_triton(cameras.intrinsics, *descriptors):
         from fieldfuse.networks.gpu.describe import pixels
 
         world, own, inverses = pixels(descriptors[0], cameras, shape, count, 1 / far, 1 / near)
@@ -215,7 +215,7 @@ def _costs(descriptors: Sequence[Tensor], cameras: Cameras, inverses: Tensor, ra
         for view in range(1, len(cameras)):
             comparison.add(descriptors[view], *_way(cameras, view), cameras.lens(view))
         return comparison.result(UNKNOWN)
-    if gpu.fits(cameras.intrinsics, *descriptors):
+    if dispatch.can_use_triton(cameras.intrinsics, *descriptors):
         from fieldfuse.networks.gpu import matching
 
         return matching.costs(descriptors, cameras, inverses, rays, own, COLOUR_GAIN, UNKNOWN)
@@ -240,7 +240,7 @@ def to_probability(costs: CostVolume, depth: Tensor | None = None, correction: T
         depth: (H, W) of the key view along z in working units, where a sensor measured it; 0 or not finite where it did not.
         said: (D, h, w) that makes planes likelier, in units of the cost (`cross_view_consistency.consistency`).
     """
-    if costs.empty is None and depth is None and gpu.fits(costs.cost):
+    if costs.empty is None and depth is None and dispatch.can_use_triton(costs.cost):
         from fieldfuse.networks.gpu import matching
 
         table = matching.decided(costs.cost, correction, SMALL, LARGE, TEMPERATURE, costs.step, PEAK)
@@ -248,7 +248,7 @@ def to_probability(costs: CostVolume, depth: Tensor | None = None, correction: T
     likely = smoothed_softmax(costs.cost if correction is None else costs.cost - correction)
     if costs.empty is not None:
         likely = carved(likely, costs.empty)
-    if depth is not None and gpu.fits(likely, costs.inverses, depth):
+    if depth is not None and dispatch.can_use_triton(likely, costs.inverses, depth):
         from fieldfuse.networks.gpu.measured import measured as table_of
 
         asked = _asked(likely, depth, costs.spacing, costs.window)
@@ -329,7 +329,7 @@ def _table(likely: Tensor, step: float) -> Tensor:
     """(D, h, w) likelihoods, farthest first → what `DepthDistribution` keeps."""
     if compiled.fits(likely):
         return compiled.table(likely, step, PEAK)
-    if gpu.fits(likely):
+    if dispatch.can_use_triton(likely):
         from fieldfuse.networks.gpu import matching
 
         return matching.table(likely, step, PEAK)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
 from fieldfuse.nerfusion.lattice import LatentVolume, cells, corner_mask, with_blocks
 from fieldfuse.nerfusion.prune import solid_cells
 from fieldfuse.volume.edit import corner_nodes, doubled, split
@@ -30,7 +30,7 @@ def split_volume(volume: LatentVolume, kept: Tensor) -> LatentVolume:
 
     Known are exactly the corners of the kept cells' children. They count little, so that what is seen finer prevails.
     """
-    if volume.topology.bounds is not None and gpu.fits(volume.rows):
+    if volume.topology.bounds is not None and dispatch.can_use_triton(volume.rows):
         from fieldfuse.volume import split_gpu
 
         given = volume.topology, kept, volume.rows.detach(), doubled(*volume.topology.bounds), INHERITED
