@@ -48,7 +48,7 @@ def test_slots_are_found_by_code() -> None:
 def test_kernels_name_their_aligned_tensors() -> None:
     launch = pytest.importorskip("fieldfuse.backends.triton.launch", reason="needs Triton")
 
-    def add(rows, count, SIZE: "tl.constexpr"):  # type: ignore[no-untyped-def]  # noqa: F821
+    def add(rows, count, SIZE: tl.constexpr):  # type: ignore[no-untyped-def]  # noqa: F821
         """Never run."""
 
     assert launch.kernel("rows")(add) is not None

@@ -16,9 +16,9 @@ from functools import cached_property, partial
 import torch
 from torch import Tensor
 
+from fieldfuse.backends.dispatch import is_cpu, to_device_async
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError
-from fieldfuse.backends.dispatch import is_cpu, to_device_async
 from fieldfuse.key_sweeps import Brought, KeySweeps, Recent, picture, sensed, together
 from fieldfuse.keyframes import KeyFrames
 from fieldfuse.networks.cameras import Cameras

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.types import Views
-from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.keyframes import KeyFrames
 from fieldfuse.networks.cameras import Cameras
 from fieldfuse.networks.matching import describe

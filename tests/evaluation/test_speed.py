@@ -13,7 +13,7 @@ from fieldfuse.evaluation.speed_state import CHANNELS, around, lens, sphere_fiel
 from fieldfuse.pipelines import bench
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_image import BakedRenderer
-from fieldfuse.training.fused import FusedOptimiser
+from fieldfuse.training.numba_engine import NumbaOptimiser
 
 
 def test_the_compiled_step_is_at_least_twice_as_fast_as_torch() -> None:
@@ -26,7 +26,7 @@ def test_a_ray_looks_up_and_touches_a_bounded_number_of_rows() -> None:
     """A wall of eight voxels with an optical thickness of about ½ each, crossed at most twice, is left after few samples."""
     counts = {}
     for size in (32, 64):
-        engine = FusedOptimiser(sphere_field(size), sphere_pixels(48), threads=1)
+        engine = NumbaOptimiser(sphere_field(size), sphere_pixels(48), threads=1)
         counts[size] = speed_cases.step_counts(engine)
         assert 3 < counts[size]["looked_up_a_ray"] < 24
         # A first step touches the corners beside what it saw, each once: never more than eight a sample, and far fewer when rays meet.
@@ -49,7 +49,7 @@ def test_memory_a_voxel() -> None:
     baked = bake(field)
     assert field.bytes / field.voxels < 4 * (CHANNELS + 1) * 4
     assert baked.bytes / baked.voxels < 70
-    engine = FusedOptimiser(field, sphere_pixels(16), threads=1)
+    engine = NumbaOptimiser(field, sphere_pixels(16), threads=1)
     rows = len(field.density_rows)
     assert engine.index.nbytes == rows * 8 and engine.marks.nbytes == len(field.occupied) * 2
     assert engine.records.shape == (rows, CHANNELS + 2) and engine.records.itemsize == 2

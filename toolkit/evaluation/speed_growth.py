@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from fieldfuse.evaluation.speed import Case, compare, pinned
 from fieldfuse.evaluation.speed_cases import BATCH, RATES
 from fieldfuse.evaluation.speed_state import sphere_field, sphere_pixels
-from fieldfuse.training.fused import FusedOptimiser
+from fieldfuse.training.numba_engine import NumbaOptimiser
 from fieldfuse.training.rays import PixelPool
 
 RAYS = (512, 2048, 8192)
@@ -34,9 +34,9 @@ def growth_cases(repetitions: int = 5) -> Iterator[Case]:
 def _growing(name: str, what: str, settings: list[tuple[int, PixelPool, int]], repetitions: int) -> Iterator[Case]:
     """Each setting (size, pixels, rays a step) against the first."""
     field = sphere_field(LATTICE)
-    first, rays_of_first = FusedOptimiser(field, settings[0][1], threads=1), settings[0][2]
+    first, rays_of_first = NumbaOptimiser(field, settings[0][1], threads=1), settings[0][2]
     for size, pool, rays in settings:
-        engine = FusedOptimiser(sphere_field(LATTICE), pool, threads=1)
+        engine = NumbaOptimiser(sphere_field(LATTICE), pool, threads=1)
         ours, reference = compare(
             lambda e=engine, n=rays: [e.step(n, RATES) for _ in range(4)],  # type: ignore[misc]
             lambda: [first.step(rays_of_first, RATES) for _ in range(4)],

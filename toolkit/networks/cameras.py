@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.backends.dispatch import to_device_async
+from fieldfuse.camera import Array, Intrinsics
 
 
 @dataclass(frozen=True)

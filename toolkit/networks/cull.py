@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fieldfuse.camera import Array
 from fieldfuse.backends.dispatch import is_cpu, to_device_async
+from fieldfuse.camera import Array
 from fieldfuse.networks.cameras import Cameras
 from fieldfuse.networks.lattice import Lattice
 from fieldfuse.volume.topology import BLOCK

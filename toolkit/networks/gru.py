@@ -114,7 +114,7 @@ class FusionGRU(nn.Module):
 
     def _on_device(self, part: LatentVolume, local: LocalVolume, numbers: torch.dtype) -> tuple[Tensor, Tensor]:
         """`compiled` on CUDA: both gates' convolutions go side by side."""
-        from fieldfuse.networks.gpu import gru
+        from fieldfuse.backends.triton import gru
 
         step, busy = gru.Step(part, local, LEAST, self.most), local.busy
         rows, count = step.average()

@@ -149,7 +149,7 @@ def cells(topology: Topology, corners: Tensor, every: bool) -> Tensor:
         (M · 512,) bool: cells whose lowest corner is that row. Corners of absent blocks count as not set.
     """
     if dispatch.can_use_triton(corners, dtypes=None):
-        from fieldfuse.volume import blocks_gpu as blocks
+        from fieldfuse.backends.triton import blocks as blocks
 
         return blocks.pooled(topology, corners, 0, 2, every)
     padded = torch.cat([corners, corners.new_zeros(1)])

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor, nn
 
 from fieldfuse.backends import dispatch
+from fieldfuse.backends.constants import CHANGE as CHANGE
+from fieldfuse.backends.constants import INSIDE as INSIDE
 from fieldfuse.networks.block_conv import BlockConv3d, Prepared
 from fieldfuse.volume.topology import Topology
 
 COLOUR_SCALE = 4.0  # a latent colour of ±1 is a colour logit of ±4
-INSIDE = 3  # the latent that starts as how far behind the surface the voxel lies
 MOST = 0.93  # latent colours are kept inside this, so that tanh is not driven to its ends
-CHANGE = 0.5  # most that networks may add to the distance behind the surface, before tanh: free space of which the sweep is sure stays so
 
 
 def within(learned: Tensor, most: float) -> Tensor:

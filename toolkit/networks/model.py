@@ -184,7 +184,7 @@ class NerfusionModel(nn.Module):
             bounded = near > 0 or math.isfinite(far)
             swept = self.sweep(views, cameras, *((near, far) if bounded else _depths(lattice, topology, cameras)))
         if self._on_device(views, swept):
-            from fieldfuse.networks.gpu.local import local_volume
+            from fieldfuse.networks.local_cuda import local_volume
 
             numbers = TRUNCATION, HIDDEN, BLIND, COLOUR_GAIN, COLOURED, FREE
             sizes = self.config.sampled, self.config.variance, self.config.channels
@@ -300,7 +300,7 @@ class NerfusionModel(nn.Module):
     def surface_cells(self, volume: LatentVolume, seen: Tensor, gamma: float) -> Tensor:
         """`refine.surface_cells` of what the head says."""
         if not torch.is_grad_enabled() and self.config.channels > INSIDE and dispatch.can_use_triton(volume.rows):
-            from fieldfuse.networks.gpu import volumes
+            from fieldfuse.backends.triton import volumes
 
             return volumes.surface_cells(volume.topology, volume.rows, volume.count, seen, self.to_field, least_thickness(gamma))
         return surface_cells(volume, seen, self.thickness(volume), gamma)

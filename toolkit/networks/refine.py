@@ -55,7 +55,7 @@ def split_volume(volume: LatentVolume, kept: Tensor) -> LatentVolume:
     Known are exactly the corners of the kept cells' children. They count little, so that what is seen finer prevails.
     """
     if volume.topology.bounds is not None and dispatch.can_use_triton(volume.rows):
-        from fieldfuse.volume import split_gpu
+        from fieldfuse.backends.triton import split as split_gpu
 
         given = volume.topology, kept, volume.rows.detach(), doubled(*volume.topology.bounds), INHERITED
         return LatentVolume(volume.lattice.finer(), *split_gpu.split(*given))
@@ -83,7 +83,7 @@ def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
     """A copy of some blocks of a volume; where it has no such block, nothing is known."""
     slots = volume.topology.slots_of(topology)
     if volume.topology.blocks and dispatch.can_use_triton(volume.rows):
-        from fieldfuse.volume import blocks_gpu as blocks
+        from fieldfuse.backends.triton import blocks as blocks
 
         return LatentVolume(volume.lattice, topology, *blocks.take(volume.rows, volume.count, slots.int(), topology))
     place = (slots.clamp_min(0)[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
@@ -98,7 +98,7 @@ def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
 def merged(before: LatentVolume, after: LatentVolume, changed: Tensor) -> LatentVolume:
     """`after` where `changed` (M · 512,), else `before`; both have the same blocks."""
     if dispatch.can_use_triton(before.rows, after.rows):
-        from fieldfuse.networks.gpu import volumes
+        from fieldfuse.backends.triton import volumes
 
         rows, count = volumes.merge(before.rows, before.count, after.rows, after.count, changed)
         return replace(before, rows=rows, count=count)

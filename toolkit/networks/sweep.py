@@ -83,7 +83,7 @@ class Sweep:
             pose, lens = self.camera.world_from_camera[0], self.camera.lens(0)
             return Sighted(*compiled.look(points, truncation, self.table, pose, lens, self.lowest, self.step).T)
         if dispatch.can_use_triton(points, truncation, self.table):
-            from fieldfuse.networks.gpu import reading
+            from fieldfuse.backends.triton import reading
 
             return Sighted(*reading.look(points, truncation, self.table, self.camera, self.lowest, self.step))
         local = self.camera.local(points)[0]
@@ -160,7 +160,7 @@ def _compared(described: Sequence[Tensor], cameras: Cameras, near: float, far: f
     spacing = SPACING if empty is None else WITHIN
     shape = _shape(described[0], spacing)
     if dispatch.can_use_triton(cameras.intrinsics, *described):
-        from fieldfuse.networks.gpu.describe import pixels
+        from fieldfuse.backends.triton.describe import pixels
 
         world, own, inverses = pixels(described[0], cameras, shape, count, 1 / far, 1 / near)
         rays = world  # the kernel takes them in working axes
@@ -211,7 +211,7 @@ def _costs(described: Sequence[Tensor], cameras: Cameras, inverses: Tensor, rays
             comparison.add(described[view], *_way(cameras, view), cameras.lens(view))
         return comparison.result(UNKNOWN)
     if dispatch.can_use_triton(cameras.intrinsics, *described):
-        from fieldfuse.networks.gpu import matching
+        from fieldfuse.backends.triton import matching
 
         return matching.costs(described, cameras, inverses, rays, own, COLOUR_GAIN, UNKNOWN)
     parts = []
@@ -236,7 +236,7 @@ def decide(compared: Compared, depth: Tensor | None = None, said: Tensor | None 
         said: (D, h, w) that makes planes likelier, in units of the cost (`witness.evidence`).
     """
     if compared.empty is None and depth is None and dispatch.can_use_triton(compared.cost):
-        from fieldfuse.networks.gpu import matching
+        from fieldfuse.backends.triton import matching
 
         table = matching.decided(compared.cost, said, SMALL, LARGE, TEMPERATURE, compared.step, PEAK)
         return Sweep(compared.camera, table, compared.lowest, compared.step)
@@ -244,7 +244,7 @@ def decide(compared: Compared, depth: Tensor | None = None, said: Tensor | None 
     if compared.empty is not None:
         likely = carved(likely, compared.empty)
     if depth is not None and dispatch.can_use_triton(likely, compared.inverses, depth):
-        from fieldfuse.networks.gpu.measured import measured as table_of
+        from fieldfuse.backends.triton.measured import measured as table_of
 
         asked = _asked(likely, depth, compared.spacing, compared.window)
         table = table_of(likely, compared.inverses, depth, *asked, compared.step, NOISE, TRUST, PEAK)
@@ -325,7 +325,7 @@ def _table(likely: Tensor, step: float) -> Tensor:
     if compiled.fits(likely):
         return compiled.table(likely, step, PEAK)
     if dispatch.can_use_triton(likely):
-        from fieldfuse.networks.gpu import matching
+        from fieldfuse.backends.triton import matching
 
         return matching.table(likely, step, PEAK)
     nearer = likely.flip(0).cumsum(0).flip(0) - 0.5 * likely  # the surface lies anywhere about its plane

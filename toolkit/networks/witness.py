@@ -49,7 +49,7 @@ class Witness:
     def numbers(self) -> Tensor:
         """(23,) that kernels for CUDA ask it by (`gpu/reading.py`), put together once."""
         if not self._numbers:
-            from fieldfuse.networks.gpu import reading
+            from fieldfuse.backends.triton import reading
 
             self._numbers.append(reading.numbers(self.camera, self.says, self.lowest, self.step))
         return self._numbers[0]
@@ -74,7 +74,7 @@ class Witness:
 def witness(swept: Sweep) -> Witness:
     """What others may ask a key frame, from its sweep."""
     if dispatch.can_use_triton(swept.table):
-        from fieldfuse.networks.gpu import reading
+        from fieldfuse.backends.triton import reading
 
         return Witness(swept.camera, reading.says(swept.table, FOR, AGAINST, ABOUT), swept.lowest, swept.step)
     nearer = swept.table[0].permute(1, 2, 0).contiguous()  # (h, w, D): planes of a pixel next to each other in memory
@@ -91,7 +91,7 @@ def certain(compared: Compared, swept: Sweep) -> Tensor:
     On CUDA all pixels, with places that are not numbers, which no witness sees, for those that are not: how many there are is not asked.
     """
     if dispatch.can_use_triton(swept.table):
-        from fieldfuse.networks.gpu import reading
+        from fieldfuse.backends.triton import reading
 
         return reading.surest(swept.table, compared.rays, compared.inverses, compared.camera.positions[0], SURE)
     likely = torch.diff(swept.table[0], dim=0).neg().flatten(1)  # between planes
@@ -111,7 +111,7 @@ def alone(compared: Compared) -> tuple[Witness, Tensor]:
 
 @torch.no_grad()
 def _alone_on_device(compared: Compared) -> tuple[Witness, Tensor]:
-    from fieldfuse.networks.gpu import matching
+    from fieldfuse.backends.triton import matching
 
     weights = (SMALL, LARGE, TEMPERATURE), PEAK, (FOR, AGAINST, ABOUT), SURE
     given = compared.cost, compared.rays, compared.inverses, compared.camera, compared.lowest, compared.step
@@ -171,7 +171,7 @@ def _mean_on_device(
     compared: Compared, grid: tuple[int, int], coarse: tuple[int, int], witnesses: Sequence[Witness], surface: Tensor | None
 ) -> Tensor:
     """(h', w', D): a share of the mean, without waiting for CUDA: how far witnesses are believed stays there."""
-    from fieldfuse.networks.gpu import reading
+    from fieldfuse.backends.triton import reading
 
     asked = reading.Asked(witnesses)
     sums = None if surface is None else asked.confirmed(surface)

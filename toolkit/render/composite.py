@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import torch
 
+from fieldfuse.backends.constants import OPAQUE as OPAQUE
+from fieldfuse.backends.constants import RAW_MAX as RAW_MAX
+from fieldfuse.backends.constants import SOLID as SOLID
+from fieldfuse.backends.constants import STOP as STOP
+from fieldfuse.backends.constants import THRESHOLD as THRESHOLD
+from fieldfuse.backends.constants import UNITS as UNITS
+
 Tensor = torch.Tensor
 
-OPAQUE = 128.0  # optical thickness whose transmittance is 0 in float32
-
-UNITS = 32.0  # σ is counted per 1/32 of normalised space, so raw densities mean the same at every resolution
-THRESHOLD = 1e-3  # samples of smaller weight have no colour and get no gradient
-SOLID = 0.5  # a ray of which less than this is left ends somewhere: its strongest sample is a surface
-STOP = 1e-4  # a ray ends where less than this part of the light is left
-RAW_MAX = 12.0  # exp(12) is opaque over a thousandth of a voxel; the clamp keeps forward values and gradients finite
 
 
 def exclusive_sum(values: Tensor, first: Tensor) -> Tensor:

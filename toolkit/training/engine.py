@@ -12,8 +12,8 @@ from typing import Protocol
 import torch
 
 from fieldfuse import libraries
-from fieldfuse.config import Settings
 from fieldfuse.backends.dispatch import choose_engine
+from fieldfuse.config import Settings
 from fieldfuse.networks.decoder import Deferred
 from fieldfuse.progress import Progress
 from fieldfuse.render.field import Field
@@ -109,12 +109,12 @@ def make_engine(settings: Settings, field: Field, pool: PixelPool) -> Engine:
 
         return TritonOptimiser(field, pool, settings.seed)
     if isinstance(field.decoder, Deferred):
-        from fieldfuse.training.fused import FusedOptimiser
+        from fieldfuse.training.numba_engine import NumbaOptimiser
 
-        return FusedOptimiser(field, pool, settings.seed)
-    from fieldfuse.training.fused_per_sample import FusedPerSampleOptimiser
+        return NumbaOptimiser(field, pool, settings.seed)
+    from fieldfuse.training.numba_per_sample import NumbaPerSampleOptimiser
 
-    return FusedPerSampleOptimiser(field, pool, settings.seed)
+    return NumbaPerSampleOptimiser(field, pool, settings.seed)
 
 
 def fit_device(settings: Settings) -> torch.device:
@@ -132,7 +132,7 @@ def warm_up(settings: Settings, progress: Progress) -> None:
 
         triton_warm.run(settings.field.channels, settings.field.width, device, progress)
         return
-    from fieldfuse.training import warm
+    from fieldfuse.training import numba_warm as warm
 
     kind = (settings.field.decoder, settings.field.channels, settings.field.width)
     if not warm.ready(*kind):
