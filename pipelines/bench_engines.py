@@ -50,11 +50,11 @@ def named(text: str) -> list[str]:
     Raises:
         InputError: something is no engine.
     """
-    from fieldfuse.config import CHOICES
+    from fieldfuse.config import ENGINES
     from fieldfuse.errors import InputError
 
     parts = [part.strip() for part in text.split(",") if part.strip()]
     for part in parts or [""]:
-        if part not in CHOICES["engine"]:
-            raise InputError(f"--engines {text!r}: there is no {part!r}; known are {', '.join(CHOICES['engine'])}")
+        if part not in ENGINES:
+            raise InputError(f"--engines {text!r}: there is no {part!r}; known are {', '.join(ENGINES)}")
     return parts

@@ -39,7 +39,7 @@ def keyframes(
     from fieldfuse.evaluation.key_frames import NEAR, key_frame_rates, walk
     from fieldfuse.evaluation.speed import machine
     from fieldfuse.files import write_json
-    from fieldfuse.fusion import FusionOptions
+    from fieldfuse.nerfusion.fusion import FusionOptions
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.job import set_threads
     from fieldfuse.steps import choose_device

@@ -5,7 +5,6 @@ Exit codes: 0 done; 1 something unexpected, with a log file; 2 bad input, settin
 
 from __future__ import annotations
 
-import atexit
 import inspect
 import os
 import signal
@@ -104,34 +103,23 @@ def main() -> None:
 
 def program() -> None:
     """The command line as a process of its own: while it ends, one more Ctrl-C changes nothing."""
-    interrupted = True
+    stopped = True
     try:
-        main()
-        interrupted = False
-    except KeyboardInterrupt:  # it came when `main` was ending already
-        pass
+        with suppress(KeyboardInterrupt):  # it came when `main` was ending already
+            main()
+            stopped = False
     except SystemExit as end:
-        interrupted = end.code == STOPPED
-        if not interrupted:
+        stopped = end.code == STOPPED
+        if not stopped:
             raise
     finally:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
-    if interrupted:
-        _leave(STOPPED)
-
-
-def _leave(code: int) -> None:
-    """End here, after what is registered for the end (temporary folders, processes of ours).
-
-    After a Ctrl-C the interpreter cannot be trusted to end with the code that it is told: CPython ends `python -m` by the signal when code
-    was being made from text (every dataclass is), and Open3D, interrupted while it loads, ends the process with 1.
-    """
-    atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError):  # closed by whoever read it
-            stream.flush()
-    os._exit(code)
+    if stopped:
+        # If the signal came while code was made from text (every dataclass is), CPython ends `python -m` by it, unless other text is
+        # evaluated afterwards.
+        eval("0")  # noqa: S307
+        sys.exit(STOPPED)
 
 
 def _fail(text: str, code: int, error: BaseException | None = None) -> None:

@@ -81,7 +81,7 @@ class ConsoleProgress(Progress):
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Turn the first SIGINT or SIGTERM into `stopping()`, the second into KeyboardInterrupt."""
+        """Turn the first SIGINT or SIGTERM into `stopping()`, the second into KeyboardInterrupt, once Open3D is not just being loaded."""
         asked = 0
         again: list[threading.Timer] = []
 
@@ -89,18 +89,24 @@ class ConsoleProgress(Progress):
             nonlocal asked
             asked += 1
             if asked > 1:
-                raise KeyboardInterrupt
+                if not _loading("open3d"):
+                    raise KeyboardInterrupt
+                later()
+                return
             self.request_stop()
             self.say(STOPPING)
 
         def unraisable(lost: sys.UnraisableHookArgs) -> None:
             # Python drops what is raised in `__del__` and in callbacks of C code; the wish to quit is told again a moment later.
             if asked > 1 and issubclass(lost.exc_type, KeyboardInterrupt):
-                again.append(threading.Timer(AGAIN, _thread.interrupt_main))
-                again[-1].daemon = True
-                again[-1].start()
+                later()
             else:
                 hook(lost)
+
+        def later() -> None:
+            again.append(threading.Timer(AGAIN, _thread.interrupt_main))
+            again[-1].daemon = True
+            again[-1].start()
 
         if threading.current_thread() is not threading.main_thread():
             yield
@@ -123,6 +129,12 @@ class ConsoleProgress(Progress):
             for number, old in before.items():
                 signal.signal(number, old)
             self.close()
+
+
+def _loading(name: str) -> bool:
+    """Whether a library is being imported. Open3D, interrupted then, ends the process with code 1 later on, whatever code it is given:
+    what it has allocated by then looks like a leak to it."""
+    return getattr(getattr(sys.modules.get(name), "__spec__", None), "_initializing", False)
 
 
 class PlainProgress(ConsoleProgress):

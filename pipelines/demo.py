@@ -1,4 +1,7 @@
-"""`make demo`: film the simulated scene, then run the main job on the video just as a user would."""
+"""`make demo`: film the simulated scene, then run the main job on the video just as a user would.
+
+`python -m fieldfuse.pipelines.demo OPTIONS` makes `demo/` in the current folder; OPTIONS are those of `fieldfuse run` (`--budget 3`).
+"""
 
 from __future__ import annotations
 
@@ -27,14 +30,14 @@ def film(video: Path) -> None:
 
 
 def main(folder: Path = FOLDER) -> None:
-    """Make the capture in `folder` and reconstruct it into `folder`/run."""
+    """Make the capture in `folder` and reconstruct it into `folder`/run, with the options of the command line."""
     video = folder / "demo.mp4"
     try:
         film(video)
     except FieldfuseError as error:
         sys.stderr.write(f"fieldfuse: {error}\n")
         sys.exit(130 if isinstance(error, Interrupted) else 2)
-    sys.argv = ["fieldfuse", "run", str(video), "--out", str(folder / "run"), "--preset", "fast"]
+    sys.argv = ["fieldfuse", "run", str(video), "--out", str(folder / "run"), "--preset", "fast", *sys.argv[1:]]
     sys.stderr.write(" ".join(sys.argv) + "\n")
     cli.main()
 

@@ -52,7 +52,7 @@ def direct_field(
         Interrupted: the user asked to stop.
     """
     from fieldfuse.evaluation.few_views import Ground
-    from fieldfuse.keyframes import KeyFrames
+    from fieldfuse.nerfusion.keyframes import KeyFrames
     from fieldfuse.training.from_network import Inference, NetworkOptions, load_networks, voxels_to_median
 
     keys = Ground(views, scene, settings).keys()

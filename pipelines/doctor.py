@@ -23,7 +23,7 @@ PACKAGES = (
     "fast-simplification",
     "typer",
     "rich",
-    "omegaconf",
+    "pydantic",
     "matplotlib",
     "safetensors",
     "pillow",

@@ -19,7 +19,7 @@ from fieldfuse.steps import choose_device
 
 if TYPE_CHECKING:
     from fieldfuse.effects.correct import Corrections
-    from fieldfuse.keyframes import KeyFrames
+    from fieldfuse.nerfusion.keyframes import KeyFrames
     from fieldfuse.pipelines.steps_network import NetworkField
     from fieldfuse.pipelines.total_budget import TotalBudget
     from fieldfuse.poses.points import Features

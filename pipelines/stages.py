@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from fieldfuse import __version__, libraries
+from fieldfuse import __version__
 from fieldfuse.errors import FieldfuseError, InputError
 from fieldfuse.files import fingerprint, read_json, remove, write_json
 from fieldfuse.memory import give_back
@@ -23,7 +23,6 @@ from fieldfuse.pipelines.console import ConsoleProgress
 from fieldfuse.pipelines.folder import STAGES, RunFolder
 from fieldfuse.pipelines.memory import PeakMemory
 
-LONG = 0.5  # seconds of a stage after which pages of libraries are given back; shorter ones load little
 T = TypeVar("T")
 
 
@@ -176,8 +175,6 @@ class Stages:
             remove(self._path(name))
             paths = [Path(path) for path in save(value)]
         give_back()
-        if time.monotonic() - start > LONG:
-            libraries.let_go()
         for path in paths:
             path.chmod(0o666 & ~_umask())  # some writers make files that only their owner may read
         outputs = {path.relative_to(self.folder.path).as_posix(): path.stat().st_size for path in paths}

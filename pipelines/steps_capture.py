@@ -16,7 +16,7 @@ from fieldfuse.steps import camera_poses, key_frames, needs_frames, prepared, re
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Capture, Frame, Views
     from fieldfuse.effects.correct import Corrections
-    from fieldfuse.keyframes import KeyFrames
+    from fieldfuse.nerfusion.keyframes import KeyFrames
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene
 
@@ -160,7 +160,7 @@ def choose_keyframes(job: Job, scene: Scene, views: Views) -> KeyFrames:
     """Key frames among the training views and their neighbours, as indices into the training views; the file has their names."""
     import numpy as np
 
-    from fieldfuse.keyframes import KeyFrames
+    from fieldfuse.nerfusion.keyframes import KeyFrames
 
     if job.keys is not None:
         return job.keys

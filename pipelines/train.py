@@ -24,11 +24,11 @@ def train(
 
     bound_threads({"flags": {"threads": threads}})
     from fieldfuse.errors import Interrupted
+    from fieldfuse.nerfusion.training.distributed import join_crew
+    from fieldfuse.nerfusion.training.settings import load_train_settings
+    from fieldfuse.nerfusion.training.train import WEIGHTS, Trainer
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.job import set_threads
-    from fieldfuse.training.nerfusion.distributed import join_crew
-    from fieldfuse.training.nerfusion.settings import load_train_settings
-    from fieldfuse.training.nerfusion.train import WEIGHTS, Trainer
 
     settings = load_train_settings(config, pairs=pairs or ())
     set_threads(threads or settings.threads)

@@ -15,10 +15,10 @@ import torch
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.effects import transfer
 from fieldfuse.errors import FieldfuseError, InputError
+from fieldfuse.nerfusion.training.paths import hand_held
+from fieldfuse.nerfusion.training.shards import write_shard
 from fieldfuse.simulate.eye import eye_of, take
 from fieldfuse.simulate.mesh_scene import MeshScene, load_mesh_scene
-from fieldfuse.training.nerfusion.paths import hand_held
-from fieldfuse.training.nerfusion.shards import write_shard
 
 EYES = (0.7, 1.8)  # metres above the floor
 TRIES = 200

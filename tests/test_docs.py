@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import configparser
 import re
 import subprocess
+import sys
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import pytest
 import typer
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
@@ -101,8 +104,50 @@ def test_settings_that_the_docs_name_exist() -> None:
 
 
 def test_places_in_the_tree_exist() -> None:
-    for place in re.findall(r"`((?:toolkit|pipelines|configs)/[\w./]*)`", (ROOT / "README.md").read_text(encoding="utf-8")):
-        assert (ROOT / place).exists(), place
+    for page in PAGES:
+        for place in re.findall(r"`((?:toolkit|pipelines|configs|tests|scripts|examples)/[\w./]*)`", page.read_text(encoding="utf-8")):
+            assert (ROOT / place).exists(), f"{place} in {where(page)}"
+
+
+def test_the_architecture_page_has_the_layers_of_the_contract() -> None:
+    parser = configparser.ConfigParser()
+    parser.read(ROOT / "setup.cfg", encoding="utf-8")
+    contract = [re.findall(r"\w+", line) for line in parser["importlinter:contract:flow"]["layers"].strip().splitlines()]
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (`[^|]*) \|", text, re.MULTILINE)
+    assert [re.findall(r"\w+", row) for row in rows] == contract
+    for package in parser["options"]["packages"].split():
+        path = package.removeprefix("fieldfuse.").replace(".", "/")
+        assert "/" not in path or f"`{path}/`" in text, package
+
+
+def test_the_site_has_every_page() -> None:
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    named = {ROOT / "docs" / name for name in re.findall(r": ([\w/]+\.md)", text.partition("\nnav:\n")[2])}
+    spec = spec_from_file_location("site_hooks", ROOT / "scripts" / "site_hooks.py")
+    assert spec is not None and spec.loader is not None
+    hooks = module_from_spec(spec)
+    spec.loader.exec_module(hooks)
+    added = {ROOT / "docs" / place: ROOT / page for page, place in hooks.PAGES.items()}
+    assert set(added) <= named
+    assert sorted(added.get(page, page) for page in named) == sorted(PAGES)
+    assert hooks.relinked("[a](docs/look.md#x) [b](setup.cfg) [c](https://d)", "") == "[a](look.md#x) b [c](https://d)"
+    assert hooks.relinked("[a](../../README.md) [b](../look.md)", "docs/measured") == "[a](../overview.md) [b](../look.md)"
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    for tool in ("mkdocs", "material", "mkdocstrings"):
+        pytest.importorskip(tool)
+    links = tmp_path / "build" / "links" / "fieldfuse"
+    links.mkdir(parents=True)
+    for place in (*(ROOT / "toolkit").iterdir(), ROOT / "pipelines", ROOT / "configs"):
+        (links / place.name).symlink_to(place)
+    for name in ("docs", "scripts", "toolkit", "mkdocs.yml", "README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    done = subprocess.run([sys.executable, "-m", "mkdocs", "build", "--strict"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "fuse_tsdf" in (tmp_path / "build" / "site" / "api" / "index.html").read_text(encoding="utf-8")
 
 
 def test_scripts_parse() -> None:

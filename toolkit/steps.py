@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from fieldfuse.camera import Array
     from fieldfuse.capture.types import Capture, Views
     from fieldfuse.effects.correct import Corrections
-    from fieldfuse.keyframes import KeyFrames
+    from fieldfuse.nerfusion.keyframes import KeyFrames
     from fieldfuse.poses.points import Features
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene
@@ -223,7 +223,7 @@ def prepared(
 def key_frames(views: Views, scene: Scene, settings: Settings) -> KeyFrames:
     """Key frames among the training views and their neighbours, as indices into the training views."""
     from fieldfuse.capture.subset import sharpness
-    from fieldfuse.keyframes import KeyFrames, select_keyframes
+    from fieldfuse.nerfusion.keyframes import KeyFrames, select_keyframes
 
     train = np.flatnonzero(~np.asarray(views.test))
     if len(train) == 0:

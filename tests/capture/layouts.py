@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array
 from tests.capture.films import film
@@ -63,18 +64,8 @@ def write_blender(root: Path) -> Pinhole:
 
 
 def quaternion(rotation: Array) -> Array:
-    """(w, x, y, z) of a rotation matrix: the eigenvector of Bar-Itzhack's symmetric 4×4 matrix with the largest eigenvalue."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    table = np.array(
-        [
-            [a - e - i, d + b, g + c, h - f],
-            [d + b, e - a - i, h + f, c - g],
-            [g + c, h + f, i - a - e, d - b],
-            [h - f, c - g, d - b, a + e + i],
-        ]
-    )
-    x, y, z, w = np.linalg.eigh(table)[1][:, -1]
-    return np.array([w, x, y, z])
+    """(w, x, y, z) of a rotation matrix (3, 3)."""
+    return np.asarray(Rotation.from_matrix(rotation).as_quat()[[3, 0, 1, 2]])
 
 
 POINTS = np.array([[0.1, -0.2, 1.2], [0.5, 0.5, 0.0], [-0.4, 0.2, 0.0]])

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import checked_pose, lenient_poses
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.capture.usable import without
-from fieldfuse.effects.adjust import rotation
 from fieldfuse.errors import InputError
 from tests.capture.layouts import LAYOUTS
 from tests.pipelines.made import circle, make_room
@@ -99,7 +99,7 @@ def test_no_uniform_scale_is_too_small(scale: float, room: Path) -> None:
 
 def test_outside_of_readers_poses_are_checked_as_strictly_as_before() -> None:
     turn = np.eye(4)
-    turn[:3, :3] = 0.4 * rotation(np.array([[0.1, 0.2, 0.3]]))[0]
+    turn[:3, :3] = 0.4 * Rotation.from_rotvec(np.array([[0.1, 0.2, 0.3]])).as_matrix()[0]
     with pytest.raises(InputError, match="not rigid"):
         checked_pose(turn, "here")
     with lenient_poses() as notes:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array, Intrinsics
-from fieldfuse.effects.adjust import Problem, predict, rotation
+from fieldfuse.effects.adjust import Problem, predict
 from fieldfuse.effects.sightings import Sightings
 
 CAMERA = Intrinsics(320, 240, 260.0, 260.0, 160.0, 120.0)
@@ -19,7 +20,6 @@ def made(
     pose_error: float = 0.0,
     noise: float = 0.1,
     points: int = 420,
-    far: float = 0.0,
     gain: Array | None = None,
     corner: float = 1.0,
 ) -> Sightings:
@@ -28,17 +28,15 @@ def made(
     Args:
         rows: seconds of a step that reading takes; the hand turns some degrees a step.
         pose_error: radians, deviation of the given poses' turns.
-        noise: pixels. far: share of the points at 1000 units.
+        noise: pixels.
         gain: (FRAMES, 3). corner: of a vignetting.
     """
     rng = np.random.default_rng(seed)
     cloud = rng.uniform([-2.5, -1.6, 2.2], [2.5, 1.6, 6.0], (points, 3))
-    away = rng.uniform(0, 1, points) < far
-    cloud[away] *= 1000 / cloud[away, 2:]
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     poses[:, :3, 3] = np.stack([np.linspace(-0.6, 0.6, FRAMES), 0.1 * np.sin(np.arange(FRAMES)), 0.02 * np.arange(FRAMES)], axis=1)
     steps = np.concatenate([rng.normal(0, 0.05, (FRAMES, 3)), np.tile([0.09, 0.0, 0.0], (FRAMES, 1))], axis=1)
-    poses[:, :3, :3] = rotation(np.cumsum(steps[:, :3], axis=0) * 0.3)
+    poses[:, :3, :3] = Rotation.from_rotvec(np.cumsum(steps[:, :3], axis=0) * 0.3).as_matrix()
     frame, point = (index.ravel() for index in np.meshgrid(np.arange(FRAMES), np.arange(points)))
     focal = np.full(FRAMES, CAMERA.fx)
     problem = Problem(poses, cloud, frame, point, np.zeros((len(frame), 2)), focal, np.zeros(len(frame)), rows * steps, lens)
@@ -57,7 +55,7 @@ def made(
     own *= ((1 + (corner**-0.5 - 1) * radius**2) ** -2)[:, None]
     given = poses.copy()
     if pose_error:
-        given[:, :3, :3] = given[:, :3, :3] @ rotation(rng.normal(0, pose_error, (FRAMES, 3)))
+        given[:, :3, :3] = given[:, :3, :3] @ Rotation.from_rotvec(rng.normal(0, pose_error, (FRAMES, 3))).as_matrix()
     return Sightings(
         names=[f"{index:03d}" for index in range(FRAMES)],
         cameras=[CAMERA] * FRAMES,

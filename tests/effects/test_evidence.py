@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fieldfuse.effects import exposure, rolling_shutter, vignetting
+from fieldfuse.effects import exposure, vignetting
 from fieldfuse.effects.evidence import Tracks, without_points_and_frames
 from fieldfuse.simulate.materials import TextureBank, texture_bank
-from tests.effects.tracks import CAMERA, FRAMES, Filmed, film_tracks
+from tests.effects.tracks import FRAMES, Filmed, film_tracks
 
 SEEDS = (11, 12)
 
@@ -86,50 +86,8 @@ def test_vignetting_is_not_taken_for_drift(bank: TextureBank) -> None:
     assert not vignetting.evidence(left, FRAMES).found
 
 
-def shifts(filmed: Filmed, readout: float, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals, rows and velocities of the tracks as a rolling shutter of this readout makes them."""
-    rng = np.random.default_rng(seed)
-    residuals, rows, velocity = [], [], []
-    step = filmed.film.times[1] - filmed.film.times[0]
-    for index in range(1, FRAMES - 1):
-        mine = filmed.tracks.frame == index
-        points, predicted = filmed.points[filmed.tracks.point[mine]], filmed.pixels[mine]
-        seen = predicted.copy()
-        for _ in range(3):  # the row decides the time, the time the row
-            times = filmed.film.times[index] + readout * (seen[:, 1] / CAMERA.height - 0.5)
-            poses = filmed.film.motion.poses(times)
-            camera = np.einsum("nji,nj->ni", poses[:, :3, :3], points - poses[:, :3, 3])
-            seen = camera[:, :2] / camera[:, 2:] * CAMERA.fx + [CAMERA.cx, CAMERA.cy]
-        seen = seen + rng.normal(0, noise, seen.shape)
-        near = filmed.film.motion.poses(filmed.film.times[index] + np.array([-0.02, 0.02]))
-        residuals.append(seen - predicted)
-        rows.append(seen[:, 1])
-        velocity.append(rolling_shutter.image_velocity(CAMERA, near, 0.04, points))
-    assert step > 0
-    return np.concatenate(residuals), np.concatenate(rows), np.concatenate(velocity)
-
-
-@pytest.mark.parametrize("readout", [0.008, 0.018, 0.033, -0.02])
-def test_a_rolling_shutter_is_found_and_measured(clean: list[Filmed], readout: float) -> None:
-    for filmed in clean:
-        found = rolling_shutter.evidence(*shifts(filmed, readout, noise=0.15), CAMERA.height)
-        assert found.found, found.reason
-        assert found.parameters["readout"] == pytest.approx(readout, rel=0.1, abs=0.001)
-
-
-def test_a_global_shutter_gives_no_evidence(clean: list[Filmed]) -> None:
-    for filmed in clean:
-        for noise in (0.0, 0.3, 1.0):
-            found = rolling_shutter.evidence(*shifts(filmed, 0.0, noise), CAMERA.height)
-            assert not found.found, found.reason
-            assert abs(found.parameters["readout"]) < 0.006
-
-
 def test_too_little_to_tell_is_said(clean: list[Filmed]) -> None:
     tracks = clean[0].tracks
     few = Tracks(tracks.linear[:5], tracks.frame[:5], tracks.point[:5], tracks.radius[:5])
     for found in (exposure.evidence(few, FRAMES), vignetting.evidence(few, FRAMES)):
         assert not found.found and "too few" in found.reason
-    assert "too few" in rolling_shutter.evidence(np.zeros((3, 2)), np.zeros(3), np.zeros((3, 2)), 10).reason
-    still = rolling_shutter.evidence(np.random.default_rng(0).normal(0, 1, (100, 2)), np.linspace(0, 96, 100), np.zeros((100, 2)), 96)
-    assert not still.found and still.number == 0

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.config import EffectsSettings
 from fieldfuse.effects import decide as module
-from fieldfuse.effects.adjust import LENS, POSES, ROWS, rotation
+from fieldfuse.effects.adjust import LENS, POSES, ROWS
 from fieldfuse.effects.bounds import STOPS, apart, beyond, beyond_depth, bounded_gains
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.effects.decide import FEWEST_TRIED, TRIED, Decision, Trial, better, decide, tried_frames
@@ -74,7 +75,7 @@ def corrected(**parts: Any) -> dict[str, str]:
 
 def test_no_correction_is_larger_than_cameras_explain() -> None:
     turned = np.eye(4)
-    turned[:3, :3] = rotation(np.array([[0.0, np.radians(14), 0.0]]))[0]
+    turned[:3, :3] = Rotation.from_rotvec(np.array([[0.0, np.radians(14), 0.0]])).as_matrix()[0]
     near = np.eye(4)
     near[0, 3] = 0.2
     names = [f"{number}" for number in range(5)]
@@ -98,7 +99,7 @@ def test_no_depth_camera_stands_where_none_can() -> None:
     def standing(way: float, degrees: float = 0.0) -> Array:
         pose = np.eye(4)
         pose[0, 3] = way
-        pose[:3, :3] = rotation(np.array([[0.0, np.radians(degrees), 0.0]]))[0]
+        pose[:3, :3] = Rotation.from_rotvec(np.array([[0.0, np.radians(degrees), 0.0]])).as_matrix()[0]
         return pose
 
     assert beyond_depth(standing(0.05, 2), metric=True, depth=2.0) is None

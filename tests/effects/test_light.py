@@ -58,11 +58,10 @@ def test_drift_is_smooth() -> None:
     assert np.array_equal(exposure.draw(exposure.PRESETS["strong"], 2, np.random.default_rng(1)), np.ones((2, 3)))
 
 
-def test_exposure_multiplies_linear_light_and_is_inverted() -> None:
+def test_exposure_multiplies_linear_light() -> None:
     linear, gain = scene(), torch.tensor([1.5, 0.5, 2.0])
     out = exposure.forward(linear, gain)
     torch.testing.assert_close(out[3, 4], linear[3, 4] * gain)
-    torch.testing.assert_close(exposure.invert(out, gain), linear)
 
 
 # ---- vignetting
@@ -79,14 +78,13 @@ def test_vignetting_at_the_axis_the_corner_and_between(strength: str) -> None:
     assert float(got[2]) == pytest.approx(np.cos(angle) ** 4, rel=1e-6)
 
 
-def test_vignetting_in_a_picture_and_back() -> None:
+def test_vignetting_in_a_picture() -> None:
     radius, linear = vignetting.radii(CAMERA), scene()
     assert float(radius[0, 0]) == pytest.approx(np.hypot(19.5, 14.5) / 25)  # the corner pixel's centre
     assert float(radius.min()) == pytest.approx(np.hypot(0.5, 0.5) / 25)
     dimmed = vignetting.forward(vignetting.Vignetting(0.5), linear, radius)
     r2 = (19.5**2 + 14.5**2) / 625
     torch.testing.assert_close(dimmed[0, 0], linear[0, 0] / (1 + (2**0.5 - 1) * r2) ** 2)
-    torch.testing.assert_close(vignetting.invert(vignetting.Vignetting(0.5), dimmed, radius), linear)
 
 
 # ---- highlights
@@ -161,7 +159,6 @@ def test_noise_has_the_variance_of_its_formula(strength: str, level: float) -> N
     variance = level / effect.well + (effect.read / effect.well) ** 2
     assert noisy.mean() == pytest.approx(level, abs=4 * np.sqrt(variance / flat.size))
     assert noisy.var() == pytest.approx(variance, rel=0.04)
-    assert float(sensor_noise.deviation(effect, np.array(level))) == pytest.approx(variance**0.5)
 
 
 def test_a_full_well_clips_before_it_is_noisy() -> None:
@@ -179,7 +176,7 @@ def test_compression_is_jpeg_with_its_quality() -> None:
     for strength in ("weak", "medium", "strong"):
         data = compression.encode(compression.PRESETS[strength], picture)
         assert data[:2] == b"\xff\xd8" and data[-2:] == b"\xff\xd9"
-        out = compression.forward(compression.PRESETS[strength], picture)
+        out = compression.decode(data)
         assert out.shape == picture.shape and out.dtype == np.uint8
         errors.append(float(((out.astype(float) - picture) ** 2).mean()))
         sizes.append(len(data))
@@ -191,7 +188,7 @@ def test_compression_rounds_each_cosine_to_its_table() -> None:
     v, u = np.mgrid[0:8, 0:8]
     wave = 128 + 50 * np.cos((2 * u + 1) * 3 * np.pi / 16) * np.cos((2 * v + 1) * 1 * np.pi / 16) + 7 * np.cos((2 * u + 1) * 7 * np.pi / 16)
     block = np.repeat(np.round(wave).astype(np.uint8)[..., None], 3, axis=2)
-    out = compression.forward(compression.Compression(50), block)[..., 0].astype(np.float32) - 128
+    out = compression.decode(compression.encode(compression.Compression(50), block))[..., 0].astype(np.float32) - 128
     given = cv2.dct(block[..., 0].astype(np.float32) - 128)
     got = cv2.dct(out)
     table = {(1, 3): 19, (0, 7): 61, (0, 0): 16}  # luminance table at quality 50, [row][column]

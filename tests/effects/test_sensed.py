@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array, invert, pixel_grid
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.effects import depth_offset
-from fieldfuse.effects.adjust import POSES, Belief, Problem, _slopes, _with, adjust, depth_residuals, predict, residuals, rotation, scatter
+from fieldfuse.effects.adjust import POSES, Belief, Problem, _slopes, _with, adjust, depth_residuals, predict, residuals, scatter
 from fieldfuse.effects.refine import believed
 from fieldfuse.effects.sensed import MARGIN, agreeing, scaled
 from tests.effects.test_registration import CAMERA, walls
@@ -26,7 +27,7 @@ def walk(seed: int) -> tuple[Array, Problem]:
     rng = np.random.default_rng(seed)
     true = np.tile(np.eye(4), (FRAMES, 1, 1))
     true[:, :3, 3] = np.stack([np.linspace(-0.15, 0.15, FRAMES), 0.05 * np.sin(np.arange(FRAMES)), np.linspace(0, 0.05, FRAMES)], axis=1)
-    true[:, :3, :3] = rotation(rng.normal(0, 0.05, (FRAMES, 3)))
+    true[:, :3, :3] = Rotation.from_rotvec(rng.normal(0, 0.05, (FRAMES, 3))).as_matrix()
     first = invert(true[FRAMES // 2])
     at = rng.uniform(4, [CAMERA.width - 4, CAMERA.height - 4], (POINTS, 2))
     rays = np.concatenate([(at - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy], np.ones((POINTS, 1))], axis=1)
@@ -38,7 +39,7 @@ def walk(seed: int) -> tuple[Array, Problem]:
     t = np.linspace(0, 1, FRAMES)[:, None]
     drift = np.sin(np.pi * t * rng.uniform(1, 3, 6) + rng.uniform(0, 6, 6)) * ([0.006] * 3 + [0.03] * 3)
     given = true.copy()
-    given[:, :3, :3] = true[:, :3, :3] @ rotation(drift[:, :3])
+    given[:, :3, :3] = true[:, :3, :3] @ Rotation.from_rotvec(drift[:, :3]).as_matrix()
     given[:, :3, 3] += drift[:, 3:]
     return true, replace(exact, poses=given, place=places)
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fieldfuse.effects import background, geometry, light, motion_blur, view_dependence
-from fieldfuse.effects.adjust import LENS, POSES, ROWS, adjust, predict, residuals, rotation, scatter, vectors
+from fieldfuse.effects import geometry, light, motion_blur
+from fieldfuse.effects.adjust import LENS, POSES, ROWS, adjust, predict, residuals, scatter
 from fieldfuse.effects.paid import Paid
 from fieldfuse.effects.refine import believed, refined_poses
 from fieldfuse.effects.survey import ORDER, _lens, _poses, _rows, look
@@ -38,7 +38,6 @@ def test_nothing_is_found_where_nothing_is(seed: int) -> None:
         ("poses", {"pose_error": 0.004}, 4),
         ("exposure", {"gain": drift(3)}, 5),
         ("vignetting", {"corner": 0.6}, 4),
-        ("background", {"far": 0.1}, 5),
     ],
 )
 def test_each_effect_alone_is_found_and_nothing_else(effect: str, arguments: dict, seed: int) -> None:
@@ -116,7 +115,7 @@ def test_refined_poses_stay_where_the_given_ones_are(seed: int) -> None:
 
     def cost(step: np.ndarray) -> float:
         """Of all poses turned about their middle by `step[:3]` and moved by `step[3:]`."""
-        turn, moved = rotation(step[None, :3])[0], poses.copy()
+        turn, moved = Rotation.from_rotvec(step[None, :3]).as_matrix()[0], poses.copy()
         moved[:, :3, :3] = turn @ poses[:, :3, :3]
         moved[:, :3, 3] = (poses[:, :3, 3] - centre) @ turn.T + centre + step[3:]
         return belief.cost(moved)
@@ -143,12 +142,6 @@ def test_depths_do_not_drift_where_a_lens_is_a_little_off(seed: int) -> None:
     assert abs(np.median(depths(refined) / exact) - 1) < 0.02
 
 
-def test_turns_become_vectors_and_back() -> None:
-    turns = np.random.default_rng(0).normal(0, 0.6, (50, 3))
-    turns[0] = 0
-    np.testing.assert_allclose(vectors(rotation(turns)), turns, atol=1e-12)
-
-
 def test_held_out_frames_move_nothing_of_the_others() -> None:
     seen, train = made(10, pose_error=0.004), np.arange(FRAMES) % 8 != 0
     before = refined_poses(seen, train, frozenset({POSES})).poses
@@ -168,18 +161,6 @@ def test_adjusting_points_alone_lowers_the_residual_to_the_noise() -> None:
     assert fitted.scatter < 0.25
 
 
-def test_neighbours_that_change_together_speak_for_view_dependence() -> None:
-    rng = np.random.default_rng(2)
-    frame, place = np.repeat(np.arange(10), 150), rng.uniform(0, 200, (1500, 2))
-    noise = rng.normal(0, 0.03, 1500)
-    alone = view_dependence.evidence(noise, frame, place)
-    spot = 0.2 * np.exp(-(((place - 100) / 30) ** 2).sum(1))
-    together = view_dependence.evidence(noise + spot, frame, place)
-    assert not alone.found and together.found, (alone.reason, together.reason)
-    few = view_dependence.evidence(noise[:5], frame[:5], place[:5])
-    assert not few.found and "too few" in few.reason
-
-
 def test_frames_that_are_less_sharp_than_others_are_told() -> None:
     rng = np.random.default_rng(3)
     frame, point = (index.ravel() for index in np.meshgrid(np.arange(12), np.arange(200)))
@@ -195,8 +176,6 @@ def test_too_little_to_tell() -> None:
     seen = made(12, points=20)
     found = look(seen)
     assert found.there == frozenset() and all("too few" in finding.reason for finding in found.findings.values())
-    empty = background.evidence(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros(0), 1.0)
-    assert not empty.found
 
 
 def test_readout_is_told_in_shares_of_a_step() -> None:

@@ -25,8 +25,6 @@ FRAMES = 12
 class Filmed:
     film: Film
     tracks: Tracks
-    points: Array  # (P, 3)
-    pixels: Array  # (O, 2) where the tracks' observations lie by the true poses
 
 
 def film_tracks(bank: TextureBank, seed: int, effects: list[str], count: int = 60, kind: str = "room") -> Filmed:
@@ -37,7 +35,7 @@ def film_tracks(bank: TextureBank, seed: int, effects: list[str], count: int = 6
     shots = [film.shot(index) for index in range(FRAMES)]
     linear = [transfer.decode(torch.from_numpy(cv2.blur(shot.rgb, (3, 3)).astype(np.float32) / 255)).numpy() for shot in shots]
     rng = np.random.default_rng(seed)
-    columns: dict[str, list[Array]] = {"linear": [], "frame": [], "point": [], "radius": [], "pixels": []}
+    columns: dict[str, list[Array]] = {"linear": [], "frame": [], "point": [], "radius": []}
     points = []
     for shot in shots:
         u, v = rng.integers(4, [[CAMERA.width - 4], [CAMERA.height - 4]], (2, count))
@@ -58,7 +56,4 @@ def film_tracks(bank: TextureBank, seed: int, effects: list[str], count: int = 6
             columns["point"].append(first + np.flatnonzero(seen))
             off = np.linalg.norm(pixels[seen] - [CAMERA.cx, CAMERA.cy], axis=1)
             columns["radius"].append(off / (0.5 * np.hypot(CAMERA.width, CAMERA.height)))
-            columns["pixels"].append(pixels[seen])
-    joined = {name: np.concatenate(values) for name, values in columns.items()}
-    where = joined.pop("pixels")
-    return Filmed(film, Tracks(**joined), np.concatenate(points), where)
+    return Filmed(film, Tracks(**{name: np.concatenate(values) for name, values in columns.items()}))

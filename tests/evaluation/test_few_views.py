@@ -7,8 +7,8 @@ import torch
 import torch.nn.functional as F
 
 from fieldfuse.evaluation.few_views import without
-from fieldfuse.networks.gru import RunningMean
-from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.nerfusion.gru import RunningMean
+from fieldfuse.nerfusion.model import NerfusionModel
 
 
 def test_the_direction_code_is_off_for_a_recording_as_well() -> None:

@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import cv2
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldfuse.errors import OutputError
 from fieldfuse.evaluation.pictures import (
     DEPTH_COLOURS,
     ERROR_TOP,
-    LABEL,
     MISSING,
     TINT,
     coloured,
     depth_picture,
     depth_range,
     error_picture,
-    make_pictures,
+    method_pictures,
     moving_pictures,
     spread,
-    strip,
-    write_picture,
-    write_strips,
 )
 from fieldfuse.stereo.left_out import LeftOut
 from tests.evaluation.samples import draw, make_views
@@ -74,10 +65,10 @@ def test_spread(count: int, most: int) -> None:
         assert found[0] == 0 and found[-1] == count - 1
 
 
-def test_make_pictures_of_both_methods() -> None:
+def test_pictures_of_both_methods() -> None:
     views = make_views()
     indices = np.flatnonzero(views.test)
-    found = make_pictures(views, indices, [draw(views, i) for i in indices], [draw(views, i, True) for i in indices], unit="m")
+    found = method_pictures(views, indices, {name: [draw(views, i, name == "tsdf") for i in indices] for name in ("field", "tsdf")}, "m")
     assert [view.name for view in found.views] == ["0000.jpg", "0003.jpg"] and found.left_out == 0
     view = found.views[0]
     assert set(view.methods) == {"field", "tsdf"} and view.measured is not None
@@ -93,7 +84,7 @@ def test_make_pictures_of_both_methods() -> None:
 def test_only_some_of_many_views() -> None:
     views = make_views(count=30, every=2)
     indices = np.flatnonzero(views.test)
-    found = make_pictures(views, indices, [draw(views, i) for i in indices], most=4)
+    found = method_pictures(views, indices, {"field": [draw(views, i) for i in indices]}, most=4)
     assert len(found.views) == 4 and found.left_out == 11
     assert found.views[0].name == "0000.jpg" and found.views[-1].name == "0028.jpg"
 
@@ -113,30 +104,5 @@ def test_what_was_left_out_is_tinted() -> None:
 
 def test_no_rendering_at_all() -> None:
     views = make_views(depth=False)
-    found = make_pictures(views, [0])
+    found = method_pictures(views, [0], {})
     assert found.views[0].methods == {} and found.depth_range is None
-
-
-def test_strips(tmp_path: Path) -> None:
-    views = make_views(width=200, height=120)
-    views.names[0], views.names[3] = "a/b c.jpg", "a/b:c.jpg"
-    found = make_pictures(views, [0, 3], [draw(views, i) for i in (0, 3)], unit="m")
-    paths = write_strips(tmp_path / "renders", found)
-    assert len(set(paths)) == 2 and all(path.parent == tmp_path / "renders" for path in paths)
-    read = cv2.imread(str(paths[0]))
-    assert read is not None and read.shape == strip(found.views[0], "field").shape
-    assert (read[LABEL : LABEL + 120, :200, ::-1] == views.images[0]).all()  # the first tile is the photo, unchanged
-    assert read[:LABEL].min() < 120  # its label
-    assert not [path for path in (tmp_path / "renders").iterdir() if path not in paths]
-
-
-def test_tiny_pictures_are_enlarged_for_their_labels() -> None:
-    views = make_views(width=20, height=15)
-    found = strip(make_pictures(views, [0], [draw(views, 0)]).views[0], "field", (1.0, 3.0), "m")
-    assert found.shape == (15 * 8 + 2 * LABEL, 4 * 160 + 3 * 6, 3)
-
-
-def test_unwritable_folder(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(OutputError):
-        write_picture(tmp_path / "file" / "x.png", np.zeros((4, 4, 3), np.uint8))

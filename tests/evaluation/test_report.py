@@ -21,7 +21,7 @@ from fieldfuse import __version__
 from fieldfuse.errors import InputError, OutputError
 from fieldfuse.evaluation.baseline import nearest_image_scores
 from fieldfuse.evaluation.page import render_page
-from fieldfuse.evaluation.pictures import Pictures, make_pictures
+from fieldfuse.evaluation.pictures import Pictures, method_pictures
 from fieldfuse.evaluation.report import CAPTURE, FIELD, POINT, POSES, SCORE, SFM_NOTE, STAGE, plain, report_data, write_report
 from fieldfuse.evaluation.score import score_views
 from fieldfuse.evaluation.table import table
@@ -92,7 +92,8 @@ def make_sample(tsdf: bool) -> tuple[dict[str, Any], Pictures]:
     }
     if surface:
         data["evaluation"]["tsdf"] = score_views(surface, views, indices, 0.1)
-    return data, make_pictures(views, indices, field, surface, unit="m")
+    shown = {"field": field, **({"tsdf": surface} if surface else {})}
+    return data, method_pictures(views, indices, shown, unit="m")
 
 
 def check_page(text: str) -> Page:
@@ -215,7 +216,7 @@ def test_field_alone_and_surface_alone() -> None:
     both, _ = sample()
     both["evaluation"]["field"] = None
     views = make_views()
-    page = check_page(render_page(report_data(both), make_pictures(views, [0], tsdf=[draw(views, 0, True)])))
+    page = check_page(render_page(report_data(both), method_pictures(views, [0], {"tsdf": [draw(views, 0, True)]})))
     assert "TSDF" in page.text and "Photo" in page.text
 
 
@@ -287,7 +288,7 @@ def test_any_settings_make_a_page(value: Any) -> None:
 def test_pictures_keep_the_page_small(tmp_path: Path) -> None:
     views = make_views(count=8, height=720, width=1280, every=2)
     indices = np.flatnonzero(views.test)
-    pictures = make_pictures(views, indices, [draw(views, i) for i in indices])
+    pictures = method_pictures(views, indices, {"field": [draw(views, i) for i in indices]})
     page = write_report(tmp_path, {}, pictures)[1]
     assert page.stat().st_size < 2_500_000
     source = next(

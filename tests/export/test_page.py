@@ -18,7 +18,7 @@ from fieldfuse.camera import Array
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation.speed_state import around, lens
 from fieldfuse.export.page import Tour, corner_densities, decoder_blocks, page, require_page, write_page
-from fieldfuse.networks.decoder import Deferred, make_decoder
+from fieldfuse.nerfusion.decoder import Deferred, make_decoder
 from fieldfuse.render.bake import BakedField, bake
 from fieldfuse.render.bake_image import BakedRenderer
 from fieldfuse.tone import brighter, decode, encode

@@ -8,6 +8,7 @@ import re
 import signal
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -94,6 +95,21 @@ def test_a_library_that_hides_the_second_signal_does_not_make_it_an_error(signal
 
     with pytest.raises(expected), ConsoleProgress().listening():
         load()
+
+
+def test_a_second_signal_waits_while_open3d_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of it would end the process with another code than it is given."""
+    half = SimpleNamespace(__spec__=SimpleNamespace(_initializing=True))
+    monkeypatch.setitem(sys.modules, "open3d", half)
+    loaded = False
+    with pytest.raises(KeyboardInterrupt), ConsoleProgress().listening():
+        for _ in range(2):
+            signal.raise_signal(signal.SIGINT)
+        time.sleep(0.1)
+        half.__spec__._initializing, loaded = False, True
+        for _ in range(500):
+            time.sleep(0.01)
+    assert loaded
 
 
 def test_a_second_signal_that_is_lost_in_del_still_ends(capsys: pytest.CaptureFixture[str]) -> None:

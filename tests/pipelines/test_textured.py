@@ -98,7 +98,7 @@ def test_a_mesh_is_made_of_pictures_as_they_were_taken_where_there_is_room(run: 
 def test_a_size_of_nothing_is_refused(tmp_path: Path, capsys: Capsys, name: str) -> None:
     make_room(tmp_path / "room", 4)
     answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", "--set", f"export.{name}=0")
-    assert answer.code == 2 and f"export.{name} is 0; it must be a positive number" in answer.sentence()
+    assert answer.code == 2 and f"export.{name} is 0; it must be greater than 0" in answer.sentence()
 
 
 def test_a_mesh_stays_when_its_texture_cannot_be_made(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 
 from fieldfuse.evaluation.speed_state import sphere_field
-from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.field import Field
 from fieldfuse.training.levels import all_places, first_field
 from fieldfuse.volume.host import TorchHost

@@ -13,7 +13,7 @@ from safetensors.numpy import load_file, save_file
 from fieldfuse.camera import Intrinsics
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation.speed_state import around, lens
-from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.bake import BakedField, bake
 from fieldfuse.render.bake_file import METADATA_KEY, read_baked, write_baked
 from fieldfuse.render.bake_image import BakedRenderer

@@ -12,17 +12,17 @@ import pytest
 import torch
 
 from fieldfuse.camera import pixel_grid, rays
-from fieldfuse.networks.cameras import Cameras
-from fieldfuse.networks.cull import all_blocks
-from fieldfuse.networks.lattice import LatentVolume, Lattice
-from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.nerfusion.cameras import Cameras
+from fieldfuse.nerfusion.cull import all_blocks
+from fieldfuse.nerfusion.lattice import LatentVolume, Lattice
+from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.render.differentiable import render_with_gradients
 from fieldfuse.render.field import Field
 from fieldfuse.render.fused import make_field, without_empty_blocks
 from fieldfuse.render.rays import render_rays
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import Topology
-from tests.networks.made import HEIGHT, INTRINSICS, WIDTH, lattice, small_model, wall_pictures
+from tests.nerfusion.made import HEIGHT, INTRINSICS, WIDTH, lattice, small_model, wall_pictures
 
 
 def full_volume(model: NerfusionModel, shell: float = 0.0, resolution: int = 32) -> LatentVolume:

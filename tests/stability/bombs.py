@@ -32,7 +32,7 @@ from fieldfuse.config import load_settings
 from fieldfuse.errors import FieldfuseError
 from fieldfuse.evaluation.selftest.edit import small_field
 from fieldfuse.files import read_json
-from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.field import Field
 from fieldfuse.volume.store import METADATA_KEY, read_field
 from tests.capture.layouts import LAYOUTS, sens_of, write_record3d, zipped

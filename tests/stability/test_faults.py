@@ -105,7 +105,7 @@ def test_no_module_with_a_writer_is_left_out() -> None:
     named = {
         # Behind `Field.save`, `save_views` and `simulate`.
         "toolkit/volume/store.py", "toolkit/capture/views_file.py", "toolkit/simulate/capture_files.py", "toolkit/export/ply.py",
-        "toolkit/training/nerfusion/validate.py",
+        "toolkit/nerfusion/training/validate.py",
     }  # fmt: skip
     missing = {name for name in found - named - set(ELSEWHERE) if name.removesuffix(".py").replace("/", ".") not in tried}
     assert missing == set()

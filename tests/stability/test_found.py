@@ -24,6 +24,7 @@ from fieldfuse.evaluation.selftest.edit import small_field
 from fieldfuse.evaluation.selftest.fits import scene_of
 from fieldfuse.export.mesh import mesh_facts
 from fieldfuse.files import read_json, write_json
+from fieldfuse.nerfusion.training.settings import load_train_settings
 from fieldfuse.pipelines.bench_table import sections
 from fieldfuse.pipelines.console import ConsoleProgress
 from fieldfuse.pipelines.folder import RunFolder
@@ -34,7 +35,6 @@ from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_file import METADATA_KEY, read_baked, write_baked
 from fieldfuse.simulate.mesh_scene import load_mesh_scene
 from fieldfuse.simulate.settings import read_scene_file
-from fieldfuse.training.nerfusion.settings import load_train_settings
 from fieldfuse.tsdf.mesh import Mesh
 
 

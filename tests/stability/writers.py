@@ -33,7 +33,6 @@ from fieldfuse.export.video import write_video
 from fieldfuse.files import write_json
 from fieldfuse.pipelines.rendered import Picture, Pictures, save_pictures, write_png, write_pngs
 from fieldfuse.tsdf.frames import DepthFrame
-from fieldfuse.tsdf.store import save_volume
 from fieldfuse.tsdf.volume import TsdfVolume
 from tests.stability.writers_more import more_writers
 
@@ -58,7 +57,6 @@ def writers() -> dict[str, Write]:
         "Field.save": lambda folder: field.save(folder / "field.safetensors"),
         "save_views": lambda folder: save_views(folder / "views.safetensors", views),
         "save_pictures": lambda folder: save_pictures(folder / "pictures.safetensors", pictures),
-        "save_volume": lambda folder: save_volume(folder / "volume.safetensors", volume),
         "write_pngs": lambda folder: write_pngs(folder, "a", pictures, 1.0),
         "write_png": lambda folder: write_png(folder / "a.png", pixels),
         "write_points": lambda folder: write_points(folder / "points.ply", mesh.vertices, mesh.colours),

@@ -23,12 +23,16 @@ from fieldfuse.capture.select import select_frames
 from fieldfuse.capture.video import read_video
 from fieldfuse.config import CaptureSettings, Settings
 from fieldfuse.evaluation.compare_page import write_comparison
-from fieldfuse.evaluation.pictures import write_picture, write_strips
 from fieldfuse.evaluation.selftest.data import texture
 from fieldfuse.evaluation.selftest.edit import small_field
 from fieldfuse.evaluation.tradeoff_page import write_tradeoff
 from fieldfuse.export.page import Tour, write_page
-from fieldfuse.networks.weights import save_model
+from fieldfuse.nerfusion.training.caution import Caution
+from fieldfuse.nerfusion.training.checkpoint import save_checkpoint
+from fieldfuse.nerfusion.training.curve import Curve
+from fieldfuse.nerfusion.training.shards import write_shard
+from fieldfuse.nerfusion.training.train import make_model
+from fieldfuse.nerfusion.weights import save_model
 from fieldfuse.pipelines.folder import RunFolder
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_file import write_baked
@@ -39,16 +43,11 @@ from fieldfuse.simulate.simulate import simulate
 from fieldfuse.stereo.left_out import LeftOut, save_left_out
 from fieldfuse.stereo.maps import save_stereo
 from fieldfuse.stereo.match import StereoDepth
-from fieldfuse.training.nerfusion.caution import Caution
-from fieldfuse.training.nerfusion.checkpoint import save_checkpoint
-from fieldfuse.training.nerfusion.curve import Curve
-from fieldfuse.training.nerfusion.shards import write_shard
-from fieldfuse.training.nerfusion.train import make_model
 from tests.capture.layouts import write_record3d, write_sens
 from tests.evaluation.test_compare_page import made, pictures
 from tests.evaluation.test_tradeoff import ladder
+from tests.nerfusion.training.tiny import tiny_settings
 from tests.simulate.test_simulate import SMALL
-from tests.training.nerfusion.tiny import tiny_settings
 
 Write = Callable[[Path], object]
 
@@ -114,8 +113,6 @@ def more_writers(place: Path) -> dict[str, Write]:
         "save_stereo": lambda folder: save_stereo(folder / "depths.safetensors", ["a"], [StereoDepth(depth, depth, camera)]),
         "write_comparison": lambda folder: write_comparison(folder, made(), shown, meshes, 0.075),
         "write_tradeoff": lambda folder: write_tradeoff(folder, tradeoff),
-        "write_strips": lambda folder: write_strips(folder, shown),
-        "write_picture": lambda folder: write_picture(folder / "a.png", texture(0, 48, 64)),
         "simulate": filmed,
         "select_frames": lambda folder: select_frames(film, folder / f"video{next(numbers)}", CaptureSettings(max_frames=4)),
         "select_frames, a scan": lambda folder: select_frames(scan, folder / f"scan{next(numbers)}", CaptureSettings(max_frames=4)),

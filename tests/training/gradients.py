@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from fieldfuse.networks.decoder import PerSample
+from fieldfuse.nerfusion.decoder import PerSample
 from fieldfuse.render.field import Field
 from fieldfuse.render.march import march
 from fieldfuse.training import step as step_module

@@ -15,8 +15,8 @@ from fieldfuse.backends.numba import train_decoder, train_order
 from fieldfuse.backends.numba.decode import RAYS, decode, layers_of
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture.types import Views
-from fieldfuse.networks.decoder import Deferred
-from fieldfuse.networks.encoding import spherical_harmonics
+from fieldfuse.nerfusion.decoder import Deferred
+from fieldfuse.nerfusion.encoding import spherical_harmonics
 from fieldfuse.render.numba_renderer import NumbaRenderer, decoder_arrays
 from fieldfuse.render.rays import render_rays
 from fieldfuse.training.depth import ROUGH

@@ -10,8 +10,8 @@ import torch
 
 from fieldfuse.backends.numba import decode_per_sample as kernels_net
 from fieldfuse.backends.numba.matrix import add_outer, product
-from fieldfuse.networks.decoder import PerSample
-from fieldfuse.networks.encoding import positional
+from fieldfuse.nerfusion.decoder import PerSample
+from fieldfuse.nerfusion.encoding import positional
 from fieldfuse.render.field import Field
 from fieldfuse.render.numba_per_sample import PerSampleRenderer, net_arrays, write_back
 from fieldfuse.render.rays import render_rays
@@ -142,7 +142,7 @@ def test_gradients_agree(shell: float, seed: int, threads: int, rates: Rates, ev
     exact = exact_gradients(field, weighed(pool, picks), rates)
     with monkeypatch.context() as patch:
         # In float32 the reference's own angles are off by 1e-5.
-        patch.setattr("fieldfuse.networks.decoder.positional", lambda values, count: positional(values.double(), count).float())
+        patch.setattr("fieldfuse.nerfusion.decoder.positional", lambda values, count: positional(values.double(), count).float())
         reference = torch_gradients(field, weighed(pool, picks), rates)
     compiled = gradients(NumbaPerSampleOptimiser(field, pool, threads=threads), picks, monkeypatch, rates)
     names = ["density_rows", "feature_rows", *(name for name, _ in field.decoder.named_parameters())]

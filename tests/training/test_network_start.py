@@ -15,8 +15,8 @@ from fieldfuse.capture.types import Views
 from fieldfuse.config import Settings, load_settings
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation.speed_state import around, lens
-from fieldfuse.keyframes import KeyFrames
-from fieldfuse.networks.decoder import Deferred
+from fieldfuse.nerfusion.decoder import Deferred
+from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import render_view
@@ -36,7 +36,7 @@ from fieldfuse.training.silhouettes import inside_silhouettes, visual_hull
 from fieldfuse.training.start import space_of
 from fieldfuse.volume.lookup import corners, gather
 from fieldfuse.volume.space import Space
-from tests.networks.made import INTRINSICS, SMALL, small_model, wall_pictures
+from tests.nerfusion.made import INTRINSICS, SMALL, small_model, wall_pictures
 
 DEPTH = 2.0
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from fieldfuse.networks.decoder import Deferred
+from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render.field import Field, density
 from fieldfuse.render.march import Samples, march
 from fieldfuse.training import step as step_module

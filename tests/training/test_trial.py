@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.types import Capture
 from fieldfuse.config import Settings, load_settings
-from fieldfuse.effects.adjust import rotation
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.training import trial as module
 from fieldfuse.training.trial import Trial, same_geometry
@@ -47,7 +47,7 @@ def test_wrong_corrections_score_worse(room: Capture, settings: Settings, monkey
     turned = {}
     for frame in room.frames:
         pose = np.array(frame.world_from_camera)
-        pose[:3, :3] = pose[:3, :3] @ rotation(rng.normal(0, 0.12, (1, 3)))[0]
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(rng.normal(0, 0.12, (1, 3))).as_matrix()[0]
         turned[frame.name] = pose
     toned, moved = score(Corrections(gain=gain)), score(Corrections(poses=turned))  # type: ignore[arg-type]
     assert plain is not None and toned is not None and moved is not None

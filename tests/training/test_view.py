@@ -10,7 +10,7 @@ import torch
 
 from fieldfuse.config import FieldSettings
 from fieldfuse.effects.decide import choose_field
-from fieldfuse.networks.decoder import Deferred, PerSample, make_decoder
+from fieldfuse.nerfusion.decoder import Deferred, PerSample, make_decoder
 from fieldfuse.training.fit import fit_field
 from fieldfuse.training.view import HARMONICS, blind, limit, of_direction
 from tests.training.test_fit import scene, sphere_views, wanted

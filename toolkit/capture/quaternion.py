@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array
 from fieldfuse.errors import InputError
@@ -18,12 +19,7 @@ def rigid(quaternion: Array, translation: Array, where: str) -> Array:
         length = np.linalg.norm(quaternion)
     if not np.isfinite(length) or length < 1e-9:
         raise InputError(f"{where}: the pose's quaternion {quaternion.tolist()} is not a rotation; correct or remove this frame")
-    w, x, y, z = quaternion / length
     out = np.eye(4)
-    out[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    out[:3, :3] = Rotation.from_quat((quaternion / length)[[1, 2, 3, 0]]).as_matrix()
     out[:3, 3] = translation
     return out

@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array
 from fieldfuse.effects.evidence import TUNING
@@ -71,7 +72,7 @@ class Belief:
         """(F, 6) turns and moves from the believed poses to these, camera axes."""
         turned = np.einsum("fji,fjk->fik", self.poses[:, :3, :3], poses[:, :3, :3])
         moved = np.einsum("fji,fj->fi", poses[:, :3, :3], poses[:, :3, 3] - self.poses[:, :3, 3])
-        return np.concatenate([vectors(turned), moved], axis=1)
+        return np.concatenate([Rotation.from_matrix(turned).as_rotvec(), moved], axis=1)
 
     def cost(self, poses: Array) -> float:
         return 0.5 * float((self.weight * self.off(poses) ** 2).sum())
@@ -138,7 +139,7 @@ def adjust(problem: Problem, unknown: frozenset[str] = frozenset(), steps: int =
     for _ in range(steps):
         moved = _step(current, left, width, unknown, damping, belief)
         new = _left(moved)
-        value = _cost(new, width, moved, belief)
+        value = _cost(new, width, moved, belief) if np.isfinite(moved.poses).all() else np.inf
         if not value < cost:
             damping *= 10
             if damping > 1e4:
@@ -274,7 +275,7 @@ def _with(problem: Problem, step: Array, unknown: frozenset[str]) -> Problem:
         moved = step[:first].reshape(-1, 6)
         poses = problem.poses.copy()
         poses[:, :3, 3] += np.einsum("fij,fj->fi", poses[:, :3, :3], moved[:, 3:])
-        poses[:, :3, :3] = poses[:, :3, :3] @ rotation(moved[:, :3])
+        poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(moved[:, :3]).as_matrix()
         problem = replace(problem, poses=poses)
     if LENS in unknown:
         k1, k2 = (float(a + b) for a, b in zip(problem.lens, step[first : first + 2], strict=True))
@@ -290,22 +291,6 @@ def _cross(v: Array) -> Array:
     x, y, z = v.T
     zero = np.zeros_like(x)
     return np.asarray(np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3))
-
-
-def rotation(vectors: Array) -> Array:
-    """(N, 3) rotation vectors → (N, 3, 3) (Rodrigues)."""
-    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
-    cross = _cross(vectors)
-    small = np.maximum(angle, 1e-12)
-    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + (1 - np.cos(angle)) / small**2 * (cross @ cross))
-
-
-def vectors(rotations: Array) -> Array:
-    """(N, 3, 3) → (N, 3) rotation vectors, for angles below a half turn: `rotation` undone."""
-    axis = 0.5 * np.stack([rotations[:, i, j] - rotations[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
-    sine, cosine = np.linalg.norm(axis, axis=1), 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1)
-    angle = np.arctan2(sine, cosine)
-    return np.asarray(axis * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)[:, None])
 
 
 def resect(problem: Problem, frame: int, steps: int = 20) -> tuple[Array, Array]:

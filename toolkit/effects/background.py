@@ -13,11 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-
-from fieldfuse.camera import Array
-from fieldfuse.effects.evidence import Evidence
 
 Tensor = torch.Tensor
 
@@ -82,50 +78,3 @@ def _clouds(effect: Background, azimuth: Tensor, elevation: Tensor) -> Tensor:
             wave = float(turns[k]) * azimuth + (0.05 + 0.3 * float(slope[k])) * (octave + 1) * elevation + 6.28 * float(phase[k])
             total += 0.6**octave * torch.sin(wave)
     return torch.sigmoid(1.5 * total - 0.5)
-
-
-THRESHOLD = 0.004  # share of what is seen
-BEYOND = 10.0  # times as far as the scene usually is
-NOISE = 0.2  # working pixels: deviation of one observation
-CONSISTENT = 0.8  # working pixels that an observation of one point may be off
-FEWEST = 50  # points whose distance can be told
-LEAST = 3  # far ones: fewer may be wrong matches
-VIEWS = 4  # that show a point, so that a wrong match hardly fits
-
-
-def evidence(directions: Array, centres: Array, point: Array, focal: Array, usual: float) -> Evidence:
-    """Share of the points, among those whose distance can be told, that lie far beyond everything else: parallax hardly reaches them.
-
-    With m the mean direction of a point's rays and a_o how far camera o stands aside of their middle, across m, a point at the distance
-    1 / rho is seen along m − rho · a_o: rho is found by least squares, and told where two of its deviations are below the half of
-    1 / (BEYOND · usual).
-
-    Args:
-        directions: (O, 3) unit rays in the world. centres: (O, 3) where they start. focal: (O,) working pixels. point: (O,) from 0, every
-            number there. usual: median depth of the points that show parallax.
-    """
-    count = int(point.max(initial=-1)) + 1
-    seen = np.maximum(np.bincount(point, minlength=count), 1)
-    total = np.stack([np.bincount(point, column, count) for column in directions.T], axis=1)
-    mean = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
-    middle = np.stack([np.bincount(point, column, count) for column in centres.T], axis=1) / seen[:, None]
-    aside = centres - middle[point]
-    aside = aside - (aside * mean[point]).sum(1, keepdims=True) * mean[point]
-    off = directions - mean[point]
-    baseline = np.maximum(np.bincount(point, (aside**2).sum(1), count), 1e-30)
-    rho = -np.bincount(point, (off * aside).sum(1), count) / baseline
-    worst = np.zeros(count)
-    np.maximum.at(worst, point, np.linalg.norm(off + rho[point, None] * aside, axis=1) * focal)
-    deviation = NOISE / (np.sqrt(baseline) * np.maximum(np.bincount(point, focal, count) / seen, 1e-9))
-    least = 1 / max(BEYOND * usual, 1e-12)
-    tells = (2 * deviation < 0.5 * least) & (worst < CONSISTENT) & (seen >= VIEWS)
-    far = tells & (np.abs(rho) < 0.5 * least)
-    enough = int(tells.sum()) >= FEWEST and int(far.sum()) >= LEAST
-    share = float(far.sum() / int(tells.sum())) if enough else 0.0
-    return Evidence(
-        "background",
-        share,
-        THRESHOLD,
-        f"{100 * share:.1f}% of the points lie more than {2 * BEYOND:g} times as far as the scene usually is; "
-        f"{100 * THRESHOLD:.1f}% or more speak for a distant background",
-    )

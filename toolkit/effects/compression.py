@@ -36,8 +36,3 @@ def decode(data: bytes) -> Array:
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None  # what `encode` wrote can be read
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
-
-
-def forward(effect: Compression, picture: Array) -> Array:
-    """(H, W, 3) uint8 sRGB → the same after writing and reading."""
-    return decode(encode(effect, picture))

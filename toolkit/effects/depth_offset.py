@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array
 
@@ -37,9 +37,7 @@ PRESETS = {
 
 def forward(effect: DepthOffset) -> Array:
     """(4, 4) the depth camera from the picture's."""
-    turns = np.radians([effect.down, effect.right, effect.roll])
-    about_x, about_y, about_z = (cv2.Rodrigues(turn * axis)[0] for turn, axis in zip(turns, np.eye(3), strict=True))
     out = np.eye(4)
-    out[:3, :3] = about_x @ about_y @ about_z
+    out[:3, :3] = Rotation.from_euler("XYZ", [effect.down, effect.right, effect.roll], degrees=True).as_matrix()
     out[:3, 3] = effect.x, effect.y, effect.z
     return out

@@ -51,11 +51,6 @@ def forward(linear: Tensor, gain: Tensor) -> Tensor:
     return linear * gain
 
 
-def invert(linear: Tensor, gain: Tensor) -> Tensor:
-    """What `forward` was given; exact where nothing was clipped afterwards."""
-    return linear / gain
-
-
 THRESHOLD = 0.04  # stops
 FEWEST = 30  # observations without which nothing can be told
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array, invert
 from fieldfuse.effects.adjust import LENS, POSES, ROWS, UNKNOWNS, Problem, adjust, residuals, scatter
@@ -74,7 +75,8 @@ def steps_of(poses: Array, times: Array) -> Array:
         passed = times[index + 1] - times[index - 1]
         if passed < 2.5 * usual:
             here, relative = poses[index, :3, :3].T, invert(poses[index - 1]) @ poses[index + 1]
-            motion[index, :3] = here @ poses[index - 1, :3, :3] @ _vector(relative[:3, :3]) / passed
+            turn = Rotation.from_matrix(relative[:3, :3]).as_rotvec()
+            motion[index, :3] = here @ poses[index - 1, :3, :3] @ turn / passed
             motion[index, 3:] = here @ (poses[index + 1, :3, 3] - poses[index - 1, :3, 3]) / passed
     return motion
 
@@ -90,13 +92,6 @@ def readout(motion: Array, steps: Array) -> tuple[float, float]:
     if size <= 0 or other <= 0:
         return 0.0, 0.0
     return product / size, product / np.sqrt(size * other)
-
-
-def _vector(rotation: Array) -> Array:
-    """(3, 3) → rotation vector (3,), for angles below a half turn."""
-    axis = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
-    sine, cosine = 0.5 * float(np.linalg.norm(axis)), 0.5 * (float(np.trace(rotation)) - 1)
-    return 0.5 * axis * (np.arctan2(sine, cosine) / sine if sine > 1e-12 else 1.0)
 
 
 def explain(seen: Sightings) -> Explained | None:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fieldfuse.camera import Array
 from fieldfuse.effects import exposure, vignetting
-from fieldfuse.effects.evidence import BRIGHTEST, DARKEST, ROUNDS, Evidence, Tracks, robust, without_points_and_frames
+from fieldfuse.effects.evidence import BRIGHTEST, DARKEST, Evidence, Tracks
 
 EXPOSURE, VIGNETTING = "exposure", "vignetting"
 HELD_OUT = 4  # every so manieth point is kept out of the fits
 MARGIN = {EXPOSURE: 0.24, VIGNETTING: 0.1}  # least relative fall of the held-out deviation: less did not pay on real pictures
 BOTH = 0.25  # … by both: each hides some of the other, so that alone neither may come as far as it does beside the other
-UNCLIPPED = 0.45  # linear light of a patch below which hardly a pixel of it is clipped, so that its mean tells how light changes
 LEAST = 0.0015  # stops by which it has to fall at least
 
 
@@ -35,13 +33,6 @@ class Light:
     after: dict[str, float]
     gain: Array
     corner: float
-
-    def canonical(self, tracks: Tracks, kept: Iterable[str] | None = None) -> Tracks:
-        """The tracks with what was kept taken out."""
-        kept = self.kept if kept is None else kept
-        out = vignetting.corrected(tracks, self.corner) if VIGNETTING in kept else tracks
-        return replace(out, linear=out.linear / self.gain[out.frame]) if EXPOSURE in kept else out
-
 
 def explain(tracks: Tracks, frames: int) -> Light:
     """Evidence of both, and which of them help held-out points by a margin, alone or together."""
@@ -125,24 +116,6 @@ def frame_gains(tracks: Tracks, frames: int, train: Array) -> Array:
             near = np.flatnonzero(train)[np.argsort(np.abs(np.flatnonzero(train) - frame), kind="stable")[:2]]
             gain[frame] = np.exp2(np.log2(gain[near]).mean(0))
     return gain
-
-
-def left_over(tracks: Tracks, frames: int) -> tuple[Array, Array]:
-    """Stops (O,) by which observations differ from their points, all frames' gains taken out; and which of them could be used (O,) bool."""
-    bright = ((tracks.linear > DARKEST) & (tracks.linear < UNCLIPPED)).all(1)
-    counts = np.bincount(tracks.point[bright], minlength=int(tracks.point.max(initial=-1)) + 1)
-    use = bright & (counts[tracks.point] > 2)
-    out = np.zeros(len(tracks.frame))
-    if not use.any():
-        return out, use
-    used = _rows(tracks, use)
-    weight = np.ones(len(used.frame))
-    light, left = np.log2(used.linear), np.zeros((len(used.frame), 3))
-    for _ in range(ROUNDS):
-        left, _ = without_points_and_frames(light, used, weight, frames)
-        weight, _ = robust(left)
-    out[use] = left.mean(1)
-    return out, use
 
 
 def _rows(tracks: Tracks, keep: Array) -> Tracks:

@@ -13,11 +13,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array
 from fieldfuse.capture.types import Capture
 from fieldfuse.effects import geometry
-from fieldfuse.effects.adjust import LENS, POSES, Belief, Problem, adjust, predict, resect, residuals, rotation, vectors
+from fieldfuse.effects.adjust import LENS, POSES, Belief, Problem, adjust, predict, resect, residuals
 from fieldfuse.effects.sensed import Agreed, agreeing
 from fieldfuse.effects.sightings import Sightings
 from fieldfuse.progress import SILENT, Progress
@@ -145,7 +146,7 @@ class Placing:
     def _corrections(self, poses: Array) -> tuple[Array, Array]:
         """(F, 3) turns and (F, 3) moves of the cameras, world axes."""
         turned = np.einsum("fij,fkj->fik", poses[:, :3, :3], self.given[:, :3, :3])
-        return vectors(turned), poses[:, :3, 3] - self.given[:, :3, 3]
+        return Rotation.from_matrix(turned).as_rotvec(), poses[:, :3, 3] - self.given[:, :3, 3]
 
     def _expected(self, frame: int) -> tuple[Array, Array]:
         """The turn and the move that the nearest other fitted cameras have, by their distance."""
@@ -163,15 +164,15 @@ class Placing:
     def _moved(self, frame: int, turn: Array, move: Array) -> Array:
         """(4, 4) the given pose with this correction."""
         pose = self.given[frame].copy()
-        pose[:3, :3] = rotation(turn[None])[0] @ pose[:3, :3]
+        pose[:3, :3] = Rotation.from_rotvec(turn).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += move
         return pose
 
     def _apart(self, frame: int, pose: Array, turn: Array, move: Array) -> float:
         """How far a correction is from another, in working pixels that the usual point moves by."""
         expected = self._moved(frame, turn, move)
-        between = vectors((pose[:3, :3] @ expected[:3, :3].T)[None])[0]
-        return self.focal * float(np.linalg.norm(between) + np.linalg.norm(pose[:3, 3] - expected[:3, 3]) / self.depth)
+        between = Rotation.from_matrix(pose[:3, :3] @ expected[:3, :3].T).magnitude()
+        return self.focal * float(between + np.linalg.norm(pose[:3, 3] - expected[:3, 3]) / self.depth)
 
 
 def believed(problem: Problem, before: float, left: float) -> Belief:

@@ -31,8 +31,3 @@ def forward(effect: SensorNoise, linear: Array, rng: np.random.Generator) -> Arr
     """Linear light (H, W, 3) → float32 of the same shape with noise; it can be a little below 0."""
     electrons = rng.poisson(np.clip(linear, 0, 1).astype(np.float64) * effect.well)
     return np.asarray((electrons + rng.normal(0, effect.read, linear.shape)) / effect.well, dtype=np.float32)
-
-
-def deviation(effect: SensorNoise, linear: Array) -> Array:
-    """Standard deviation of the noise at linear light (any shape)."""
-    return np.asarray(np.sqrt(np.clip(linear, 0, 1) / effect.well + (effect.read / effect.well) ** 2))

@@ -10,9 +10,9 @@ import numpy as np
 
 from fieldfuse.camera import Array
 from fieldfuse.capture.types import Capture
-from fieldfuse.effects import background, beyond, geometry, light, motion_blur, sheen, view_dependence
-from fieldfuse.effects.adjust import LENS, POSES, ROWS, Problem, predict
-from fieldfuse.effects.evidence import Evidence
+from fieldfuse.effects import beyond, geometry, light, motion_blur, sheen
+from fieldfuse.effects.adjust import LENS, POSES, ROWS, predict
+from fieldfuse.effects.evidence import Evidence, HeldOut
 from fieldfuse.effects.light import EXPOSURE, VIGNETTING
 from fieldfuse.effects.paid import POINTS, Paid
 from fieldfuse.effects.sightings import QUICK, Look, Sightings, choose, gather
@@ -141,9 +141,10 @@ def look(seen: Sightings, began: float | None = None, paid: Paid | None = None) 
     with paid.by(BLUR):
         blur = motion_blur.evidence(kept.slope[:, 0] + kept.slope[:, 2], depth, kept.frame, kept.point, frames, kept.linear)
     with paid.by(VIEWS):
-        views = _views(kept, explained.problem, depth, found)
+        views = _of_patches(sheen.shiny(kept, explained.problem, depth, found))
     with paid.by(FAR):
-        far = _far(seen, explained.problem, float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0)
+        usual = float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
+        far = _of_patches(beyond.far(seen, explained.problem, usual))
     findings = {
         **{name: _of_light(found, name) for name in (EXPOSURE, VIGNETTING)},
         LENS: _lens(explained),
@@ -161,6 +162,13 @@ def look(seen: Sightings, began: float | None = None, paid: Paid | None = None) 
 
 def _plain(evidence: Evidence) -> Finding:
     return Finding(evidence.effect, evidence.number, evidence.threshold, evidence.reason, evidence.found)
+
+
+def _of_patches(held_out: HeldOut) -> Finding:
+    evidence = held_out.evidence
+    return Finding(
+        evidence.effect, evidence.number, evidence.threshold, evidence.reason, held_out.found, held_out.before, held_out.after, "stops"
+    )
 
 
 def _of_light(found: light.Light, name: str) -> Finding:
@@ -212,29 +220,3 @@ def _poses(found: geometry.Explained) -> Finding:
         f"{percent} {way}"
     )
     return Finding(POSES, max(_gain(choice), 0.0), geometry.MARGIN[POSES], reason, choice.kept, choice.before, choice.after, PIXELS)
-
-
-def _views(kept: Sightings, problem: Problem, depth: Array, found: light.Light) -> Finding:
-    """By patches of the pictures; without pictures by points alone."""
-    if kept.pictures:
-        said = sheen.shiny(kept, problem, depth, found)
-        number, threshold, reason = said.evidence.number, said.evidence.threshold, said.evidence.reason
-        return Finding(VIEWS, number, threshold, reason, said.found, said.before, said.after, "stops")
-    left, use = light.left_over(found.canonical(kept.tracks()), len(kept.names))
-    place = kept.pixel * kept.scale[kept.frame][:, None]
-    return _plain(view_dependence.evidence(left[use], kept.frame[use], place[use]))
-
-
-def _far(seen: Sightings, problem: Problem, usual: float) -> Finding:
-    """By patches of the pictures; without pictures by points, also those no two rays of which meet (the problem does not have these)."""
-    if seen.pictures:
-        found = beyond.far(seen, problem, usual)
-        said = found.evidence
-        return Finding(FAR, said.number, said.threshold, said.reason, found.found, found.before, found.after, "stops")
-    ideal = seen.ideal()
-    known = np.isfinite(ideal).all(1)
-    poses = problem.poses[seen.frame[known]]
-    rays = np.einsum("oij,oj->oi", poses[:, :3, :3], np.concatenate([ideal[known], np.ones((int(known.sum()), 1))], axis=1))
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    number = np.unique(seen.point[known], return_inverse=True)[1]
-    return _plain(background.evidence(rays, poses[:, :3, 3], number, seen.focal[seen.frame[known]], usual))

@@ -47,11 +47,6 @@ def forward(effect: Vignetting, linear: Tensor, radius: Tensor) -> Tensor:
     return linear * falloff(effect, radius)[..., None]
 
 
-def invert(effect: Vignetting, linear: Tensor, radius: Tensor) -> Tensor:
-    """What `forward` was given; exact where nothing was clipped afterwards."""
-    return linear / falloff(effect, radius)[..., None]
-
-
 THRESHOLD = 0.05  # share of the light
 FEWEST = 60
 STRONGEST = 20.0  # of a: a corner with a four-hundredth of the light

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array, Intrinsics, project
 from fieldfuse.effects.listed import parse
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json, write_json
 from fieldfuse.progress import SILENT, Progress
-from fieldfuse.simulate.curve import rotations
 from fieldfuse.simulate.film import Shot
 from fieldfuse.simulate.settings import SceneFile, scene_file
 from fieldfuse.simulate.simulate import prepare, simulate
@@ -178,7 +178,7 @@ def _forget(path: Path, planned: Planned) -> None:
         degrees, share = POSE_ERROR[strength]
         rng = np.random.default_rng([planned.seed, 4711])
         depth = _median_depth(path.parent)
-        turns = rotations(np.deg2rad(rng.normal(0, degrees / np.sqrt(3), (len(data["frames"]), 3))))
+        turns = Rotation.from_rotvec(rng.normal(0, degrees / np.sqrt(3), (len(data["frames"]), 3)), degrees=True).as_matrix()
         for entry, turn in zip(data["frames"], turns, strict=True):
             pose = np.array(entry["transform_matrix"])
             pose[:3, :3] = pose[:3, :3] @ turn

@@ -19,9 +19,9 @@ from fieldfuse.capture.types import Views
 from fieldfuse.config import Settings
 from fieldfuse.evaluation.baseline import nearest_image_scores
 from fieldfuse.evaluation.score import score_views
-from fieldfuse.keyframes import KeyFrames, select_keyframes
-from fieldfuse.networks.gru import RunningMean
-from fieldfuse.networks.model import NerfusionModel
+from fieldfuse.nerfusion.gru import RunningMean
+from fieldfuse.nerfusion.keyframes import KeyFrames, select_keyframes
+from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.field import Field

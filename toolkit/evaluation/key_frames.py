@@ -13,17 +13,17 @@ import torch
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError
-from fieldfuse.fusion import FusionOptions, fuse_views, fusion_lattice
-from fieldfuse.key_sweeps import beside
-from fieldfuse.keyframes import KeyFrames, select_keyframes
-from fieldfuse.networks.lattice import Lattice
-from fieldfuse.networks.model import NerfusionModel
-from fieldfuse.networks.weights import SHIPPED, load_model
+from fieldfuse.nerfusion.extras.keyframe_depth import beside
+from fieldfuse.nerfusion.fusion import FusionOptions, fuse_views, fusion_lattice
+from fieldfuse.nerfusion.keyframes import KeyFrames, select_keyframes
+from fieldfuse.nerfusion.lattice import Lattice
+from fieldfuse.nerfusion.model import NerfusionModel
+from fieldfuse.nerfusion.training.paths import hand_held
+from fieldfuse.nerfusion.weights import SHIPPED, load_model
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.simulate.materials import texture_bank
 from fieldfuse.simulate.procedural import random_scene
 from fieldfuse.simulate.scene import Scene
-from fieldfuse.training.nerfusion.paths import hand_held
 from fieldfuse.volume.space import Space
 
 EVERY = 2  # frames to a key frame: a key frame's neighbours are others' as well, as in a video

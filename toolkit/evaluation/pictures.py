@@ -5,21 +5,17 @@ Error maps have one fixed scale everywhere; depth maps have one range a run, so 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import cv2
 import numpy as np
 
 from fieldfuse.camera import Array
 from fieldfuse.capture.types import Views
-from fieldfuse.errors import OutputError
 from fieldfuse.evaluation.depth import has_depth
 from fieldfuse.evaluation.pixels import as_float
 from fieldfuse.evaluation.score import RenderedView, as_photo, entry
-from fieldfuse.files import atomic_path
 from fieldfuse.stereo.left_out import LeftOut
 
 ERROR_TOP = 0.2  # mean absolute difference of the three channels, in [0, 1], that gets the brightest colour
@@ -28,11 +24,6 @@ DEPTH_COLOURS = cv2.COLORMAP_TURBO
 TINT = (235, 40, 60)  # of what was left out
 MISSING = (128, 128, 128)  # neutral grey: no depth, or no truth to compare with
 
-PAPER = 255
-INK = (40, 40, 40)
-LABEL = 22  # pixels; height of the line of text above and below each tile of a strip
-GAP = 6
-FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 @dataclass(frozen=True)
@@ -132,18 +123,6 @@ def moving_pictures(views: Views, left_out: LeftOut | None, most: int = 12) -> l
     return out
 
 
-def make_pictures(
-    views: Views,
-    indices: Sequence[int] | Array,
-    field: Sequence[RenderedView] | None = None,
-    tsdf: Sequence[RenderedView] | None = None,
-    unit: str = "units",
-    most: int = 24,
-) -> Pictures:
-    """Tiles of the views at `indices` for the two methods of a run; see `method_pictures`."""
-    return method_pictures(views, indices, {name: of for name, of in (("field", field), ("tsdf", tsdf)) if of is not None}, unit, most)
-
-
 def method_pictures(
     views: Views,
     indices: Sequence[int] | Array,
@@ -182,76 +161,3 @@ def method_pictures(
 def colour_bar(width: int, height: int, colours: int) -> Array:
     """(height, width, 3) uint8: the colour map from low (left) to high (right)."""
     return coloured(np.broadcast_to(np.linspace(0, 1, width), (height, width)), colours)
-
-
-def _text_line(width: int, text: str) -> Array:
-    """(LABEL, width, 3) uint8: a line of small text, shortened to what fits."""
-    line = np.full((LABEL, width, 3), PAPER, dtype=np.uint8)
-    text = text.encode("ascii", "replace").decode()  # the burnt-in font has no other letters
-    while len(text) > 1 and cv2.getTextSize(text, FONT, 0.42, 1)[0][0] > width - 4:
-        text = text[:-1]
-    cv2.putText(line, text, (2, LABEL - 7), FONT, 0.42, INK, 1, cv2.LINE_AA)
-    return line
-
-
-def _scale_line(width: int, low: str, high: str, colours: int) -> Array:
-    """(LABEL, width, 3) uint8: colour bar between its two end labels."""
-    line = _text_line(width, low)
-    left, right = (cv2.getTextSize(text, FONT, 0.42, 1)[0][0] + 8 for text in (low, high))
-    if width > left + right + 16:
-        line[6 : LABEL - 6, left : width - right] = colour_bar(width - left - right, LABEL - 12, colours)
-        line[:, width - right :] = _text_line(right, " " + high)[:, :right]
-    return line
-
-
-def strip(view: ViewPictures, method: str, limits: tuple[float, float] | None = None, unit: str = "units") -> Array:
-    """truth | render | error | depth of one method side by side with labels and colour bars, (H', W', 3) uint8."""
-    tiles = view.methods[method]
-    height, width = view.truth.shape[:2]
-    grow = max(1, -(-160 // width))  # whole-number enlargement: tiny pictures leave no room for labels
-    near, far = (f"{value:.3g}" for value in limits) if limits else ("near", "far")
-    columns = []
-    for title, tile, scale in (
-        (view.name, view.truth, None),
-        (method.upper() if method == "tsdf" else method, tiles.render, None),
-        ("error", tiles.error, ("0", f"{ERROR_TOP:g}", ERROR_COLOURS)),
-        (f"depth ({unit})", tiles.depth, (near, far, DEPTH_COLOURS)),
-    ):
-        large = np.repeat(np.repeat(tile, grow, axis=0), grow, axis=1)
-        below = _scale_line(width * grow, *scale) if scale else _text_line(width * grow, "")
-        columns += [
-            np.concatenate([_text_line(width * grow, title), large, below]),
-            np.full((height * grow + 2 * LABEL, GAP, 3), PAPER, np.uint8),
-        ]
-    return np.concatenate(columns[:-1], axis=1)
-
-
-def write_picture(path: Path, picture: Array) -> None:
-    """Write (H, W, 3) uint8 RGB as PNG, atomically.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    done, data = cv2.imencode(".png", picture[..., ::-1])
-    if not done:
-        raise OutputError(f"cannot make a PNG for {path}; the picture has shape {picture.shape}")
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data.tobytes())
-
-
-def write_strips(folder: Path, pictures: Pictures) -> list[Path]:
-    """Write `<view>_<method>.png` strips into `folder`; letters of view names that a file name should not have become `_`.
-
-    Raises:
-        OutputError: the folder is not writable or the disk is full.
-    """
-    paths: list[Path] = []
-    for view in pictures.views:
-        stem = re.sub(r"[^A-Za-z0-9-]+", "_", Path(view.name).with_suffix("").as_posix()).strip("_") or "view"
-        for method in view.methods:
-            path = folder / f"{stem}_{method}.png"
-            if path in paths:  # two names that differ only in such letters
-                path = folder / f"{stem}_{len(paths)}_{method}.png"
-            write_picture(path, strip(view, method, pictures.depth_range, pictures.unit))
-            paths.append(path)
-    return paths

@@ -132,7 +132,7 @@ def lookup_case(size: int = 128, points: int = 100_000, repetitions: int = 5) ->
 
 def convolution_case(size: int = 64, channels: int = 16, repetitions: int = 5) -> Case:
     """Block-sparse 3×3×3 convolution against a dense one over the same cube."""
-    from fieldfuse.networks.block_conv import block_conv3d
+    from fieldfuse.nerfusion.block_conv import block_conv3d
 
     field = sphere_field(size)
     topology, generator = field.topology, torch.Generator().manual_seed(0)
@@ -149,10 +149,10 @@ def convolution_case(size: int = 64, channels: int = 16, repetitions: int = 5) -
 
 def key_frame_case(side: int = 48, size: int = 32, repetitions: int = 3) -> Case:
     """Fusing a key frame on two levels against looking everywhere at the finer one. Untrained weights: the work is the same."""
-    from fieldfuse.fusion import Fusion, FusionOptions
-    from fieldfuse.networks.cameras import Cameras
-    from fieldfuse.networks.lattice import Lattice
-    from fieldfuse.networks.model import NerfusionModel
+    from fieldfuse.nerfusion.cameras import Cameras
+    from fieldfuse.nerfusion.fusion import Fusion, FusionOptions
+    from fieldfuse.nerfusion.lattice import Lattice
+    from fieldfuse.nerfusion.model import NerfusionModel
     from fieldfuse.volume.space import Space
 
     state = torch.get_rng_state()

@@ -9,7 +9,7 @@ import torch
 
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.types import Views
-from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.composite import UNITS
 from fieldfuse.render.field import Field
 from fieldfuse.render.paths import look_at

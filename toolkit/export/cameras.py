@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import FISHEYE, Array, Intrinsics, Similarity, invert, opengl_from_world
 from fieldfuse.errors import InputError
@@ -129,18 +130,8 @@ def colmap_model(camera: Intrinsics) -> tuple[str, list[float]]:
 
 
 def quaternion(rotation: Array) -> Array:
-    """(w, x, y, z) with w ≥ 0 of a rotation matrix: the largest eigenvector of its symmetric 4×4 form (Bar-Itzhack 2000)."""
-    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)
-    form = np.array(
-        [
-            [a + e + i, h - f, c - g, d - b],
-            [h - f, a - e - i, b + d, c + g],
-            [c - g, b + d, e - a - i, f + h],
-            [d - b, c + g, f + h, i - a - e],
-        ]
-    )
-    out = np.linalg.eigh(form)[1][:, -1]
-    return np.asarray(-out if out[0] < 0 else out)
+    """(w, x, y, z) with w ≥ 0 of a rotation matrix (3, 3)."""
+    return np.asarray(Rotation.from_matrix(rotation).as_quat(canonical=True))[[3, 0, 1, 2]]
 
 
 def _camera_keys(camera: Intrinsics) -> dict[str, Any]:

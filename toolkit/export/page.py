@@ -25,8 +25,8 @@ from fieldfuse.backends.numba.baked_march import CORNERS, FINER
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.errors import InputError
 from fieldfuse.files import atomic_path
-from fieldfuse.networks.decoder import Deferred
-from fieldfuse.networks.encoding import BEHIND, DIRECTION, SH
+from fieldfuse.nerfusion.decoder import Deferred
+from fieldfuse.nerfusion.encoding import BEHIND, DIRECTION, SH
 from fieldfuse.render.bake import BakedField
 from fieldfuse.render.field import Field
 from fieldfuse.render.march import MAX_STRETCH

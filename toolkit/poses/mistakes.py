@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array, invert
 
@@ -71,8 +72,9 @@ def _other(raw: Array, inverse: Array, axes: Array) -> Iterator[Reading]:
     text = "with rotations transposed (rows for columns) and translations kept"
     yield Reading(text, _axes(invert(_joined(rotation, inverse[:, :3, 3])), axes))
     for given in (raw, inverse):
-        for order, name in (((3, 0, 1, 2), "qx qy qz qw, not qw qx qy qz"), ((1, 2, 3, 0), "qw qx qy qz, not qx qy qz qw")):
-            read = _joined(from_quaternion(to_quaternion(given[:, :3, :3])[:, order]), given[:, :3, 3])
+        quaternions = Rotation.from_matrix(given[:, :3, :3]).as_quat()  # x, y, z, w
+        for shift, name in ((1, "qx qy qz qw, not qw qx qy qz"), (-1, "qw qx qy qz, not qx qy qz qw")):
+            read = _joined(Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix(), given[:, :3, 3])
             yield Reading(f"with quaternions in the order {name}", _axes(read if given is raw else invert(read), axes))
     moved = {
         "with the camera's centre where a translation was read": -np.einsum("nij,nj->ni", turned, centre),
@@ -121,27 +123,3 @@ def _joined(rotation: Array, translation: Array) -> Array:
     out = np.tile(np.eye(4), (len(rotation), 1, 1))
     out[:, :3, :3], out[:, :3, 3] = rotation, translation
     return out
-
-
-def to_quaternion(rotation: Array) -> Array:
-    """(N, 4) unit quaternions w, x, y, z of rotations (N, 3, 3), of either sign."""
-    m = rotation
-    k = np.zeros((len(m), 4, 4))  # its eigenvector of the largest eigenvalue (Bar-Itzhack, 2000)
-    k[:, 0, 0] = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
-    for a in range(3):
-        b, c = (a + 1) % 3, (a + 2) % 3
-        k[:, 0, a + 1] = k[:, a + 1, 0] = m[:, c, b] - m[:, b, c]
-        k[:, a + 1, a + 1] = m[:, a, a] - m[:, b, b] - m[:, c, c]
-        k[:, a + 1, b + 1] = k[:, b + 1, a + 1] = m[:, a, b] + m[:, b, a]
-    return np.asarray(np.linalg.eigh(k)[1][:, :, -1])
-
-
-def from_quaternion(quaternion: Array) -> Array:
-    """(N, 3, 3) rotations of quaternions (N, 4) w, x, y, z of unit length."""
-    w, x, y, z = quaternion.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)

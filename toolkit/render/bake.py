@@ -12,7 +12,7 @@ from fieldfuse.backends.numba import common as K
 from fieldfuse.backends.numba.baked_march import CORNERS, FINER, LEVELS, Baked
 from fieldfuse.backends.numba.render_rays import chessboard_distance
 from fieldfuse.errors import InputError
-from fieldfuse.networks.decoder import Deferred
+from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render.composite import RAW_MAX, UNITS
 from fieldfuse.render.field import Field
 from fieldfuse.render.numba_renderer import FARTHEST, decoder_arrays

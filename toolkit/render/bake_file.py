@@ -21,7 +21,7 @@ from fieldfuse.backends.numba.baked_march import CORNERS, FINER, LEVELS, Baked
 from fieldfuse.camera import Similarity
 from fieldfuse.errors import InputError, OutputError, all_lines, first_line
 from fieldfuse.files import atomic_path
-from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.nerfusion.encoding import DIRECTION
 from fieldfuse.render.bake import BakedField
 from fieldfuse.render.sky import checked_sky
 from fieldfuse.volume.space import Space

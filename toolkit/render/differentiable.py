@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from fieldfuse.networks.decoder import Deferred
+from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render.composite import weights
 from fieldfuse.render.field import Field, density
 from fieldfuse.render.march import Samples, march

@@ -11,7 +11,7 @@ import torch
 
 from fieldfuse.camera import Similarity
 from fieldfuse.errors import InputError, first_line
-from fieldfuse.networks.decoder import Deferred, PerSample, make_decoder
+from fieldfuse.nerfusion.decoder import Deferred, PerSample, make_decoder
 from fieldfuse.render.composite import RAW_MAX, UNITS
 from fieldfuse.render.march import MarchGrid
 from fieldfuse.render.sky import checked_sky

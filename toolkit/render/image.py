@@ -11,7 +11,7 @@ import torch
 
 from fieldfuse.backends.dispatch import choose_engine
 from fieldfuse.camera import Array, Intrinsics, pixel_grid, rays
-from fieldfuse.networks.decoder import Deferred
+from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render.field import Field
 from fieldfuse.render.rays import RayValues, render_rays
 from fieldfuse.render.sky import on_sky

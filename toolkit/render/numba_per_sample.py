@@ -12,8 +12,8 @@ from fieldfuse.backends.numba.decode_per_sample import Net, make_tape
 from fieldfuse.backends.numba.march_per_sample import NEGLIGIBLE
 from fieldfuse.backends.numba.matrix import LANES
 from fieldfuse.backends.numba.render_per_sample import render_pass
-from fieldfuse.networks.decoder import FREQUENCIES, PerSample
-from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.nerfusion.decoder import FREQUENCIES, PerSample
+from fieldfuse.nerfusion.encoding import DIRECTION
 from fieldfuse.render.composite import STOP
 from fieldfuse.render.field import Field
 from fieldfuse.render.numba_renderer import PIECE, make_space, make_volume

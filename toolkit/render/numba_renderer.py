@@ -8,7 +8,7 @@ import torch
 from fieldfuse.backends.numba import common as K
 from fieldfuse.backends.numba.decode import layers_of, rays_of
 from fieldfuse.backends.numba.render_rays import chessboard_distance, render_pass
-from fieldfuse.networks.decoder import Deferred
+from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render.composite import STOP, THRESHOLD
 from fieldfuse.render.field import Field
 from fieldfuse.threads import share

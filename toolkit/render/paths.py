@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array
 from fieldfuse.errors import InputError
@@ -131,7 +132,7 @@ def _along(poses: Array, share: Array) -> Array:
     knots = np.concatenate([[0], np.cumsum(np.maximum(pace, 1e-3))])
     curve = _hermite(knots, np.concatenate([positions, turns], axis=1), share * knots[-1])
     out = np.tile(np.eye(4), (len(share), 1, 1))
-    out[:, :3, :3] = _rotations(_unit(curve[:, 3:]))
+    out[:, :3, :3] = Rotation.from_quat(curve[:, 3:]).as_matrix()
     out[:, :3, 3] = curve[:, :3]
     return out
 
@@ -183,30 +184,10 @@ def _tour(positions: Array) -> Array:
 
 
 def _quaternions(rotations: Array) -> Array:
-    """(N, 4) w, x, y, z of (N, 3, 3), each on the side of the one before it."""
-    m = rotations
-    form = np.empty((len(m), 4, 4))
-    form[:, 0, 0] = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        form[:, 0, i + 1] = form[:, i + 1, 0] = m[:, k, j] - m[:, j, k]
-        form[:, i + 1, i + 1] = m[:, i, i] - m[:, j, j] - m[:, k, k]
-        form[:, i + 1, j + 1] = form[:, j + 1, i + 1] = m[:, i, j] + m[:, j, i]
-    out = np.linalg.eigh(form)[1][:, :, -1].copy()
-    for i in range(1, len(out)):
-        if out[i] @ out[i - 1] < 0:
-            out[i] *= -1
-    return out
-
-
-def _rotations(quaternions: Array) -> Array:
-    w, x, y, z = quaternions.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
+    """(N, 4) x, y, z, w of (N, 3, 3), each on the side of the one before it."""
+    out = np.asarray(Rotation.from_matrix(rotations).as_quat())
+    sides = np.where((out[1:] * out[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+    return out * np.concatenate([[1.0], np.cumprod(sides)])[:, None]
 
 
 def _unit(vectors: Array) -> Array:

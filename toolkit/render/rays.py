@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from fieldfuse.networks.decoder import Deferred
+from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render.composite import STOP, ray_sum, weights
 from fieldfuse.render.field import Field, density
 from fieldfuse.render.march import Samples, march

@@ -18,7 +18,7 @@ import torch
 from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.camera import Intrinsics, pixel_grid, rays
 from fieldfuse.capture.types import Views
-from fieldfuse.networks.decoder import Deferred
+from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.composite import SOLID, STOP, THRESHOLD, ray_sum
 from fieldfuse.render.differentiable import render_with_gradients

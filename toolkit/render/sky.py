@@ -10,7 +10,7 @@ import math
 
 import torch
 
-from fieldfuse.networks.encoding import BEHIND, spherical_harmonics
+from fieldfuse.nerfusion.encoding import BEHIND, spherical_harmonics
 
 Tensor = torch.Tensor
 SHAPE = (BEHIND, 3)

@@ -7,8 +7,8 @@ import torch.nn.functional as F
 import triton
 
 from fieldfuse.backends.triton.march import DX, LAYERS, MEDIAN, OPACITY, RAYS, SHOWN, SUMS, composite, walk
-from fieldfuse.networks.decoder import Deferred
-from fieldfuse.networks.encoding import DIRECTION, spherical_harmonics
+from fieldfuse.nerfusion.decoder import Deferred
+from fieldfuse.nerfusion.encoding import DIRECTION, spherical_harmonics
 from fieldfuse.render.field import Field
 from fieldfuse.render.march import BRICK
 from fieldfuse.render.rays import RayValues

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array
 
@@ -95,18 +96,8 @@ class Motion:
         if self.bob:
             out[:, 2, 3] += self.bob * np.sin(2 * np.pi * 1.8 * seconds)
         if self.shake is not None:
-            out[:, :3, :3] = out[:, :3, :3] @ rotations(self.shake.vectors(seconds))
+            out[:, :3, :3] = out[:, :3, :3] @ Rotation.from_rotvec(self.shake.vectors(seconds)).as_matrix()
         return out
-
-
-def rotations(vectors: Array) -> Array:
-    """(N, 3) rotation vectors → (N, 3, 3) rotations (Rodrigues)."""
-    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-    small = np.maximum(angle, 1e-12)
-    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + (1 - np.cos(angle)) / small**2 * (cross @ cross))
 
 
 def _unit(vectors: Array) -> Array:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
+from pydantic import Field
 
 from fieldfuse.camera import Array
 from fieldfuse.errors import InputError
@@ -34,11 +36,11 @@ class PathSettings:
     """
 
     kind: str = "walk"
-    frames: int = 60
-    fps: float = 10.0
-    speed: float = 0.5
-    turn: float = 20.0
-    shake: float = 2.0
+    frames: Annotated[int, Field(ge=1, le=100_000)] = 60
+    fps: Annotated[float, Field(ge=1e-3, le=1e4, allow_inf_nan=False)] = 10.0
+    speed: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.5
+    turn: Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)] = 20.0
+    shake: Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)] = 2.0
 
     @property
     def seconds(self) -> float:

@@ -11,7 +11,7 @@ import torch
 
 from fieldfuse.camera import rays
 from fieldfuse.capture.types import Views
-from fieldfuse.networks.encoding import BEHIND, SH, spherical_harmonics
+from fieldfuse.nerfusion.encoding import BEHIND, SH, spherical_harmonics
 from fieldfuse.render.sky import SHAPE
 
 Tensor = torch.Tensor

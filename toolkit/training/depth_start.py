@@ -17,7 +17,7 @@ import torch
 from fieldfuse.camera import Array, invert, unproject
 from fieldfuse.capture.types import Views
 from fieldfuse.config import Settings
-from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.field import Field
 from fieldfuse.training.levels import FEATURE_NOISE, all_places, occupancy

@@ -11,10 +11,9 @@ from typing import Protocol
 
 import torch
 
-from fieldfuse import libraries
 from fieldfuse.backends.dispatch import choose_engine
 from fieldfuse.config import Settings
-from fieldfuse.networks.decoder import Deferred
+from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.progress import Progress
 from fieldfuse.render.field import Field
 from fieldfuse.render.rays import render_rays
@@ -138,4 +137,3 @@ def warm_up(settings: Settings, progress: Progress) -> None:
     if not warm.ready(*kind):
         progress.update(0, 1, "compiling the fast engine, once on this machine, about half a minute")
         warm.run(*kind)
-        libraries.let_go()  # what was read to load kernels

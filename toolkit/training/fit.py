@@ -18,7 +18,7 @@ from fieldfuse.capture.types import Views
 from fieldfuse.config import Settings
 from fieldfuse.errors import InputError
 from fieldfuse.memory import give_back
-from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.field import Field

@@ -18,14 +18,14 @@ import torch
 from fieldfuse.capture.types import Views
 from fieldfuse.config import NetworkSettings
 from fieldfuse.errors import InputError
-from fieldfuse.fusion import Fused, FusionOptions, fuse_views
-from fieldfuse.key_sweeps import beside
-from fieldfuse.keyframes import KeyFrames
-from fieldfuse.networks import weights
-from fieldfuse.networks.lattice import Lattice
-from fieldfuse.networks.model import NerfusionModel
-from fieldfuse.networks.precision import AUTO
-from fieldfuse.networks.weights import load_model
+from fieldfuse.nerfusion import weights
+from fieldfuse.nerfusion.extras.keyframe_depth import beside
+from fieldfuse.nerfusion.fusion import Fused, FusionOptions, fuse_views
+from fieldfuse.nerfusion.keyframes import KeyFrames
+from fieldfuse.nerfusion.lattice import Lattice
+from fieldfuse.nerfusion.model import NerfusionModel
+from fieldfuse.nerfusion.precision import AUTO
+from fieldfuse.nerfusion.weights import load_model
 from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.field import Field

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from fieldfuse.networks.decoder import Deferred, PerSample
+from fieldfuse.nerfusion.decoder import Deferred, PerSample
 from fieldfuse.render.field import Field
 from fieldfuse.volume.edit import dilate, erase_empty_blocks, resample, split, with_corner_blocks
 from fieldfuse.volume.host import Host

@@ -13,7 +13,7 @@ import torch
 
 from fieldfuse.capture.types import Views
 from fieldfuse.config import Settings
-from fieldfuse.networks.decoder import Deferred, PerSample, make_decoder
+from fieldfuse.nerfusion.decoder import Deferred, PerSample, make_decoder
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.field import Field
 from fieldfuse.training.levels import FEATURE_NOISE, all_places, occupancy

@@ -19,8 +19,8 @@ from fieldfuse.backends.numba import train_decoder, train_rays
 from fieldfuse.backends.numba.decode import layers_of, rays_of
 from fieldfuse.backends.numba.render_rays import render_pass
 from fieldfuse.backends.numba.train_order import Batch, Tiles
-from fieldfuse.networks.decoder import Deferred
-from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.nerfusion.decoder import Deferred
+from fieldfuse.nerfusion.encoding import DIRECTION
 from fieldfuse.render.composite import STOP, THRESHOLD
 from fieldfuse.render.field import Field
 from fieldfuse.render.numba_renderer import decoder_arrays, make_space, make_volume

@@ -12,8 +12,8 @@ from fieldfuse.backends.numba.decode_per_sample import Net, make_tape
 from fieldfuse.backends.numba.march_per_sample import NEGLIGIBLE
 from fieldfuse.backends.numba.render_per_sample import render_pass
 from fieldfuse.backends.numba.train_common import Losses
-from fieldfuse.networks.decoder import PerSample
-from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.nerfusion.decoder import PerSample
+from fieldfuse.nerfusion.encoding import DIRECTION
 from fieldfuse.render.composite import STOP
 from fieldfuse.render.field import Field
 from fieldfuse.render.numba_per_sample import net_arrays, turn, write_back

@@ -7,7 +7,7 @@ import torch
 
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture.types import Views
-from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.numba_per_sample import PerSampleRenderer
 from fieldfuse.render.numba_renderer import NumbaRenderer
 from fieldfuse.training.levels import finer, first_field, visible

@@ -10,8 +10,8 @@ import torch
 from numba import njit
 
 from fieldfuse.capture.types import Views
-from fieldfuse.networks import compiled
-from fieldfuse.networks.lattice import Lattice
+from fieldfuse.nerfusion import compiled
+from fieldfuse.nerfusion.lattice import Lattice
 from fieldfuse.render.field import Field
 from fieldfuse.training.levels import all_places
 from fieldfuse.training.start import COARSEST, WHOLE, emptied_by_views

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from fieldfuse.networks.decoder import Deferred
+from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render.composite import RAW_MAX, SOLID, STOP, distortion, ray_sum, thickness_gradient, weights
 from fieldfuse.render.field import Field, density
 from fieldfuse.render.march import BRICK, Samples, march

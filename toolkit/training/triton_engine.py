@@ -18,8 +18,8 @@ from fieldfuse.backends.triton.train_adam import count_step, learn, move
 from fieldfuse.backends.triton.train_draw import draw
 from fieldfuse.backends.triton.train_gradients import inspect, judge, spread
 from fieldfuse.backends.triton.train_rates import RATES, told
-from fieldfuse.networks.decoder import Deferred
-from fieldfuse.networks.encoding import DIRECTION, spherical_harmonics
+from fieldfuse.nerfusion.decoder import Deferred
+from fieldfuse.nerfusion.encoding import DIRECTION, spherical_harmonics
 from fieldfuse.render.field import Field
 from fieldfuse.render.march import BRICK
 from fieldfuse.render.triton_renderer import Tables, TritonRenderer, buffers_for, launch_composite, launch_walk

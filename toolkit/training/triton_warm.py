@@ -8,7 +8,7 @@ import torch
 from fieldfuse.backends.triton.march import RAYS
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture.types import Views
-from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.progress import Progress
 from fieldfuse.render.triton_renderer import TritonRenderer
 from fieldfuse.training.levels import finer, first_field, visible

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import torch
 
-from fieldfuse.networks.decoder import Deferred, PerSample
-from fieldfuse.networks.encoding import DIRECTION
+from fieldfuse.nerfusion.decoder import Deferred, PerSample
+from fieldfuse.nerfusion.encoding import DIRECTION
 
 Tensor = torch.Tensor
 HARMONICS = {"none": 0, "low": 4, "full": DIRECTION, "auto": DIRECTION}  # of spherical_harmonics, lowest first

@@ -196,17 +196,6 @@ class Mesh:
             out.vertex_normals = o3d.utility.Vector3dVector(self.normals)
         return out
 
-    @classmethod
-    def from_open3d(cls, mesh: o3d.geometry.TriangleMesh) -> Mesh:
-        """From Open3D's (legacy) triangle mesh."""
-        return cls.create(
-            np.asarray(mesh.vertices),
-            np.asarray(mesh.triangles),
-            np.asarray(mesh.vertex_colors) if mesh.has_vertex_colors() else None,
-            np.asarray(mesh.vertex_normals) if mesh.has_vertex_normals() else None,
-        )
-
-
 def places(positions: Array, *others: Array | None) -> Array:
     """(N,) int64 indices that sort (N, 3) `positions` by x, then y, then z; `others` (N, C) decide between equal ones."""
     order = np.lexsort(positions.T[::-1])

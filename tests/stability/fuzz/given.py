@@ -17,15 +17,15 @@ from fieldfuse.capture.types import Views
 from fieldfuse.errors import FieldfuseError
 from fieldfuse.evaluation.compare_truth import find_truth, true_depths
 from fieldfuse.files import write_json
+from fieldfuse.nerfusion.training.captured import CapturedScene
+from fieldfuse.nerfusion.training.datasets.dtu import dtu_scene, dtu_scenes
+from fieldfuse.nerfusion.training.datasets.scanned_objects import scanned_object_folders, scanned_object_scene
+from fieldfuse.nerfusion.training.datasets.scannet import scannet_folders, scannet_scene
+from fieldfuse.nerfusion.training.datasets.synthetic import synthetic_folders, synthetic_scene
 from fieldfuse.simulate.mesh_scene import load_mesh_scene
 from fieldfuse.simulate.seen import Rays
-from fieldfuse.training.nerfusion.captured import CapturedScene
-from fieldfuse.training.nerfusion.datasets.dtu import dtu_scene, dtu_scenes
-from fieldfuse.training.nerfusion.datasets.scanned_objects import scanned_object_folders, scanned_object_scene
-from fieldfuse.training.nerfusion.datasets.scannet import scannet_folders, scannet_scene
-from fieldfuse.training.nerfusion.datasets.synthetic import synthetic_folders, synthetic_scene
 from tests.capture.layouts import LAYOUTS
-from tests.training.nerfusion import layouts
+from tests.nerfusion.training import layouts
 
 MESHES = ("ascii.ply", "binary.ply", "coloured.ply", "model.obj", "model.mtl", "picture.png", "model.glb", "model.gltf")
 TRUTH = ("ground_truth/cameras.json", "ground_truth/0.safetensors", "ground_truth/mesh.ply")

@@ -12,8 +12,12 @@ from fieldfuse.camera import Intrinsics
 from fieldfuse.evaluation import budget
 from fieldfuse.evaluation.selftest.edit import small_field
 from fieldfuse.files import write_json
-from fieldfuse.networks.model import ModelConfig, NerfusionModel
-from fieldfuse.networks.weights import load_model, save_model
+from fieldfuse.nerfusion.model import ModelConfig, NerfusionModel
+from fieldfuse.nerfusion.training.caution import Caution
+from fieldfuse.nerfusion.training.checkpoint import checkpoint_settings, load_caution, load_checkpoint, save_checkpoint
+from fieldfuse.nerfusion.training.settings import load_train_settings, train_settings_dict
+from fieldfuse.nerfusion.training.shards import ShardScene, write_shard
+from fieldfuse.nerfusion.weights import load_model, save_model
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_file import read_baked, write_baked
 from fieldfuse.render.bake_image import BakedRenderer
@@ -21,11 +25,7 @@ from fieldfuse.simulate.settings import read_scene_file
 from fieldfuse.stereo.left_out import LeftOut, load_left_out, save_left_out
 from fieldfuse.stereo.maps import load_stereo, save_stereo
 from fieldfuse.stereo.match import StereoDepth
-from fieldfuse.training.nerfusion.caution import Caution
-from fieldfuse.training.nerfusion.checkpoint import checkpoint_settings, load_caution, load_checkpoint, save_checkpoint
-from fieldfuse.training.nerfusion.settings import load_train_settings, train_settings_dict
-from fieldfuse.training.nerfusion.shards import ShardScene, write_shard
-from tests.training.nerfusion.tiny import tiny_settings
+from tests.nerfusion.training.tiny import tiny_settings
 
 
 def make_models(root: Path) -> None:
@@ -60,7 +60,7 @@ def read_models(root: Path, number: int) -> None:
 
 def make_training(root: Path) -> None:
     """A shard of training pictures, a checkpoint, settings, depth by matching, and what is remembered of a machine."""
-    from fieldfuse.training.nerfusion.train import make_model  # here, for workers that read other things: it brings matplotlib
+    from fieldfuse.nerfusion.training.train import make_model  # here, for workers that read other things: it brings matplotlib
 
     root.mkdir(parents=True)
     rng = np.random.default_rng(0)
@@ -87,7 +87,7 @@ def make_training(root: Path) -> None:
 
 def read_training(root: Path, number: int) -> None:
     """Each file by its own reader; a file of speeds that is damaged counts as none."""
-    from fieldfuse.training.nerfusion.train import make_model
+    from fieldfuse.nerfusion.training.train import make_model
 
     os.environ["XDG_CACHE_HOME"] = str(root)
     budget.remembered("machine")

@@ -188,8 +188,6 @@ def make_runs(root: Path) -> None:
     from fieldfuse.pipelines.folder import RunFolder
     from fieldfuse.pipelines.rendered import Picture, Pictures, save_pictures
     from fieldfuse.poses.scene import Scene
-    from fieldfuse.tsdf.store import save_volume
-    from fieldfuse.tsdf.volume import TsdfVolume
 
     source = root / "source"
     LAYOUTS["transforms"][1](source)
@@ -219,8 +217,6 @@ def make_runs(root: Path) -> None:
     save_pictures(root / "field.pictures.safetensors", Pictures(["a"], [Picture(pixels, depth)], [0.1], {"x": 1}))
     small_field(1, 0.2).save(root / "field.safetensors")
     small_field(1, 0.2, decoder="per_sample", shell=1.0).save(root / "other.safetensors")
-    volume = TsdfVolume(0.1, 3.0, expected_blocks=16)
-    save_volume(root / "tsdf.safetensors", volume)
     (root / "settings.yaml").write_text("preset: fast\nfit: {budget: 5.0}\nexport:\n  formats: [ply, obj]\ntsdf: {enabled: off}\n")
 
 
@@ -266,12 +262,10 @@ def read_fields(root: Path, number: int) -> None:
 
 def read_tensors(root: Path, number: int) -> None:
     from fieldfuse.pipelines.rendered import load_pictures
-    from fieldfuse.tsdf.store import load_volume
 
     reader = (
         lambda: load_views(root / "views.safetensors"),
         lambda: load_pictures(root / "field.pictures.safetensors"),
-        lambda: load_volume(root / "tsdf.safetensors"),
     )
     for read in reader:
         read()
@@ -292,7 +286,7 @@ TARGETS: tuple[Target, ...] = (
     Target("results", RESULT_FILES, make_results, read_results, 2.5),
     Target("measured", MEASURED, make_measured, read_measured, 2.5),
     Target("field", ("field.safetensors", "other.safetensors"), make_runs, read_fields, 3.0),
-    Target("tensors", ("views.safetensors", "field.pictures.safetensors", "tsdf.safetensors"), make_runs, read_tensors, 1.5),
+    Target("tensors", ("views.safetensors", "field.pictures.safetensors"), make_runs, read_tensors, 1.5),
     Target("baked", ("bounded.safetensors", "background.safetensors"), make_models, read_baked_field, 2.0),
     Target("models", ("weights.safetensors", "scene.yaml", "scene.yaml"), make_models, read_models, 1.0),
     Target("training", TRAINING_FILES, make_training, read_training, 1.0),

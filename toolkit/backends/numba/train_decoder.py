@@ -13,7 +13,7 @@ from fieldfuse.backends.numba.decode import RAYS, Layers, rays_of, whole_lanes
 from fieldfuse.backends.numba.matrix import add_outer, product
 
 if TYPE_CHECKING:
-    from fieldfuse.networks.decoder import Deferred
+    from fieldfuse.nerfusion.decoder import Deferred
 
 Array = np.ndarray[Any, Any]
 ZERO = K.ZERO

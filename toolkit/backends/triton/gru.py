@@ -14,7 +14,7 @@ from fieldfuse.backends.triton.launch import kernel, pieces, power_of_two
 from fieldfuse.backends.triton.volumes import tanh
 
 if TYPE_CHECKING:
-    from fieldfuse.networks.lattice import LatentVolume, LocalVolume
+    from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
 
 BLOCK = 64  # rows at a time
 

@@ -13,7 +13,7 @@ from fieldfuse.capture.types import Capture, Frame, Views
 from fieldfuse.errors import InputError, PoseError
 from fieldfuse.evaluation.baseline import nearest_training
 from fieldfuse.evaluation.selftest.case import Measure, absolute, case, not_finite, refused
-from fieldfuse.keyframes import select_keyframes
+from fieldfuse.nerfusion.keyframes import select_keyframes
 from fieldfuse.poses.given import given_poses
 from fieldfuse.poses.gravity import up_direction
 from fieldfuse.poses.points import intersect

@@ -11,7 +11,7 @@ from torch import Tensor
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation.selftest.case import Measure, absolute, by_size, case, not_finite, refused
 from fieldfuse.evaluation.selftest.lookup import lattice, scattered_blocks
-from fieldfuse.networks.decoder import make_decoder
+from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.field import Field, density
 from fieldfuse.render.rays import render_rays
 from fieldfuse.volume.edit import corner_nodes, erase_empty_blocks, prune, resample, split, trilinear_density, with_corner_blocks

@@ -17,7 +17,7 @@ from fieldfuse.camera import Intrinsics
 from fieldfuse.capture.types import Views
 from fieldfuse.evaluation.selftest.case import Measure, by_size, case, not_finite
 from fieldfuse.evaluation.selftest.edit import small_field
-from fieldfuse.networks.decoder import Deferred, PerSample
+from fieldfuse.nerfusion.decoder import Deferred, PerSample
 from fieldfuse.render.differentiable import render_with_gradients
 from fieldfuse.render.field import Field
 from fieldfuse.render.march import BRICK

@@ -11,10 +11,10 @@ from torch import Tensor
 from fieldfuse.evaluation.selftest import reference
 from fieldfuse.evaluation.selftest.case import Measure, absolute, by_size, case, not_finite
 from fieldfuse.evaluation.selftest.lookup import lattice, scattered_blocks
-from fieldfuse.networks.aggregate import aggregate, evidence
-from fieldfuse.networks.block_conv import block_conv3d
-from fieldfuse.networks.decoder import make_decoder
-from fieldfuse.networks.encoding import positional, spherical_harmonics
+from fieldfuse.nerfusion.aggregate import aggregate, evidence
+from fieldfuse.nerfusion.block_conv import block_conv3d
+from fieldfuse.nerfusion.decoder import make_decoder
+from fieldfuse.nerfusion.encoding import positional, spherical_harmonics
 from fieldfuse.volume.topology import Topology
 
 GROUP = "networks"

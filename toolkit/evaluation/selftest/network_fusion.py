@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from fieldfuse.evaluation.selftest.case import Measure, absolute, by_size, case, not_finite
-from fieldfuse.networks.gru import LEAST, FusionGRU, RunningMean
-from fieldfuse.training.nerfusion.health import saturation
+from fieldfuse.nerfusion.gru import LEAST, FusionGRU, RunningMean
+from fieldfuse.nerfusion.training.health import saturation
 from fieldfuse.volume.topology import Topology
 
 GROUP = "networks"

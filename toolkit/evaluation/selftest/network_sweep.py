@@ -10,10 +10,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from fieldfuse.evaluation.selftest.case import Measure, absolute, case, not_finite
-from fieldfuse.networks.cameras import Cameras
-from fieldfuse.networks.matching import LARGE, SMALL, TEMPERATURE, UNKNOWN, describe
-from fieldfuse.networks.sweep import Sweep, carved, compare, decide, sweep
-from fieldfuse.networks.witness import AGAINST, FOR, SHARE, evidence, witness
+from fieldfuse.nerfusion.cameras import Cameras
+from fieldfuse.nerfusion.extras.cross_view_consistency import AGAINST, FOR, SHARE, evidence, witness
+from fieldfuse.nerfusion.extras.matching import LARGE, SMALL, TEMPERATURE, UNKNOWN, describe
+from fieldfuse.nerfusion.extras.plane_sweep import Sweep, carved, compare, decide, sweep
 
 GROUP = "networks"
 WIDTH, HEIGHT, FOCAL = 24, 18, 22.0

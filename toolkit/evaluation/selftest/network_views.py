@@ -12,11 +12,11 @@ from fieldfuse.evaluation.selftest.case import Measure, absolute, by_size, case,
 from fieldfuse.evaluation.selftest.edit import aimed_rays, small_field
 from fieldfuse.evaluation.selftest.lookup import scattered_blocks
 from fieldfuse.evaluation.selftest.network import GROUP
-from fieldfuse.networks.aggregate import aggregate, evidence
-from fieldfuse.networks.block_conv import block_conv3d
-from fieldfuse.networks.cameras import Cameras
-from fieldfuse.networks.decoder import make_decoder
-from fieldfuse.networks.unproject import MARGIN, project
+from fieldfuse.nerfusion.aggregate import aggregate, evidence
+from fieldfuse.nerfusion.block_conv import block_conv3d
+from fieldfuse.nerfusion.cameras import Cameras
+from fieldfuse.nerfusion.decoder import make_decoder
+from fieldfuse.nerfusion.unproject import MARGIN, project
 from fieldfuse.training.step import Optimiser, Rates
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 50.0

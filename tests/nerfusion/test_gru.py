@@ -1,0 +1,178 @@
+"""The recurrence: what it starts as, what it never does, and the same on sparse blocks as on a dense grid."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+
+from fieldfuse.nerfusion.gru import FusionGRU, RunningMean
+from fieldfuse.nerfusion.head import FieldHead
+from fieldfuse.nerfusion.volume_net import LocalReconstruction, colour_latent, inside_latent
+from fieldfuse.volume.topology import Topology
+from tests.nerfusion.test_block_conv import cube, dense_of, rows_of
+
+CHANNELS = 4
+
+
+def trained(seed: int = 0, gain: float = 4.0) -> FusionGRU:
+    """A GRU as training could leave it: weights and biases far from the start."""
+    torch.manual_seed(seed)
+    gru = FusionGRU(CHANNELS, 6)
+    for parameter in gru.parameters():
+        parameter.data = parameter.data * gain + 0.1 * torch.randn_like(parameter)
+    return gru
+
+
+def inputs(topology: Topology, seed: int, share: float = 0.6, channels: int = CHANNELS) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    size = topology.zero_row
+    inside = torch.rand(size, generator=generator) < share
+    count = torch.randint(0, 5, (size,), generator=generator).float() * inside
+    mask = torch.cat([inside, inside.new_zeros(1)])[:, None]
+    raw = torch.randn((size + 1, channels), generator=generator) * mask
+    known = torch.cat([count > 0, inside.new_zeros(1)])[:, None]
+    state = torch.tanh(torch.randn((size + 1, channels), generator=generator)) * known
+    weight = (0.01 + 0.99 * torch.rand(size, generator=generator)) * inside
+    return {"state": state, "count": count, "local": torch.tanh(raw), "raw": raw, "weight": weight, "inside": inside}
+
+
+def test_the_start_is_close_to_the_running_mean_of_what_was_seen() -> None:
+    topology, _ = cube(2, 1.0, 0)
+    torch.manual_seed(1)
+    gru = FusionGRU(CHANNELS, 6)
+    given = inputs(topology, 0)
+    out = gru(**given, topology=topology).detach()
+    mean = RunningMean()(**given, topology=topology)
+    first = torch.cat([(given["count"] == 0) & given["inside"], torch.zeros(1, dtype=torch.bool)])
+    assert float((out - mean).abs().mean()) < 0.1
+    z = (given["weight"] / (given["weight"] + given["count"]))[:, None]
+    by_hand = ((1 - z) * given["state"][:-1] + z * given["local"][:-1])[given["inside"]]
+    torch.testing.assert_close(mean[:-1][given["inside"]], by_hand, atol=1e-6, rtol=1e-5)
+    assert float((out - given["local"])[first].abs().mean()) < 0.15, "what was never seen before takes the local volume"
+    for gate in (gru.update, gru.candidate):
+        gate.convolutions[-1].weight.data.zero_()
+    torch.testing.assert_close(gru(**given, topology=topology), mean, atol=1e-6, rtol=1e-5)
+
+
+def test_unknown_voxels_take_nothing_from_before_and_outside_stays_zero() -> None:
+    topology, _ = cube(2, 1.0, 0)
+    gru = trained()
+    given = inputs(topology, 3)
+    out = gru(**given, topology=topology).detach()
+    assert not out[:-1][~given["inside"]].any() and not out[-1].any()
+    assert bool(torch.isfinite(out).all()) and float(out.abs().max()) <= 1
+
+
+def test_against_dense_convolutions() -> None:
+    """The equations written down again on a dense grid in float64."""
+    topology, low = cube(3, 0.5, 5)
+    gru = trained(2).double()
+    given = {name: value.double() if value.is_floating_point() else value for name, value in inputs(topology, 7).items()}
+    inside = given["inside"]
+    mask = dense_of(inside.double()[:, None], topology, low, 3)
+
+    def dense(rows: torch.Tensor) -> torch.Tensor:
+        return dense_of(rows[:-1], topology, low, 3)
+
+    def gate(module: torch.nn.Module, x: torch.Tensor) -> torch.Tensor:
+        for number, layer in enumerate(module.convolutions):
+            x = F.conv3d(torch.relu(x) if number else x, layer.weight, layer.bias, padding=1) * mask
+        return x
+
+    state, local, raw = dense(given["state"]), dense(given["local"]), dense(given["raw"])
+    count, weight = (dense_of(given[name][:, None], topology, low, 3) for name in ("count", "weight"))
+    z = torch.sigmoid(gate(gru.update, torch.cat([state, local], 1)) + torch.log(weight / count))
+    r = torch.sigmoid(gate(gru.reset, torch.cat([state, local], 1)))
+    learned = gate(gru.candidate, torch.cat([r * state, local], 1))
+    learned[:, 3] = 0.5 * torch.tanh(learned[:, 3] / 0.5)  # the distance behind the surface is changed by no more than half
+    candidate = torch.tanh(raw + learned)
+    expected = rows_of((1 - z) * state + z * candidate, topology, low)
+    found = gru(**given, topology=topology)[:-1]
+    torch.testing.assert_close(found[inside], expected[inside], atol=1e-10, rtol=1e-8)
+
+
+def test_a_thousand_steps_stay_bounded() -> None:
+    topology = Topology(torch.tensor([[0, 0, 0]]))
+    torch.manual_seed(0)
+    gru = FusionGRU(CHANNELS, 6, layers=1)
+    for parameter in gru.parameters():
+        parameter.data = 6 * parameter.data + 0.5 * torch.randn_like(parameter)
+    given = inputs(topology, 0, 0.2)
+    mask = torch.cat([given["inside"], given["inside"].new_zeros(1)])[:, None]
+    with torch.no_grad():
+        for step in range(1000):
+            given["state"] = gru(**given, topology=topology)
+            given["count"] = given["count"] + given["weight"]
+            if step % 100 == 99:  # now and then something else is seen, without measure
+                given["raw"] = torch.randn_like(given["raw"]) * 10 * mask
+                given["local"] = torch.tanh(given["raw"])
+    assert bool(torch.isfinite(given["state"]).all()) and 0.5 < float(given["state"].abs().max()) <= 1
+
+
+def test_gradients_reach_every_parameter_and_are_finite() -> None:
+    topology, _ = cube(2, 0.6, 0)
+    gru = FusionGRU(CHANNELS, 6)
+    given = inputs(topology, 1)
+    given["raw"].requires_grad_()
+    out = gru(**{**given, "local": torch.tanh(given["raw"])}, topology=topology)
+    (out * torch.randn_like(out)).sum().backward()
+    for name, value in [*gru.named_parameters(), ("raw", given["raw"])]:
+        assert value.grad is not None and bool(torch.isfinite(value.grad).all()) and float(value.grad.abs().max()) > 0, name
+
+
+def test_local_network_against_dense_convolutions() -> None:
+    topology, low = cube(3, 0.5, 9)
+    torch.manual_seed(0)
+    network = LocalReconstruction(5, 6, CHANNELS).double()
+    generator = torch.Generator().manual_seed(1)
+    seen = torch.rand(topology.zero_row, generator=generator) < 0.5
+    mask = torch.cat([seen, seen.new_zeros(1)])[:, None]
+    rows = torch.relu(torch.randn((len(mask), 6), generator=generator, dtype=torch.float64)) * mask
+    start = torch.randn((len(mask), CHANNELS), generator=generator, dtype=torch.float64) * mask
+    x, present = dense_of(rows[:-1], topology, low, 3), dense_of(seen.double()[:, None], topology, low, 3)
+    for number, layer in enumerate(network.convolutions):
+        x = F.conv3d(torch.relu(x) if number else x, layer.weight, layer.bias, padding=1) * present
+    x[:, 3] = 0.5 * torch.tanh(x[:, 3] / 0.5)
+    expected = rows_of(x, topology, low) + start[:-1]
+    found = network(rows, start, topology, seen)
+    torch.testing.assert_close(found[:-1], expected, atol=1e-10, rtol=1e-8)
+    assert not found[-1].any() and not found[:-1][~seen].any()
+
+
+def test_what_the_sweep_is_sure_of_stays_whatever_was_learned() -> None:
+    """A voxel surely in front of the surface stays nearly free, and one surely behind it stays solid, under any weights."""
+    topology, _ = cube(2, 1.0, 0)
+    torch.manual_seed(0)
+    network, gru, head = LocalReconstruction(5, 6, 8), FusionGRU(8, 6), FieldHead(8, 6, 8)
+    with torch.no_grad():
+        for parameter in (*network.parameters(), *gru.parameters(), *head.density.parameters(), *head.body.parameters()):
+            parameter.mul_(30).add_(torch.randn_like(parameter))
+    seen = torch.ones(topology.zero_row, dtype=torch.bool)
+    for signed, thinnest, thickest in ((1.0, 0.0, 0.1), (-1.0, 4.0, torch.inf)):
+        start = torch.zeros(topology.zero_row + 1, 8)
+        start[:-1, 3] = inside_latent(torch.tensor(signed))
+        raw = network(torch.rand(topology.zero_row + 1, 6), start, topology, seen)
+        none, weight = torch.zeros_like(start), torch.ones(topology.zero_row)
+        state, count = none, torch.zeros(topology.zero_row)
+        for _ in range(3):
+            state = gru(state, count, torch.tanh(raw), raw, weight, topology, seen).detach()
+            count += 1
+        thickness = torch.exp(head.thickness(state[:-1])).detach()
+        assert thinnest <= float(thickness.min()) and float(thickness.max()) <= thickest
+
+
+def test_colour_latents_decode_to_their_colour() -> None:
+    colour = torch.rand(100, 3) * 0.94 + 0.03
+    back = torch.sigmoid(4.0 * torch.tanh(colour_latent(colour)))
+    torch.testing.assert_close(back, colour, atol=1e-5, rtol=1e-4)
+    extreme = colour_latent(torch.tensor([[0.0, 1.0, 0.5]]))
+    assert bool(torch.isfinite(extreme).all()) and float(extreme.abs().max()) < 2
+
+
+def test_fewer_digits_without_gradients_are_those_with_them() -> None:
+    topology, _ = cube(2, 1.0, 0)
+    gru, given = trained(), inputs(topology, 3)
+    with torch.autocast("cpu", torch.bfloat16):
+        with torch.no_grad():
+            quick = gru(**given, topology=topology)
+        assert torch.equal(quick, gru(**given, topology=topology))

@@ -1,0 +1,61 @@
+"""Training with witnesses: a sample's sweeps against those that direct inference makes of the same pictures, and a step with them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from fieldfuse.nerfusion.extras.cross_view_consistency import certain, evidence, witness
+from fieldfuse.nerfusion.extras.matching import describe
+from fieldfuse.nerfusion.extras.plane_sweep import compare, decide
+from fieldfuse.nerfusion.training.distributed import Crew
+from fieldfuse.nerfusion.training.mixture import Mixture
+from fieldfuse.nerfusion.training.procedural import ProceduralScene
+from fieldfuse.nerfusion.training.train import Trainer
+from fieldfuse.nerfusion.training.witnessed import cameras_of, sweeps_of
+from fieldfuse.simulate.eye import take, take_all
+from tests.nerfusion.training.tiny import tiny_settings
+
+
+def test_a_samples_sweeps_are_held_against_each_other() -> None:
+    sample = Mixture(tiny_settings()).sample(0, 2)
+    described = describe(sample.pictures.images)
+    first, second = (
+        compare([described[k] for k in indices], cameras_of(sample.pictures, indices), sample.near, sample.far)
+        for indices in sample.references
+    )
+    alone = decide(first)
+    said = evidence(first, [witness(decide(second))], certain(first, alone))
+    swept = sweeps_of(sample)
+    assert len(swept) == 2 and not torch.equal(swept[0].table, alone.table)
+    torch.testing.assert_close(swept[0].table, decide(first, said=said).table)
+    assert swept[0].lowest == alone.lowest and swept[0].step == alone.step
+
+
+def test_one_key_frame_has_no_witness() -> None:
+    sample = Mixture(tiny_settings()).sample(0, 1)
+    indices = sample.references[0]
+    described = describe(sample.pictures.images)
+    compared = compare([described[k] for k in indices], cameras_of(sample.pictures, indices), sample.near, sample.far)
+    (swept,) = sweeps_of(sample)
+    assert torch.equal(swept.table, decide(compared).table)
+
+
+def test_a_step_with_witnesses_learns_something_else(tmp_path: Path) -> None:
+    rows = []
+    for witnesses in (False, True):
+        settings = tiny_settings(stage={"steps": 0, "fused_steps": 2, "most_split": 100, "witnesses": witnesses})
+        rows.append(Trainer(settings, tmp_path / str(witnesses), Crew()).one_step())
+    assert all(math.isfinite(row["loss"]) and row["skipped"] == 0 for row in rows)
+    assert rows[0]["loss"] != rows[1]["loss"]
+
+
+def test_frames_drawn_at_once_are_those_drawn_alone() -> None:
+    scene = ProceduralScene("room", np.random.default_rng(1), 48, 8, 0)
+    for index, many in zip((1, 5), take_all(scene._scene, scene._eye, scene._poses[[1, 5]]), strict=True):
+        one = take(scene._scene, scene._eye, scene._poses[index][None])
+        for name in ("linear", "depth", "normals", "albedo", "gloss"):
+            torch.testing.assert_close(getattr(many, name), getattr(one, name), atol=1e-6, rtol=0)

@@ -1,0 +1,170 @@
+"""The GRU that fuses a local volume into the global one (NeRFusion, section 3.2, eq. 3).
+
+    z = σ(M_z([H, V]) + log(w / n))      r = σ(M_r([H, V]))
+    T = tanh(V_raw + M_t([r ∘ H, V]))
+    H' = (1 − z) ∘ H + z ∘ T
+
+H is the global volume, V = tanh(V_raw) the local one, w its weight and n the sum of the weights so far. What differs from the paper are
+the two known terms: with M_z = M_t = 0 (the start) this is w V + n H over w + n, the weighted running mean of the local volumes, the
+fusion that needs no learning, and z = 1 where nothing was known. A local volume weighs little where its key frame does not see; without
+that, each more key frame wrote its ignorance over what others knew. n is capped, so that late frames still count. H stays within (−1, 1)
+for ever: it is always a mixture of values of tanh.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d
+from fieldfuse.nerfusion.compiled_gru import Step
+from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
+from fieldfuse.nerfusion.volume_net import CHANGE, INSIDE, held
+from fieldfuse.volume.topology import Topology
+
+LEAST = 1e-3  # of a local volume's weight
+MOST = 16  # cap on n
+
+
+class _Gate(nn.Module):
+    """Three sparse convolutions [H, V] → channels; the last starts near zero."""
+
+    def __init__(self, channels: int, hidden: int, layers: int) -> None:
+        super().__init__()
+        widths = [2 * channels] + [hidden] * (layers - 1) + [channels]
+        self.convolutions = nn.ModuleList(BlockConv3d(a, b) for a, b in pairwise(widths))
+        last = self.convolutions[-1]
+        assert isinstance(last, BlockConv3d)
+        with torch.no_grad():
+            last.weight.mul_(0.1)
+
+    @property
+    def layers(self) -> list[BlockConv3d]:
+        return [layer for layer in self.convolutions if isinstance(layer, BlockConv3d)]
+
+    @property
+    def first(self) -> BlockConv3d:
+        return self.layers[0]
+
+    def forward(self, rows: Tensor, topology: Topology, inside: Tensor, begun: Tensor | None = None) -> Tensor:
+        """`begun`: what the first convolution gives for `rows`, if that is known already."""
+        rows = self.first(rows, topology, inside) if begun is None else begun
+        for convolution in self.convolutions[1:]:
+            rows = convolution(rows, topology, inside, True)
+        return rows
+
+
+class FusionGRU(nn.Module):
+    """One step of the recurrence on the voxels of a local volume.
+
+    Args:
+        most: cap on n.
+    """
+
+    def __init__(self, channels: int, hidden: int, layers: int = 3, most: int = MOST) -> None:
+        super().__init__()
+        self.update, self.reset, self.candidate = (_Gate(channels, hidden, layers) for _ in range(3))
+        self.most = most
+        self._gates_prepared, self._candidate_prepared = Prepared(), Prepared()
+
+    def forward(
+        self, state: Tensor, count: Tensor, local: Tensor, raw: Tensor, weight: Tensor, topology: Topology, inside: Tensor
+    ) -> Tensor:
+        """H' on the local volume's rows.
+
+        Args:
+            state: (M · 512 + 1, C) H, zero outside the local volume and where nothing is known.
+            count, weight: (M · 512,) n and w.
+            local, raw: (M · 512 + 1, C) V and V_raw.
+            inside: (M · 512,) bool, the voxels of the local volume.
+
+        Returns:
+            (M · 512 + 1, C), zero outside.
+        """
+        both = _beside(state, local)
+        known = torch.log(count.clamp_max(self.most)) - torch.log(weight.clamp_min(LEAST))  # −∞ where nothing is known: z = 1
+        known = torch.cat([known, known.new_full((1,), -torch.inf)])[:, None]
+        update, reset = self._gates(both, topology, inside)
+        z, r = torch.sigmoid(update - known), torch.sigmoid(reset)
+        candidate = torch.tanh(raw + held(self.candidate(_beside(r * state, local), topology, inside)))
+        return torch.lerp(state, candidate, z)
+
+    def compiled(self, part: LatentVolume, local: LocalVolume) -> tuple[Tensor, Tensor]:
+        """The running mean on all rows of `part` (the global volume on the local one's blocks) and `forward` on those of busy blocks,
+        without gradients, by kernels (float32; convolutions in what autocast says).
+
+        Returns:
+            (M · 512 + 1, C), zero outside the local volume, and (M · 512,) weights so far, likewise.
+        """
+        kind, busy = part.rows.device.type, local.busy
+        numbers = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
+        if not on_cpu(part.rows.device):
+            return self._on_device(part, local, numbers)
+        step = Step(local.place[:-1], part, local, LEAST, self.most)
+        rows = step.average()
+        if busy.blocks:
+            inside = local.known[local.place[:-1]]
+            both = step.beside(numbers)
+            update, reset = self._gates(both, busy, inside)
+            step.forget(reset, both)
+            step.update(update, self.candidate(both, busy, inside), INSIDE, CHANGE, rows)
+        return rows, part.count * local.known + local.weight
+
+    def _on_device(self, part: LatentVolume, local: LocalVolume, numbers: torch.dtype) -> tuple[Tensor, Tensor]:
+        """`compiled` on CUDA: both gates' convolutions go side by side."""
+        from fieldfuse.backends.triton import gru
+
+        step, busy = gru.Step(part, local, LEAST, self.most), local.busy
+        rows, count = step.average()
+        if busy.blocks:
+            both, inside = step.beside(numbers)
+            gates = self._gates_prepared.convolve(list(zip(self.update.layers, self.reset.layers, strict=True)), both, busy, inside)
+            step.forget(gates, both)
+            candidate = self._candidate_prepared.convolve([[layer] for layer in self.candidate.layers], both, busy, inside)
+            step.update(gates, candidate, INSIDE, CHANGE, rows)
+        return rows, count
+
+    def _gates(self, both: Tensor, topology: Topology, inside: Tensor) -> list[Tensor]:
+        """M_z and M_r of [H, V]; their first convolutions are one, which costs as much as either alone."""
+        one, other = self.update.first, self.reset.first
+        assert one.bias is not None and other.bias is not None
+        weight, bias = torch.cat([one.weight, other.weight]), torch.cat([one.bias, other.bias])
+        rows = block_conv3d(both, topology, weight, bias, inside, one.chunk)
+        return [gate(both, topology, inside, part) for gate, part in zip((self.update, self.reset), rows.chunk(2, 1), strict=True)]
+
+
+def on_cpu(device: torch.device) -> bool:
+    return device.type == "cpu"
+
+
+def _beside(one: Tensor, other: Tensor) -> Tensor:
+    """Both rows' channels; without gradients at once in the numbers that convolutions compute in, which is half as much to write."""
+    kind = one.device.type
+    if torch.is_autocast_enabled(kind) and not torch.is_grad_enabled():
+        reduced = torch.get_autocast_dtype(kind)
+        one, other = one.to(reduced), other.to(reduced)
+    return torch.cat([one, other], 1)
+
+
+def mean_gate(count: Tensor, weight: Tensor, most: int = MOST) -> Tensor:
+    """(M · 512,) n and w → (M · 512 + 1, 1) the z of the weighted running mean; the last row's is one."""
+    weight = weight.clamp_min(LEAST)
+    z = weight / (weight + count.clamp_max(most))
+    return torch.cat([z, z.new_ones(1)])[:, None]
+
+
+class RunningMean(nn.Module):
+    """The fusion without learning, for the ablation: the weighted mean of the local volumes, n capped as in the GRU."""
+
+    def __init__(self, most: int = MOST) -> None:
+        super().__init__()
+        self.most = most
+
+    def forward(
+        self, state: Tensor, count: Tensor, local: Tensor, raw: Tensor, weight: Tensor, topology: Topology, inside: Tensor
+    ) -> Tensor:
+        """See `FusionGRU.forward`."""
+        z = mean_gate(count, weight, self.most)
+        return torch.lerp(state, local, z)
