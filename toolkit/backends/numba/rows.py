@@ -2,6 +2,9 @@
 
 The compiler does not make vectors of loops over channels: it cannot tell that what is read and what is written do not overlap. Here all of
 a row is read before anything is written. Rows are C-contiguous float32 with as many channels as the tuple `width` has entries.
+
+With plain loops instead a fit (fox, 320 pixels, one thread) has 11% fewer rays a second and a render takes 17% longer; with `mix` alone
+as it is here, 16% fewer rays.
 """
 
 from __future__ import annotations
