@@ -125,6 +125,7 @@ def warm_up(settings: Settings, progress: Progress) -> None:
     """Have the kernels compiled (once a machine: they are kept on disk) or loaded, before any clock runs."""
     chosen = chosen_engine(settings, device := fit_device(settings))
     if chosen == "torch":
+        torch.optim.Adam([torch.zeros(1, requires_grad=True)])  # the first optimiser imports torch's compiler: 1.6 s
         return
     if chosen == "triton":
         from fieldfuse.training import triton_warm

@@ -11,7 +11,7 @@ from fieldfuse.render.composite import SOLID, STOP, distortion, ray_sum, weights
 from fieldfuse.render.field import Field, density
 from fieldfuse.render.march import BRICK, Samples, march
 from fieldfuse.render.rays import OPACITY_FLOOR
-from fieldfuse.training.adam import Adam, LazyAdam
+from fieldfuse.training.adam import LazyAdam
 from fieldfuse.training.depth import FINE, depth_gradient
 from fieldfuse.training.finite import NotFiniteError, check
 from fieldfuse.training.near import slowness
@@ -42,7 +42,7 @@ class Optimiser:
 
     def __init__(self, field: Field) -> None:
         self.blind = blind(field.decoder)
-        self.decoder = Adam(field.decoder.parameters(), (0.9, 0.99), 1e-10)
+        self.decoder = torch.optim.Adam(field.decoder.parameters(), betas=(0.9, 0.99), eps=1e-10)
         self.renew_rows(field)
 
     def renew_rows(self, field: Field) -> None:
@@ -71,13 +71,15 @@ class Optimiser:
         try:
             error = (self._deferred if isinstance(field.decoder, Deferred) else self._per_sample)(batch, samples, rates)
         except NotFiniteError:
-            self.decoder.forget()
+            self.decoder.zero_grad()
             self.seen.nan_to_num_(0.0)
             raise
-        self.decoder.step(rates.decoder)
+        for group in self.decoder.param_groups:
+            group["lr"] = rates.decoder
+        self.decoder.step()
         if self.blind.any():
             of_direction(field.decoder)[:, self.blind] = 0.0
-        self.decoder.forget()
+        self.decoder.zero_grad()
         return error, len(samples)
 
     def _deferred(self, batch: Batch, samples: Samples, rates: Rates) -> float:
@@ -91,11 +93,11 @@ class Optimiser:
         alive = transmittance >= STOP
         self._mark(samples, weight, alive, count)
         # Samples of small weight dim those behind them, and get no gradient.
-        chosen = ((weight > rates.colour_threshold) & alive).nonzero().squeeze(1)
+        chosen = (weight > rates.colour_threshold) & alive
         kept, rows, corner_weights = samples.keep(chosen), rows[chosen], corner_weights[chosen]
         raw, slow = raw[chosen].requires_grad_(True), slowness(kept.distance, rates.slow_within)
         features = gather(field.feature_rows, rows, corner_weights).requires_grad_(True)
-        thickness = thickness.index_copy(0, chosen, _slowed(density(raw) * kept.length, slow))
+        thickness = thickness.masked_scatter(chosen, _slowed(density(raw) * kept.length, slow))
         weight = weights(thickness, samples.first)[0][chosen]
         opacity = ray_sum(weight, kept.ray, count)
         mean = ray_sum(weight[:, None] * _slowed(features, slow[:, None]), kept.ray, count) / opacity.clamp_min(OPACITY_FLOOR)[:, None]
