@@ -49,7 +49,7 @@ def everything(engine: Any) -> list[np.ndarray]:
     out = [field.density_rows, field.feature_rows, *field.decoder.state_dict().values()]
     if isinstance(engine, TorchEngine):
         out += [engine.density.state, engine.feature.state]
-        out += [torch.tensor(engine.decoder.steps), *(value for pair in engine.decoder.moments for value in pair)]
+        out += [value for state in engine.decoder.state.values() for value in state.values()]
     else:
         out += [engine.records, *(value for pair in engine.moments for value in pair)]
     return [np.array(value.detach() if isinstance(value, torch.Tensor) else value) for value in out]
