@@ -10,7 +10,7 @@ and counts 1 / q in all losses, which leaves their means as they are but for a f
 no ray came to has q = 1.
 
 Pixels are drawn by lot from evenly drawn ones, so masks and weights of pictures need no index. Here for any device; compiled twins of the
-functions are in `train_draw.py`.
+functions are in `backends/numba/train_draw.py`.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ def render_tiles(
 
     Args:
         camera: (4,) float32 fx, fy, cx, cy; pose: (3, 4) float32 world_from_camera; size: (width, height), ints.
-        tape: this thread's own `kernels_decode.Rays`.
+        tape: this thread's own `decode.Rays`.
         tiles: range of tiles, row by row, as (first, last + 1).
         limits: float32 stop, threshold: see `baked_march`.
         out: (H · W, 5) float32 colour, depth along z, opacity.

@@ -1,4 +1,4 @@
-"""Features to colour, compiled: the encoding of directions and the deferred decoder; `networks/decoder.py` is the reference.
+"""Features to colour, compiled: the encoding of directions and the deferred decoder; `nerfusion/decoder.py` is the reference.
 
 A few rays are decoded at a time, as products of small matrices. One ray at a time a layer is a product of a matrix with a vector, which
 reads every weight for one multiplication; several rays share what is read.

@@ -1,4 +1,4 @@
-"""Samples along a ray, compiled; `march.py` is the reference. Empty space is skipped by the distance to what is occupied."""
+"""Samples along a ray, compiled; `render/march.py` is the reference. Empty space is skipped by the distance to what is occupied."""
 
 from __future__ import annotations
 

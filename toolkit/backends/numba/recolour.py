@@ -35,9 +35,9 @@ def project_back_pass(
     """Add what the rays (B, 3) that end somewhere ask for to `sums` (M · 512 + 1, 4): Σ a (c − ĉ) / ĉ' and Σ a.
 
     Args:
-        tape: this thread's own `kernels_decode.Rays`.
+        tape: this thread's own `decode.Rays`.
         steepest, most: see `recolour.STEEPEST` and `recolour.MOST`.
-        marks: (M · 512,) uint16 for `kernels_march.mark`.
+        marks: (M · 512,) uint16 for `march.mark`.
     """
     channels = len(space.width)
     cells, values = np.empty(ROOM, np.int32), np.empty((ROOM, K.VALUES), np.float32)

@@ -29,7 +29,7 @@ class Turned(NamedTuple):
 class Tape(NamedTuple):
     """What is known of `RAYS` rays, a row a ray; and sums over a batch of the gradients of the weights, `total`."""
 
-    given: Any  # as in `kernels_decode.Rays`
+    given: Any  # as in `decode.Rays`
     h1: Any
     h2: Any
     colour: Any

@@ -1,4 +1,4 @@
-"""Pixels drawn by the errors of their tiles, compiled: the twin of `importance.py`."""
+"""Pixels drawn by the errors of their tiles, compiled: the twin of `training/importance.py`."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def _add_rows(values: Any, count: Any, out: Any) -> None:
 
 @njit(**K.OPTIONS)
 def _encode_backward(width: Any, given: Any, g: Any) -> None:
-    """g[:C] from the gradients g[:11 C] of what `kernels_net.encode` wrote: d sin(a v) = a cos(a v), d cos(a v) = -a sin(a v)."""
+    """g[:C] from the gradients g[:11 C] of what `decode_per_sample.encode` wrote: d sin(a v) = a cos(a v), d cos(a v) = -a sin(a v)."""
     c_count = len(width)
     cosines = c_count * FREQUENCIES
     angle = F(np.pi)

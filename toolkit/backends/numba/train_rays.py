@@ -19,7 +19,7 @@ from fieldfuse.backends.numba.train_common import ask_for, depth_pull, pixel_ray
 from fieldfuse.backends.numba.train_decoder import Tape, decode_backward, forget_gradients
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
-MOST = 1024  # samples of one ray that are kept, see `kernels_march`
+MOST = 1024  # samples of one ray that are kept, see `march`
 ROOM = 2 * MOST  # samples of all rays of a block: one with fewer than `RAYS` rays where they are many
 AHEAD = 8  # pixels for which memory is asked before they are needed
 WALK_WORK = F(0.7)  # what a coarse step costs whose fine ones are tried, in samples that are looked up
