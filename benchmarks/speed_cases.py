@@ -13,10 +13,10 @@ from benchmarks.timing import Case, compare, pinned
 from fieldfuse.evaluation.sphere import around, lens, sphere_field, sphere_pixels
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_image import BakedRenderer
-from fieldfuse.render.compiled import CompiledRenderer
+from fieldfuse.render.numba_renderer import NumbaRenderer
 from fieldfuse.render.rays import render_rays
 from fieldfuse.training.engine import TorchEngine
-from fieldfuse.training.fused import FusedOptimiser
+from fieldfuse.training.numba_engine import NumbaOptimiser
 from fieldfuse.training.rays import PixelPool
 from fieldfuse.training.step import Rates
 
@@ -35,7 +35,7 @@ def step_cases(sizes: tuple[int, ...] = SIZES, repetitions: int = 5) -> Iterator
     pool = sphere_pixels()
     with pinned(1):
         for size in sizes:
-            engine, reference = FusedOptimiser(sphere_field(size), pool, threads=1), TorchEngine(sphere_field(size), pool, 0)
+            engine, reference = NumbaOptimiser(sphere_field(size), pool, threads=1), TorchEngine(sphere_field(size), pool, 0)
             times = compare(
                 lambda e=engine: e.step(BATCH, RATES),  # type: ignore[misc]
                 lambda r=reference: r.step(BATCH, RATES),  # type: ignore[misc]
@@ -44,7 +44,7 @@ def step_cases(sizes: tuple[int, ...] = SIZES, repetitions: int = 5) -> Iterator
             yield Case("training step", f"{size}³", "ray", BATCH, *times, against="torch engine", counts=step_counts(engine))
 
 
-def step_counts(engine: FusedOptimiser) -> dict[str, float]:
+def step_counts(engine: NumbaOptimiser) -> dict[str, float]:
     """Operations of one step a ray: samples looked up, and lattice corners that get a gradient."""
     before = engine.next_record
     _, looked = engine.step(BATCH, RATES)
@@ -66,7 +66,7 @@ def render_cases(sizes: tuple[int, ...] = SIZES, side: int = 128, repetitions: i
         for size in sizes:
             field = sphere_field(size)
             origins, directions, _ = rays(camera, pose, pixel_grid(side, side))
-            compiled, baked = CompiledRenderer(field, 1), BakedRenderer(bake(field), 1)
+            compiled, baked = NumbaRenderer(field, 1), BakedRenderer(bake(field), 1)
             few = origins[:: side // 16], directions[:: side // 16]
             times = compare(lambda c=compiled, f=few: c.render(*f), lambda d=field, f=few: render_rays(d, *f), repetitions)  # type: ignore[misc]
             yield Case("rendering", f"{size}³", "ray", len(few[0]), *times, against="torch engine")
@@ -89,7 +89,7 @@ def thread_cases(threads: int, size: int = 128, repetitions: int = 5) -> Iterato
     """Several threads against one, by the wall clock."""
     pool, field = sphere_pixels(), sphere_field(size)
     camera, pose, baked = lens(256, 256), around()[1], bake(field)
-    many, one = (FusedOptimiser(sphere_field(size), pool, threads=n) for n in (threads, 1))
+    many, one = (NumbaOptimiser(sphere_field(size), pool, threads=n) for n in (threads, 1))
     renderers = [BakedRenderer(baked, n) for n in (threads, 1)]
     pairs: list[tuple[str, int, Callable[[], Any], Callable[[], Any]]] = [
         ("training step", 4 * BATCH, lambda: many.step(4 * BATCH, RATES), lambda: one.step(4 * BATCH, RATES)),
@@ -104,7 +104,7 @@ def order_case(size: int = 256, repetitions: int = 5) -> Case:
     """The same rays in the order of a picture against a random order: what memory that is not in the cache costs."""
     from fieldfuse.camera import pixel_grid, rays
 
-    renderer = CompiledRenderer(sphere_field(size), 1)
+    renderer = NumbaRenderer(sphere_field(size), 1)
     origins, directions, _ = rays(lens(160, 160), around()[1], pixel_grid(160, 160))
     mixed = torch.randperm(len(origins), generator=torch.Generator().manual_seed(0))
     shuffled = origins[mixed], directions[mixed]
@@ -197,9 +197,9 @@ def growth_cases(repetitions: int = 5) -> Iterator[Case]:
 def _growing(name: str, what: str, settings: list[tuple[int, PixelPool, int]], repetitions: int) -> Iterator[Case]:
     """Each setting (size, pixels, rays a step) against the first."""
     field = sphere_field(LATTICE)
-    first, rays_of_first = FusedOptimiser(field, settings[0][1], threads=1), settings[0][2]
+    first, rays_of_first = NumbaOptimiser(field, settings[0][1], threads=1), settings[0][2]
     for size, pool, rays in settings:
-        engine = FusedOptimiser(sphere_field(LATTICE), pool, threads=1)
+        engine = NumbaOptimiser(sphere_field(LATTICE), pool, threads=1)
         ours, reference = compare(
             lambda e=engine, n=rays: [e.step(n, RATES) for _ in range(4)],  # type: ignore[misc]
             lambda: [first.step(rays_of_first, RATES) for _ in range(4)],

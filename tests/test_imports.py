@@ -22,7 +22,7 @@ LIGHT = (
     "fieldfuse.volume.store",
     "fieldfuse.volume.topology",
     "fieldfuse.nerfusion",
-    "fieldfuse.networks",
+    "fieldfuse.backends",
     "fieldfuse.render",
     "fieldfuse.training",
     "fieldfuse.simulate",

@@ -19,19 +19,22 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
+from fieldfuse.backends.triton import blocks as blocks_gpu
+from fieldfuse.backends.triton import cast as cast_gpu
+from fieldfuse.backends.triton import coarse_steps as march_gpu
+from fieldfuse.backends.triton import convolution, describe, matching, measured, reading
+from fieldfuse.backends.triton import feature_lookup as lookup
+from fieldfuse.backends.triton import split as split_gpu
+from fieldfuse.backends.triton import tables as tables_gpu
+from fieldfuse.backends.triton import volumes as volumes_gpu
+from fieldfuse.backends.triton.gru import Step
+from fieldfuse.backends.triton.observe import Observer
 from fieldfuse.nerfusion.cull import all_blocks
 from fieldfuse.nerfusion.extras.cross_view_consistency import CrossView
 from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution
 from fieldfuse.nerfusion.head import FieldHead
 from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
-from fieldfuse.networks.gpu import convolution, describe, lookup, matching, measured, reading
-from fieldfuse.networks.gpu import volumes as volumes_gpu
-from fieldfuse.networks.gpu.gru import Step
-from fieldfuse.networks.gpu.observe import Observer
-from fieldfuse.render import march_gpu
-from fieldfuse.simulate import cast_gpu
 from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids, upright
-from fieldfuse.volume import blocks_gpu, split_gpu, tables_gpu
 from fieldfuse.volume.topology import Topology
 from tests.nerfusion.made import SMALL as SIZES
 from tests.nerfusion.made import cameras, lattice, pictures, small_model

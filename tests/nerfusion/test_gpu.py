@@ -19,6 +19,14 @@ if importlib.util.find_spec("triton") is None or torch.cuda.is_available():
 os.environ.setdefault("TRITON_INTERPRET", "1")
 
 from fieldfuse.backends import dispatch
+from fieldfuse.backends.triton import blocks as blocks_gpu
+from fieldfuse.backends.triton import convolution, matching, observe, reading
+from fieldfuse.backends.triton import describe as describing
+from fieldfuse.backends.triton import feature_lookup as lookup
+from fieldfuse.backends.triton import gru as compiled_rows
+from fieldfuse.backends.triton import split as split_gpu
+from fieldfuse.backends.triton import tables as tables_gpu
+from fieldfuse.backends.triton import volumes as volumes_gpu
 from fieldfuse.nerfusion import compiled, compiled_lookup
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d
 from fieldfuse.nerfusion.cull import all_blocks
@@ -28,12 +36,7 @@ from fieldfuse.nerfusion.extras.plane_sweep import _table, cost_volume, to_proba
 from fieldfuse.nerfusion.fusion import Fusion, FusionOptions
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, cells, rows_of
 from fieldfuse.nerfusion.unproject import look_up, project
-from fieldfuse.networks.gpu import convolution, lookup, matching, observe, reading
-from fieldfuse.networks.gpu import describe as describing
-from fieldfuse.networks.gpu import gru as compiled_rows
-from fieldfuse.networks.gpu import volumes as volumes_gpu
 from fieldfuse.render.march import MarchGrid, march
-from fieldfuse.volume import blocks_gpu, split_gpu, tables_gpu
 from fieldfuse.volume.edit import corner_nodes, split
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import Topology

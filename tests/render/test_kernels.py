@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from numba import njit
 from scipy.ndimage import distance_transform_cdt
 
-from fieldfuse.render import kernels as K
-from fieldfuse.render.compiled import FARTHEST, chessboard_distance
+from fieldfuse.backends.numba import common as K
+from fieldfuse.backends.numba.render_rays import chessboard_distance
+from fieldfuse.render.numba_renderer import FARTHEST
 
 
 @njit

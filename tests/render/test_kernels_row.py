@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from fieldfuse.render import kernels_row as row
-from fieldfuse.render.kernels import LEAF
+from fieldfuse.backends.numba import rows as row
+from fieldfuse.backends.numba.common import LEAF
 
 
 @njit(**{**LEAF, "cache": False})

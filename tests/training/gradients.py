@@ -39,7 +39,7 @@ def torch_gradients(field: Field, batch: Batch, rates: Rates) -> tuple[torch.Ten
         patch.setattr(step_module.LazyAdam, "step", lambda _, rows, g, rate: (density if g.ndim == 1 else feature).index_add_(0, rows, g))
         patch.setattr(torch, "rand", lambda *size, generator=None: torch.zeros(*size, dtype=kind))  # no jitter
         patch.setattr(optimiser, "_mark", lambda *_: None)
-        patch.setattr(optimiser.decoder, "step", lambda _: held.extend(p.grad.clone() for p in field.decoder.parameters()))  # type: ignore[misc]
+        patch.setattr(optimiser.decoder, "step", lambda: held.extend(p.grad.clone() for p in field.decoder.parameters()))  # type: ignore[misc]
         optimiser.step(batch, rates, torch.Generator())
     return density, feature, *held
 

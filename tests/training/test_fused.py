@@ -11,16 +11,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.backends.numba import train_decoder, train_order
+from fieldfuse.backends.numba.decode import RAYS, decode, layers_of
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture.types import Views
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.nerfusion.encoding import spherical_harmonics
-from fieldfuse.render.compiled import CompiledRenderer, decoder_arrays
-from fieldfuse.render.kernels_decode import RAYS, decode, layers_of
+from fieldfuse.render.numba_renderer import NumbaRenderer, decoder_arrays
 from fieldfuse.render.rays import render_rays
-from fieldfuse.training import fused_decoder, fused_order
 from fieldfuse.training.depth import ROUGH
-from fieldfuse.training.fused import FusedOptimiser
+from fieldfuse.training.numba_engine import NumbaOptimiser
 from fieldfuse.training.rays import PixelPool
 from fieldfuse.training.step import Optimiser, Rates
 from tests.render.made import random_field, random_rays
@@ -60,7 +60,7 @@ def test_pictures_agree(shell: float, keep: float) -> None:
     if shell:
         origins = origins * torch.linspace(0.02, 3, 500)[:, None]
     expected = render_rays(field, origins, directions)
-    got = CompiledRenderer(field, 1).render(origins, directions)
+    got = NumbaRenderer(field, 1).render(origins, directions)
     assert float(expected.opacity.std()) > 0 and float(expected.colour.std()) > 0.05
     torch.testing.assert_close(got[:, :3], expected.colour, atol=1e-4, rtol=0)
     torch.testing.assert_close(got[:, 4], expected.opacity, atol=1e-4, rtol=0)
@@ -69,7 +69,7 @@ def test_pictures_agree(shell: float, keep: float) -> None:
     assert float(close.float().mean()) > 0.99
 
 
-def gradients(engine: FusedOptimiser, picks: torch.Tensor, rates: Rates = RATES) -> list[torch.Tensor]:
+def gradients(engine: NumbaOptimiser, picks: torch.Tensor, rates: Rates = RATES) -> list[torch.Tensor]:
     """Dense gradients of densities and features, and the decoder's in the order of its parameters."""
     field, counts = engine.field, {}
 
@@ -78,7 +78,7 @@ def gradients(engine: FusedOptimiser, picks: torch.Tensor, rates: Rates = RATES)
         counts[thread] = used
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fieldfuse.training.fused.moves.adam_pass", keep_sums)
+        patch.setattr("fieldfuse.training.numba_engine.moves.adam_pass", keep_sums)
         engine.step_on(picks.numpy(), np.zeros(len(picks), np.float32), rates, some_weights(len(picks)).numpy())
     assert len(counts) == engine.threads
     dense = [torch.zeros_like(field.density_rows), torch.zeros_like(field.feature_rows)]
@@ -86,7 +86,7 @@ def gradients(engine: FusedOptimiser, picks: torch.Tensor, rates: Rates = RATES)
         rows = torch.from_numpy(engine.touched[thread, :used].astype(np.int64))
         dense[0].index_add_(0, rows, torch.from_numpy(engine.density_sums[thread, :used]))
         dense[1].index_add_(0, rows, torch.from_numpy(engine.feature_sums[thread, :used]))
-    totals = [fused_decoder.in_order(block.tape.total) for block in engine.blocks]
+    totals = [train_decoder.in_order(block.tape.total) for block in engine.blocks]
     for number, layer in enumerate(field.decoder.layers):
         weight, bias = (torch.from_numpy(sum(total[number][part] for total in totals)) for part in (0, 1))
         dense += [weight[: layer.out_features, : layer.in_features], bias[: layer.out_features]]
@@ -102,7 +102,7 @@ def test_gradients_agree(shell: float, seed: int, threads: int, rates: Rates) ->
     picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(seed))[:300]
     exact = exact_gradients(field, weighed(pool, picks), rates)
     reference = torch_gradients(field, weighed(pool, picks), rates)
-    compiled = gradients(FusedOptimiser(field, pool, threads=threads), picks, rates)
+    compiled = gradients(NumbaOptimiser(field, pool, threads=threads), picks, rates)
     for wanted, of_torch, of_ours in zip(exact, reference, compiled, strict=True):
         scale = float(wanted.abs().max())
         assert scale > 0
@@ -118,12 +118,12 @@ def test_a_few_rays_are_decoded_as_by_torch(channels: int, hidden: int, rays: in
     generator = torch.Generator().manual_seed(rays)
     decoder = Deferred(channels, hidden)
     layers = layers_of(decoder_arrays(decoder))
-    turned, tape = fused_decoder.turned(layers, channels), fused_decoder.make_tape(layers, channels)
+    turned, tape = train_decoder.turned(layers, channels), train_decoder.make_tape(layers, channels)
     exact = copy.deepcopy(decoder).double()
     features = torch.randn(2, rays, channels, generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(2, rays, 3, generator=generator), dim=-1)
     g_colour = torch.randn(2, rays, 3, generator=generator)
-    fused_decoder.forget_gradients(tape.total)
+    train_decoder.forget_gradients(tape.total)
     for block in range(2):
         given = features[block].double().requires_grad_(True)
         colour = exact(given, directions[block].double())
@@ -134,9 +134,9 @@ def test_a_few_rays_are_decoded_as_by_torch(channels: int, hidden: int, rays: in
         decode(layers, tape, rays)
         np.testing.assert_allclose(tape.colour[:rays], colour.detach(), atol=1e-5)
         tape.g_logit[:rays] = (g_colour[block].double() * colour * (1 - colour)).detach()
-        fused_decoder.decode_backward(layers, turned, tape, rays)
+        train_decoder.decode_backward(layers, turned, tape, rays)
         np.testing.assert_allclose(tape.g_given[:rays, :channels], given.grad, atol=1e-5)
-    for layer, (weight, bias) in zip(exact.layers, fused_decoder.in_order(tape.total), strict=True):
+    for layer, (weight, bias) in zip(exact.layers, train_decoder.in_order(tape.total), strict=True):
         for got, wanted in ((weight, layer.weight), (bias, layer.bias)):
             own = tuple(slice(0, size) for size in wanted.shape)
             np.testing.assert_allclose(got[own], 0 if wanted.grad is None else wanted.grad, atol=1e-4)
@@ -150,7 +150,7 @@ def test_a_step_moves_rows_as_the_reference_does() -> None:
     pool = PixelPool(made_views(), depth=True)
     fields = [random_field(1.0, 32, keep=0.5, raw=-2.5) for _ in range(2)]
     rates = replace(RATES, density=0.1, feature=0.05, decoder=1e-3)
-    reference, fused = Optimiser(fields[0]), FusedOptimiser(fields[1], pool, threads=2)
+    reference, fused = Optimiser(fields[0]), NumbaOptimiser(fields[1], pool, threads=2)
     before = fields[0].feature_rows.clone()
     for number in range(3):
         picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(number))[:400]
@@ -179,7 +179,7 @@ def test_the_same_seed_gives_the_same_field(threads: int) -> None:
     results = []
     for _ in range(2):
         field = random_field(1.0, 32, keep=0.5, raw=-2.5)
-        engine = FusedOptimiser(field, pool, seed=4, threads=threads)
+        engine = NumbaOptimiser(field, pool, seed=4, threads=threads)
         for _ in range(5):
             engine.step(256, replace(RATES, density=0.1, feature=0.05, decoder=1e-3))
         results.append(engine.sync())
@@ -195,9 +195,9 @@ def test_threads_get_equal_work(threads: int, work: list[float]) -> None:
     memory[:, 1] = work
     tiles = np.random.default_rng(0).permutation(len(work)).astype(np.int32)
     cuts = np.array([0, *[-1] * (threads - 1), len(work)], np.int64)
-    fused_order.share(tiles, memory, cuts)
+    train_order.share(tiles, memory, cuts)
     assert (np.diff(cuts) >= 0).all()
-    each = memory[tiles, 1].astype(float) + fused_order.RAY_WORK
+    each = memory[tiles, 1].astype(float) + train_order.RAY_WORK
     for part in range(threads):
         got = each[cuts[part] : cuts[part + 1]].sum()
         assert abs(got - each.sum() / threads) <= each.max() * 1.01
@@ -207,7 +207,7 @@ def test_threads_get_equal_work(threads: int, work: list[float]) -> None:
 def test_a_batch_is_drawn_anew_when_what_is_asked_for_changes(threads: int) -> None:
     """The order of a batch is found beside the step before it, and dropped when its size or its pixels are no longer those wanted."""
     pool = PixelPool(made_views(), depth=True)
-    engine, got = FusedOptimiser(random_field(0.0, 32, keep=0.5, raw=-2.5), pool, threads=threads), []
+    engine, got = NumbaOptimiser(random_field(0.0, 32, keep=0.5, raw=-2.5), pool, threads=threads), []
     original = engine._gradients
 
     def noted(thread: int, part: slice, picks: np.ndarray, *rest: object) -> tuple[int, float, int]:
@@ -232,7 +232,7 @@ def test_numbers_of_rows_begin_again_before_they_are_too_large(threads: int) -> 
     """What a batch notes of its rows is never wiped but outgrown; before 32 bits are full all begins anew, and nothing else changes."""
     pool, fields = PixelPool(made_views(), depth=True), []
     for late in (False, True):
-        engine = FusedOptimiser(random_field(1.0, 32, keep=0.5, raw=-2.5), pool, seed=4, threads=threads)
+        engine = NumbaOptimiser(random_field(1.0, 32, keep=0.5, raw=-2.5), pool, seed=4, threads=threads)
         first = np.iinfo(np.int32).max - len(engine.index) if late else 0
         engine.bases[:], bases = first, [first]
         for _ in range(4):
@@ -247,7 +247,7 @@ def test_numbers_of_rows_begin_again_before_they_are_too_large(threads: int) -> 
 @pytest.mark.parametrize("failing", [0, 1, 2])
 def test_a_thread_that_fails_is_heard_and_stops_the_others(failing: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """They wait for each other within a step; none waits for one that does not come, and the next step is as good as any."""
-    engine = FusedOptimiser(random_field(1.0, 32, keep=0.5, raw=-2.5), PixelPool(made_views(), depth=True), threads=3)
+    engine = NumbaOptimiser(random_field(1.0, 32, keep=0.5, raw=-2.5), PixelPool(made_views(), depth=True), threads=3)
     original = engine._gradients
 
     def spoilt(thread: int, *rest: object) -> tuple[int, float, int]:
@@ -269,7 +269,7 @@ def test_pruned_voxels_are_left_alone() -> None:
     """After pruning rows stay where they are, so the optimiser state stays good and erased voxels get no gradient."""
     pool = PixelPool(made_views(), depth=True)
     field = random_field(1.0, 32, keep=1.0, raw=-2.5)
-    engine = FusedOptimiser(field, pool, seed=1, threads=1)
+    engine = NumbaOptimiser(field, pool, seed=1, threads=1)
     engine.step(256, replace(RATES, density=0.1, feature=0.05))
     records = engine.next_record
     empty = replace(field, occupied=torch.zeros_like(field.occupied))

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.backends.numba import decode_per_sample as kernels_net
+from fieldfuse.backends.numba.matrix import add_outer, product
 from fieldfuse.nerfusion.decoder import PerSample
 from fieldfuse.nerfusion.encoding import positional
-from fieldfuse.render import kernels_net
-from fieldfuse.render.compiled_per_sample import PerSampleRenderer, net_arrays, write_back
 from fieldfuse.render.field import Field
-from fieldfuse.render.kernels_matrix import add_outer, product
+from fieldfuse.render.numba_per_sample import PerSampleRenderer, net_arrays, write_back
 from fieldfuse.render.rays import render_rays
 from fieldfuse.training.depth import ROUGH
-from fieldfuse.training.fused_per_sample import FusedPerSampleOptimiser
+from fieldfuse.training.numba_per_sample import NumbaPerSampleOptimiser
 from fieldfuse.training.rays import PixelPool
 from fieldfuse.training.step import Optimiser, Rates
 from tests.render.made import random_field, random_rays
@@ -30,8 +30,8 @@ SLOW = replace(RATES, slow_within=3.0, depth_noise=ROUGH.noise)  # the made view
 @pytest.fixture
 def every_sample(monkeypatch: pytest.MonkeyPatch) -> None:
     """The compiled engine looks at samples behind spent light too, as the reference does."""
-    monkeypatch.setattr("fieldfuse.training.fused.STOP", 0.0)
-    monkeypatch.setattr("fieldfuse.training.fused_per_sample.NEGLIGIBLE", -1.0)
+    monkeypatch.setattr("fieldfuse.training.numba_engine.STOP", 0.0)
+    monkeypatch.setattr("fieldfuse.training.numba_per_sample.NEGLIGIBLE", -1.0)
 
 
 def made_field(shell: float, keep: float, raw: float) -> Field:
@@ -96,7 +96,7 @@ def test_pictures_agree(shell: float, keep: float) -> None:
 
 
 def gradients(
-    engine: FusedPerSampleOptimiser, picks: torch.Tensor, monkeypatch: pytest.MonkeyPatch, rates: Rates = RATES
+    engine: NumbaPerSampleOptimiser, picks: torch.Tensor, monkeypatch: pytest.MonkeyPatch, rates: Rates = RATES
 ) -> list[torch.Tensor]:
     """Dense gradients of densities and features, and the decoder's in the order of its parameters."""
     field, counts = engine.field, {}
@@ -106,7 +106,7 @@ def gradients(
         counts[thread] = used
 
     with monkeypatch.context() as patch:
-        patch.setattr("fieldfuse.training.fused.moves.adam_pass", keep_sums)
+        patch.setattr("fieldfuse.training.numba_engine.moves.adam_pass", keep_sums)
         engine.step_on(picks.numpy(), np.zeros(len(picks), np.float32), rates, some_weights(len(picks)).numpy())
     assert len(counts) == engine.threads
     dense = [torch.zeros_like(field.density_rows), torch.zeros_like(field.feature_rows)]
@@ -144,7 +144,7 @@ def test_gradients_agree(shell: float, seed: int, threads: int, rates: Rates, ev
         # In float32 the reference's own angles are off by 1e-5.
         patch.setattr("fieldfuse.nerfusion.decoder.positional", lambda values, count: positional(values.double(), count).float())
         reference = torch_gradients(field, weighed(pool, picks), rates)
-    compiled = gradients(FusedPerSampleOptimiser(field, pool, threads=threads), picks, monkeypatch, rates)
+    compiled = gradients(NumbaPerSampleOptimiser(field, pool, threads=threads), picks, monkeypatch, rates)
     names = ["density_rows", "feature_rows", *(name for name, _ in field.decoder.named_parameters())]
     for name, wanted, of_torch, of_ours in zip(names, exact, reference, compiled, strict=True):
         scale = float(wanted.abs().max())
@@ -166,10 +166,10 @@ def test_what_is_left_out_has_no_weight(monkeypatch: pytest.MonkeyPatch, every_s
     field = made_field(1.0, 0.5, -2.5)
     pool = PixelPool(made_views(), depth=True)
     picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(2))[:200]
-    whole = FusedPerSampleOptimiser(field, pool, threads=1)
+    whole = NumbaPerSampleOptimiser(field, pool, threads=1)
     wanted = gradients(whole, picks, monkeypatch)
     monkeypatch.undo()
-    ended = FusedPerSampleOptimiser(field, pool, threads=1)
+    ended = NumbaPerSampleOptimiser(field, pool, threads=1)
     got = gradients(ended, picks, monkeypatch)
     assert int(ended.visits.sum()) < 0.8 * int(whole.visits.sum())
     for values, others in ((got[:1], wanted[:1]), (got[1:2], wanted[1:2]), (got[2:], wanted[2:])):
@@ -183,7 +183,7 @@ def test_a_step_moves_rows_as_the_reference_does() -> None:
     pool = PixelPool(made_views(), depth=True)
     fields = [made_field(1.0, 0.5, -3.5) for _ in range(2)]
     rates = replace(RATES, density=0.1, feature=0.05, decoder=1e-3)
-    reference, fused = Optimiser(fields[0]), FusedPerSampleOptimiser(fields[1], pool, threads=2)
+    reference, fused = Optimiser(fields[0]), NumbaPerSampleOptimiser(fields[1], pool, threads=2)
     before = fields[0].feature_rows.clone()
     for number in range(3):
         picks = torch.randperm(len(pool), generator=torch.Generator().manual_seed(number))[:400]
@@ -217,7 +217,7 @@ def test_the_same_seed_gives_the_same_field(threads: int) -> None:
     results = []
     for _ in range(2):
         field = made_field(1.0, 0.5, -2.5)
-        engine = FusedPerSampleOptimiser(field, pool, seed=4, threads=threads)
+        engine = NumbaPerSampleOptimiser(field, pool, seed=4, threads=threads)
         for _ in range(5):
             engine.step(256, replace(RATES, density=0.1, feature=0.05, decoder=1e-3))
         results.append(engine.sync())
@@ -230,7 +230,7 @@ def test_the_same_seed_gives_the_same_field(threads: int) -> None:
 def test_colours_during_a_fit_are_those_of_the_field() -> None:
     """After steps and `sync`, torch sees the same pictures."""
     field = made_field(1.0, 0.5, -2.5)
-    engine = FusedPerSampleOptimiser(field, PixelPool(made_views(), depth=True), threads=1)
+    engine = NumbaPerSampleOptimiser(field, PixelPool(made_views(), depth=True), threads=1)
     for _ in range(3):
         engine.step(128, replace(RATES, density=0.1, feature=0.05, decoder=1e-2))
     origins, directions = random_rays(200)
@@ -242,7 +242,7 @@ def test_colours_during_a_fit_are_those_of_the_field() -> None:
 def test_pruned_voxels_are_left_alone() -> None:
     """Rays through nothing are background, and move nothing."""
     field = made_field(1.0, 1.0, -2.5)
-    engine = FusedPerSampleOptimiser(field, PixelPool(made_views(), depth=True), seed=1, threads=1)
+    engine = NumbaPerSampleOptimiser(field, PixelPool(made_views(), depth=True), seed=1, threads=1)
     engine.go_on_with(replace(field, occupied=torch.zeros_like(field.occupied)))
     before = field.density_rows.clone()
     error, looked = engine.step(256, replace(RATES, density=0.1, feature=0.05))

@@ -10,14 +10,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.backends.numba import train_draw
+from fieldfuse.backends.numba.train_order import Tiles
 from fieldfuse.config import Settings
 from fieldfuse.errors import InputError
-from fieldfuse.training import fused_draw
 from fieldfuse.training.engine import TorchEngine, make_engine
 from fieldfuse.training.fit import fit_field
-from fieldfuse.training.fused import FusedOptimiser
-from fieldfuse.training.fused_order import Tiles
-from fieldfuse.training.importance import SHARE, TOP, Errors, densities
+from fieldfuse.training.importance import SHARE, TOP, Errors, densities, tile_grid
+from fieldfuse.training.numba_engine import NumbaOptimiser
 from fieldfuse.training.rays import PixelPool
 from tests.render.made import random_field
 from tests.training.test_fit import scene, wanted
@@ -48,7 +48,7 @@ def drawn(kind: str, pool: PixelPool, errors: Errors) -> tuple[np.ndarray, np.nd
         generator = torch.Generator().manual_seed(0)
         parts = [errors.draw(1000, generator) for _ in range(ROUNDS)]
         return np.concatenate([p.numpy() for p, _ in parts]), np.concatenate([w.numpy() for _, w in parts])
-    tiles, pixels = Tiles(pool), FusedOptimiser(random_field(0.0, 16, keep=0.1), pool, threads=1).pixels
+    tiles, pixels = Tiles(len(pool.pose), tile_grid(pool)), NumbaOptimiser(random_field(0.0, 16, keep=0.1), pool, threads=1).pixels
     tiles.error[:] = errors.error.numpy()
     tiles.renew()
     picks, weights = np.empty((ROUNDS, 1000), np.int64), np.empty((ROUNDS, 1000), np.float32)
@@ -81,7 +81,7 @@ def test_weighed_draws_are_even(kind: str) -> None:
 def test_densities_agree_and_are_bounded(error: list[float]) -> None:
     given_errors = np.array(error, np.float32)
     out = np.empty_like(given_errors)
-    fused_draw.densities(given_errors, out)
+    train_draw.densities(given_errors, out)
     np.testing.assert_allclose(out, densities(torch.from_numpy(given_errors)).numpy(), rtol=1e-4)
     assert out.min() >= 1 - SHARE - 1e-6 and out.max() <= TOP + 1e-5 and np.all(out[given_errors == 0] == 1)
 

@@ -10,8 +10,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.backends.numba.train_common import slow_near
 from fieldfuse.config import FitSettings
-from fieldfuse.training.fused_kernels import slow_near
 from fieldfuse.training.near import slowness
 from fieldfuse.training.rays import PixelPool
 from fieldfuse.training.schedule import Schedule

@@ -19,8 +19,8 @@ from fieldfuse.training.adam import LazyAdam
 from fieldfuse.training.engine import Engine, TorchEngine, make_engine, warm_up
 from fieldfuse.training.finite import NotFiniteError, check
 from fieldfuse.training.fit import _first, fit_field
-from fieldfuse.training.fused import FusedOptimiser
-from fieldfuse.training.fused_per_sample import FusedPerSampleOptimiser
+from fieldfuse.training.numba_engine import NumbaOptimiser
+from fieldfuse.training.numba_per_sample import NumbaPerSampleOptimiser
 from fieldfuse.training.rays import PixelPool
 from fieldfuse.training.step import Rates
 from fieldfuse.volume.host import TorchHost
@@ -38,7 +38,7 @@ def engine_of(name: str, decoder: str, threads: int = 1) -> Engine:
     generator = torch.Generator().manual_seed(0)
     field, _ = _first(views, views, scene(), settings, torch.device("cpu"), TorchHost(), generator)
     if name == "numba" and threads > 1:
-        kind = FusedOptimiser if decoder == "deferred" else FusedPerSampleOptimiser
+        kind = NumbaOptimiser if decoder == "deferred" else NumbaPerSampleOptimiser
         return kind(field, PixelPool(views), 0, threads)
     return make_engine(settings, field, PixelPool(views))
 
@@ -49,7 +49,7 @@ def everything(engine: Any) -> list[np.ndarray]:
     out = [field.density_rows, field.feature_rows, *field.decoder.state_dict().values()]
     if isinstance(engine, TorchEngine):
         out += [engine.density.state, engine.feature.state]
-        out += [torch.tensor(engine.decoder.steps), *(value for pair in engine.decoder.moments for value in pair)]
+        out += [value for state in engine.decoder.state.values() for value in state.values()]
     else:
         out += [engine.records, *(value for pair in engine.moments for value in pair)]
     return [np.array(value.detach() if isinstance(value, torch.Tensor) else value) for value in out]
@@ -68,14 +68,14 @@ def spoiling(monkeypatch: pytest.MonkeyPatch, engine: str, value: float, when: I
 
         monkeypatch.setattr(step, "scatter", scatter)
         return
-    compiled = FusedOptimiser._broken
+    compiled = NumbaOptimiser._broken
 
-    def broken(self: FusedOptimiser, thread: int, error: float) -> str | None:
+    def broken(self: NumbaOptimiser, thread: int, error: float) -> str | None:
         if thread == self.threads - 1 and next(when):
             (self.density_sums[thread] if what == "densities" else self.feature_sums[thread, 0])[5] = value
         return compiled(self, thread, error)
 
-    monkeypatch.setattr(FusedOptimiser, "_broken", broken)
+    monkeypatch.setattr(NumbaOptimiser, "_broken", broken)
 
 
 @pytest.mark.parametrize("value", [math.nan, -math.inf])

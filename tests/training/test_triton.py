@@ -26,7 +26,7 @@ from tests.training.test_fused import made_views
 
 triton = pytest.importorskip("triton", reason="triton is not installed: it comes with torch for CUDA, and with `make test` on Linux")
 
-from fieldfuse.render.triton_field import Tables, TritonRenderer, bricks_to_skip  # noqa: E402
+from fieldfuse.render.triton_renderer import Tables, TritonRenderer, bricks_to_skip  # noqa: E402
 from fieldfuse.training import triton_warm  # noqa: E402
 from fieldfuse.training.triton_engine import TritonOptimiser  # noqa: E402
 

@@ -64,6 +64,6 @@ def is_cpu(device: torch.device) -> bool:
 
 
 def to_device_async(values: NDArray[Any], device: torch.device) -> Tensor:
-    """The same numbers on `device`; to CUDA without a wait, from pinned memory that PyTorch frees once the copy is done."""
+    """The same numbers on `device`. On CUDA nobody waits for the copy, from pinned memory that PyTorch frees after it."""
     whole = torch.from_numpy(np.ascontiguousarray(values))
     return whole.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else whole.to(device)

@@ -83,7 +83,7 @@ class Prepared:
         Returns:
             (M · 512 + 1, C'), one layer's channels after the other's.
         """
-        from fieldfuse.networks.gpu import convolution
+        from fieldfuse.backends.triton import convolution
 
         kind = rows.device.type
         numbers = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else rows.dtype
@@ -94,7 +94,7 @@ class Prepared:
         return rows
 
     def _parameters(self, stages: Sequence[Stage], numbers: torch.dtype) -> list[tuple[Tensor, Tensor | None]]:
-        from fieldfuse.networks.gpu import convolution
+        from fieldfuse.backends.triton import convolution
 
         known = [[(one.weight, one.bias) for one in stage] for stage in stages]
         key = [numbers, *[(w.data_ptr(), w._version, b is not None and (b.data_ptr(), b._version)) for stage in known for w, b in stage]]
@@ -142,7 +142,7 @@ def block_conv3d(
     kind = rows.device.type
     reduced = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else None
     if not torch.is_grad_enabled() and dispatch.can_use_triton(rows, dtypes=dispatch.FLOATS):
-        from fieldfuse.networks.gpu import convolution
+        from fieldfuse.backends.triton import convolution
 
         numbers = reduced or rows.dtype
         taps, added = convolution.taps_of(weight.to(numbers)), None if bias is None else bias.to(numbers)
@@ -181,7 +181,7 @@ def _clear(rows: Tensor, kept: Tensor) -> None:
 def _convolve(rows: Tensor, weight: Tensor, bias: Tensor | None, topology: Topology, occupied: Tensor | None, chunk: int) -> Tensor:
     """(M · 512 + 1, C) → (M · 512 + 1, C')."""
     if dispatch.can_use_triton(rows, dtypes=dispatch.FLOATS):
-        from fieldfuse.networks.gpu import convolution
+        from fieldfuse.backends.triton import convolution
 
         return convolution.convolve(rows, topology.around, convolution.taps_of(weight), bias, occupied)
     out = rows.new_empty((topology.zero_row + 1, len(weight)))
@@ -242,7 +242,7 @@ class _BlockConv(torch.autograd.Function):
 def _weight_gradient(rows: Tensor, gradient: Tensor, weight: Tensor, topology: Topology, chunk: int) -> Tensor:
     """(C', C, 3, 3, 3) in the weight's type, summed over chunks in it."""
     if dispatch.can_use_triton(rows, dtypes=dispatch.FLOATS):
-        from fieldfuse.networks.gpu import convolution
+        from fieldfuse.backends.triton import convolution
 
         return convolution.weight_gradient(rows, topology.around, gradient).to(weight.dtype)
     total = torch.zeros_like(weight, memory_format=torch.contiguous_format)

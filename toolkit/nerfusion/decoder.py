@@ -13,10 +13,10 @@ from typing import Any
 import torch
 from torch import nn
 
+from fieldfuse.backends.constants import FREQUENCIES as FREQUENCIES
 from fieldfuse.nerfusion.encoding import BEHIND, DIRECTION, positional, spherical_harmonics
 
 Tensor = torch.Tensor
-FREQUENCIES = 5
 
 
 class Deferred(nn.Module):

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import torch
 
+from fieldfuse.backends.constants import DIRECTION as DIRECTION
+from fieldfuse.backends.constants import SH as SH
+
 Tensor = torch.Tensor
-# Constants of the real spherical harmonics, orthonormal on the sphere: 1; y, z, x; xy, yz, xz; 3z² - 1; x² - y²; and of degree 3
-# y(3x² - y²), x(x² - 3y²); xyz; y(5z² - 1), x(5z² - 1); z(5z² - 3); z(x² - y²)
-SH = (
-    *(0.28209479177387814, 0.4886025119029199, 1.0925484305920792, 0.31539156525252005, 0.5462742152960396),
-    *(0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277),
-)
-DIRECTION = 16  # harmonics of degree 3 and less, which decoders take
 BEHIND = 9  # of degree 2 and less
 
 

@@ -18,10 +18,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from fieldfuse.backends.constants import CHANGE, INSIDE
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d
 from fieldfuse.nerfusion.compiled_gru import Step
-from fieldfuse.nerfusion.extras.bounded_outputs import CHANGE, bounded
-from fieldfuse.nerfusion.extras.known_terms import INSIDE
+from fieldfuse.nerfusion.extras.bounded_outputs import bounded
 from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
 from fieldfuse.volume.topology import Topology
 
@@ -115,7 +115,7 @@ class FusionGRU(nn.Module):
 
     def _on_device(self, part: LatentVolume, local: LocalVolume, numbers: torch.dtype) -> tuple[Tensor, Tensor]:
         """`compiled` on CUDA: both gates' convolutions go side by side."""
-        from fieldfuse.networks.gpu import gru
+        from fieldfuse.backends.triton import gru
 
         step, near_surface = gru.Step(part, local, LEAST, self.most), local.near_surface
         rows, count = step.average()

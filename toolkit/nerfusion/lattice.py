@@ -157,7 +157,7 @@ def cells(topology: Topology, corners: Tensor, every: bool) -> Tensor:
         (M · 512,) bool: cells whose lowest corner is that row. Corners of absent blocks count as not set.
     """
     if dispatch.can_use_triton(corners, dtypes=None):
-        from fieldfuse.volume import blocks_gpu as blocks
+        from fieldfuse.backends.triton import blocks as blocks
 
         return blocks.pooled(topology, corners, 0, 2, every)
     padded = torch.cat([corners, corners.new_zeros(1)])
@@ -176,7 +176,7 @@ def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
     """A copy of some blocks of a volume; where it has no such block, nothing is known."""
     slots = volume.topology.slots_of(topology)
     if volume.topology.blocks and dispatch.can_use_triton(volume.rows):
-        from fieldfuse.volume import blocks_gpu as blocks
+        from fieldfuse.backends.triton import blocks
 
         return LatentVolume(volume.lattice, topology, *blocks.take(volume.rows, volume.count, slots.int(), topology))
     place = (slots.clamp_min(0)[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
@@ -191,7 +191,7 @@ def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
 def merged(before: LatentVolume, after: LatentVolume, changed: Tensor) -> LatentVolume:
     """`after` where `changed` (M · 512,), else `before`; both have the same blocks."""
     if dispatch.can_use_triton(before.rows, after.rows):
-        from fieldfuse.networks.gpu import volumes
+        from fieldfuse.backends.triton import volumes
 
         rows, count = volumes.merge(before.rows, before.count, after.rows, after.count, changed)
         return replace(before, rows=rows, count=count)

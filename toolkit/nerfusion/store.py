@@ -77,7 +77,7 @@ class GlobalStore:
         """A copy of some blocks, to be written next; corners of which nothing is known here are as `inherited`, a volume that has at least
         these blocks."""
         if dispatch.can_use_triton(self._rows):
-            from fieldfuse.volume import blocks_gpu as blocks
+            from fieldfuse.backends.triton import blocks as blocks
 
             slots = self._places(topology)  # may grow
             below = None if inherited is None else (inherited.rows, inherited.count, inherited.topology)
@@ -88,7 +88,7 @@ class GlobalStore:
     def write(self, values: LatentVolume, changed: Tensor) -> None:
         """Take over the corners `changed` (M · 512,) of some blocks."""
         if dispatch.can_use_triton(self._rows, values.rows):
-            from fieldfuse.volume import blocks_gpu as blocks
+            from fieldfuse.backends.triton import blocks as blocks
 
             slots = self._places(values.topology)
             blocks.put(self._rows, self._count, slots, values.rows, values.count, changed)

@@ -113,7 +113,7 @@ def look_up(views: Sequence[EncodedView], projection: Projection, step: Tensor) 
     if compiled_lookup.fits(tables, projection.pixels, step, projection.footprint):
         return _filled(views, projection, step)
     if dispatch.can_use_triton(*tables, projection.pixels, step, projection.footprint):
-        from fieldfuse.networks.gpu import lookup
+        from fieldfuse.backends.triton import feature_lookup as lookup
 
         return lookup.look_up(views, projection.pixels, step, projection.footprint, COLOURED)
     parts = []

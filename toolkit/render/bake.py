@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from fieldfuse.backends.numba import common as K
+from fieldfuse.backends.numba.baked_march import CORNERS, FINER, LEVELS, Baked
+from fieldfuse.backends.numba.render_rays import chessboard_distance
 from fieldfuse.errors import InputError
 from fieldfuse.nerfusion.decoder import Deferred
-from fieldfuse.render import kernels as K
-from fieldfuse.render.bake_kernels import CORNERS, FINER, LEVELS, Baked
-from fieldfuse.render.compiled import FARTHEST, chessboard_distance, decoder_arrays
 from fieldfuse.render.composite import RAW_MAX, UNITS
 from fieldfuse.render.field import Field
+from fieldfuse.render.numba_renderer import FARTHEST, decoder_arrays
 from fieldfuse.volume.edit import erase_empty_blocks
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import LOOKUP, VOXELS, Topology
@@ -31,7 +32,7 @@ class BakedField:
     Attributes:
         space, resolution, near, fine, table_origin: see `Field` and `Topology`.
         background: (3,) float32.
-        arrays: see `bake_kernels.Baked`; they may be windows into a file.
+        arrays: see `baked_march.Baked`; they may be windows into a file.
         decoder: the weights, float32.
         sky: (9, 3) float32, see `Field`; None: there is none.
     """

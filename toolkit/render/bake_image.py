@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from fieldfuse.backends.numba.baked_tiles import TILE, render_tiles
+from fieldfuse.backends.numba.decode import layers_of, rays_of
 from fieldfuse.camera import Array, Intrinsics, pixel_grid, rays
 from fieldfuse.errors import InputError
 from fieldfuse.render.bake import BakedField
-from fieldfuse.render.bake_tiles import TILE, render_tiles
 from fieldfuse.render.image import SOLID, Rendered
-from fieldfuse.render.kernels_decode import layers_of, rays_of
 from fieldfuse.render.sky import on_sky
 from fieldfuse.threads import share
 

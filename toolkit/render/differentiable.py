@@ -1,7 +1,7 @@
 """Rendering with gradients by autograd, for training the networks: through a field's rows to whatever made them.
 
-The same march, the same compositing and the same decoders as everywhere else. Slower than the hand-written step of a per-scene fit, but
-everything in front of the rows can be learned.
+The same march, the same compositing and the same decoders as everywhere else. Slower than the step of a per-scene fit, whose gradients
+end at what was looked up, but everything in front of the rows can be learned.
 """
 
 from __future__ import annotations

@@ -45,15 +45,15 @@ def make_renderer(field: Field, engine: str = "auto") -> View:
     deferred = isinstance(field.decoder, Deferred)
     chosen = choose_engine(engine, "deferred" if deferred else "per_sample", field.device)
     if chosen == "triton":
-        from fieldfuse.render.triton_field import TritonRenderer
+        from fieldfuse.render.triton_renderer import TritonRenderer
 
         return TritonRenderer(field)
     if chosen == "torch":
         return partial(_in_chunks, field)
-    from fieldfuse.render.compiled import CompiledRenderer
-    from fieldfuse.render.compiled_per_sample import PerSampleRenderer
+    from fieldfuse.render.numba_per_sample import PerSampleRenderer
+    from fieldfuse.render.numba_renderer import NumbaRenderer
 
-    compiled = CompiledRenderer(field) if deferred else PerSampleRenderer(field)
+    compiled = NumbaRenderer(field) if deferred else PerSampleRenderer(field)
 
     def render(origins: torch.Tensor, directions: torch.Tensor) -> RayValues:
         values = compiled.render(origins, directions)

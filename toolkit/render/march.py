@@ -14,12 +14,12 @@ import torch
 import torch.nn.functional as F
 
 from fieldfuse.backends import dispatch
+from fieldfuse.backends.constants import BRICK as BRICK
+from fieldfuse.backends.constants import MAX_STRETCH as MAX_STRETCH
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
 
 Tensor = torch.Tensor
-BRICK = BLOCK // 2
-MAX_STRETCH = 1e4  # a coarse step is never longer than this many times its length at the region of interest
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _coarse_distances(grid: MarchGrid, origins: Tensor, directions: Tensor, near
     far = space.shell / grid.voxel  # |y| in the outermost voxel: the last step starts before it
     limit = int(2 * math.sqrt(3) * 2 * space.extent / step) + 8
     if dispatch.can_use_triton(origins, directions, jitter):
-        from fieldfuse.render import march_gpu
+        from fieldfuse.backends.triton import coarse_steps as march_gpu
 
         return march_gpu.walk(origins, directions, jitter, 2 * limit, near, step, far, space.shell, space.extent, MAX_STRETCH)
     # Beyond the region a place moves in contracted space by at most c / n² of its way, c² = b² + (extent · closest approach)².

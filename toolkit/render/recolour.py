@@ -155,8 +155,8 @@ class _Compiled:
     """The same by the CPU's kernels; each thread has sums of its own, so that they do not depend on who comes first."""
 
     def __init__(self, field: Field) -> None:
-        from fieldfuse.render.compiled import decoder_arrays, make_space, make_volume
-        from fieldfuse.render.kernels_decode import layers_of
+        from fieldfuse.backends.numba.decode import layers_of
+        from fieldfuse.render.numba_renderer import decoder_arrays, make_space, make_volume
 
         assert isinstance(field.decoder, Deferred)
         self.threads = torch.get_num_threads()
@@ -165,8 +165,8 @@ class _Compiled:
         self.marks = np.zeros((self.threads, len(field.occupied)), np.uint16)
 
     def add(self, origins: Tensor, directions: Tensor, colours: Tensor) -> None:
-        from fieldfuse.render.kernels_decode import rays_of
-        from fieldfuse.render.kernels_recolour import project_back_pass
+        from fieldfuse.backends.numba.decode import rays_of
+        from fieldfuse.backends.numba.recolour import project_back_pass
 
         given = [values.float().contiguous().numpy() for values in (origins, directions, colours)]
         limits = [np.float32(value) for value in (STOP, THRESHOLD, STEEPEST, MOST)]

@@ -50,7 +50,7 @@ def cast(solids: Solids, origins: Tensor, directions: Tensor) -> tuple[Tensor, T
         the ray starts in is not seen (rooms are seen from inside).
     """
     if dispatch.can_use_triton(origins, directions):
-        from fieldfuse.simulate import cast_gpu
+        from fieldfuse.backends.triton import cast as cast_gpu
 
         return cast_gpu.cast(solids, origins, directions, FAR, NEAREST)
     parts = [

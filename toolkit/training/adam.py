@@ -1,9 +1,6 @@
-"""Adam on the rows that a step touched, and on whole weights. `torch.optim.SparseAdam` costs more than everything else in a step; this
-does not."""
+"""Adam on the rows that a step touched. `torch.optim.SparseAdam` costs more than everything else in a step; this does not."""
 
 from __future__ import annotations
-
-from collections.abc import Iterable
 
 import torch
 
@@ -36,29 +33,3 @@ class LazyAdam:
         update = (gradient / second.sqrt().add_(self.epsilon)).mul_(torch.sqrt(1 - self.decay**count) * rate)
         old = self.values.index_select(0, rows)
         self.values.index_copy_(0, rows, old - update.view_as(old))
-
-
-class Adam:
-    """`torch.optim.Adam` on whole weights, the same to the bit on the CPU. Torch's own imports its compiler: 1.6 s of a fit."""
-
-    def __init__(self, values: Iterable[Tensor], betas: tuple[float, float], epsilon: float) -> None:
-        self.values, self.betas, self.epsilon = list(values), betas, epsilon
-        self.moments = [(torch.zeros_like(value), torch.zeros_like(value)) for value in self.values]
-        self.steps = [0] * len(self.values)
-
-    @torch.no_grad()
-    def step(self, rate: float) -> None:
-        """Move the weights against their gradients; those without one stay."""
-        for index, (value, (first, second)) in enumerate(zip(self.values, self.moments, strict=True)):
-            if value.grad is None:
-                continue
-            self.steps[index] += 1
-            unbiased = [1 - beta ** self.steps[index] for beta in self.betas]
-            first.lerp_(value.grad, 1 - self.betas[0])
-            second.mul_(self.betas[1]).addcmul_(value.grad, value.grad, value=1 - self.betas[1])
-            value.addcdiv_(first, (second.sqrt() / unbiased[1] ** 0.5).add_(self.epsilon), value=-rate / unbiased[0])
-
-    def forget(self) -> None:
-        """Drop the gradients."""
-        for value in self.values:
-            value.grad = None

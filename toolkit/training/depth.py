@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from fieldfuse.backends.constants import REACH as REACH
 from fieldfuse.camera import Array, Intrinsics
 
 Tensor = torch.Tensor
-REACH = 0.05  # r: share of the distance, beyond the noise, within which a sample counts as near the surface
 
 
 @dataclass(frozen=True)

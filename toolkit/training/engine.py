@@ -108,12 +108,12 @@ def make_engine(settings: Settings, field: Field, pool: PixelPool) -> Engine:
 
         return TritonOptimiser(field, pool, settings.seed)
     if isinstance(field.decoder, Deferred):
-        from fieldfuse.training.fused import FusedOptimiser
+        from fieldfuse.training.numba_engine import NumbaOptimiser
 
-        return FusedOptimiser(field, pool, settings.seed)
-    from fieldfuse.training.fused_per_sample import FusedPerSampleOptimiser
+        return NumbaOptimiser(field, pool, settings.seed)
+    from fieldfuse.training.numba_per_sample import NumbaPerSampleOptimiser
 
-    return FusedPerSampleOptimiser(field, pool, settings.seed)
+    return NumbaPerSampleOptimiser(field, pool, settings.seed)
 
 
 def fit_device(settings: Settings) -> torch.device:
@@ -125,13 +125,14 @@ def warm_up(settings: Settings, progress: Progress) -> None:
     """Have the kernels compiled (once a machine: they are kept on disk) or loaded, before any clock runs."""
     chosen = chosen_engine(settings, device := fit_device(settings))
     if chosen == "torch":
+        torch.optim.Adam([torch.zeros(1, requires_grad=True)])  # the first optimiser imports torch's compiler: 1.6 s
         return
     if chosen == "triton":
         from fieldfuse.training import triton_warm
 
         triton_warm.run(settings.field.channels, settings.field.width, device, progress)
         return
-    from fieldfuse.training import warm
+    from fieldfuse.training import numba_warm as warm
 
     kind = (settings.field.decoder, settings.field.channels, settings.field.width)
     if not warm.ready(*kind):

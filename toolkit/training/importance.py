@@ -10,22 +10,22 @@ and counts 1 / q in all losses, which leaves their means as they are but for a f
 no ray came to has q = 1.
 
 Pixels are drawn by lot from evenly drawn ones, so masks and weights of pictures need no index. Here for any device; compiled twins of the
-functions are in `fused_draw.py`.
+functions are in `backends/numba/train_draw.py`.
 """
 
 from __future__ import annotations
 
 import torch
 
+from fieldfuse.backends.constants import KEEP as KEEP
+from fieldfuse.backends.constants import MOST as MOST
+from fieldfuse.backends.constants import RENEW as RENEW
+from fieldfuse.backends.constants import SHARE as SHARE
+from fieldfuse.backends.constants import TILE as TILE
+from fieldfuse.backends.constants import TOP as TOP
 from fieldfuse.training.rays import PixelPool
 
 Tensor = torch.Tensor
-TILE = 8  # pixels a side
-SHARE = 0.8  # S
-MOST = 4.0  # M
-TOP = 1 - SHARE + SHARE * MOST  # of q
-KEEP = 0.75  # of a tile's error stays when a ray comes to it
-RENEW = 64  # steps from one look at all errors to the next
 
 
 def tile_grid(pool: PixelPool) -> tuple[int, int]:

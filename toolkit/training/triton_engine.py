@@ -1,6 +1,6 @@
 """The engine of a fit on CUDA: a step is some thirty launches whose shapes are known beforehand, recorded once and replayed.
 
-What `Optimiser._deferred` does with flat lists of samples is done here ray by ray (`triton_march` and the other modules of that name);
+What `Optimiser._deferred` does with flat lists of samples is done here ray by ray (`backends/triton/march.py` and `train_*.py` beside it);
 the decoder's layers are products of matrices. Nothing waits for the GPU but a look at every `LOOK`-th step for what was not finite: such
 a step moves nothing.
 """
@@ -13,20 +13,20 @@ import torch
 import triton
 
 from fieldfuse.backends.dispatch import OTHERS_GO_ON
+from fieldfuse.backends.triton.march import BEHIND, COUNTS, JITTER, NOTES, RED, TARGET
+from fieldfuse.backends.triton.train_adam import count_step, learn, move
+from fieldfuse.backends.triton.train_draw import draw
+from fieldfuse.backends.triton.train_gradients import inspect, judge, spread
+from fieldfuse.backends.triton.train_rates import RATES, told
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.nerfusion.encoding import DIRECTION, spherical_harmonics
 from fieldfuse.render.field import Field
 from fieldfuse.render.march import BRICK
-from fieldfuse.render.triton_field import Tables, TritonRenderer, buffers_for, launch_composite, launch_walk
-from fieldfuse.render.triton_march import BEHIND, COUNTS, JITTER, NOTES, RED, TARGET
+from fieldfuse.render.triton_renderer import Tables, TritonRenderer, buffers_for, launch_composite, launch_walk
 from fieldfuse.training.finite import NotFiniteError
 from fieldfuse.training.importance import RENEW, densities, tile_grid
 from fieldfuse.training.rays import Batch, PixelPool
 from fieldfuse.training.step import Rates
-from fieldfuse.training.triton_adam import count_step, learn, move
-from fieldfuse.training.triton_draw import draw
-from fieldfuse.training.triton_gradients import inspect, judge, spread
-from fieldfuse.training.triton_rates import RATES, told
 from fieldfuse.training.view import blind
 
 Tensor = torch.Tensor

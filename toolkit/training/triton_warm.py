@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from fieldfuse.backends.triton.march import RAYS
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture.types import Views
 from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.progress import Progress
-from fieldfuse.render.triton_field import TritonRenderer
-from fieldfuse.render.triton_march import RAYS
+from fieldfuse.render.triton_renderer import TritonRenderer
 from fieldfuse.training.levels import finer, first_field, visible
 from fieldfuse.training.rays import PixelPool
 from fieldfuse.training.step import Rates

@@ -37,7 +37,7 @@ def _pooled(topology: Topology, occupied: Tensor, last: int) -> Tensor:
     """(M · 512,) bool: rows with an occupied row among the offsets −1 … `last` along each axis."""
     width = last + 2
     if dispatch.can_use_triton(occupied, dtypes=None):
-        from fieldfuse.volume import blocks_gpu as blocks
+        from fieldfuse.backends.triton import blocks as blocks
 
         return blocks.pooled(topology, occupied, -1, width)
     padded = torch.cat([occupied, occupied.new_zeros(1)])
@@ -228,7 +228,7 @@ def resample(
         raise ValueError(f"mode must be one of {', '.join(MODES)} and scale positive, not {mode!r} and {scale}")
     nodes = corner_nodes(topology, occupied)
     if mode == "trilinear" and topology.bounds is not None and dispatch.can_use_triton(*rows):  # keys are small there
-        from fieldfuse.volume import blocks_gpu as blocks
+        from fieldfuse.backends.triton import blocks as blocks
 
         return blocks.resample(topology, nodes, rows, new_keys, scale)
     row_of_valid = torch.where(nodes, torch.arange(len(nodes), device=nodes.device), topology.zero_row)

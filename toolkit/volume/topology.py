@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fieldfuse.backends import dispatch
+from fieldfuse.backends.constants import BLOCK as BLOCK
+from fieldfuse.backends.constants import LOOKUP as LOOKUP
+from fieldfuse.backends.constants import VOXELS as VOXELS
 from fieldfuse.backends.dispatch import is_cpu
 
-BLOCK = 8
-VOXELS = BLOCK**3
-LOOKUP = (BLOCK + 1) ** 3
 HALO = (BLOCK + 2) ** 3
 MAX_TABLE_CELLS = 2**26
 MAX_BLOCKS = 2**31 // VOXELS - 2
@@ -108,7 +108,7 @@ class Topology:
     @cached_property
     def _placed(self) -> tuple[Tensor, Tensor]:
         """The table and the cells of its own blocks; elsewhere than on CUDA already known."""
-        from fieldfuse.volume import tables_gpu
+        from fieldfuse.backends.triton import tables as tables_gpu
 
         return tables_gpu.table(self.keys, self.table_origin, self.table_size)
 
@@ -192,7 +192,7 @@ class Topology:
     def around(self) -> Tensor:
         """(M, 27) int64 slots of the 3×3×3 blocks around each, −1 absent; column (dz+1)·9 + (dy+1)·3 + (dx+1), itself in column 13."""
         if self.bounds is not None and dispatch.can_use_triton(self.keys, dtypes=None):
-            from fieldfuse.volume import tables_gpu
+            from fieldfuse.backends.triton import tables as tables_gpu
 
             if self._among is None:
                 return tables_gpu.around(*self._placed)

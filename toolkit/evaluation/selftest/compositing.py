@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fieldfuse.evaluation.selftest import reference
 from fieldfuse.evaluation.selftest.case import Measure, absolute, by_size, case, not_finite, relative
-from fieldfuse.render.composite import ray_sum, thickness_gradient, weights
+from fieldfuse.render.composite import ray_sum, weights
 from fieldfuse.render.march import first_of_ray
 
 GROUP = "compositing"
@@ -25,8 +25,16 @@ def flatten(rays: Sequence[Sequence[float]]) -> tuple[Tensor, Tensor, Tensor]:
     return torch.tensor([tau for samples in rays for tau in samples], dtype=torch.float32), ray, first_of_ray(ray)
 
 
+def gradient_of_sum(thickness: Tensor, first: Tensor) -> Tensor:
+    """(samples,) gradient of the sum of all weights."""
+    leaf = thickness.detach().clone().requires_grad_(True)
+    weights(leaf, first)[0].sum().backward()
+    assert leaf.grad is not None
+    return leaf.grad
+
+
 def compositing_errors(rays: Sequence[Sequence[float]], seed: int = 0) -> dict[str, float]:
-    """Errors of weights, sums and both gradients (by hand, and autograd's) over whole rays of any thickness."""
+    """Errors of weights, sums and gradients over whole rays of any thickness."""
     thickness, ray, first = flatten(rays)
     rays = [samples.tolist() for samples in thickness.double().split([len(samples) for samples in rays])]  # as float32 holds them
     generator = torch.Generator().manual_seed(seed)
@@ -42,16 +50,14 @@ def compositing_errors(rays: Sequence[Sequence[float]], seed: int = 0) -> dict[s
     (weight * pull).sum().backward()
     assert leaf.grad is not None
     weight, light = weight.detach(), light.detach()
-    by_hand = thickness_gradient(weight, light, thickness, pull, first, ray, len(rays))
     total = ray_sum(weight.double(), ray, len(rays)) + torch.tensor([part[2] for part in parts], dtype=torch.float64)
     return {
         "weight": absolute(weight, wanted_weight),
         "weight, relative": relative(weight, wanted_weight, 1e-30),
         "transmittance": absolute(light, wanted_light),
         "sum with what passes through": absolute(total, torch.ones(len(rays))),
-        "gradient by hand": absolute(by_hand, wanted_gradient),
-        "gradient by autograd": absolute(leaf.grad, wanted_gradient),
-        "values that are not finite": not_finite(weight, light, by_hand, leaf.grad),
+        "gradient": absolute(leaf.grad, wanted_gradient),
+        "values that are not finite": not_finite(weight, light, leaf.grad),
     }
 
 
@@ -61,8 +67,7 @@ def measures(errors: dict[str, float], **bounds: float) -> list[Measure]:
         "weight": SUM,
         "transmittance": SUM,
         "sum with what passes through": SUM,
-        "gradient by hand": EXACT,
-        "gradient by autograd": EXACT,
+        "gradient": EXACT,
         "values that are not finite": 0.0,
         **{name.replace("_", " "): bound for name, bound in bounds.items()},
     }
@@ -117,10 +122,10 @@ def no_length(folder: Path) -> list[Measure]:
 @case(GROUP, "a fully opaque first sample")
 def opaque_first(folder: Path) -> list[Measure]:
     rays = [[tau, *spread(500, 1e-6, 10, 3)] for tau in (200.0, 1e4, 1e6)]
-    thickness, ray, first = flatten(rays)
-    weight, light = weights(thickness, first)
+    thickness, _, first = flatten(rays)
+    light = weights(thickness, first)[1]
     behind = torch.arange(len(thickness)) != first
-    gradient = thickness_gradient(weight, light, thickness, torch.ones_like(weight), first, ray, len(rays))
+    gradient = gradient_of_sum(thickness, first)
     return [
         *measures(compositing_errors(rays)),
         Measure("light behind it", float(light[behind].max()), 0.0),
@@ -138,7 +143,7 @@ def empty_rays(folder: Path) -> list[Measure]:
     nothing = torch.zeros(0)
     none = torch.zeros(0, dtype=torch.int64)
     weight, light = weights(nothing, first_of_ray(none))
-    gradient = thickness_gradient(weight, light, nothing, nothing, none, none, 3)
+    gradient = gradient_of_sum(nothing, first_of_ray(none))
     out.append(Measure("samples made of nothing", float(len(weight) + len(light) + len(gradient)), 0.0))
     return out
 
@@ -152,13 +157,12 @@ def neighbours_in_a_list(folder: Path) -> list[Measure]:
     thin = ray >= 400
     parts = [reference.composite(samples.tolist()) for samples in thickness.double()[thin].split(64)]
     wanted = torch.tensor([w for part in parts for w in part[0]], dtype=torch.float64)
-    pull = torch.ones_like(weight)
-    gradient = thickness_gradient(weight, light, thickness, pull, first, ray, len(rays))[thin]
+    gradient = gradient_of_sum(thickness, first)[thin]
     exact = [g for samples in thickness.double()[thin].split(64) for g in reference.composite_gradient(samples.tolist(), [1.0] * 64)]
     total = ray_sum(weight.double(), ray, len(rays))[400:] + torch.tensor([part[2] for part in parts], dtype=torch.float64)
     return [
         Measure("weight of the thin rays, relative", relative(weight[thin], wanted), 1e-6),
         Measure("sum with what passes through", absolute(total, torch.ones(3)), SUM),
-        Measure("gradient by hand", by_size(gradient, exact), EXACT),
+        Measure("gradient", by_size(gradient, exact), EXACT),
         Measure("values that are not finite", not_finite(weight, light, gradient), 0.0),
     ]

@@ -10,7 +10,7 @@ import torch
 from fieldfuse.evaluation.selftest import reference
 from fieldfuse.evaluation.selftest.case import Measure, absolute, by_size, case, not_finite, relative
 from fieldfuse.evaluation.selftest.compositing import GROUP, flatten, spread
-from fieldfuse.render.composite import distortion, ray_sum, thickness_gradient, weights
+from fieldfuse.render.composite import distortion, ray_sum, weights
 from fieldfuse.render.field import density
 from fieldfuse.render.march import first_of_ray
 
@@ -27,7 +27,10 @@ def distortion_errors(rays: list[tuple[list[float], list[float], list[float]]]) 
         reference.distortion(*(values.tolist() for values in parts))
         for parts in zip(*(values.double().split(sizes) for values in (weight, place, length)), strict=True)
     ]
-    loss, gradient = distortion(weight, place, length, first_of_ray(ray), ray, len(rays))
+    leaf = weight.clone().requires_grad_(True)
+    loss = distortion(leaf, place, length, first_of_ray(ray), ray, len(rays))
+    loss.sum().backward()
+    loss, gradient = loss.detach(), leaf.grad if leaf.grad is not None else torch.zeros(0)
     losses = [one for one, _ in exact]
     return {
         "loss": absolute(loss, losses) / LEAST if max(losses, default=0.0) < LEAST else by_size(loss, losses),
@@ -87,15 +90,13 @@ def half_types(folder: Path) -> list[Measure]:
         weight, light = weights(leaf, first)
         weight.float().sum().backward()
         assert leaf.grad is not None
-        pull = torch.ones_like(weight)
         parts = [part.tolist() for part in thickness.double().split(sizes)]
         gradient = [g for part in parts for g in reference.composite_gradient(part, [1.0] * len(part))]
-        by_hand = thickness_gradient(weight.detach(), light.detach(), thickness, pull.detach(), first, ray, 3)
         step = float(torch.finfo(kind).eps)
         name = str(kind).removeprefix("torch.")
         out.append(Measure(f"weight in {name}, by the largest", by_size(weight, exact), 2 * step))
-        out.append(Measure(f"gradient by hand in {name}, by the largest", by_size(by_hand, gradient), 4 * step))
-        out.append(Measure(f"not finite in {name}", not_finite(weight, light, leaf.grad, by_hand), 0.0))
+        out.append(Measure(f"gradient in {name}, by the largest", by_size(leaf.grad, gradient), 4 * step))
+        out.append(Measure(f"not finite in {name}", not_finite(weight, light, leaf.grad), 0.0))
         with torch.autocast("cpu", dtype=kind):
             same, _ = weights(full, first)
             opacity = ray_sum(same, ray, 3)

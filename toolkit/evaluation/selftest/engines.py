@@ -12,8 +12,8 @@ from torch import Tensor
 from fieldfuse.evaluation.selftest import reference
 from fieldfuse.evaluation.selftest.case import Measure, case, not_finite
 from fieldfuse.evaluation.selftest.edit import aimed_rays, small_field
-from fieldfuse.render.compiled import CompiledRenderer
 from fieldfuse.render.field import Field, density
+from fieldfuse.render.numba_renderer import NumbaRenderer
 from fieldfuse.render.rays import render_rays
 
 GROUP = "engines"
@@ -23,7 +23,7 @@ OPACITY = 1e-6
 def both(field: Field, origins: Tensor, directions: Tensor, threshold: float) -> dict[str, Tensor]:
     """(B, 5) colour, distance and opacity by each engine."""
     slow = render_rays(field, origins, directions, threshold)
-    fast = CompiledRenderer(field, 1).render(origins, directions, threshold)
+    fast = NumbaRenderer(field, 1).render(origins, directions, threshold)
     return {"torch": torch.cat([slow.colour, slow.distance[:, None], slow.opacity[:, None]], 1), "compiled": fast}
 
 

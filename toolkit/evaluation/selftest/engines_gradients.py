@@ -11,26 +11,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fieldfuse.backends.numba.decode import Layers
+from fieldfuse.backends.numba.train_decoder import write_layers
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture.types import Views
 from fieldfuse.evaluation.selftest.case import Measure, by_size, case, not_finite
 from fieldfuse.evaluation.selftest.edit import small_field
 from fieldfuse.nerfusion.decoder import Deferred, PerSample
-from fieldfuse.render.compiled_per_sample import write_back
 from fieldfuse.render.differentiable import render_with_gradients
 from fieldfuse.render.field import Field
-from fieldfuse.render.kernels_decode import Layers
 from fieldfuse.render.march import BRICK
+from fieldfuse.render.numba_per_sample import write_back
 from fieldfuse.render.paths import look_at
-from fieldfuse.training.fused import BETAS, FusedOptimiser
-from fieldfuse.training.fused_decoder import write_layers
-from fieldfuse.training.fused_per_sample import FusedPerSampleOptimiser
+from fieldfuse.training.numba_engine import BETAS, NumbaOptimiser
+from fieldfuse.training.numba_per_sample import NumbaPerSampleOptimiser
 from fieldfuse.training.rays import Batch, PixelPool
 from fieldfuse.training.step import Rates
 
 GROUP = "engines"
 SIDE, FOCAL = 20, 22.0
-NAMES = ("w1", "b1", "w2", "b2", "density", "density_bias", "w3", "b3", "w4", "b4")  # as `FusedPerSampleOptimiser` moves them
+NAMES = ("w1", "b1", "w2", "b2", "density", "density_bias", "w3", "b3", "w4", "b4")  # as `NumbaPerSampleOptimiser` moves them
 RATES = Rates(0.0, 0.0, 0.0, distortion=0.02, opacity=0.03, colour_threshold=0.0)
 
 
@@ -54,7 +54,7 @@ def translucent(seed: int, shell: float, decoder: str) -> Field:
 
 def compiled_gradients(field: Field, pool: PixelPool, picks: Tensor) -> dict[str, Tensor]:
     """What a step of the compiled engine gathers, its step sizes zero; the decoder's from Adam's first moments."""
-    kind = FusedPerSampleOptimiser if isinstance(field.decoder, PerSample) else FusedOptimiser
+    kind = NumbaPerSampleOptimiser if isinstance(field.decoder, PerSample) else NumbaOptimiser
     engine = kind(field, pool, threads=1)
     engine.step_on(picks.numpy(), np.zeros(len(picks), np.float32), RATES)
     rows = torch.from_numpy(engine.touched[0, : engine.used[0]].astype(np.int64))
@@ -63,7 +63,7 @@ def compiled_gradients(field: Field, pool: PixelPool, picks: Tensor) -> dict[str
     features[rows] = torch.from_numpy(engine.feature_sums[0, : len(rows)])
     moments = [np.ascontiguousarray(first / (1 - BETAS[0])) for first, _ in engine.moments]
     net = deepcopy(field.decoder)
-    if isinstance(engine, FusedPerSampleOptimiser):
+    if isinstance(engine, NumbaPerSampleOptimiser):
         assert isinstance(net, PerSample)
         write_back(engine.net._replace(**dict(zip(NAMES, moments, strict=True))), net)
     else:

@@ -146,8 +146,9 @@ def optimiser_state(folder: Path) -> list[Measure]:
     optimiser.renew_rows(grown)
     fresh = float(optimiser.density.state.abs().sum() + optimiser.feature.state.abs().sum())
     optimiser.step(batch, rates, generator)
-    decoder = [value for pair in optimiser.decoder.moments for value in pair]
-    forgotten = min(optimiser.decoder.steps) < 5 or not all(bool(value.any()) for value in decoder)
+    states = optimiser.decoder.state.values()
+    decoder = [state[name] for state in states for name in ("exp_avg", "exp_avg_sq")]
+    forgotten = min(int(state["step"]) for state in states) < 5 or not all(bool(value.any()) for value in decoder)
     return [
         Measure("rows' moments changed by pruning", lost, 0.0),
         Measure("rows' moments left at a split", fresh, 0.0),

@@ -1,4 +1,4 @@
-// From a pixel's mean features to what is shown: `render/kernels_decode.py`, and what lies behind everything (`render/sky.py`).
+// From a pixel's mean features to what is shown: `backends/numba/decode.py`, and what lies behind everything (`render/sky.py`).
 
 uniform highp usampler2D first, second, rest;
 uniform highp sampler2D palette;

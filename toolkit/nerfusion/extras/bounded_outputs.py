@@ -8,9 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fieldfuse.nerfusion.extras.known_terms import INSIDE
-
-CHANGE = 0.5  # most that networks may add to the distance behind the surface, before tanh: free space of which the sweep is sure stays so
+from fieldfuse.backends.constants import CHANGE, INSIDE
 
 
 def soft_bound(learned: Tensor, most: float) -> Tensor:

@@ -49,7 +49,7 @@ class CrossView:
     def numbers(self) -> Tensor:
         """(23,) that kernels for CUDA ask it by (`gpu/reading.py`), put together once."""
         if not self._numbers:
-            from fieldfuse.networks.gpu import reading
+            from fieldfuse.backends.triton import reading
 
             self._numbers.append(reading.numbers(self.camera, self.log_odds, self.lowest, self.step))
         return self._numbers[0]
@@ -74,7 +74,7 @@ class CrossView:
 def cross_view(distribution: DepthDistribution) -> CrossView:
     """A key frame's evidence for others, from its depth distribution."""
     if dispatch.can_use_triton(distribution.table):
-        from fieldfuse.networks.gpu import reading
+        from fieldfuse.backends.triton import reading
 
         return CrossView(distribution.camera, reading.says(distribution.table, FOR, AGAINST, ABOUT), distribution.lowest, distribution.step)
     nearer = distribution.table[0].permute(1, 2, 0).contiguous()  # (h, w, D): planes of a pixel next to each other in memory
@@ -91,7 +91,7 @@ def confident_points(costs: CostVolume, distribution: DepthDistribution) -> Tens
     On CUDA all pixels, with points that are not numbers, which no key frame sees, for the others: their number is not read back.
     """
     if dispatch.can_use_triton(distribution.table):
-        from fieldfuse.networks.gpu import reading
+        from fieldfuse.backends.triton import reading
 
         return reading.surest(distribution.table, costs.rays, costs.inverses, costs.camera.positions[0], SURE)
     likely = torch.diff(distribution.table[0], dim=0).neg().flatten(1)  # between planes
@@ -111,7 +111,7 @@ def own_estimate(costs: CostVolume) -> tuple[CrossView, Tensor]:
 
 @torch.no_grad()
 def _alone_on_device(costs: CostVolume) -> tuple[CrossView, Tensor]:
-    from fieldfuse.networks.gpu import matching
+    from fieldfuse.backends.triton import matching
 
     weights = (SMALL, LARGE, TEMPERATURE), PEAK, (FOR, AGAINST, ABOUT), SURE
     given = costs.cost, costs.rays, costs.inverses, costs.camera, costs.lowest, costs.step
@@ -181,7 +181,7 @@ def _mean_on_device(
     costs: CostVolume, grid: tuple[int, int], coarse: tuple[int, int], others: Sequence[CrossView], surface: Tensor | None
 ) -> Tensor:
     """(h', w', D): a share of the mean, without waiting for CUDA: reliabilities stay there."""
-    from fieldfuse.networks.gpu import reading
+    from fieldfuse.backends.triton import reading
 
     asked = reading.Asked(others)
     sums = None if surface is None else asked.confirmed(surface)

@@ -10,11 +10,11 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from fieldfuse.backends.constants import INSIDE
 from fieldfuse.nerfusion.extras.plane_sweep import SdfEstimate
 from fieldfuse.volume.topology import VOXELS, Topology
 
 COLOUR_SCALE = 4.0  # a latent colour of ±1 is a colour logit of ±4
-INSIDE = 3  # the latent that starts as how far behind the surface the voxel lies
 MOST = 0.93  # known terms are clamped to ± this, so that tanh is not driven to its ends
 TRUNCATION = 2.0  # voxels about the surface within which distances are told apart
 HIDDEN = 0.02  # voxels that are visible with less likelihood are not known

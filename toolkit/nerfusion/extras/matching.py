@@ -31,7 +31,7 @@ def patch_descriptors(images: Tensor, side: int = SIDE) -> Tensor:
         size = [max(1, round(length * side / long)) for length in images.shape[-2:]]
         images = F.interpolate(images, size, mode="bilinear", antialias=True)
     if dispatch.can_use_triton(images):
-        from fieldfuse.networks.gpu import describe as kernels
+        from fieldfuse.backends.triton import describe as kernels
 
         return kernels.describe(images, GREY, CONTRAST)
     red, green, blue = images.split(1, 1)
@@ -73,7 +73,7 @@ def semi_global(cost: Tensor) -> Tensor:
     if compiled.fits(cost) and len(cost) > 2:
         return compiled.semi_global(cost, SMALL, LARGE)
     if dispatch.can_use_triton(cost):
-        from fieldfuse.networks.gpu import matching
+        from fieldfuse.backends.triton import matching
 
         return matching.semi_global(cost, SMALL, LARGE)
     volume = cost.permute(1, 2, 0)  # (h, w, D)
@@ -98,7 +98,7 @@ def _paths(volume: Tensor) -> Tensor:
 def smoothed_softmax(cost: Tensor) -> Tensor:
     """(D, h, w) costs → how likely the surface lies at each plane; sums to one over D."""
     if dispatch.can_use_triton(cost):
-        from fieldfuse.networks.gpu import matching
+        from fieldfuse.backends.triton import matching
 
         return matching.distribution(cost, SMALL, LARGE, TEMPERATURE)
     along = semi_global(cost).permute(1, 2, 0)  # (h, w, D), where the planes of a pixel lie next to each other in memory on the CPU

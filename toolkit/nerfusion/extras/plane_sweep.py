@@ -88,7 +88,7 @@ class DepthDistribution:
             pose, lens = self.camera.world_from_camera[0], self.camera.lens(0)
             return SdfEstimate(*compiled.look(points, truncation, self.table, pose, lens, self.lowest, self.step).T)
         if dispatch.can_use_triton(points, truncation, self.table):
-            from fieldfuse.networks.gpu import reading
+            from fieldfuse.backends.triton import reading
 
             return SdfEstimate(*reading.look(points, truncation, self.table, self.camera, self.lowest, self.step))
         local = self.camera.local(points)[0]
@@ -165,7 +165,7 @@ def _compared(descriptors: Sequence[Tensor], cameras: Cameras, near: float, far:
     spacing = SPACING if empty is None else WITHIN
     shape = _shape(descriptors[0], spacing)
     if dispatch.can_use_triton(cameras.intrinsics, *descriptors):
-        from fieldfuse.networks.gpu.describe import pixels
+        from fieldfuse.backends.triton.describe import pixels
 
         world, own, inverses = pixels(descriptors[0], cameras, shape, count, 1 / far, 1 / near)
         rays = world  # the kernel takes them in working axes
@@ -216,7 +216,7 @@ def _costs(descriptors: Sequence[Tensor], cameras: Cameras, inverses: Tensor, ra
             comparison.add(descriptors[view], *_way(cameras, view), cameras.lens(view))
         return comparison.result(UNKNOWN)
     if dispatch.can_use_triton(cameras.intrinsics, *descriptors):
-        from fieldfuse.networks.gpu import matching
+        from fieldfuse.backends.triton import matching
 
         return matching.costs(descriptors, cameras, inverses, rays, own, COLOUR_GAIN, UNKNOWN)
     parts = []
@@ -241,7 +241,7 @@ def to_probability(costs: CostVolume, depth: Tensor | None = None, correction: T
         said: (D, h, w) that makes planes likelier, in units of the cost (`cross_view_consistency.consistency`).
     """
     if costs.empty is None and depth is None and dispatch.can_use_triton(costs.cost):
-        from fieldfuse.networks.gpu import matching
+        from fieldfuse.backends.triton import matching
 
         table = matching.decided(costs.cost, correction, SMALL, LARGE, TEMPERATURE, costs.step, PEAK)
         return DepthDistribution(costs.camera, table, costs.lowest, costs.step)
@@ -249,7 +249,7 @@ def to_probability(costs: CostVolume, depth: Tensor | None = None, correction: T
     if costs.empty is not None:
         likely = carved(likely, costs.empty)
     if depth is not None and dispatch.can_use_triton(likely, costs.inverses, depth):
-        from fieldfuse.networks.gpu.measured import measured as table_of
+        from fieldfuse.backends.triton.measured import measured as table_of
 
         asked = _asked(likely, depth, costs.spacing, costs.window)
         table = table_of(likely, costs.inverses, depth, *asked, costs.step, NOISE, TRUST, PEAK)
@@ -330,7 +330,7 @@ def _table(likely: Tensor, step: float) -> Tensor:
     if compiled.fits(likely):
         return compiled.table(likely, step, PEAK)
     if dispatch.can_use_triton(likely):
-        from fieldfuse.networks.gpu import matching
+        from fieldfuse.backends.triton import matching
 
         return matching.table(likely, step, PEAK)
     nearer = likely.flip(0).cumsum(0).flip(0) - 0.5 * likely  # the surface lies anywhere about its plane

@@ -31,7 +31,7 @@ def split_volume(volume: LatentVolume, kept: Tensor) -> LatentVolume:
     Known are exactly the corners of the kept cells' children. They count little, so that what is seen finer prevails.
     """
     if volume.topology.bounds is not None and dispatch.can_use_triton(volume.rows):
-        from fieldfuse.volume import split_gpu
+        from fieldfuse.backends.triton import split as split_gpu
 
         given = volume.topology, kept, volume.rows.detach(), doubled(*volume.topology.bounds), INHERITED
         return LatentVolume(volume.lattice.finer(), *split_gpu.split(*given))

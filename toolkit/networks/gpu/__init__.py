@@ -1,1 +1,0 @@
-"""The networks' kernels for CUDA."""
