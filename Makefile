@@ -84,7 +84,7 @@ links:
 	@ln -s $(CURDIR)/benchmarks $(LINKS)/
 
 docs: $(VENV)/.installed-docs links
-	$(BIN)/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "Open build/site/index.html"
 
 venv: $(VENV)/.installed $(VENV)/.installed-xfeat
