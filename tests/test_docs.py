@@ -123,7 +123,7 @@ def test_settings_that_the_docs_name_exist() -> None:
 
 
 def test_places_in_the_tree_exist() -> None:
-    folders = "toolkit|pipelines|configs|benchmarks|tests|scripts|examples"
+    folders = "toolkit|pipelines|configs|benchmarks|tests|examples"
     for page in PAGES:
         for place in re.findall(rf"`((?:{folders})/[\w./]*)`", page.read_text(encoding="utf-8")):
             assert (ROOT / place).exists(), f"{place} in {where(page)}"
@@ -144,7 +144,7 @@ def test_the_architecture_page_has_the_layers_of_the_contract() -> None:
 def test_the_site_has_every_page() -> None:
     text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     named = {ROOT / "docs" / name for name in re.findall(r": ([\w/]+\.md)", text.partition("\nnav:\n")[2])}
-    spec = spec_from_file_location("site_hooks", ROOT / "scripts" / "site_hooks.py")
+    spec = spec_from_file_location("site_hooks", ROOT / ".ci" / "site_hooks.py")
     assert spec is not None and spec.loader is not None
     hooks = module_from_spec(spec)
     spec.loader.exec_module(hooks)
@@ -163,7 +163,7 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     links.mkdir(parents=True)
     for place in (*(ROOT / "toolkit").iterdir(), ROOT / "pipelines", ROOT / "configs"):
         (links / place.name).symlink_to(place)
-    for name in ("docs", "scripts", "toolkit", "mkdocs.yml", "README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
+    for name in ("docs", ".ci", "toolkit", "mkdocs.yml", "README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
         (tmp_path / name).symlink_to(ROOT / name)
     done = subprocess.run([sys.executable, "-m", "mkdocs", "build", "--strict"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
