@@ -110,7 +110,8 @@ def test_no_modules_import_each_other() -> None:
             parts = (package, *path.relative_to(ROOT / folder).with_suffix("").parts)
             modules[".".join(parts).removesuffix(".__init__")] = path
     assert len(modules) > 300
-    TopologicalSorter({name: imports(name, path, modules) for name, path in modules.items()}).prepare()  # raises CycleError, which names the circle
+    graph = {name: imports(name, path, modules) for name, path in modules.items()}
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 
 def test_no_module_gives_a_constant_two_values() -> None:
