@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from fieldfuse.backends import dispatch
-from fieldfuse.networks.store import _Slots
+from fieldfuse.nerfusion.store import _Slots
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 
