@@ -33,7 +33,6 @@ from fieldfuse.pipelines import (
     poses,
     render,
     run,
-    selftest,
     simulate,
     tradeoff,
     train,
@@ -143,7 +142,6 @@ for _command in (
     tradeoff.tradeoff,
     info.info,
     train.train,
-    selftest.selftest,
     simulate.simulate,
 ):
     app.command()(_command)

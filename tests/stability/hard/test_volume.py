@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
+import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
-from fieldfuse.evaluation.selftest.case import Measure, absolute, case, not_finite, refused
-from fieldfuse.evaluation.selftest.lookup import scattered_blocks
 from fieldfuse.volume.topology import BLOCK, KEY_HIGH, KEY_LOW, VOXELS, Topology
+from tests.stability.hard.errors import absolute, not_finite, refused
+from tests.stability.hard.fields import scattered_blocks
+from tests.stability.hard.ranges import FEW, KEYS
+from tests.stability.hard.within import Within
 
 GROUP = "volume"
 Key = tuple[int, int, int]
@@ -72,38 +75,32 @@ def topology_errors(topology: Topology) -> dict[str, float]:
     return wrong
 
 
-def _zero(errors: dict[str, float], what: str = "") -> list[Measure]:
-    return [Measure(f"wrong {name}{what}", error, 0.0) for name, error in errors.items()]
-
-
-@case(GROUP, "growth in the middle of a run, erasing, coming back")
-def a_life(folder: Path) -> list[Measure]:
+def test_a_life(within: Within) -> None:
+    """Growth in the middle of a run, erasing, coming back."""
     generator = torch.Generator().manual_seed(4)
     operations: list[tuple[str, list[Key]]] = []
     for turn in range(40):
         count = 1 + int(torch.randint(1, 12, (1,), generator=generator)) * (1 + turn // 8)
         keys = [(int(x), int(y), int(z)) for x, y, z in torch.randint(-3, 4, (count, 3), generator=generator)]
         operations.append((("activate", "write", "erase", "activate", "write")[turn % 5], keys))
-    return _zero(grid_errors(operations))
+    within.each(grid_errors(operations), name="wrong {}")
 
 
-@case(GROUP, "no blocks, one block, the same block many times")
-def few_blocks(folder: Path) -> list[Measure]:
+def test_few_blocks(within: Within) -> None:
+    """No blocks, one block, the same block many times."""
     one = (5, -6, 7)
     operations = [("activate", []), ("erase", [one]), ("write", [one]), ("activate", [one] * 500), ("write", [one]), ("erase", [one])]
     operations += [("activate", [one]), ("erase", [one, one]), ("activate", [])]
     empty = Topology(torch.zeros((0, 3), dtype=torch.int32))
-    return [
-        *_zero(grid_errors(operations, 1)),
-        *_zero(topology_errors(empty), ", no blocks"),
-        *_zero(topology_errors(Topology(torch.tensor([one]))), ", one block"),
-        Measure("slots of an empty set", float((empty.find(torch.zeros((9, 3), dtype=torch.int64)) >= 0).sum()), 0.0),
-        Measure("rows of an empty set", float(len(empty.halo_rows) + len(empty.lookup_rows) + len(empty.dilated_keys())), 0.0),
-    ]
+    within.each(grid_errors(operations, 1), name="wrong {}")
+    within.each(topology_errors(empty), name="wrong {}, no blocks")
+    within.each(topology_errors(Topology(torch.tensor([one]))), name="wrong {}, one block")
+    within("slots of an empty set", float((empty.find(torch.zeros((9, 3), dtype=torch.int64)) >= 0).sum()), 0.0)
+    within("rows of an empty set", float(len(empty.halo_rows) + len(empty.lookup_rows) + len(empty.dilated_keys())), 0.0)
 
 
-@case(GROUP, "negative and extreme keys")
-def extreme_keys(folder: Path) -> list[Measure]:
+def test_extreme_keys(within: Within) -> None:
+    """Negative and extreme keys."""
     high, low = KEY_HIGH, KEY_LOW
     corners = [(x, y, z) for x in (low, high) for y in (low, high) for z in (low, high)]
     beside = [(low + 1, low, low), (high - 1, high, high), (high, high - 1, high - 1), (-1, -1, -1), (0, 0, 0), (0, -1, 0)]
@@ -112,64 +109,72 @@ def extreme_keys(folder: Path) -> list[Measure]:
     lone = Topology(torch.tensor([(high, high, high)]))
     operations = [("activate", keys), ("write", keys[::2]), ("erase", keys[::3]), ("activate", keys)]
     too_far = refused(lambda: Topology(torch.tensor([[2**31, 0, 0]])), ValueError, "int32")
-    return [
-        *_zero(grid_errors(operations)),
-        *_zero(topology_errors(topology)),
-        *_zero(topology_errors(lone), " at the far end"),
-        Measure("a key beyond int32 is taken", too_far, 0.0),
-        Measure("keys grown beyond int32", float((lone.dilated_keys().long().abs() > 2**31).sum()), 0.0),
-    ]
+    within.each(grid_errors(operations), name="wrong {}")
+    within.each(topology_errors(topology), name="wrong {}")
+    within.each(topology_errors(lone), name="wrong {} at the far end")
+    within("a key beyond int32 is taken", too_far, 0.0)
+    within("keys grown beyond int32", float((lone.dilated_keys().long().abs() > 2**31).sum()), 0.0)
 
 
-@case(GROUP, "keys made to collide in a hash table")
-def colliding_keys(folder: Path) -> list[Measure]:
-    """Keys that agree in their low bits, and keys whose sums of multiples (the usual spatial hashes) agree."""
+def test_colliding_keys(within: Within) -> None:
+    """Keys made to collide in a hash table.
+
+    Keys that agree in their low bits, and keys whose sums of multiples (the usual spatial hashes) agree.
+    """
     strides = [(i << 20, 0, 0) for i in range(-200, 200)] + [(0, i << 16, 0) for i in range(1, 200)]
     mirrored = [(i, -i, 0) for i in range(1, 200)] + [(i, j, -i - j) for i in range(20) for j in range(1, 20)]
     keys: list[Key] = list(dict.fromkeys(strides + mirrored))
     operations = [("activate", keys), ("write", keys[::2]), ("erase", keys[1::2]), ("activate", keys[::-1]), ("write", keys[::3])]
-    return _zero(grid_errors(operations, 8))
+    within.each(grid_errors(operations, 8), name="wrong {}")
 
 
-@case(GROUP, "blocks far apart: searched codes and the dense table agree")
-def codes_and_table(folder: Path) -> list[Measure]:
+def test_codes_and_table(within: Within) -> None:
+    """Blocks far apart: searched codes and the dense table agree."""
     keys = scattered_blocks(40, 2, 4).keys
     far = torch.cat([keys, keys + torch.tensor([2**30, -(2**30), 2**29], dtype=torch.int32)])
     dense, coded = Topology(keys), Topology(keys, max_table_cells=1)
     query = torch.randint(-7, 8, (20_000, 3))
-    return [
-        Measure("find", absolute(dense.find(query), coded.find(query)), 0.0),
-        Measure("around", absolute(dense.around, coded.around), 0.0),
-        Measure("halo rows", absolute(dense.halo_rows, coded.halo_rows), 0.0),
-        Measure("grown keys", absolute(_sorted(dense.dilated_keys(2)), _sorted(coded.dilated_keys(2))), 0.0),
-        *_zero(topology_errors(Topology(far)), ", two clusters"),
-    ]
+    within("find", absolute(dense.find(query), coded.find(query)), 0.0)
+    within("around", absolute(dense.around, coded.around), 0.0)
+    within("halo rows", absolute(dense.halo_rows, coded.halo_rows), 0.0)
+    within("grown keys", absolute(_sorted(dense.dilated_keys(2)), _sorted(coded.dilated_keys(2))), 0.0)
+    within.each(topology_errors(Topology(far)), name="wrong {}, two clusters")
 
 
 def _sorted(keys: Tensor) -> Tensor:
     return torch.unique(keys, dim=0)
 
 
-@case(GROUP, "200,000 blocks", slow=True)
-def many_blocks(folder: Path) -> list[Measure]:
+@pytest.mark.long
+def test_many_blocks(within: Within) -> None:
+    """200,000 blocks."""
     from fieldfuse.volume.grid import BlockGrid
 
     line = torch.arange(-29, 30)
     keys = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1).view(-1, 3)
     keys = keys[torch.randperm(len(keys))[:200_000]]
     topology = Topology(keys)
-    out = [
-        Measure("keys not found", float((topology.find(keys) != torch.arange(len(keys))).sum()), 0.0),
-        Measure("halo of the last block", float((topology.halo_chunk(199_999, 200_000) > topology.zero_row).sum()), 0.0),
-    ]
+    within("keys not found", float((topology.find(keys) != torch.arange(len(keys))).sum()), 0.0)
+    within("halo of the last block", float((topology.halo_chunk(199_999, 200_000) > topology.zero_row).sum()), 0.0)
     with BlockGrid(0.01, {"value": 1}, capacity=150_000) as grid:  # too few: it grows once
         first = grid.activate(keys[:100_000])
         grid.rows("value").view(-1, VOXELS)[first] = 1.0
         grid.activate(keys)
         held = grid.rows("value").view(-1, VOXELS)
-        out.append(Measure("values lost in growth", float((held[grid.find(keys[:100_000])] != 1).sum()), 0.0))
-        out.append(Measure("new blocks that are not zero", float((held[grid.find(keys[100_000:])] != 0).sum()), 0.0))
-        out.append(Measure("erased", abs(grid.erase(keys[::2]) - 100_000.0), 0.0))
-        out.append(Measure("left", abs(len(grid) - 100_000.0), 0.0))
-        out.append(Measure("values that are not finite", not_finite(held[:1000]), 0.0))
-    return out
+        within("values lost in growth", float((held[grid.find(keys[:100_000])] != 1).sum()), 0.0)
+        within("new blocks that are not zero", float((held[grid.find(keys[100_000:])] != 0).sum()), 0.0)
+        within("erased", abs(grid.erase(keys[::2]) - 100_000.0), 0.0)
+        within("left", abs(len(grid) - 100_000.0), 0.0)
+        within("values that are not finite", not_finite(held[:1000]), 0.0)
+
+
+@FEW
+@given(st.lists(st.tuples(st.sampled_from(["activate", "erase", "write"]), st.lists(KEYS, max_size=12)), max_size=12), st.integers(1, 6))
+def test_the_life_of_a_volume(operations: list[tuple[str, list[tuple[int, int, int]]]], capacity: int) -> None:
+    assert not any(grid_errors(operations, capacity).values())
+
+
+@FEW
+@given(st.lists(st.tuples(*[st.integers(-(2**31), 2**31 - 1)] * 3), min_size=1, max_size=12, unique=True))
+def test_keys_anywhere(keys: list[tuple[int, int, int]]) -> None:
+    assert not any(topology_errors(Topology(torch.tensor(keys))).values())
