@@ -83,7 +83,7 @@ links:
 	@rm -rf $(LINKS) && mkdir -p $(LINKS)/fieldfuse && ln -s $(CURDIR)/toolkit/* $(CURDIR)/pipelines $(CURDIR)/configs $(LINKS)/fieldfuse/
 
 docs: $(VENV)/.installed-docs links
-	$(BIN)/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "Open build/site/index.html"
 
 venv: $(VENV)/.installed $(VENV)/.installed-xfeat

@@ -166,10 +166,10 @@ def _torch() -> Check:
     count = torch.get_num_threads()
     threads = f"{count} thread{'' if count == 1 else 's'}"
     if torch.cuda.is_available():
-        from fieldfuse.gpu import runs_kernels
+        from fieldfuse.backends.dispatch import triton_runs_on
 
         seen = f"CUDA, {torch.cuda.get_device_name(0)}; CPU with {threads}"
-        if runs_kernels(torch.device("cuda")):
+        if triton_runs_on(torch.device("cuda")):
             return Check("torch device", OK, seen)
         return Check("torch device", WARN, f"{seen}; without Triton for it fits take forty times as long", "pip install triton")
     return Check("torch device", OK, f"CPU with {threads}")

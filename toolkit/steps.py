@@ -92,9 +92,9 @@ def check_engine(engine: str, device: str) -> None:
     """
     import torch
 
-    from fieldfuse.gpu import runs_kernels
+    from fieldfuse.backends.dispatch import triton_runs_on
 
-    if engine == "triton" and not runs_kernels(torch.device(device)):
+    if engine == "triton" and not triton_runs_on(torch.device(device)):
         why = "Triton for it is not installed, or it is too old" if device == "cuda" else f"the device is {device!r}"
         raise InputError(f"engine is 'triton', which runs on CUDA alone, and {why}; leave --engine at auto")
 

@@ -67,12 +67,24 @@ def test_lens_and_light_are_measured() -> None:
 
 def test_gains_of_training_frames_have_mean_one_and_do_not_hang_on_the_others() -> None:
     seen, test = made(8, gain=drift(8)), np.arange(FRAMES) % 8 == 0
-    gain = light.frame_gains(seen.tracks(), FRAMES, ~test)
+    gain, borrowed = light.frame_gains(seen.tracks(), FRAMES, ~test)
     np.testing.assert_allclose(np.log2(gain[~test]).mean(0), 0, atol=1e-9)
     changed = replace(seen, linear=np.where(test[seen.frame, None], 0.5 * seen.linear, seen.linear))
-    other = light.frame_gains(changed.tracks(), FRAMES, ~test)
+    other, changed_borrowed = light.frame_gains(changed.tracks(), FRAMES, ~test)
     np.testing.assert_array_equal(other[~test], gain[~test])
     np.testing.assert_allclose(other[test], 0.5 * gain[test], rtol=0.02)
+    assert not borrowed and not changed_borrowed, "points that agree are believed, however far off they are"
+
+
+def test_a_held_out_frame_whose_points_disagree_has_its_neighbours_gain() -> None:
+    seen, test = made(8, gain=drift(8)), np.arange(FRAMES) % 8 == 0
+    expected, _ = light.frame_gains(seen.tracks(), FRAMES, ~test)
+    factor = np.exp2(np.random.default_rng(0).normal(1.0, 0.8, (len(seen.frame), 1)))
+    torn = replace(seen, linear=np.where((seen.frame == 8)[:, None], factor * seen.linear, seen.linear))
+    gain, borrowed = light.frame_gains(torn.tracks(), FRAMES, ~test)
+    assert borrowed == [8]
+    np.testing.assert_allclose(np.log2(gain[8]), np.log2(expected[[7, 9]]).mean(0), atol=1e-9)
+    np.testing.assert_allclose(gain[test][[0]], expected[test][[0]])
 
 
 def aligned(poses: np.ndarray, given: np.ndarray, use: np.ndarray) -> np.ndarray:

@@ -204,7 +204,7 @@ def test_where_a_device_works_behind_the_processor_pictures_are_encoded_ahead(mo
     monkeypatch.setattr(model, "encode", counted)
     one_by_one, expected = fused()
     assert set(together) == {1} and one_by_one == [2, *range(3, 12), 11]
-    monkeypatch.setattr("fieldfuse.nerfusion.fusion.asks_freely", lambda device: False)
+    monkeypatch.setattr("fieldfuse.nerfusion.fusion.is_cpu", lambda device: False)
     ahead, found = fused()
     # Four key frames and their neighbours; the next ones come when the fourth is fused.
     assert together == [5, 4, 2] and ahead == [5, 5, 5, 9, 9, 9, 9, 11, 11, 11, 11]

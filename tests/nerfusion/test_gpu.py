@@ -18,7 +18,7 @@ if importlib.util.find_spec("triton") is None or torch.cuda.is_available():
     pytest.skip("needs Triton, interpreting; with a CUDA device see test_gpu_device.py", allow_module_level=True)
 os.environ.setdefault("TRITON_INTERPRET", "1")
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
 from fieldfuse.nerfusion import compiled, compiled_lookup
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d
 from fieldfuse.nerfusion.cull import all_blocks
@@ -71,10 +71,23 @@ def unchecked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
         monkeypatch.setattr(interpreter_builder, "options", replace(interpreter_builder.options, sanitize_overflow=False))
 
 
+SINGLE = (torch.float32,)
+
+
+def _use_triton(monkeypatch: pytest.MonkeyPatch, kinds: tuple[torch.dtype, ...] | None = SINGLE, use: bool = True) -> None:
+    """Where tensors of these kinds have to lie on CUDA for the kernels, say so of those on the CPU."""
+    before = dispatch.can_use_triton
+
+    def chosen(*values: torch.Tensor, dtypes: tuple[torch.dtype, ...] | None = SINGLE) -> bool:
+        return use if dtypes == kinds else before(*values, dtypes=dtypes)
+
+    monkeypatch.setattr(dispatch, "can_use_triton", chosen)
+
+
 def forced(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tensors on the CPU take the way of those on CUDA."""
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
-    monkeypatch.setattr(gpu, "fits", lambda *values: True)
+    _use_triton(monkeypatch)
 
 
 @pytest.mark.parametrize("shape", [(40, 5, 6), (3, 6, 1), (64, 1, 3)])
@@ -195,7 +208,7 @@ def test_convolution_and_its_gradients(inside: int, outside: int, monkeypatch: p
         return [out.detach(), *(value.grad for value in given)]
 
     slow = everything()
-    monkeypatch.setattr(gpu, "takes", lambda values: True)
+    _use_triton(monkeypatch, dispatch.FLOATS)
     for quick, expected in zip(everything(), slow, strict=True):
         torch.testing.assert_close(quick, expected, atol=2e-3, rtol=1e-4)
 
@@ -225,7 +238,7 @@ def test_lookup(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiled_lookup, "fits", lambda *values: False)
     with torch.no_grad():
         slow = look_up(views, projection, step)
-        monkeypatch.setattr(gpu, "fits", lambda *values: True)
+        _use_triton(monkeypatch)
         torch.testing.assert_close(look_up(views, projection, step), slow, atol=1e-5, rtol=1e-5)
 
 
@@ -243,7 +256,7 @@ def test_the_gradient_of_lookup(monkeypatch: pytest.MonkeyPatch) -> None:
         return list(torch.autograd.grad(shown, list(model.sample.parameters()), slopes))
 
     slow = gradients()
-    monkeypatch.setattr(gpu, "fits", lambda *values: True)
+    _use_triton(monkeypatch)
     for quick, expected in zip(gradients(), slow, strict=True):
         torch.testing.assert_close(quick, expected, atol=1e-4, rtol=1e-4)
 
@@ -265,12 +278,13 @@ def on_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """All of what tensors on CUDA make different, but for the convolution."""
     forced(monkeypatch)
     monkeypatch.setattr(convolution, "convolve", convolved)
-    monkeypatch.setattr(gpu, "takes", lambda values: True)
-    monkeypatch.setattr(gpu, "there", lambda values: True)
+    _use_triton(monkeypatch, dispatch.FLOATS)
+    _use_triton(monkeypatch, None)
     monkeypatch.setattr("fieldfuse.nerfusion.gru.on_cpu", lambda device: False)
-    for module in ("fusion", "networks.lattice", "networks.store", "networks.model", "volume.topology", "volume.edit", "networks.cull"):
-        monkeypatch.setattr(f"fieldfuse.{module}.asks_freely", lambda device: False)
-    for module in ("networks.compiled_lookup", "networks.model"):
+    nerfusion = ("fusion", "lattice", "store", "model", "cull")
+    for module in (*(f"nerfusion.{name}" for name in nerfusion), "volume.topology", "volume.edit"):
+        monkeypatch.setattr(f"fieldfuse.{module}.is_cpu", lambda device: False)
+    for module in ("nerfusion.compiled_lookup", "nerfusion.model"):
         monkeypatch.setattr(f"fieldfuse.{module}.fits", lambda *values: False)
 
 
@@ -362,9 +376,9 @@ def test_a_finer_lattice(believed: bool, monkeypatch: pytest.MonkeyPatch) -> Non
     if believed:
         topology = Topology(keys, bounds=((-1, -1, -1), (5, 5, 5)))
         for module in ("fieldfuse.volume.edit", "fieldfuse.volume.topology"):
-            monkeypatch.setattr(f"{module}.asks_freely", lambda device: False)
-    monkeypatch.setattr(gpu, "fits", lambda *values: True)
-    monkeypatch.setattr(gpu, "there", lambda values: True)
+            monkeypatch.setattr(f"{module}.is_cpu", lambda device: False)
+    _use_triton(monkeypatch)
+    _use_triton(monkeypatch, None)
     quick, inside_quick, (made,) = split(topology, occupied, [rows])
     place = quick.find(slow.keys)
     assert len(quick.keys) == len(slow.keys) and bool((place >= 0).all())
@@ -374,7 +388,7 @@ def test_a_finer_lattice(believed: bool, monkeypatch: pytest.MonkeyPatch) -> Non
     for every in (False, True):
         mask = torch.rand(slow.zero_row, generator=generator) < 0.5
         with monkeypatch.context() as patch:
-            patch.setattr(gpu, "there", lambda values: False)
+            _use_triton(patch, None, False)
             expected = cells(slow, mask, every)
         assert torch.equal(cells(slow, mask, every), expected)
 
@@ -387,7 +401,7 @@ def test_coarse_steps_of_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     grid = MarchGrid(Space((0.0, 0.0, 0.0), 0.7, 1.0), 32, topology, torch.ones(topology.zero_row, dtype=torch.bool))
     jitter = torch.rand(40, generator=generator)
     slow = march(grid, origins, directions, 0.1, 4, jitter)
-    monkeypatch.setattr(gpu, "fits", lambda *values: True)
+    _use_triton(monkeypatch)
     quick = march(grid, origins, directions, 0.1, 4, jitter)
     for name in ("ray", "cell"):
         assert torch.equal(getattr(quick, name), getattr(slow, name))

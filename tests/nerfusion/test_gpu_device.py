@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
 
 if not torch.cuda.is_available():
     pytest.skip("needs a CUDA device", allow_module_level=True)
@@ -42,7 +42,7 @@ def timed(name: str, work: Callable[[], Any]) -> Any:
 
 def both(name: str, work: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Any]:
     quick = timed(name, work)
-    monkeypatch.setattr(gpu, "_there", lambda: False)
+    monkeypatch.setattr(dispatch, "_installed", lambda: False)
     slow = timed(name + ", tensors", work)
     monkeypatch.undo()
     return quick, slow

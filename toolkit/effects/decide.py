@@ -145,6 +145,10 @@ def decide(
     if trials is not None and any(one.wish == "auto" for one in decisions.values() if one.on and _tried(one)):
         decisions = _judged(decisions, worked, capture, found, trials, chosen, aside)
     corrections = worked.parts(_corrected(decisions))
+    if worked.borrowed and decisions[EXPOSURE].on:
+        which = ", ".join(worked.borrowed[:3]) + (", …" if len(worked.borrowed) > 3 else "")
+        note = f"held-out frames whose points disagree about their exposure have that of their neighbours: {which}"
+        decisions[EXPOSURE] = replace(decisions[EXPOSURE], note=note)
     if worked.agreed is not None and decisions[POSES].on:
         decisions[POSES] = replace(decisions[POSES], note=worked.agreed.note)
     if capture.has_depth:
@@ -302,6 +306,7 @@ class Worked:
         seen: what was seen in most images.
         agreed: how poses agree with a sensor's depth, where it took part.
         misplaced: why poses cannot be used; None: they can.
+        borrowed: held-out frames, by name, whose gain is their neighbours'.
     """
 
     all: Corrections
@@ -309,6 +314,7 @@ class Worked:
     seen: Sightings | None
     agreed: Agreed | None = None
     misplaced: str | None = None
+    borrowed: Sequence[str] = ()
 
     def parts(self, on: frozenset[str], tried: bool = False) -> Corrections:
         """What is corrected with the effects `on`."""
@@ -347,15 +353,16 @@ def _worked_out(
     both = Corrections(corner=corner, lens=lens, weight=weight)
     if seen is None or not on & {EXPOSURE, POSES}:
         return Worked(both, both, seen)
-    tried, agreed, misplaced = both, None, None
+    tried, agreed, misplaced, borrowed = both, None, None, list[int]()
     with found.paid.by(POINTS):
         every = gather(capture, range(len(capture.frames)), progress, known=known)
     if EXPOSURE in on:
         with found.paid.by(EXPOSURE):
             tracks = every.tracks()
             flat = tracks if corner is None else vignetting.corrected(tracks, corner)
-            gains = [_by_name(every.names, light.frame_gains(flat, len(every.names), train)) for train in (~test, ~test & ~aside)]
-        both, tried = replace(both, gain=gains[0]), replace(tried, gain=gains[1])
+            (gain, borrowed), (gain_aside, _) = (light.frame_gains(flat, len(every.names), train) for train in (~test, ~test & ~aside))
+        both = replace(both, gain=_by_name(every.names, gain))
+        tried = replace(tried, gain=_by_name(every.names, gain_aside))
     if POSES in on:
         kept = found.explained.kept if found.explained is not None else frozenset[str]()
         with found.paid.by(POSES):
@@ -366,7 +373,7 @@ def _worked_out(
         tried = replace(tried, poses=dict(zip(every.names, placed, strict=True)), lens=lens, by_depth=agreed is not None)
         if refined.fails:
             misplaced = f"{refined.borrowed} of {refined.placed} held-out frames cannot be placed by the points that the others share"
-    return Worked(both, tried, every, agreed, misplaced)
+    return Worked(both, tried, every, agreed, misplaced, [every.names[frame] for frame in borrowed])
 
 
 def _by_name(names: Sequence[str], gains: Array) -> dict[str, Gain]:

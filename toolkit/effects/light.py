@@ -15,6 +15,9 @@ HELD_OUT = 4  # every so manieth point is kept out of the fits
 MARGIN = {EXPOSURE: 0.24, VIGNETTING: 0.1}  # least relative fall of the held-out deviation: less did not pay on real pictures
 BOTH = 0.25  # … by both: each hides some of the other, so that alone neither may come as far as it does beside the other
 LEAST = 0.0015  # stops by which it has to fall at least
+FEWEST_POINTS = 10  # that a held-out frame's gain is measured by
+TORN = 1.5  # times the usual disagreement of points about a frame's gain, from which it is doubtful …
+APART = 0.2  # … if it lies so many stops outside of its neighbours' gains as well
 
 
 @dataclass(frozen=True)
@@ -89,18 +92,24 @@ def spread(tracks: Tracks) -> float:
     return float(1.4826 * np.median(np.abs(light - middle[used.point]).max(1)))
 
 
-def frame_gains(tracks: Tracks, frames: int, train: Array) -> Array:
-    """(frames, 3) gains: of training frames from the points that they share, with geometric mean 1; of others by comparison with these.
+def frame_gains(tracks: Tracks, frames: int, train: Array) -> tuple[Array, list[int]]:
+    """Gains of training frames from the points that they share, with geometric mean 1; of others by comparison with these.
+
+    A frame that is held out has its neighbours' gain (exposure changes smoothly) where it shows too few of the points, or where these
+    disagree about it and together put it outside of what its neighbours have: it plays no part in what the training frames agree on.
 
     Args:
         train: (frames,) bool.
+
+    Returns:
+        (frames, 3), and the held-out frames whose gain is their neighbours' although they show enough points.
     """
     gain = np.ones((frames, 3))
     number = np.cumsum(train) - 1
     mine = _rows(tracks, train[tracks.frame])
     inner = exposure.evidence(replace(mine, frame=number[mine.frame]), int(train.sum()))
     if "gain" not in inner.parameters:
-        return gain
+        return gain, []
     gain[train] = np.array(inner.parameters["gain"])
     points = int(tracks.point.max(initial=-1)) + 1
     bright = ((tracks.linear > DARKEST) & (tracks.linear < BRIGHTEST)).all(1)
@@ -108,14 +117,28 @@ def frame_gains(tracks: Tracks, frames: int, train: Array) -> Array:
     known = train[tracks.frame] & bright
     count = np.bincount(tracks.point[known], minlength=points)
     mean = np.stack([np.bincount(tracks.point[known], light[known, c], points) for c in range(3)], axis=1) / np.maximum(count[:, None], 1)
+    compared = bright & (count[tracks.point] > 0)
+    off = light - mean[tracks.point]
+
+    def disagreement(frame: int) -> float:
+        mine = off[(tracks.frame == frame) & compared]
+        return float(np.median(np.abs(mine - np.median(mine, axis=0)))) if len(mine) >= FEWEST_POINTS else np.inf
+
+    trained, borrowed = np.flatnonzero(train), []
+    usual = float(np.median([disagreement(int(frame)) for frame in trained])) if len(trained) else 0.0
     for frame in np.flatnonzero(~train):
-        rows = (tracks.frame == frame) & bright & (count[tracks.point] > 0)
-        if rows.sum() >= 10:
-            gain[frame] = np.exp2(np.median(light[rows] - mean[tracks.point[rows]], axis=0))
-        elif train.any():  # the neighbours in the list: exposure changes smoothly
-            near = np.flatnonzero(train)[np.argsort(np.abs(np.flatnonzero(train) - frame), kind="stable")[:2]]
-            gain[frame] = np.exp2(np.log2(gain[near]).mean(0))
-    return gain
+        near = trained[np.argsort(np.abs(trained - frame), kind="stable")[:2]]
+        theirs = np.log2(gain[near])
+        rows = (tracks.frame == frame) & compared
+        found = np.median(off[rows], axis=0) if rows.sum() >= FEWEST_POINTS else None
+        if found is not None and len(near):
+            beyond = np.maximum(found - theirs.max(0), theirs.min(0) - found).max()
+            if beyond > APART and disagreement(int(frame)) > TORN * usual:
+                borrowed.append(int(frame))
+                found = None
+        if found is not None or len(near):
+            gain[frame] = np.exp2(theirs.mean(0) if found is None else found)
+    return gain, borrowed
 
 
 def _rows(tracks: Tracks, keep: Array) -> Tracks:

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
 from fieldfuse.volume.topology import BLOCK, HALO, VOXELS, Topology
 
 DEFAULT_CHUNK = 64  # blocks at a time: 4 MB of halo at 16 channels in float32
@@ -50,7 +50,7 @@ class BlockConv3d(nn.Module):
 
     def forward(self, rows: Tensor, topology: Topology, occupied: Tensor | None = None, relu: bool = False) -> Tensor:
         """See `block_conv3d`."""
-        if not torch.is_grad_enabled() and gpu.takes(rows):
+        if not torch.is_grad_enabled() and dispatch.can_use_triton(rows, dtypes=dispatch.FLOATS):
             return self._prepared.convolve([[self]], rows, topology, occupied, relu)
         return block_conv3d(rows, topology, self.weight, self.bias, occupied, self.chunk, relu)
 
@@ -141,7 +141,7 @@ def block_conv3d(
         return rows.new_zeros((len(rows), len(weight)))
     kind = rows.device.type
     reduced = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else None
-    if not torch.is_grad_enabled() and gpu.takes(rows):
+    if not torch.is_grad_enabled() and dispatch.can_use_triton(rows, dtypes=dispatch.FLOATS):
         from fieldfuse.networks.gpu import convolution
 
         numbers = reduced or rows.dtype
@@ -180,7 +180,7 @@ def _clear(rows: Tensor, kept: Tensor) -> None:
 
 def _convolve(rows: Tensor, weight: Tensor, bias: Tensor | None, topology: Topology, occupied: Tensor | None, chunk: int) -> Tensor:
     """(M · 512 + 1, C) → (M · 512 + 1, C')."""
-    if gpu.takes(rows):
+    if dispatch.can_use_triton(rows, dtypes=dispatch.FLOATS):
         from fieldfuse.networks.gpu import convolution
 
         return convolution.convolve(rows, topology.around, convolution.taps_of(weight), bias, occupied)
@@ -241,7 +241,7 @@ class _BlockConv(torch.autograd.Function):
 
 def _weight_gradient(rows: Tensor, gradient: Tensor, weight: Tensor, topology: Topology, chunk: int) -> Tensor:
     """(C', C, 3, 3, 3) in the weight's type, summed over chunks in it."""
-    if gpu.takes(rows):
+    if dispatch.can_use_triton(rows, dtypes=dispatch.FLOATS):
         from fieldfuse.networks.gpu import convolution
 
         return convolution.weight_gradient(rows, topology.around, gradient).to(weight.dtype)

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fieldfuse.backends.dispatch import to_device_async
 from fieldfuse.camera import Array, Intrinsics
-from fieldfuse.gpu import sent
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Cameras:
             return cls(inner.view(-1, 4), size.view(-1, 2), poses.view(-1, 4, 4), host)
 
         host = split(torch.from_numpy(whole), None)
-        return host if device.type == "cpu" else split(sent(whole, device), host)
+        return host if device.type == "cpu" else split(to_device_async(whole, device), host)
 
     @classmethod
     def same_size(cls, intrinsics: Tensor, world_from_camera: Tensor, width: int, height: int) -> Cameras:

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fieldfuse.backends.dispatch import is_cpu, to_device_async
 from fieldfuse.camera import Array
-from fieldfuse.gpu import asks_freely, sent
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.lattice import Lattice
 from fieldfuse.volume.topology import BLOCK
@@ -40,8 +40,8 @@ def block_balls(lattice: Lattice, keys: Tensor) -> tuple[Tensor, Tensor]:
 
 def visible_blocks(centres: Tensor, radii: Tensor, cameras: Cameras, near: float, far: float) -> Tensor:
     """(M,) bool: a part of the ball lies in at least one camera's frustum between the depths `near` and `far` (never too few)."""
-    if not asks_freely(centres.device):
-        normals, offsets = (sent(values, centres.device) for values in _planes(cameras.to("cpu"), near, far))
+    if not is_cpu(centres.device):
+        normals, offsets = (to_device_async(values, centres.device) for values in _planes(cameras.to("cpu"), near, far))
         apart = torch.addmm(offsets, centres, normals.T) + radii[:, None]  # (M, K · 6)
         return (apart > 0).view(len(centres), -1, 6).all(2).any(1)
     local = cameras.local(centres)  # (K, M, 3)

@@ -16,9 +16,9 @@ from functools import cached_property, partial
 import torch
 from torch import Tensor
 
+from fieldfuse.backends.dispatch import is_cpu, to_device_async
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError
-from fieldfuse.gpu import asks_freely, sent
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.cull import all_blocks, block_balls, visible_at_once, visible_blocks
 from fieldfuse.nerfusion.extras.keyframe_depth import Brought, KeySweeps, Recent, picture, sensed, together
@@ -167,10 +167,10 @@ class Fusion:
         """Blocks of the coarsest lattice in the frustum of the key frame."""
         near, far, device = self.options.near, self.options.far, self.model.device
         bounds = self.stores[0].lattice.bounds(device)
-        if asks_freely(device):
+        if is_cpu(device):
             return Topology(self._keys[visible_blocks(*self._balls, cameras[0], near, far)], bounds=bounds)
         kept = self._keys.numpy()[visible_at_once(self._balls[0].numpy(), self._balls[1].numpy(), cameras[0], near, far)]
-        return Topology(sent(kept, device), bounds=bounds, host=kept)
+        return Topology(to_device_async(kept, device), bounds=bounds, host=kept)
 
     @property
     def volume(self) -> LatentVolume:
@@ -199,7 +199,7 @@ class _Pictures:
 
     def __init__(self, model: NerfusionModel, views: Views, side: int | None, precision: str) -> None:
         self.model, self.views, self.side, self.precision = model, views, side, precision
-        self.ahead = 1 if asks_freely(model.device) else AHEAD
+        self.ahead = 1 if is_cpu(model.device) else AHEAD
         self.brought = None if self.ahead == 1 else Brought(views, model.device)
         self._kept: Recent[tuple[EncodedView, Cameras]] = Recent(KEPT_PICTURES if self.ahead == 1 else KEPT_ON_DEVICE)
 

@@ -12,8 +12,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from fieldfuse import gpu
-from fieldfuse.gpu import asks_freely
+from fieldfuse.backends import dispatch
+from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import BLOCK, VOXELS, Bounds, Topology
 
@@ -40,7 +40,7 @@ class Lattice:
     def bounds(self, device: torch.device | str) -> Bounds | None:
         """Keys that blocks of the lattice can have, with one more on each side for corners of its outermost cells. On the CPU None: there
         it costs nothing to look at keys, and tables are as small as they can be."""
-        if asks_freely(torch.device(device)):
+        if is_cpu(torch.device(device)):
             return None
         most = self.resolution // BLOCK + 1
         return (-1, -1, -1), (most, most, most)
@@ -148,7 +148,7 @@ def cells(topology: Topology, corners: Tensor, every: bool) -> Tensor:
     Returns:
         (M · 512,) bool: cells whose lowest corner is that row. Corners of absent blocks count as not set.
     """
-    if gpu.there(corners):
+    if dispatch.can_use_triton(corners, dtypes=None):
         from fieldfuse.volume import blocks_gpu as blocks
 
         return blocks.pooled(topology, corners, 0, 2, every)

@@ -21,8 +21,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from fieldfuse import gpu
-from fieldfuse.gpu import asks_freely
+from fieldfuse.backends import dispatch
+from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.nerfusion.aggregate import CUES, FLAGS, aggregate, agreement, direction_spread, evidence
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.compiled import fits
@@ -209,7 +209,7 @@ class NerfusionModel(nn.Module):
     def _on_device(self, views: Sequence[EncodedView], swept: Sweep) -> bool:
         """Whether kernels on CUDA make local volumes."""
         wide = self.config.hidden in (16, 32) and self.config.channels > INSIDE
-        return not torch.is_grad_enabled() and wide and gpu.fits(swept.table, *(view.features.rows for view in views))
+        return not torch.is_grad_enabled() and wide and dispatch.can_use_triton(swept.table, *(view.features.rows for view in views))
 
     def _seen(
         self,
@@ -224,7 +224,7 @@ class NerfusionModel(nn.Module):
     ) -> tuple[Tensor, ...]:
         """`_observe` of all corners that are `wanted`, None: of all."""
         rows = torch.arange(topology.zero_row, device=topology.device) if wanted is None else wanted.nonzero().view(-1)
-        few = CHUNK if asks_freely(rows.device) else AT_ONCE
+        few = CHUNK if is_cpu(rows.device) else AT_ONCE
         parts = [self._observe(views, cameras, lattice, topology, part, near, far, swept) for part in rows.split(few)]
         return tuple(torch.cat(values) for values in zip(*parts, strict=True))
 
@@ -284,7 +284,7 @@ class NerfusionModel(nn.Module):
     def fuse_part(self, part: LatentVolume, local: LocalVolume) -> LatentVolume:
         """One step of the recurrence on the blocks of a local volume alone: `part` is the global volume there."""
         known = part.rows, part.count, local.rows, local.raw
-        if isinstance(self.fusion, FusionGRU) and not torch.is_grad_enabled() and (fits(*known) or gpu.fits(*known)):
+        if isinstance(self.fusion, FusionGRU) and not torch.is_grad_enabled() and (fits(*known) or dispatch.can_use_triton(*known)):
             rows, count = self.fusion.compiled(part, local)
             return replace(part, rows=rows, count=count)
         inside = local.known
@@ -299,7 +299,7 @@ class NerfusionModel(nn.Module):
 
     def surface_cells(self, volume: LatentVolume, seen: Tensor, gamma: float) -> Tensor:
         """`refine.surface_cells` of what the head says."""
-        if not torch.is_grad_enabled() and self.config.channels > INSIDE and gpu.fits(volume.rows):
+        if not torch.is_grad_enabled() and self.config.channels > INSIDE and dispatch.can_use_triton(volume.rows):
             from fieldfuse.networks.gpu import volumes
 
             return volumes.surface_cells(volume.topology, volume.rows, volume.count, seen, self.to_field, least_thickness(gamma))
@@ -307,7 +307,7 @@ class NerfusionModel(nn.Module):
 
     def thickness(self, volume: LatentVolume) -> Tensor:
         """(M · 512 + 1,) the first of what `head` gives, alone."""
-        if not asks_freely(volume.rows.device):
+        if not is_cpu(volume.rows.device):
             mask = torch.cat([volume.known, volume.known.new_zeros(1)])
             return torch.where(mask, self.to_field.thickness(volume.rows).float(), 0.0)
         known = volume.known.nonzero().view(-1)

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fieldfuse.gpu import OTHERS_GO_ON
+from fieldfuse.backends.dispatch import OTHERS_GO_ON
 
 MOST = 4  # recordings that are kept
 Work = Callable[..., tuple[Tensor, ...]]

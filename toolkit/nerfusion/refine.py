@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
 from fieldfuse.nerfusion.lattice import LatentVolume, cells
 from fieldfuse.volume.edit import corner_nodes, doubled, split
 from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
@@ -54,7 +54,7 @@ def split_volume(volume: LatentVolume, kept: Tensor) -> LatentVolume:
 
     Known are exactly the corners of the kept cells' children. They count little, so that what is seen finer prevails.
     """
-    if volume.topology.bounds is not None and gpu.fits(volume.rows):
+    if volume.topology.bounds is not None and dispatch.can_use_triton(volume.rows):
         from fieldfuse.volume import split_gpu
 
         given = volume.topology, kept, volume.rows.detach(), doubled(*volume.topology.bounds), INHERITED
@@ -82,7 +82,7 @@ def adopt(state: LatentVolume, inherited: LatentVolume) -> LatentVolume:
 def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
     """A copy of some blocks of a volume; where it has no such block, nothing is known."""
     slots = volume.topology.slots_of(topology)
-    if volume.topology.blocks and gpu.fits(volume.rows):
+    if volume.topology.blocks and dispatch.can_use_triton(volume.rows):
         from fieldfuse.volume import blocks_gpu as blocks
 
         return LatentVolume(volume.lattice, topology, *blocks.take(volume.rows, volume.count, slots.int(), topology))
@@ -97,7 +97,7 @@ def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
 
 def merged(before: LatentVolume, after: LatentVolume, changed: Tensor) -> LatentVolume:
     """`after` where `changed` (M · 512,), else `before`; both have the same blocks."""
-    if gpu.fits(before.rows, after.rows):
+    if dispatch.can_use_triton(before.rows, after.rows):
         from fieldfuse.networks.gpu import volumes
 
         rows, count = volumes.merge(before.rows, before.count, after.rows, after.count, changed)

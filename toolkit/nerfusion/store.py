@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
+from fieldfuse.backends.dispatch import is_cpu, to_device_async
 from fieldfuse.camera import Array
-from fieldfuse.gpu import asks_freely, sent
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice
 from fieldfuse.nerfusion.refine import adopt, part
 from fieldfuse.volume.topology import VOXELS, Topology
@@ -54,7 +54,7 @@ class GlobalStore:
         """The blocks; on CUDA brought there when they are asked for."""
         if self._topology is None:
             bounds, device = self.lattice.bounds(self._rows.device), self._rows.device
-            self._topology = Topology(sent(self._keys, device), bounds=bounds, host=self._keys)
+            self._topology = Topology(to_device_async(self._keys, device), bounds=bounds, host=self._keys)
         return self._topology
 
     @property
@@ -74,7 +74,7 @@ class GlobalStore:
     def part(self, topology: Topology, inherited: LatentVolume | None = None) -> LatentVolume:
         """A copy of some blocks, to be written next; corners of which nothing is known here are as `inherited`, a volume that has at least
         these blocks."""
-        if gpu.fits(self._rows):
+        if dispatch.can_use_triton(self._rows):
             from fieldfuse.volume import blocks_gpu as blocks
 
             slots = self._places(topology)  # may grow
@@ -85,7 +85,7 @@ class GlobalStore:
 
     def write(self, values: LatentVolume, changed: Tensor) -> None:
         """Take over the corners `changed` (M · 512,) of some blocks."""
-        if gpu.fits(self._rows, values.rows):
+        if dispatch.can_use_triton(self._rows, values.rows):
             from fieldfuse.volume import blocks_gpu as blocks
 
             slots = self._places(values.topology)
@@ -93,7 +93,7 @@ class GlobalStore:
             return
         slots = self._slots(values.topology)
         place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
-        if asks_freely(place.device):
+        if is_cpu(place.device):
             which = changed.nonzero().view(-1)
             place = place[which]
             self._rows[place] = values.rows[which]
@@ -112,7 +112,7 @@ class GlobalStore:
         self._rows[: len(rows)], self._count[: len(count)] = rows, count
         self._topology = self.topology.alike(self.topology.keys[kept])
         self._asked = None
-        if gpu.fits(self._rows):
+        if dispatch.can_use_triton(self._rows):
             self._keys, self._known = self._topology.host, _Slots()
             self._known.add(self._keys.astype(np.int64) @ CODE, np.arange(len(self._keys), dtype=np.int32))
 
@@ -126,7 +126,7 @@ class GlobalStore:
                 self._known.add(codes[missing], slots[missing])
                 self._keys, self._topology = np.concatenate([self._keys, topology.host[missing]]), None
                 self._grow()
-            self._asked = topology, sent(slots, self._rows.device)
+            self._asked = topology, to_device_async(slots, self._rows.device)
         return self._asked[1]
 
     def _slots(self, topology: Topology) -> Tensor:

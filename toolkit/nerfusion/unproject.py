@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
 from fieldfuse.nerfusion import compiled_lookup
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.pyramid import Pyramid
@@ -85,7 +85,7 @@ def look_up(views: Sequence[EncodedView], projection: Projection, step: Tensor) 
     tables = [pyramid.rows for view in views for pyramid in (view.features, view.colours)]
     if compiled_lookup.fits(tables, projection.pixels, step, projection.footprint):
         return _filled(views, projection, step)
-    if gpu.fits(*tables, projection.pixels, step, projection.footprint):
+    if dispatch.can_use_triton(*tables, projection.pixels, step, projection.footprint):
         from fieldfuse.networks.gpu import lookup
 
         return lookup.look_up(views, projection.pixels, step, projection.footprint, COLOURED)

@@ -7,7 +7,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared
 from fieldfuse.volume.topology import Topology
 
@@ -80,7 +80,7 @@ class LocalReconstruction(nn.Module):
 
     def learned(self, rows: Tensor, topology: Topology, seen: Tensor) -> Tensor:
         """(M · 512 + 1, channels) what the convolutions give, before it is `held` and added to the start."""
-        if not torch.is_grad_enabled() and gpu.takes(rows):
+        if not torch.is_grad_enabled() and dispatch.can_use_triton(rows, dtypes=dispatch.FLOATS):
             return self._prepared.convolve([[layer] for layer in self.convolutions if isinstance(layer, BlockConv3d)], rows, topology, seen)
         for number, convolution in enumerate(self.convolutions):
             rows = convolution(rows, topology, seen, number > 0)

@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from fieldfuse.backends.dispatch import choose_engine
 from fieldfuse.camera import Array, Intrinsics, pixel_grid, rays
-from fieldfuse.gpu import runs_kernels
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render.field import Field
 from fieldfuse.render.rays import RayValues, render_rays
@@ -42,16 +42,18 @@ def make_renderer(field: Field, engine: str = "auto") -> View:
     Args:
         engine: auto | numba | triton | torch. Numba runs on the CPU alone, Triton on CUDA alone.
     """
-    if engine in ("auto", "triton") and isinstance(field.decoder, Deferred) and runs_kernels(field.device):
+    deferred = isinstance(field.decoder, Deferred)
+    chosen = choose_engine(engine, "deferred" if deferred else "per_sample", field.device)
+    if chosen == "triton":
         from fieldfuse.render.triton_field import TritonRenderer
 
         return TritonRenderer(field)
-    if engine == "torch" or field.device.type != "cpu":
+    if chosen == "torch":
         return partial(_in_chunks, field)
     from fieldfuse.render.compiled import CompiledRenderer
     from fieldfuse.render.compiled_per_sample import PerSampleRenderer
 
-    compiled = CompiledRenderer(field) if isinstance(field.decoder, Deferred) else PerSampleRenderer(field)
+    compiled = CompiledRenderer(field) if deferred else PerSampleRenderer(field)
 
     def render(origins: torch.Tensor, directions: torch.Tensor) -> RayValues:
         values = compiled.render(origins, directions)

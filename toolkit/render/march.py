@@ -13,7 +13,7 @@ from functools import cached_property
 import torch
 import torch.nn.functional as F
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
 
@@ -130,7 +130,7 @@ def _coarse_distances(grid: MarchGrid, origins: Tensor, directions: Tensor, near
         return torch.where((leave > enter)[:, None], distance, torch.full_like(distance, -1.0)).clamp_max(leave.clamp_min(-1.0)[:, None])
     far = space.shell / grid.voxel  # |y| in the outermost voxel: the last step starts before it
     limit = int(2 * math.sqrt(3) * 2 * space.extent / step) + 8
-    if gpu.fits(origins, directions, jitter):
+    if dispatch.can_use_triton(origins, directions, jitter):
         from fieldfuse.render import march_gpu
 
         return march_gpu.walk(origins, directions, jitter, 2 * limit, near, step, far, space.shell, space.extent, MAX_STRETCH)

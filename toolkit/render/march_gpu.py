@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from fieldfuse.gpu import kernel
+from fieldfuse.backends.triton.launch import kernel
 
 BLOCK = 64
 

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import torch
 
+from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.camera import Intrinsics, pixel_grid, rays
 from fieldfuse.capture.types import Views
-from fieldfuse.gpu import asks_freely
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.composite import SOLID, STOP, THRESHOLD, ray_sum
@@ -121,7 +121,7 @@ class _Torch:
         self.seen = torch.zeros(len(field.occupied), device=field.device)
 
     def add(self, origins: Tensor, directions: Tensor, colours: Tensor) -> None:
-        few = CHUNK if asks_freely(self.field.device) else AT_ONCE
+        few = CHUNK if is_cpu(self.field.device) else AT_ONCE
         given = (values.to(self.field.device).split(few) for values in (origins, directions, colours))
         for o, d, c in zip(*given, strict=True):
             project_back(self.field, o, d, c, self.total, self.seen)

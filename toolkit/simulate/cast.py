@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
 from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids
 
 Tensor = torch.Tensor
@@ -49,7 +49,7 @@ def cast(solids: Solids, origins: Tensor, directions: Tensor) -> tuple[Tensor, T
         distance (N,), `FAR` where nothing is hit, and the number of the solid (N,) int64, −1 where nothing is hit. A solid that
         the ray starts in is not seen (rooms are seen from inside).
     """
-    if gpu.fits(origins, directions):
+    if dispatch.can_use_triton(origins, directions):
         from fieldfuse.simulate import cast_gpu
 
         return cast_gpu.cast(solids, origins, directions, FAR, NEAREST)

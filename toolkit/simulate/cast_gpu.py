@@ -8,7 +8,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from fieldfuse.gpu import kernel
+from fieldfuse.backends.triton.launch import kernel
 from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids
 
 BLOCK = 128

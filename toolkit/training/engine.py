@@ -11,8 +11,8 @@ from typing import Protocol
 
 import torch
 
+from fieldfuse.backends.dispatch import choose_engine
 from fieldfuse.config import Settings
-from fieldfuse.gpu import runs_kernels
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.progress import Progress
 from fieldfuse.render.field import Field
@@ -94,11 +94,8 @@ class TorchEngine(Optimiser):
 
 
 def chosen_engine(settings: Settings, device: torch.device) -> str:
-    """numba, triton or torch: the first runs on the CPU, the second on CUDA and where a ray is decoded once."""
-    if device.type == "cpu":
-        return "torch" if settings.engine == "torch" else "numba"
-    fast = settings.engine in ("auto", "triton") and settings.field.decoder == "deferred" and runs_kernels(device)
-    return "triton" if fast else "torch"
+    """numba, triton or torch: the backend of a fit with these settings on `device`."""
+    return choose_engine(settings.engine, settings.field.decoder, device)
 
 
 def make_engine(settings: Settings, field: Field, pool: PixelPool) -> Engine:

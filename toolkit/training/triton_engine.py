@@ -12,7 +12,7 @@ import math
 import torch
 import triton
 
-from fieldfuse.gpu import OTHERS_GO_ON
+from fieldfuse.backends.dispatch import OTHERS_GO_ON
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.nerfusion.encoding import DIRECTION, spherical_harmonics
 from fieldfuse.render.field import Field

@@ -9,7 +9,7 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from fieldfuse.gpu import kernel, power_of_two
+from fieldfuse.backends.triton.launch import kernel, power_of_two
 from fieldfuse.volume.tables_gpu import row_of
 from fieldfuse.volume.topology import VOXELS, Topology
 

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from fieldfuse import gpu
-from fieldfuse.gpu import asks_freely
+from fieldfuse.backends import dispatch
+from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.volume.lookup import corners, gather
 from fieldfuse.volume.rows import zero_rows
 from fieldfuse.volume.topology import BLOCK, VOXELS, Bounds, Topology, constant
@@ -34,7 +34,7 @@ def corner_nodes(topology: Topology, occupied: Tensor) -> Tensor:
 def _pooled(topology: Topology, occupied: Tensor, last: int) -> Tensor:
     """(M · 512,) bool: rows with an occupied row among the offsets −1 … `last` along each axis."""
     width = last + 2
-    if gpu.there(occupied):
+    if dispatch.can_use_triton(occupied, dtypes=None):
         from fieldfuse.volume import blocks_gpu as blocks
 
         return blocks.pooled(topology, occupied, -1, width)
@@ -196,7 +196,7 @@ def split(topology: Topology, occupied: Tensor, rows: Sequence[Tensor], mode: st
 
 def _cleared(values: Tensor, unused: Tensor) -> Tensor:
     """(N + 1, …) rows, in place, zero where `unused` (N,)."""
-    if asks_freely(values.device):
+    if is_cpu(values.device):
         return values.index_fill_(0, unused.nonzero().view(-1), 0.0)
     values[:-1].masked_fill_(unused.view(-1, *[1] * (values.ndim - 1)), 0.0)
     return values
@@ -226,7 +226,7 @@ def resample(
     if mode not in MODES or not 0 < scale < math.inf:
         raise ValueError(f"mode must be one of {', '.join(MODES)} and scale positive, not {mode!r} and {scale}")
     nodes = corner_nodes(topology, occupied)
-    if mode == "trilinear" and topology.bounds is not None and gpu.fits(*rows):  # keys are small there
+    if mode == "trilinear" and topology.bounds is not None and dispatch.can_use_triton(*rows):  # keys are small there
         from fieldfuse.volume import blocks_gpu as blocks
 
         return blocks.resample(topology, nodes, rows, new_keys, scale)
@@ -238,7 +238,7 @@ def resample(
     flat = [values.flatten(1) if values.ndim > 1 else values[:, None] for values in rows]
     side = math.floor((BLOCK - 1) * scale) + 3
     widths = [values.shape[1] for values in flat]
-    most = _ELEMENTS if asks_freely(topology.device) else _AT_ONCE
+    most = _ELEMENTS if is_cpu(topology.device) else _AT_ONCE
     step = max(most // (side**3 * (sum(widths) + 1)), 1)
     for start in range(0, len(new_keys), step):
         corner = new_keys[start : start + step].long()[..., None] * BLOCK + torch.arange(BLOCK, device=new_keys.device)
@@ -261,7 +261,7 @@ def _box_rows(topology: Topology, low: Tensor, side: int) -> Tensor:
     local = line & (BLOCK - 1)
     first = block[..., :1]
     spans = (side + BLOCK - 2) // BLOCK + 1  # as many as there can be
-    if asks_freely(low.device):
+    if is_cpu(low.device):
         spans = int((block[..., -1:] - first).amax()) + 1 if len(low) else 1
     reach = torch.arange(spans, device=low.device)
     near = first + reach  # (n, 3, spans): the blocks that a cube can touch

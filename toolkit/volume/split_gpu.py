@@ -11,7 +11,8 @@ import triton.language as tl
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fieldfuse.gpu import kernel, power_of_two, sent
+from fieldfuse.backends.dispatch import to_device_async
+from fieldfuse.backends.triton.launch import kernel, power_of_two
 from fieldfuse.volume.blocks_gpu import pooled
 from fieldfuse.volume.tables_gpu import row_of
 from fieldfuse.volume.topology import VOXELS, Bounds, Topology
@@ -124,7 +125,7 @@ def split(topology: Topology, kept: Tensor, rows: Tensor, bounds: Bounds, weight
     if topology.blocks:
         _reach[(topology.blocks,)](mask, reach)
     keys = children(topology, reach.cpu().numpy())
-    fine = Topology(sent(keys, device), bounds=bounds, host=keys)
+    fine = Topology(to_device_async(keys, device), bounds=bounds, host=keys)
     if not len(keys):
         return fine, rows.new_zeros((1, channels)), rows.new_zeros(0)
     out, count = rows.new_empty((fine.zero_row + 1, channels)), rows.new_empty(fine.zero_row)

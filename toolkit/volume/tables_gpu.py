@@ -8,7 +8,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from fieldfuse.gpu import kernel, pieces
+from fieldfuse.backends.triton.launch import kernel, pieces
 
 BLOCK = 256
 

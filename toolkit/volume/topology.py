@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fieldfuse import gpu
-from fieldfuse.gpu import asks_freely
+from fieldfuse.backends import dispatch
+from fieldfuse.backends.dispatch import is_cpu
 
 BLOCK = 8
 VOXELS = BLOCK**3
@@ -66,7 +66,7 @@ class Topology:
             bounds = None
         self.bounds, self._host = bounds, host
         self._among: tuple[Topology, Tensor, Tensor] | None = None  # where `around` is found, see `some`
-        if bounds is not None and gpu.there(keys):
+        if bounds is not None and dispatch.can_use_triton(keys, dtypes=None):
             self._believe(keys, bounds, max_table_cells)
             return
         wide = keys.to(torch.int64)
@@ -167,7 +167,7 @@ class Topology:
     def _cells(self, wide: Tensor) -> Tensor:
         """(..., 3) int64 keys inside the table's box → (...) flat cell."""
         (ox, oy, oz), (sx, sy, _) = self.table_origin, self.table_size
-        if not asks_freely(wide.device):  # fewer launches
+        if not is_cpu(wide.device):  # fewer launches
             return (wide * constant((1, sx, sx * sy), wide.device)).sum(-1).sub_((oz * sy + oy) * sx + ox)
         return ((wide[..., 2] - oz) * sy + (wide[..., 1] - oy)) * sx + (wide[..., 0] - ox)
 
@@ -191,7 +191,7 @@ class Topology:
     @cached_property
     def around(self) -> Tensor:
         """(M, 27) int64 slots of the 3×3×3 blocks around each, −1 absent; column (dz+1)·9 + (dy+1)·3 + (dx+1), itself in column 13."""
-        if self.bounds is not None and gpu.there(self.keys):
+        if self.bounds is not None and dispatch.can_use_triton(self.keys, dtypes=None):
             from fieldfuse.volume import tables_gpu
 
             if self._among is None:

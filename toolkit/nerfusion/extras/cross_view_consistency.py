@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
 from fieldfuse.nerfusion import compiled, compiled_witness
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.matching import LARGE, SMALL, TEMPERATURE
@@ -73,7 +73,7 @@ class Witness:
 
 def witness(swept: Sweep) -> Witness:
     """What others may ask a key frame, from its sweep."""
-    if gpu.fits(swept.table):
+    if dispatch.can_use_triton(swept.table):
         from fieldfuse.networks.gpu import reading
 
         return Witness(swept.camera, reading.says(swept.table, FOR, AGAINST, ABOUT), swept.lowest, swept.step)
@@ -90,7 +90,7 @@ def certain(compared: Compared, swept: Sweep) -> Tensor:
 
     On CUDA all pixels, with places that are not numbers, which no witness sees, for those that are not: how many there are is not asked.
     """
-    if gpu.fits(swept.table):
+    if dispatch.can_use_triton(swept.table):
         from fieldfuse.networks.gpu import reading
 
         return reading.surest(swept.table, compared.rays, compared.inverses, compared.camera.positions[0], SURE)
@@ -103,7 +103,7 @@ def certain(compared: Compared, swept: Sweep) -> Tensor:
 
 def alone(compared: Compared) -> tuple[Witness, Tensor]:
     """The `witness` that a key frame's pictures alone make it, and the places that they are `certain` of."""
-    if compared.empty is None and gpu.fits(compared.cost):
+    if compared.empty is None and dispatch.can_use_triton(compared.cost):
         return _alone_on_device(compared)
     swept = decide(compared)
     return witness(swept), certain(compared, swept)
@@ -142,7 +142,7 @@ def evidence(compared: Compared, witnesses: Sequence[Witness], surface: Tensor |
         return None
     planes, height, width = compared.cost.shape
     coarse = [-(-side // SPACING) for side in (height, width)]
-    if gpu.fits(compared.rays, *[one.says for one in witnesses]):
+    if dispatch.can_use_triton(compared.rays, *[one.says for one in witnesses]):
         mean = _mean_on_device(compared, (height, width), (coarse[0], coarse[1]), witnesses, surface)
         return F.interpolate(mean[None].permute(0, 3, 1, 2), (height, width), mode="bilinear")[0]
     rays = F.interpolate(compared.rays.T.view(1, 3, height, width), coarse, mode="bilinear").view(3, -1).T.contiguous()

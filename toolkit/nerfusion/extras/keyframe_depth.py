@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.types import Views
-from fieldfuse.gpu import asks_freely
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.cross_view_consistency import Witness, alone, evidence, witness
 from fieldfuse.nerfusion.extras.matching import describe
@@ -97,7 +97,7 @@ class KeySweeps:
         poses = self.views.world_from_camera[group]
         cameras = Cameras.of([self.views.intrinsics[index] for index in group], poses, self.device)
         new = [index for index in group if index not in self._described]
-        if len(new) > 1 and not asks_freely(torch.device(self.device)) and len({self.views.images[index].shape for index in new}) == 1:
+        if len(new) > 1 and not is_cpu(torch.device(self.device)) and len({self.views.images[index].shape for index in new}) == 1:
             # Together they take as many launches as one.
             for index, made in zip(new, describe(torch.cat([self._picture(index) for index in new])), strict=True):
                 self._described.put(index, made)

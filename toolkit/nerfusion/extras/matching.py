@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
 from fieldfuse.nerfusion import compiled
 
 SIDE = 256  # pixels of the long side at which pictures are compared (docs/measured/few_views.md) …
@@ -30,7 +30,7 @@ def describe(images: Tensor, side: int = SIDE) -> Tensor:
     if long > side:
         size = [max(1, round(length * side / long)) for length in images.shape[-2:]]
         images = F.interpolate(images, size, mode="bilinear", antialias=True)
-    if gpu.fits(images):
+    if dispatch.can_use_triton(images):
         from fieldfuse.networks.gpu import describe as kernels
 
         return kernels.describe(images, GREY, CONTRAST)
@@ -72,7 +72,7 @@ def semi_global(cost: Tensor) -> Tensor:
     """(D, h, w) costs → the same smoothed along four directions, each the cheapest path up to the pixel (semi-global matching)."""
     if compiled.fits(cost) and len(cost) > 2:
         return compiled.semi_global(cost, SMALL, LARGE)
-    if gpu.fits(cost):
+    if dispatch.can_use_triton(cost):
         from fieldfuse.networks.gpu import matching
 
         return matching.semi_global(cost, SMALL, LARGE)
@@ -97,7 +97,7 @@ def _paths(volume: Tensor) -> Tensor:
 
 def distribution(cost: Tensor) -> Tensor:
     """(D, h, w) costs → how likely the surface lies at each plane; sums to one over D."""
-    if gpu.fits(cost):
+    if dispatch.can_use_triton(cost):
         from fieldfuse.networks.gpu import matching
 
         return matching.distribution(cost, SMALL, LARGE, TEMPERATURE)

@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from fieldfuse import gpu
+from fieldfuse.backends import dispatch
 from fieldfuse.nerfusion import compiled
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.matching import COLOUR_GAIN, LARGE, SMALL, TEMPERATURE, UNKNOWN, difference, distribution, together
@@ -82,7 +82,7 @@ class Sweep:
         if compiled.fits(points, truncation, self.table):
             pose, lens = self.camera.world_from_camera[0], self.camera.lens(0)
             return Sighted(*compiled.look(points, truncation, self.table, pose, lens, self.lowest, self.step).T)
-        if gpu.fits(points, truncation, self.table):
+        if dispatch.can_use_triton(points, truncation, self.table):
             from fieldfuse.networks.gpu import reading
 
             return Sighted(*reading.look(points, truncation, self.table, self.camera, self.lowest, self.step))
@@ -159,7 +159,7 @@ def _compared(described: Sequence[Tensor], cameras: Cameras, near: float, far: f
     lowest, step = float(first), float(second - first)
     spacing = SPACING if empty is None else WITHIN
     shape = _shape(described[0], spacing)
-    if gpu.fits(cameras.intrinsics, *described):
+    if dispatch.can_use_triton(cameras.intrinsics, *described):
         from fieldfuse.networks.gpu.describe import pixels
 
         world, own, inverses = pixels(described[0], cameras, shape, count, 1 / far, 1 / near)
@@ -210,7 +210,7 @@ def _costs(described: Sequence[Tensor], cameras: Cameras, inverses: Tensor, rays
         for view in range(1, len(cameras)):
             comparison.add(described[view], *_way(cameras, view), cameras.lens(view))
         return comparison.result(UNKNOWN)
-    if gpu.fits(cameras.intrinsics, *described):
+    if dispatch.can_use_triton(cameras.intrinsics, *described):
         from fieldfuse.networks.gpu import matching
 
         return matching.costs(described, cameras, inverses, rays, own, COLOUR_GAIN, UNKNOWN)
@@ -235,7 +235,7 @@ def decide(compared: Compared, depth: Tensor | None = None, said: Tensor | None 
         depth: (H, W) of the key view along z in working units, where a sensor measured it; 0 or not finite where it did not.
         said: (D, h, w) that makes planes likelier, in units of the cost (`witness.evidence`).
     """
-    if compared.empty is None and depth is None and gpu.fits(compared.cost):
+    if compared.empty is None and depth is None and dispatch.can_use_triton(compared.cost):
         from fieldfuse.networks.gpu import matching
 
         table = matching.decided(compared.cost, said, SMALL, LARGE, TEMPERATURE, compared.step, PEAK)
@@ -243,7 +243,7 @@ def decide(compared: Compared, depth: Tensor | None = None, said: Tensor | None 
     likely = distribution(compared.cost if said is None else compared.cost - said)
     if compared.empty is not None:
         likely = carved(likely, compared.empty)
-    if depth is not None and gpu.fits(likely, compared.inverses, depth):
+    if depth is not None and dispatch.can_use_triton(likely, compared.inverses, depth):
         from fieldfuse.networks.gpu.measured import measured as table_of
 
         asked = _asked(likely, depth, compared.spacing, compared.window)
@@ -324,7 +324,7 @@ def _table(likely: Tensor, step: float) -> Tensor:
     """(D, h, w) likelihoods, farthest first → what `Sweep` keeps."""
     if compiled.fits(likely):
         return compiled.table(likely, step, PEAK)
-    if gpu.fits(likely):
+    if dispatch.can_use_triton(likely):
         from fieldfuse.networks.gpu import matching
 
         return matching.table(likely, step, PEAK)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from fieldfuse.gpu import sent
+from fieldfuse.backends.dispatch import to_device_async
 from fieldfuse.nerfusion.training.samples import Pictures
 
 Tensor = torch.Tensor
@@ -58,7 +58,8 @@ def random_rays(pictures: Pictures, targets: Tensor, count: int, generator: torc
     flat = targets.reshape(-1).cpu()
     view = flat[torch.arange(count) % len(flat)]
     pixel = torch.randint(height * width, (count,), generator=generator)
-    return rays_through(pictures, *sent(torch.stack([view, pixel // width, pixel % width]).numpy(), pictures.images.device).unbind())
+    chosen = torch.stack([view, pixel // width, pixel % width]).numpy()
+    return rays_through(pictures, *to_device_async(chosen, pictures.images.device).unbind())
 
 
 def in_sight(rays: TargetRays, pictures: Pictures, references: Tensor) -> Tensor:

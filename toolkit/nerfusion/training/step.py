@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from fieldfuse.gpu import sent
+from fieldfuse.backends.dispatch import to_device_async
 from fieldfuse.nerfusion.extras.matching import SIDE
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume
 from fieldfuse.nerfusion.losses import Traced, annealed, rendering_loss
@@ -61,7 +61,7 @@ def background_of(pictures: Pictures, count: int, generator: torch.Generator | N
         return torch.tensor(pictures.background, device=device)
     if generator is None:
         return torch.full((3,), 0.5, device=device)
-    return sent(torch.rand(count, 3, generator=generator).numpy(), device)
+    return to_device_async(torch.rand(count, 3, generator=generator).numpy(), device)
 
 
 def local_of(model: NerfusionModel, sample: Sample, frame: int, log: Outcome | None = None) -> LocalVolume:

@@ -1,1 +1,1 @@
-"""The networks' kernels for CUDA (`toolkit/gpu.py`)."""
+"""The networks' kernels for CUDA."""

@@ -7,7 +7,7 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from fieldfuse.gpu import kernel, pieces, power_of_two
+from fieldfuse.backends.triton.launch import kernel, pieces, power_of_two
 from fieldfuse.volume.topology import VOXELS
 
 TILE = 128  # voxels of a block at a time: two of its layers …

@@ -9,7 +9,7 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from fieldfuse.gpu import kernel, pieces
+from fieldfuse.backends.triton.launch import kernel, pieces
 from fieldfuse.networks.gpu.matching import CHANNELS, COLOURS, corners, lens
 
 BLOCK = 32  # pixels whose neighbours or channels are looked at together

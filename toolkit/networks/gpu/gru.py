@@ -7,7 +7,7 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from fieldfuse.gpu import kernel, pieces, power_of_two
+from fieldfuse.backends.triton.launch import kernel, pieces, power_of_two
 from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
 from fieldfuse.networks.gpu.volumes import tanh
 from fieldfuse.volume.topology import VOXELS

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from fieldfuse.gpu import sent
+from fieldfuse.backends.dispatch import to_device_async
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.plane_sweep import Sweep
 from fieldfuse.nerfusion.lattice import Lattice, LocalVolume
@@ -49,7 +49,7 @@ def local_volume(
     filled_keys, busy_keys = keys[filled], keys[busy]
     # All that the processor has to say goes there in one piece.
     parts: list[Any] = [slots, filled_keys, busy_keys, slots[1, filled], slots[0, busy], busy]
-    whole = sent(np.concatenate([part.reshape(-1) for part in parts]), topology.device).split([part.size for part in parts])
+    whole = to_device_async(np.concatenate([part.reshape(-1) for part in parts]), topology.device).split([part.size for part in parts])
     kept = topology.alike(whole[1].view(-1, 3), filled_keys)
     # Beside which blocks they lie is read in a table that others need as well.
     given = whole[2].view(-1, 3), busy_keys

@@ -12,7 +12,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from fieldfuse.gpu import kernel, pieces, power_of_two
+from fieldfuse.backends.triton.launch import kernel, pieces, power_of_two
 
 BLOCK = 64  # voxels at a time
 

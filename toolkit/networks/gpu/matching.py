@@ -16,7 +16,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from fieldfuse.gpu import kernel, pieces, power_of_two, sent
+from fieldfuse.backends.dispatch import to_device_async
+from fieldfuse.backends.triton.launch import kernel, pieces, power_of_two
 
 CHANNELS = 21  # of a descriptor, colours first
 COLOURS = 3
@@ -107,7 +108,7 @@ def _cost(
 def noted(pictures: Sequence[Tensor]) -> Tensor:
     """(K, 3) int64 on the device of (C, h, w) pictures, contiguous: where each lies, its height and its width."""
     rows = [(picture.data_ptr(), *picture.shape[1:]) for picture in pictures]
-    return sent(np.array(rows, np.int64), pictures[0].device)
+    return to_device_async(np.array(rows, np.int64), pictures[0].device)
 
 
 def costs(described: Sequence[Tensor], cameras: Any, inverses: Tensor, rays: Tensor, own: Tensor, gain: float, unknown: float) -> Tensor:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import triton.language as tl
 from torch import Tensor
 
-from fieldfuse.gpu import kernel, pieces
+from fieldfuse.backends.triton.launch import kernel, pieces
 from fieldfuse.networks.gpu import matching
 from fieldfuse.networks.gpu.matching import corners, table_of
 

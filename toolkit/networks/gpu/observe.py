@@ -15,7 +15,8 @@ import triton.language as tl
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fieldfuse.gpu import kernel, pieces, power_of_two, sent
+from fieldfuse.backends.dispatch import to_device_async
+from fieldfuse.backends.triton.launch import kernel, pieces, power_of_two
 from fieldfuse.networks.gpu.lookup import corners
 from fieldfuse.networks.gpu.reading import local, sighted
 
@@ -305,7 +306,7 @@ class Observer:
         if count:
             fine, coarse = self.views[0].colours, self.views[0].features
             rows = [(view.features.rows.contiguous(), view.colours.rows.contiguous()) for view in self.views]
-            pictures = sent(np.array([of.data_ptr() for pair in rows for of in pair], np.int64), keys.device)
+            pictures = to_device_async(np.array([of.data_ptr() for pair in rows for of in pair], np.int64), keys.device)
             wide = coarse.rows.shape[1]
             truncation, least, blind, gain, part, _ = self.numbers
             _observe[(pieces(count, BLOCK),)](

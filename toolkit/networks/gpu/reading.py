@@ -12,7 +12,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from fieldfuse.gpu import kernel, pieces, sent
+from fieldfuse.backends.dispatch import to_device_async
+from fieldfuse.backends.triton.launch import kernel, pieces
 from fieldfuse.networks.gpu import matching
 
 BLOCK = 128
@@ -202,7 +203,7 @@ def _mean(
 
 def numbers(camera: Any, says: Tensor, lowest: float, step: float) -> Tensor:
     """(23,) that a witness is asked by: its pose (12), lens (4) and size (2), its planes' lowest and step, and h, w and D."""
-    rest = sent(np.array([lowest, step, says.shape[1], says.shape[2], says.shape[0]], np.float32), says.device)
+    rest = to_device_async(np.array([lowest, step, says.shape[1], says.shape[2], says.shape[0]], np.float32), says.device)
     return torch.cat([camera.world_from_camera[0, :3].reshape(12), camera.intrinsics[0], camera.size[0], rest])
 
 
@@ -218,7 +219,7 @@ class Asked:
         # Kept until kernels that go to their addresses are on their way.
         self._kept = [(matching.rows(one.says), one.numbers()) for one in witnesses]
         places = np.array([(says.data_ptr(), row.data_ptr()) for says, row in self._kept], np.int64)
-        self._addresses = sent(places, self._kept[0][0].device)
+        self._addresses = to_device_async(places, self._kept[0][0].device)
 
     def confirmed(self, points: Tensor) -> Tensor:
         """(W, B, 2): for each witness the sum of what it says of places (N, 3), and how many of them it sees, in B parts."""

@@ -10,7 +10,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from fieldfuse.gpu import kernel, pieces, power_of_two
+from fieldfuse.backends.triton.launch import kernel, pieces, power_of_two
 from fieldfuse.nerfusion.volume_net import CHANGE, INSIDE
 from fieldfuse.volume.topology import VOXELS, Topology
 

@@ -1,0 +1,1 @@
+"""Kernels in Triton, for CUDA. Only imported where `dispatch` has found that they can be used."""
