@@ -7,7 +7,7 @@ import math
 import torch
 
 SIDE = 16  # voxels along the lattice
-TOLERANCE = 1e-5  # of opacity and colour
+TOLERANCE = 2e-4  # of opacity and colour: what a kernel that is right may round on any device
 
 
 def engine_errors() -> dict[str, float]:
