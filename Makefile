@@ -28,7 +28,7 @@ FORGET := find toolkit pipelines -name '*.nb[ic]' -delete
 RUFF_RULES := E,F,W,I,B,UP,PTH,RUF,PERF,SIM,C4,PIE,RET,T20,S102,S301,S307,S506,S602,S605
 # RUF001-003: × and – are meant. PERF203: a try inside a loop is how one bad frame is told from a bad capture.
 RUFF := $(BIN)/ruff check --isolated --line-length 140 --target-version py311 --config 'lint.isort.known-first-party=["fieldfuse"]' --select $(RUFF_RULES) --ignore RUF001,RUF002,RUF003,PERF203
-SOURCES := toolkit pipelines configs scripts tests
+SOURCES := toolkit pipelines configs benchmarks tests .ci
 # Static tools find packages by their folders' names: a folder of links that is laid out as the wheel is.
 LINKS := build/links
 
@@ -81,6 +81,7 @@ imports: $(VENV)/.installed-test links
 
 links:
 	@rm -rf $(LINKS) && mkdir -p $(LINKS)/fieldfuse && ln -s $(CURDIR)/toolkit/* $(CURDIR)/pipelines $(CURDIR)/configs $(LINKS)/fieldfuse/
+	@ln -s $(CURDIR)/benchmarks $(LINKS)/
 
 docs: $(VENV)/.installed-docs links
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet

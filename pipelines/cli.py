@@ -19,15 +19,9 @@ from fieldfuse import __version__
 from fieldfuse.errors import FieldfuseError, Interrupted
 from fieldfuse.pipelines import (
     bake,
-    bench,
-    bench_captures,
-    bench_effects,
-    bench_engines,
-    bench_keyframes,
     compare,
     evaluate,
     export,
-    few_views,
     finetune,
     info,
     poses,
@@ -82,10 +76,10 @@ def doctor(json: Json = False) -> None:
         raise typer.Exit(1)
 
 
-def main() -> None:
+def main(commands: typer.Typer = app) -> None:
     """Entry point of the command line."""
     try:
-        app()
+        commands()
     except Interrupted as error:
         _fail(f"{error}", STOPPED)
     except FieldfuseError as error:
@@ -100,12 +94,12 @@ def main() -> None:
         _fail(f"something unexpected went wrong ({type(error).__name__}); {place}", 1, error)
 
 
-def program() -> None:
+def program(commands: typer.Typer = app) -> None:
     """The command line as a process of its own: while it ends, one more Ctrl-C changes nothing."""
     stopped = True
     try:
         with suppress(KeyboardInterrupt):  # it came when `main` was ending already
-            main()
+            main(commands)
             stopped = False
     except SystemExit as end:
         stopped = end.code == STOPPED
@@ -145,17 +139,8 @@ for _command in (
     simulate.simulate,
 ):
     app.command()(_command)
-bench.app.command("captures")(bench_captures.captures)
-bench.app.command("effects")(bench_effects.effects)
-bench.app.command("effects-by-hand")(bench_effects.by_hand)
-bench.app.command("few-views")(few_views.few_views)
-bench.app.command("ablations")(few_views.ablations)
-bench.app.command("engines")(bench_engines.engines)
-bench.app.command("keyframes")(bench_keyframes.keyframes)
-for _list in (app, bench.app):
-    for _entry in _list.registered_commands:  # in the list of commands their first sentences are wrapped like this, and cut off otherwise
-        _entry.short_help = " ".join((_entry.help or inspect.getdoc(_entry.callback) or "").partition("\n\n")[0].split())
-app.add_typer(bench.app, name="bench")
+for _entry in app.registered_commands:  # in the list of commands their first sentences are wrapped like this, and cut off otherwise
+    _entry.short_help = " ".join((_entry.help or inspect.getdoc(_entry.callback) or "").partition("\n\n")[0].split())
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from fieldfuse.steps import network_weights
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Views
     from fieldfuse.config import Settings
+    from fieldfuse.nerfusion.keyframes import KeyFrames
     from fieldfuse.poses.scene import Scene
     from fieldfuse.progress import Progress
     from fieldfuse.render.field import Field
@@ -38,11 +39,25 @@ def weights_state(settings: Settings) -> str:
     return fingerprint(network_weights(settings))
 
 
+def training_key_frames(views: Views, scene: Scene, settings: Settings) -> KeyFrames:
+    """Key frames among the training views, as a run chooses them but for sharpness."""
+    from fieldfuse.nerfusion.keyframes import select_keyframes
+
+    train = np.flatnonzero(~np.asarray(views.test))
+    return select_keyframes(
+        views.world_from_camera[train],
+        [views.intrinsics[int(index)] for index in train],
+        scene.median_depth,
+        method=settings.keyframes.method,
+        every=settings.keyframes.every,
+        most=settings.keyframes.most,
+    )
+
+
 def direct_field(
     settings: Settings, views: Views, scene: Scene, progress: Progress, share: float = 1.0, voxel_factor: float = 1.0
 ) -> DirectField:
-    """Fuse the key frames (about `share` of them, evenly spread) of the training views into a field. Key frames are chosen as by a run but
-    for sharpness.
+    """Fuse the key frames (about `share` of them, evenly spread) of the training views into a field.
 
     Args:
         voxel_factor: voxels this many times as large as `network.voxels` asks for.
@@ -51,11 +66,10 @@ def direct_field(
         InputError: there is no training view, or no weights.
         Interrupted: the user asked to stop.
     """
-    from fieldfuse.evaluation.few_views import Ground
     from fieldfuse.nerfusion.keyframes import KeyFrames
     from fieldfuse.training.from_network import Inference, NetworkOptions, load_networks, voxels_to_median
 
-    keys = Ground(views, scene, settings).keys()
+    keys = training_key_frames(views, scene, settings)
     if share < 1:
         kept = np.unique(np.linspace(0, len(keys.indices) - 1, max(1, round(share * len(keys.indices)))).round().astype(int))
         keys = KeyFrames(keys.indices[kept], keys.neighbours[kept])

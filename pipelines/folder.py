@@ -218,7 +218,9 @@ class RunFolder:
 
 def command_line() -> str:
     """The command as it was typed, to be repeated by copying it."""
-    return shlex.join(["fieldfuse", *sys.argv[1:]])
+    script = Path(sys.argv[0])
+    program = ["python", "-m", f"benchmarks.{script.stem}"] if script.parent.name == "benchmarks" else ["fieldfuse"]
+    return shlex.join([*program, *sys.argv[1:]])
 
 
 def failed_write(error: Exception) -> bool:

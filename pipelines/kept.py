@@ -36,10 +36,6 @@ POINT = {
     "?variant": (None, TEXT), "?error": (None, TEXT), "?measured": ANY, "?wanted": (None, WANTED), "?changed": (None, WANTED), "*": MAYBE
 }  # fmt: skip
 TRADEOFF = {"rows": [POINT], "command": TEXT, "unit": (None, TEXT), "machine": {"*": (None, NUMBER, TEXT)}, "*": ANY}
-FEW_VIEWS = {
-    "rows": [{"views": NUMBER, "start": TEXT, "budget": NUMBER, "?psnr": MAYBE, "?seconds": NUMBER, "*": (None, NUMBER, TEXT, FLAG)}],
-    "*": ANY
-}  # fmt: skip
 MEASURED_POINT = {"key": TEXT, "crashed": FLAG, "wall_seconds": NUMBER, "rows": [POINT]}
 EXPORT_FACTS = {"mesh": (None, MESH), "?notes": [TEXT], "?note": (None, TEXT)}
 TIMELINE = [{"seconds": NUMBER, "psnr": (None, NUMBER), "*": (None, NUMBER, TEXT)}]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import importlib
 import re
 import subprocess
 import sys
@@ -59,7 +60,7 @@ def test_every_page_is_in_the_index() -> None:
 
 
 def test_pages_that_the_code_names_exist() -> None:
-    for folder in ("toolkit", "pipelines", "configs", "scripts", "tests"):
+    for folder in ("toolkit", "pipelines", "configs", "benchmarks", "tests"):
         for path in sorted((ROOT / folder).rglob("*")):
             if path.suffix in (".py", ".yaml", ".j2", ".js", ".html"):
                 for page in re.findall(r"\bdocs/[\w/]+\.md", path.read_text(encoding="utf-8")):
@@ -78,8 +79,26 @@ def test_commands_and_options_exist(page: Path) -> None:
         for word in words:
             if word.startswith("--") and not word.endswith(".sh"):
                 assert word.split("=")[0].rstrip(",;.)") in known, line
+    for name, rest in re.findall(r"python -m benchmarks\.(\w+)([^\n`|#]*)", text):
+        options = {option for parameter in benchmark(name).params for option in parameter.opts}
+        assert {word.split("=")[0] for word in rest.split() if word.startswith("--")} <= options, f"{name}{rest}"
     for name in re.findall(r"`make ([a-z]+)`", text):
         assert f"\n{name}:" in (ROOT / "Makefile").read_text(encoding="utf-8"), name
+
+
+def benchmark(name: str) -> typer.core.TyperCommand:
+    """Its command line."""
+    command = typer.main.get_command(importlib.import_module(f"benchmarks.{name}").app)
+    assert isinstance(command, typer.core.TyperCommand)
+    return command
+
+
+def test_every_benchmark_is_in_the_docs() -> None:
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    names = [path.stem for path in (ROOT / "benchmarks").glob("*.py") if "\napp = application(" in path.read_text(encoding="utf-8")]
+    assert len(names) > 8
+    for name in names:
+        assert f"python -m benchmarks.{name}" in text, name
 
 
 def test_every_command_is_in_the_readme() -> None:
@@ -104,8 +123,9 @@ def test_settings_that_the_docs_name_exist() -> None:
 
 
 def test_places_in_the_tree_exist() -> None:
+    folders = "toolkit|pipelines|configs|benchmarks|tests|examples"
     for page in PAGES:
-        for place in re.findall(r"`((?:toolkit|pipelines|configs|tests|scripts|examples)/[\w./]*)`", page.read_text(encoding="utf-8")):
+        for place in re.findall(rf"`((?:{folders})/[\w./]*)`", page.read_text(encoding="utf-8")):
             assert (ROOT / place).exists(), f"{place} in {where(page)}"
 
 
@@ -124,7 +144,7 @@ def test_the_architecture_page_has_the_layers_of_the_contract() -> None:
 def test_the_site_has_every_page() -> None:
     text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     named = {ROOT / "docs" / name for name in re.findall(r": ([\w/]+\.md)", text.partition("\nnav:\n")[2])}
-    spec = spec_from_file_location("site_hooks", ROOT / "scripts" / "site_hooks.py")
+    spec = spec_from_file_location("site_hooks", ROOT / ".ci" / "site_hooks.py")
     assert spec is not None and spec.loader is not None
     hooks = module_from_spec(spec)
     spec.loader.exec_module(hooks)
@@ -143,7 +163,7 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     links.mkdir(parents=True)
     for place in (*(ROOT / "toolkit").iterdir(), ROOT / "pipelines", ROOT / "configs"):
         (links / place.name).symlink_to(place)
-    for name in ("docs", "scripts", "toolkit", "mkdocs.yml", "README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
+    for name in ("docs", ".ci", "toolkit", "mkdocs.yml", "README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
         (tmp_path / name).symlink_to(ROOT / name)
     done = subprocess.run([sys.executable, "-m", "mkdocs", "build", "--strict"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

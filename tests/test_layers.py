@@ -22,8 +22,8 @@ def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
     """The packages and their contract, to be broken on purpose."""
-    for name in ("toolkit", "pipelines", "configs"):
-        place = tmp_path / "fieldfuse" / ("" if name == "toolkit" else name)
+    for name in ("toolkit", "pipelines", "configs", "benchmarks"):
+        place = tmp_path / (name if name == "benchmarks" else "fieldfuse" if name == "toolkit" else f"fieldfuse/{name}")
         shutil.copytree(ROOT / name, place, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "setup.cfg", tmp_path)
     return tmp_path
@@ -40,6 +40,7 @@ def test_the_contracts_are_kept(copy: Path) -> None:
         ("fieldfuse/camera.py", "from fieldfuse.render import march", "One direction of flow"),
         ("fieldfuse/files.py", "import fieldfuse.camera", "One direction of flow"),
         ("fieldfuse/evaluation/__init__.py", "import fieldfuse.pipelines.doctor", "One direction of flow"),
+        ("fieldfuse/pipelines/doctor.py", "import benchmarks.timing", "imports no benchmark"),
         ("fieldfuse/training/__init__.py", "import open3d", "needs no Open3D"),
         ("fieldfuse/capture/__init__.py", "import pycolmap", "needs no Open3D"),
         ("fieldfuse/volume/topology.py", "from fieldfuse.volume import grid", "needs no Open3D"),
@@ -85,7 +86,7 @@ def test_the_layers_name_only_what_may_exist() -> None:
 
 def test_no_module_gives_a_constant_two_values() -> None:
     """A name given to two thresholds of one module silently makes the first the second."""
-    for path in [*(ROOT / "toolkit").rglob("*.py"), *(ROOT / "pipelines").rglob("*.py")]:
+    for path in [path for folder in ("toolkit", "pipelines", "benchmarks") for path in (ROOT / folder).rglob("*.py")]:
         lines = ast.parse(path.read_text(encoding="utf-8")).body
         goals = [goal for line in lines if isinstance(line, ast.Assign) for goal in line.targets]
         names = [node.id for goal in goals for node in ast.walk(goal) if isinstance(node, ast.Name)]

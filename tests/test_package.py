@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = (".ci", "benchmarks", "configs", "docs", "examples", "pipelines", "scripts", "tests", "toolkit")
+FOLDERS = (".ci", "benchmarks", "configs", "docs", "examples", "pipelines", "tests", "toolkit")
 MADE = ("__pycache__", "*.egg-info", "build", "dist", "*.nb[ic]")
 OURS = ("configs", "pipelines", "toolkit")  # folders here, and names that another project may have, too
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.protocols import suite_of
 from fieldfuse.camera import Similarity
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.images import load_depth, load_image
@@ -20,7 +21,6 @@ from fieldfuse.capture.select import select_frames
 from fieldfuse.capture.sens import scan
 from fieldfuse.config import CaptureSettings
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.suites import suite_of
 from fieldfuse.nerfusion.training.datasets.scannet import scannet_folders, scannet_scene
 from tests.capture.layouts import OFF_CENTRE, SCANNET_COLOUR, rows, sens_of, whole_centres, write_sens
 from tests.capture.made import eyes, pixel_error, render

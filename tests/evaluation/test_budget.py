@@ -13,7 +13,6 @@ from fieldfuse.config import load_settings
 from fieldfuse.evaluation import budget as model
 from fieldfuse.evaluation.budget import KINDS, Choice, Speed, Work, amounts, choose, effects_work, most_export_seconds, predict, sfm_work
 from fieldfuse.evaluation.budget_probe import self_test
-from fieldfuse.evaluation.budget_table import budget_table
 from fieldfuse.files import write_json
 from fieldfuse.poses.job import MAX_EXHAUSTIVE
 
@@ -194,18 +193,3 @@ def test_finer_depth_of_a_mesh_takes_longer_and_less_than_rendering_it_would() -
     small, finer, rendered = (model.mesh_work(FOX, choice) for choice in (Choice(320), Choice(320, mesh_size=400), Choice(400)))
     assert all(a < b < c for a, b, c in zip(small, finer, rendered, strict=True))
     assert model.mesh_work(FOX, Choice(320, mesh_size=320)) == small
-
-
-def test_runs_of_a_budget_become_one_table() -> None:
-    def run(source: str, asked: float, real: float, effects: bool) -> dict[str, object]:
-        choice = {"image_size": 240, "fit_seconds": 12.5, "resolution": 256, "video_frames": 0, "effects": effects}
-        told = {"asked_seconds": asked, "predicted_seconds": asked, "real_seconds": real, "stages": {}, "choice": choice}
-        return {"source": source, "budget": told, "evaluation": {"field": {"psnr": 27.25}}}
-
-    fox = run("/data/fox", 30, 36, False)
-    fox["budget"]["choice"] |= {"texture": False, "page": True}  # type: ignore[index]
-    text = budget_table([run("/data/lego", 60, 63, True), fox], ["fieldfuse run a", "fieldfuse run b"])
-    rows = [line for line in text.splitlines() if line.startswith("| ")]
-    assert rows[2].startswith("| fox | 30 s | 30.0 s | 36.0 s | +20% | not looked for |") and rows[3].startswith("| lego | 60 s |")
-    assert "240 pixels, 256³, no video, no texture | 27.2 |" in rows[2] and "256³, no video | 27.2 |" in rows[3]
-    assert "1 of 2 runs took what was predicted, within 15%" in text and "    fieldfuse run b" in text

@@ -16,7 +16,7 @@ import torch
 
 from fieldfuse.camera import Array
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.speed_state import around, lens
+from fieldfuse.evaluation.sphere import around, lens
 from fieldfuse.export.page import Tour, corner_densities, decoder_blocks, page, require_page, write_page
 from fieldfuse.nerfusion.decoder import Deferred, make_decoder
 from fieldfuse.render.bake import BakedField, bake

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from fieldfuse.evaluation.speed import pinned
+from benchmarks.timing import pinned
 from fieldfuse.nerfusion import compiled
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.cross_view_consistency import Witness, certain, evidence, witness

@@ -9,7 +9,7 @@ import pytest
 import torch
 from numba import njit
 
-from fieldfuse.evaluation.speed import pinned
+from benchmarks.timing import pinned
 from fieldfuse.nerfusion import compiled_gru, model
 from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
 from fieldfuse.volume.topology import Topology

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import json
 import os
@@ -139,12 +140,19 @@ def said(*arguments: object) -> Answer:
     return Answer(code, out.getvalue(), err.getvalue())
 
 
-def _main(arguments: tuple[object, ...]) -> int:
+def bench(capsys: pytest.CaptureFixture[str], name: str, *arguments: object) -> Answer:
+    """`python -m benchmarks.NAME …` in this process."""
+    code = _main(arguments, f"benchmarks/{name}.py", importlib.import_module(f"benchmarks.{name}").app)
+    shown = capsys.readouterr()
+    return Answer(code, shown.out, shown.err)
+
+
+def _main(arguments: tuple[object, ...], program: str = "fieldfuse", *commands: Any) -> int:
     """The exit code."""
     from fieldfuse.pipelines import cli
 
-    with mock.patch.object(sys, "argv", ["fieldfuse", *map(str, arguments)]), pytest.raises(SystemExit) as end:
-        cli.main()
+    with mock.patch.object(sys, "argv", [program, *map(str, arguments)]), pytest.raises(SystemExit) as end:
+        cli.main(*commands)
     return int(end.value.code or 0)
 
 

@@ -19,7 +19,7 @@ from fieldfuse.files import read_json, write_json
 from fieldfuse.pipelines.steps_compare import choose_surfaces
 from fieldfuse.tsdf.mesh import Mesh
 from tests.evaluation.browser import embedded_pictures, open_page
-from tests.pipelines.made import call
+from tests.pipelines.made import bench, call
 from tests.pipelines.short import steady
 from tests.pipelines.test_matched import CAMERA, make_corner
 from tests.poses.textured import PLANES, arc, render
@@ -117,7 +117,7 @@ def test_the_page_shows_them(compared: Path, tmp_path: Path) -> None:
 def test_its_table_goes_into_a_page(compared: Path, tmp_path: Path, capsys: Capsys) -> None:
     page = tmp_path / "page.md"
     page.write_text("# Numbers\n", encoding="utf-8")
-    assert call(capsys, "bench", "table", compared / "compare.json", "--into", page, "--name", "corner").code == 0
+    assert bench(capsys, "table", compared / "compare.json", "--into", page, "--name", "corner").code == 0
     text = page.read_text(encoding="utf-8")
     head = "|  | Field | Field, not fitted | TSDF | TSDF of matched pictures | TSDF of exact depth |"
     assert head in text and "F-score at 1 voxel" in text and "Depth by matching, training views" in text

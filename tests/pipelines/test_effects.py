@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.simulated import known_light
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.prepare import held_out
 from fieldfuse.config import load_settings
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.effects.decide import Decided, asleep, decide, wish
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.effects_truth import known_light
 from fieldfuse.pipelines.kept import EFFECTS, fitting
 from fieldfuse.pipelines.steps_effects import moved_cameras
 from fieldfuse.simulate.settings import scene_file

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,12 +14,10 @@ import pytest
 import torch
 
 from fieldfuse.config import load_settings
-from fieldfuse.errors import InputError
 from fieldfuse.files import read_json
-from fieldfuse.pipelines.few_views import numbers, part_of, wanted
 from fieldfuse.pipelines.steps_network import uses_network
 from tests.pipelines.made import CAMERA, call, make_room
-from tests.pipelines.short import clocked, start, wait_for
+from tests.pipelines.short import start, wait_for
 
 Capsys = pytest.CaptureFixture[str]
 FAST = [
@@ -150,46 +147,6 @@ def test_a_run_killed_among_the_key_frames_goes_on(room: Path, tmp_path: Path, c
     assert cached["keyframes"] and not list(out.rglob(".tmp-*"))
 
 
-def test_tables_of_few_views_go_on_where_they_stopped(room: Path, tmp_path: Path, capsys: Capsys) -> None:
-    out = tmp_path / "table"
-    settings = ["--set", "field.resolution=32", "--set", "network.voxels=12"]
-    first = call(capsys, "bench", "few-views", room, "--out", out, "--views", "3", "--budgets", "0.5", "--starts", "classical", *settings)
-    assert first.code == 0, first.err
-    assert read_json(out / "few_views.json")["settings"]["fit"]["budget"] == load_settings().fit.budget, "rows tell their own"
-    kept = read_json(out / "few_views.json")["rows"]
-    assert [row["start"] for row in kept] == ["nearest", "classical"]
-    answer = call(capsys, "bench", "few-views", room, "--out", out, "--views", "3,all", "--budgets", "0.5", *settings)
-    assert answer.code == 0, answer.err
-    rows = read_json(out / "few_views.json")["rows"]
-    assert rows[:2] == kept and {(row["views"], row["start"]) for row in rows} == {
-        (count, start) for count in (3, 10) for start in ("nearest", "direct", "network", "classical")
-    }
-    assert all(5 < row["psnr"] < 60 for row in rows)
-    lines = (out / "few_views.md").read_text().splitlines()
-    assert len(lines) == 4 and lines[2].startswith("| 3 |") and "classical start, 0.5 s" in lines[0] and lines[0] in answer.out
-
-
-def test_rows_of_other_settings_do_not_go_into_one_table(room: Path, tmp_path: Path, capsys: Capsys) -> None:
-    out, found = tmp_path / "table", []
-    for side in (48, 32):
-        size = ["--image-size", side, "--set", "effects=off"]
-        answer = call(capsys, "bench", "few-views", room, "--out", out, "--views", "3", "--starts", ",", *size)  # the nearest picture alone
-        assert answer.code == 0 and ("of other settings" in answer.err) is (side == 32)
-        found += read_json(out / "few_views.json")["rows"]
-    assert len(found) == 2 and found[0]["psnr"] != found[1]["psnr"]
-
-
-def test_parts_of_the_networks_can_be_switched_off(room: Path, tmp_path: Path, capsys: Capsys) -> None:
-    settings = ["--set", "network.voxels=12", "--views", "4"]
-    answer = call(capsys, "bench", "ablations", room, "--out", tmp_path / "table", *settings, "--quiet")
-    assert answer.code == 0, answer.err
-    rows = {row["part"]: row for row in read_json(tmp_path / "table" / "ablations.json")["rows"]}
-    parts = ["whole", "no variance", "no direction code", "mean instead of GRU", "no pruning", "sweeps alone", "colours of the fusion"]
-    assert list(rows) == parts
-    others = [row["psnr"] for name, row in rows.items() if name != "whole"]
-    assert all(value != rows["whole"]["psnr"] for value in others) and len(set(others)) == len(parts) - 1
-
-
 @pytest.mark.parametrize(("count", "used"), [(23, True), (24, False)])
 def test_which_start_is_automatic(count: int, used: bool) -> None:
     settings = load_settings()
@@ -202,43 +159,7 @@ def test_which_start_is_automatic(count: int, used: bool) -> None:
     assert uses_network(job, views)  # type: ignore[arg-type]
 
 
-def test_lists_of_numbers() -> None:
-    assert numbers("30, 120", "budgets") == [30.0, 120.0] and wanted("3,all") == ["3", "all"] and part_of("direct") == ["direct"]
-    for text in ("", "x", "-1", "nan"):
-        with pytest.raises(InputError, match="--budgets"):
-            numbers(text, "budgets")
-    with pytest.raises(InputError, match="'0'"):
-        wanted("0")
-    with pytest.raises(InputError, match="magic"):
-        part_of("magic")
-
-
-def test_engines_are_measured_side_by_side(room: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each engine fits within the same seconds, and pictures of its field are timed."""
-    monkeypatch.setattr("fieldfuse.evaluation.engines.PICTURE", (96, 72))
-    monkeypatch.setattr("fieldfuse.evaluation.engines.STEPS", 2)
-    with clocked(lambda: time.process_time):  # what else the machine does is not counted
-        answer = call(
-            *(capsys, "bench", "engines", room, "--out", tmp_path / "engines", "--budgets", "1", "--engines", "auto,torch"),
-            *("--threads", 1, "--set", "field.resolution=32", "--set", "effects=off", "--quiet"),
-        )
-    assert answer.code == 0, answer.err
-    kept = read_json(tmp_path / "engines" / "engines.json")
-    assert [row["engine"] for row in kept["rows"]] == ["numba", "torch"]
-    for row in kept["rows"]:
-        assert row["psnr"] > 10 and row["picture_ms"] > 0 and row["timeline"]
-    assert kept["rows"][0]["rays"] > kept["rows"][1]["rays"]
-    assert len((tmp_path / "engines" / "engines.md").read_text(encoding="utf-8").splitlines()) == 4
-
-
-def test_an_unknown_engine_is_told(room: Path, tmp_path: Path, capsys: Capsys) -> None:
-    answer = call(capsys, "bench", "engines", room, "--out", tmp_path / "engines", "--engines", "auto,steam")
-    assert answer.code == 2 and "there is no 'steam'; known are auto, numba, triton, torch" in answer.err
-
-
 @pytest.mark.skipif(torch.cuda.is_available(), reason="Triton's engine runs here")
-@pytest.mark.parametrize("command_line", [("run", "--engine"), ("bench", "engines", "--engines")])
-def test_the_engine_for_cuda_is_refused_without_it(command_line: tuple[str, ...], room: Path, tmp_path: Path, capsys: Capsys) -> None:
-    *words, flag = command_line
-    answer = call(capsys, *words, room, "--out", tmp_path / "out", flag, "triton", "--set", "effects=off")
+def test_the_engine_for_cuda_is_refused_without_it(room: Path, tmp_path: Path, capsys: Capsys) -> None:
+    answer = call(capsys, "run", room, "--out", tmp_path / "out", "--engine", "triton", "--set", "effects=off")
     assert answer.code == 2 and "runs on CUDA alone, and the device is 'cpu'; leave --engine at auto" in answer.err

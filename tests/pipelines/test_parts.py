@@ -16,7 +16,7 @@ from fieldfuse.errors import InputError
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.folder import FILES, SUBFOLDERS
 from fieldfuse.pipelines.thread_limits import THREAD_VARIABLES, bound_threads
-from tests.pipelines.made import call, make_room
+from tests.pipelines.made import bench, call, make_room
 from tests.pipelines.short import FAST, finished, report, stages
 
 Capsys = pytest.CaptureFixture[str]
@@ -96,7 +96,7 @@ def test_tsdf_alone_then_the_rest_in_the_same_folder(tmp_path: Path, capsys: Cap
     assert told["export_facts"]["mesh"]["triangles"] > 0
     page = tmp_path / "page.md"
     page.write_text("# Results\n")
-    answer = call(capsys, "bench", "table", out / "report.json", "--into", page, "--data", tmp_path)
+    answer = bench(capsys, "table", out / "report.json", "--into", page, "--data", tmp_path)
     assert answer.code == 0, answer.err
     assert "| room | 8 / 2 |" in page.read_text() and "its TSDF" in page.read_text()
 

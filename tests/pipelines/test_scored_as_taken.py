@@ -18,8 +18,8 @@ from fieldfuse.capture.views_file import load_views
 from fieldfuse.evaluation.baseline import nearest_image_scores
 from fieldfuse.evaluation.geometry import read_mesh
 from fieldfuse.evaluation.images import psnr
-from fieldfuse.evaluation.speed_state import around
-from fieldfuse.evaluation.speed_state import lens as around_lens
+from fieldfuse.evaluation.sphere import around
+from fieldfuse.evaluation.sphere import lens as around_lens
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.cli import app
 from fieldfuse.pipelines.pictures import camera_of

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from fieldfuse.evaluation.speed_state import sphere_field
+from fieldfuse.evaluation.sphere import sphere_field
 from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.field import Field
 from fieldfuse.training.levels import all_places, first_field

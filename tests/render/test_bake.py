@@ -12,7 +12,7 @@ from safetensors.numpy import load_file, save_file
 
 from fieldfuse.camera import Intrinsics
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.speed_state import around, lens
+from fieldfuse.evaluation.sphere import around, lens
 from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.bake import BakedField, bake
 from fieldfuse.render.bake_file import METADATA_KEY, read_baked, write_baked

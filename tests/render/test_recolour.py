@@ -12,7 +12,7 @@ import torch
 
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import Interrupted
-from fieldfuse.evaluation.speed_state import around, lens, sphere_field
+from fieldfuse.evaluation.sphere import around, lens, sphere_field
 from fieldfuse.progress import Progress
 from fieldfuse.render.composite import SOLID, THRESHOLD
 from fieldfuse.render.differentiable import render_with_gradients

@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 from fieldfuse.camera import Intrinsics, pixel_grid, rays
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.speed_state import around, lens, sphere_field
+from fieldfuse.evaluation.sphere import around, lens, sphere_field
 from fieldfuse.nerfusion.encoding import SH
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_file import read_baked, write_baked

@@ -12,6 +12,7 @@ import trimesh
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
+from benchmarks.table import sections
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
 from fieldfuse.capture.types import Capture
@@ -19,14 +20,11 @@ from fieldfuse.config import load_settings
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation.compare_truth import find_truth
-from fieldfuse.evaluation.few_views import few_views_table
 from fieldfuse.export.mesh import mesh_facts
 from fieldfuse.files import read_json, write_json
 from fieldfuse.nerfusion.training.settings import load_train_settings
-from fieldfuse.pipelines.bench_table import sections
 from fieldfuse.pipelines.console import ConsoleProgress
 from fieldfuse.pipelines.folder import RunFolder
-from fieldfuse.pipelines.kept import FEW_VIEWS, read_kept
 from fieldfuse.pipelines.stages import Stages
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.bake import bake
@@ -142,18 +140,6 @@ def test_measurements_that_are_none(damaged: object, tmp_path: Path) -> None:
     with pytest.raises(InputError) as told:
         sections([path], None, None)
     assert str(path) in str(told.value) or "damaged" in str(told.value) or "methods" in str(told.value)
-
-
-@pytest.mark.parametrize("seconds", [{}, {"seconds": "5"}, {"seconds": None}, {"seconds": 5.0, "psnr": "20"}])
-def test_few_views_whose_seconds_are_not_there_or_no_number(seconds: dict[str, object], tmp_path: Path) -> None:
-    path = tmp_path / "few_views.json"
-    row = {"views": 3, "start": "direct", "budget": 0, "psnr": 20.0, **seconds}
-    path.write_text(json.dumps({"rows": [row]}))
-    if seconds:
-        with pytest.raises(InputError, match="is not a number"):
-            read_kept(path, FEW_VIEWS)
-    else:
-        assert "| 3 |  | 20.00 |  |" in few_views_table(read_kept(path, FEW_VIEWS)["rows"])
 
 
 @pytest.mark.parametrize("damage", ["a picture cut short", "a corner that is not there", "a number beyond float32", "nothing"])

@@ -14,7 +14,7 @@ from fieldfuse.camera import Intrinsics, Similarity, pixel_grid, rays
 from fieldfuse.capture.types import Views
 from fieldfuse.config import Settings, load_settings
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.speed_state import around, lens
+from fieldfuse.evaluation.sphere import around, lens
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.poses.scene import Scene

@@ -311,7 +311,7 @@ def cache_file() -> Path:
 
 def signature(threads: int, device: str) -> str:
     """What times depend on: processor, cores, threads, libraries, and how work is counted."""
-    from fieldfuse.evaluation.speed import machine
+    from fieldfuse.evaluation.machine import machine
 
     about = machine(threads)
     return fingerprint([about[key] for key in ("machine", "system", "cores", "threads", "python", "versions")], device, COUNTED)

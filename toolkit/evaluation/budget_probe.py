@@ -11,7 +11,7 @@ import torch
 
 from fieldfuse.config import Settings
 from fieldfuse.evaluation.budget import KINDS, Speed
-from fieldfuse.evaluation.speed_state import around, lens, sphere_field, sphere_pixels
+from fieldfuse.evaluation.sphere import around, lens, sphere_field, sphere_pixels
 
 SECONDS = 0.4  # for each kind, after a first call that does not count
 SIDE = 128  # voxels and pixels a side of what is rendered and fitted

@@ -133,8 +133,8 @@ def read_results(root: Path, number: int) -> None:
 
 def make_measured(root: Path) -> None:
     """What `tradeoff`, `compare`, the benchmarks and runs of a total budget leave."""
+    from benchmarks.protocols import SUITES
     from fieldfuse.evaluation.compare import compare_data
-    from fieldfuse.evaluation.suites import SUITES
     from fieldfuse.evaluation.tradeoff_page import csv_text, tradeoff_data
 
     wanted = {"iterations": 10.0, "voxel_size": 1.0, "views": 1.0, "samples": 4, "precision": "float16", "decoder": "deferred"}
@@ -180,22 +180,22 @@ def make_measured(root: Path) -> None:
     suite = next(iter(SUITES.values()))
     row = {"scene": "lego", "variant": suite.variants[0].key, "width": 9, "height": 9, "train": 8, "test": 2, "psnr": 20.0, "ssim": 0.8,
            "lpips": 0.2, "fit_seconds": 1.0, "seconds": 2.0, "voxels": 10, "error": None}  # fmt: skip
-    write_json(root / "results.json", {"suite": next(iter(SUITES)), "command": "fieldfuse bench", "machine": machine, "rows": [row, row]})
+    results = {"experiment": "suites", "suite": suite.name, "command": "python", "machine": machine, "rows": [row, row]}
+    write_json(root / "results.json", results)
     few = [
         {"views": 3, "start": start, "budget": budget, "psnr": 20.0, "ssim": 0.5, "seconds": 1.0}
         for start, budget in (("direct", 0), ("network", 5))
     ]
-    write_json(root / "few_views.json", {"rows": few})
+    write_json(root / "few_views.json", {"experiment": "few_views", "command": "python", "machine": machine, "rows": few})
 
 
 def read_measured(root: Path, number: int) -> None:
     """What the commands that go on from them, or show them, make of each; the worker judges the first that fails."""
+    from benchmarks.table import sections
     from fieldfuse.evaluation.compare import compare_data
     from fieldfuse.evaluation.compare_text import comparison_text
-    from fieldfuse.evaluation.few_views import few_views_table
     from fieldfuse.evaluation.tradeoff_page import tradeoff_data
     from fieldfuse.pipelines import kept
-    from fieldfuse.pipelines.bench_table import sections
     from fieldfuse.pipelines.tradeoff_sweep import rows_at
 
     def compared() -> None:
@@ -212,7 +212,7 @@ def read_measured(root: Path, number: int) -> None:
         lambda: sections([root / "compare" / "compare.json"], None, None),
         lambda: sections([root / "report.json"], None, None),
         lambda: tradeoff_data({"rows": rows_at(root / "tradeoff" / "points" / "point.json", "abc") or []}),
-        lambda: few_views_table(kept.read_kept(root / "few_views.json", kept.FEW_VIEWS)["rows"]),
+        lambda: sections([root / "few_views.json"], None, None),
         compared,
     )
     first: Exception | None = None

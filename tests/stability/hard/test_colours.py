@@ -9,7 +9,7 @@ import torch
 
 from fieldfuse.camera import Array
 from fieldfuse.capture.types import Views
-from fieldfuse.evaluation.speed_state import around, lens, sphere_field
+from fieldfuse.evaluation.sphere import around, lens, sphere_field
 from fieldfuse.render.composite import RAW_MAX
 from fieldfuse.render.recolour import COLOURS, MOST, recoloured
 from fieldfuse.render.sky import sky_colours

@@ -53,7 +53,7 @@ def shard_files(root: Path | str) -> list[Path]:
     """
     found = sorted(Path(root).glob("*.safetensors"))
     if not found:
-        raise InputError(f"{root} holds no shards (*.safetensors); make them with scripts/make_shards.py, see docs/training.md")
+        raise InputError(f"{root} holds no shards (*.safetensors); make them with python -m benchmarks.make_shards, see docs/training.md")
     return found
 
 
