@@ -17,7 +17,6 @@ from fieldfuse.camera import (
     PINHOLE,
     Array,
     Intrinsics,
-    checked_pose,
     distort,
     lens_limit,
     pixel_grid,
@@ -27,6 +26,7 @@ from fieldfuse.camera import (
     undistort_maps,
     unproject,
 )
+from fieldfuse.capture.poses import checked_pose
 from fieldfuse.capture.types import Capture, Frame, Views
 from fieldfuse.errors import InputError, PoseError
 from fieldfuse.evaluation.baseline import nearest_training

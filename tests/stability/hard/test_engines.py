@@ -74,5 +74,3 @@ def test_nothing(within: Within) -> None:
             within(f"{name}, {what}: not the background", apart + float(values[:, 3:].abs().max()), 1e-6)
     none = both(field, origins[:0], directions[:0], 1e-3)
     within("pictures of no rays", float(sum(len(values) for values in none.values())), 0.0)
-
-

@@ -17,12 +17,12 @@ from fieldfuse.camera import (
     Array,
     Intrinsics,
     Similarity,
-    checked_pose,
     invert,
     pixel_grid,
     rays,
     world_from_opengl,
 )
+from fieldfuse.capture.poses import checked_pose
 from fieldfuse.export.cameras import quaternion, write_cameras
 from fieldfuse.export.mesh import write_mesh
 from fieldfuse.export.points import write_points

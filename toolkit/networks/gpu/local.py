@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fieldfuse.backends.dispatch import to_device_async
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.extras.plane_sweep import Sweep
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution
 from fieldfuse.nerfusion.lattice import Lattice, LocalVolume
 from fieldfuse.nerfusion.unproject import EncodedView
 from fieldfuse.nerfusion.volume_net import LocalReconstruction
@@ -29,7 +29,7 @@ def local_volume(
     wanted: Tensor | None,
     near: float,
     far: float,
-    swept: Sweep,
+    swept: DepthDistribution,
     numbers: tuple[float, ...],
     sizes: tuple[int, bool, int],
 ) -> LocalVolume:

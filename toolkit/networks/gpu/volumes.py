@@ -11,7 +11,8 @@ import triton.language as tl
 from torch import Tensor
 
 from fieldfuse.backends.triton.launch import kernel, pieces, power_of_two
-from fieldfuse.nerfusion.volume_net import CHANGE, INSIDE
+from fieldfuse.nerfusion.extras.bounded_outputs import CHANGE
+from fieldfuse.nerfusion.extras.known_terms import INSIDE
 from fieldfuse.volume.topology import VOXELS, Topology
 
 BLOCK = 64  # rows at a time
