@@ -61,7 +61,7 @@ test: $(VENV)/.installed-test links
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile || tests=$$?; wait $$types; exit $$tests
 
 stability: $(VENV)/.installed-test
-	$(BIN)/python -m tests.stability.page docs/stability.md
+	$(BIN)/python -m pytest tests/stability/hard --page docs/stability.md
 	$(BIN)/python -m tests.stability.kills --kills 50 --state .kills-state.json --page docs/stability.md
 	$(BIN)/python -m tests.stability.stops --page docs/stability.md
 

@@ -27,7 +27,6 @@ from fieldfuse.pipelines import (
     poses,
     render,
     run,
-    selftest,
     simulate,
     tradeoff,
     train,
@@ -137,7 +136,6 @@ for _command in (
     tradeoff.tradeoff,
     info.info,
     train.train,
-    selftest.selftest,
     simulate.simulate,
 ):
     app.command()(_command)

@@ -28,6 +28,8 @@ PACKAGES = (
     "safetensors",
     "pillow",
     "jinja2",
+    "pyyaml",
+    "scipy",
     "psutil",
 )
 # Shared libraries that Open3D loads, and the Debian packages that hold them.
@@ -51,6 +53,10 @@ import pycolmap
 pycolmap.incremental_mapping, pycolmap.global_mapping, pycolmap.match_sequential
 print(pycolmap.__version__)
 """
+KERNELS = """
+from fieldfuse.pipelines.kernel_check import report
+print(report())
+"""
 GIB = 2**30
 OLDEST_PYTHON = (3, 11)
 
@@ -69,7 +75,7 @@ def collect() -> list[Check]:
     """Look at everything (a few seconds). Never raises: what goes wrong in a check is its finding."""
     checks = [_python(), *_packages()]
     extras: tuple[Callable[[], Check], ...] = (_xfeat, _lpips, _viewer, _heic, _record3d, _h264)
-    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _video, *extras, _cores, _memory, _disk)
+    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _kernels, _video, *extras, _cores, _memory, _disk)
     for look in looks:
         try:
             checks.append(look())
@@ -173,6 +179,13 @@ def _torch() -> Check:
             return Check("torch device", OK, seen)
         return Check("torch device", WARN, f"{seen}; without Triton for it fits take forty times as long", "pip install triton")
     return Check("torch device", OK, f"CPU with {threads}")
+
+
+def _kernels() -> Check:
+    good, said = in_child(KERNELS, 300)  # from an empty cache they are compiled first
+    if good:
+        return Check("kernels", OK, said)
+    return Check("kernels", FAIL, said, "install numba and torch again, from constraints.txt; `--engine torch` avoids compiled kernels")
 
 
 def _video() -> Check:

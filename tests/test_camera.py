@@ -34,7 +34,7 @@ from fieldfuse.camera import (
 )
 from fieldfuse.capture.poses import checked_pose
 from fieldfuse.errors import InputError
-from tests.capture.board import bend, unbend
+from tests.capture.board import bend
 
 CAMERA = Intrinsics(64, 48, 50.0, 52.0, 31.0, 25.5)
 near = st.floats(-1, 1, allow_nan=False)
@@ -81,26 +81,6 @@ def lenses(draw: st.DrawFn) -> Intrinsics:
 
 
 # ---------------------------------------------------------------------------------------------------- lens
-
-
-@given(lenses(), st.lists(st.tuples(st.floats(-0.6, 0.6), st.floats(-0.5, 0.5)), min_size=1, max_size=20))
-def test_distort_is_the_published_formula_and_can_be_undone(camera: Intrinsics, points: list[tuple[float, float]]) -> None:
-    ideal = np.array(points)
-    bent = distort(camera, ideal)
-    np.testing.assert_allclose(bent, np.stack(bend(camera, ideal[:, 0], ideal[:, 1]), axis=1), atol=1e-9)
-    back = np.stack(unbend(camera, bent[:, 0], bent[:, 1]), axis=1)
-    np.testing.assert_allclose(back, ideal, atol=1e-4)
-
-
-def test_rational_lens_is_opencvs() -> None:
-    values = (0.1, -0.05, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003)
-    camera = replace(CAMERA, lens=OPENCV, distortion=values)
-    k1, k2, p1, p2, k3, k4, k5, k6 = values
-    x, y = 0.3, -0.2
-    r2 = x * x + y * y
-    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
-    expected = [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y]
-    np.testing.assert_allclose(distort(camera, np.array([[x, y]]))[0], expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("lens", [OPENCV, FISHEYE])
@@ -334,12 +314,6 @@ def test_project_after_unproject_is_identity(pose: Array, values: list[tuple[flo
     got, z = project(CAMERA, pose, unproject(CAMERA, pose, pixels, depth))
     np.testing.assert_allclose(got, pixels, atol=1e-6)
     np.testing.assert_allclose(z, depth, rtol=1e-9, atol=1e-9)
-
-
-def test_points_behind_have_no_pixel() -> None:
-    pixels, depth = project(CAMERA, np.eye(4), np.array([[0, 0, -1.0], [0.1, 0.1, 0.0], [0, 0, 2.0]]))
-    assert np.isnan(pixels[:2]).all() and (depth[:2] <= 0).all()
-    np.testing.assert_allclose(pixels[2], [31.0, 25.5])
 
 
 @settings(deadline=None)

@@ -23,7 +23,7 @@ def checks() -> dict[str, Check]:
 
 def test_a_machine_that_runs_the_tests_is_fit_for_use(checks: dict[str, Check]) -> None:
     assert [check for check in checks.values() if check.status == FAIL] == []
-    assert {"python", "open3d", "pycolmap", "torch device", "video", "cores", "memory", "disk", "lpips", "xfeat"} <= checks.keys()
+    assert {"open3d", "pycolmap", "torch device", "kernels", "video", "cores", "memory", "disk", "lpips", "xfeat"} <= checks.keys()
     assert checks["open3d"].found.startswith("0.")
     assert all(check.status == OK or check.advice for check in checks.values())
 
@@ -45,6 +45,25 @@ def test_a_child_that_aborts_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(doctor, "PYCOLMAP", "import os; os.abort()")
     found = doctor._pycolmap()
     assert found.status == FAIL and "signal 6" in found.found and "pycolmap" in found.advice
+
+
+def test_a_kernel_that_renders_wrongly_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong = "import fieldfuse.pipelines.kernel_check as k; k.engine_errors = lambda: {'numba': 0.1}; k.report()"
+    monkeypatch.setattr(doctor, "KERNELS", wrong)
+    found = doctor._kernels()
+    assert found.status == FAIL and "numba 1e-01" in found.found and "constraints.txt" in found.advice
+
+
+@pytest.mark.parametrize("factor", [0.99, 1.01])
+def test_a_slightly_wrong_kernel_is_noticed(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
+    from fieldfuse.pipelines import kernel_check
+    from fieldfuse.render.numba_renderer import NumbaRenderer
+
+    plain = NumbaRenderer.render
+    assert max(kernel_check.engine_errors().values()) < kernel_check.TOLERANCE
+    monkeypatch.setattr(NumbaRenderer, "render", lambda *given: plain(*given) * factor)
+    with pytest.raises(ArithmeticError, match="numba"):
+        kernel_check.report()
 
 
 def test_a_child_that_hangs_is_a_finding() -> None:
@@ -73,6 +92,7 @@ def test_a_check_that_raises_does_not_stop_the_others(monkeypatch: pytest.Monkey
     monkeypatch.setitem(sys.modules, "cv2", None)  # `import cv2` now raises ImportError
     monkeypatch.setattr(doctor, "OPEN3D", "print('0.0')")
     monkeypatch.setattr(doctor, "PYCOLMAP", "print('0.0')")
+    monkeypatch.setattr(doctor, "KERNELS", "print('0.0')")
     found = {check.name: check for check in doctor.collect()}
     assert found["video"].status == FAIL and "cv2" in found["video"].found
     assert found["disk"].status in (OK, WARN)

@@ -11,7 +11,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldfuse.camera import invert
 from fieldfuse.camera import project as project_one
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.cull import all_blocks, block_balls, visible_blocks
@@ -100,16 +99,6 @@ def test_nothing_depends_on_the_unit_of_length() -> None:
     large = model.local_volume(model.encode(pictures(), large_by), large_by, large_lattice, near=8.0, far=2.4 * 16)
     assert torch.equal(small.count, large.count) and float(small.count.max()) == 3
     torch.testing.assert_close(small.rows, large.rows, atol=1e-4, rtol=1e-3)
-
-
-def test_depth_limits_and_what_is_behind() -> None:
-    seen_by = Cameras.of([INTRINSICS], np.eye(4)[None])
-    points = torch.tensor([[0.0, 0, 1.0], [0, 0, -1.0], [0, 0, 0.0], [0, 0, 3.0], [0, 0, 0.1], [0, 5.0, 1.0]])
-    seen = project(points, torch.ones(6), seen_by, 0.2, 2.0)
-    assert seen.visible[0].tolist() == [True, False, False, False, False, False]
-    assert bool(torch.isfinite(seen.footprint).all())
-    world = invert(np.eye(4))
-    assert world.shape == (4, 4)
 
 
 def test_what_views_show_is_the_same_with_gradients_and_without() -> None:

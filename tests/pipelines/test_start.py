@@ -65,7 +65,8 @@ def test_unexpected_errors_leave_a_log_and_no_traceback(tmp_path: Path, capsys: 
     assert "a bolt is loose" in (tmp_path / "out" / "error.log").read_text()
 
 
-def test_doctor_as_json(capsys: Capsys) -> None:
+def test_doctor_as_json(capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fieldfuse.pipelines.doctor.KERNELS", "print('sound')")  # tests/test_doctor.py runs them
     answer = call(capsys, "doctor", "--json")
     checks = json.loads(answer.out)
     assert {"python", "torch", "pycolmap"} <= {check["name"] for check in checks}

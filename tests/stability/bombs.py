@@ -30,13 +30,13 @@ from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.capture.video import read_video
 from fieldfuse.config import load_settings
 from fieldfuse.errors import FieldfuseError
-from fieldfuse.evaluation.selftest.edit import small_field
 from fieldfuse.files import read_json
 from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.field import Field
 from fieldfuse.volume.store import METADATA_KEY, read_field
 from tests.capture.layouts import LAYOUTS, sens_of, write_record3d, zipped
 from tests.stability.fuzz.watch import SECONDS, bound_memory
+from tests.stability.hard.fields import small_field
 
 
 def png(width: int, height: int, depth: int, kind: int, data: bytes) -> bytes:

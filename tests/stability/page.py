@@ -1,18 +1,15 @@
 """`docs/stability.md`: the parts between `<!-- NAME -->` and `<!-- /NAME -->` are written by programs, the rest by people.
 
-`python -m tests.stability.page docs/stability.md` runs every case of the self-test and replaces the parts `kernels` and `cases`.
+`pytest tests/stability/hard --page docs/stability.md` runs every hard case and replaces the parts `kernels` and `cases`.
 """
 
 from __future__ import annotations
 
 import math
 import re
-import sys
 from pathlib import Path
 
-import numpy as np
-
-from fieldfuse.evaluation.selftest.case import Measure, Outcome, all_cases, run_cases
+from tests.stability.hard.within import Measure, Within
 
 
 def replace_part(page: Path, name: str, lines: list[str]) -> None:
@@ -33,32 +30,32 @@ def number(value: float) -> str:
     return "0" if value == 0 else f"{value:.1e}" if math.isfinite(value) and not 0.01 <= abs(value) < 1000 else f"{value:.3g}"
 
 
-def case_lines(outcomes: list[Outcome]) -> list[str]:
+def case_lines(cases: list[Within]) -> list[str]:
     """A table: each case's measure that comes nearest to its bound."""
-    numbers = sum(len(outcome.measures) for outcome in outcomes)
-    bad = [outcome for outcome in outcomes if not outcome.good]
-    silent = sum(not math.isfinite(measure.error) for outcome in outcomes for measure in outcome.measures)
+    numbers = sum(len(case.measures) for case in cases)
+    bad = [case for case in cases if not case.good]
+    silent = sum(not math.isfinite(measure.error) for case in cases for measure in case.measures)
     out = [
-        f"{len(outcomes)} cases, {numbers} numbers; {len(bad)} cases missed a bound; {silent} errors were NaN or infinite.",
+        f"{len(cases)} cases, {numbers} numbers; {len(bad)} cases missed a bound; {silent} errors were NaN or infinite.",
         "",
         "| case | numbers | worst quantity | error | bound |",
         "| --- | --- | --- | --- | --- |",
     ]
-    for outcome in outcomes:
-        if outcome.failure or not outcome.measures:
-            out.append(f"| {outcome.case.title} | | failed: {outcome.failure} | | |")
+    for case in cases:
+        if case.failure or not case.measures:
+            out.append(f"| {case.title} | | failed: {case.failure} | | |")
             continue
-        worst = max(outcome.measures, key=lambda measure: (not measure.good, _share(measure.error, measure.bound)))
+        worst = max(case.measures, key=lambda measure: (not measure.good, _share(measure.error, measure.bound)))
         quantity = worst.quantity.replace("|", "·")
-        out.append(f"| {outcome.case.title} | {len(outcome.measures)} | {quantity} | {number(worst.error)} | {number(worst.bound)} |")
+        out.append(f"| {case.title} | {len(case.measures)} | {quantity} | {number(worst.error)} | {number(worst.bound)} |")
     return out
 
 
-def kernel_lines(outcomes: list[Outcome]) -> list[str]:
+def kernel_lines(cases: list[Within]) -> list[str]:
     """A table: each kernel's worst errors that are relative (by the reference's size, or by its largest entry), values and gradients."""
     groups: dict[str, list[Measure]] = {}
-    for outcome in outcomes:
-        groups.setdefault(outcome.case.group, []).extend(outcome.measures)
+    for case in cases:
+        groups.setdefault(case.title.split(": ")[0], []).extend(case.measures)
     out = ["| kernel | worst relative error, float32 | of a gradient | in lower precision |", "| --- | --- | --- | --- |"]
     for group, measures in groups.items():
         known = [measure for measure in measures if _relative(measure)]
@@ -85,20 +82,3 @@ def _worst(measures: list[Measure]) -> str:
 
 def _share(error: float, bound: float) -> float:
     return error / bound if bound > 0 else error
-
-
-def _tell(outcome: Outcome) -> None:
-    sys.stderr.write(f"{outcome.seconds:6.1f} s  {outcome.case.title}\n")
-
-
-def main() -> int:
-    page = Path(sys.argv[1])
-    with np.errstate(all="ignore"):
-        outcomes = run_cases(all_cases(), _tell)
-    replace_part(page, "cases", case_lines(outcomes))
-    replace_part(page, "kernels", kernel_lines(outcomes))
-    return 0 if all(outcome.good for outcome in outcomes) else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -20,8 +20,6 @@ from fieldfuse.config import load_settings
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation.compare_truth import find_truth
-from fieldfuse.evaluation.selftest.edit import small_field
-from fieldfuse.evaluation.selftest.fits import scene_of
 from fieldfuse.export.mesh import mesh_facts
 from fieldfuse.files import read_json, write_json
 from fieldfuse.nerfusion.training.settings import load_train_settings
@@ -34,6 +32,8 @@ from fieldfuse.render.bake_file import METADATA_KEY, read_baked, write_baked
 from fieldfuse.simulate.mesh_scene import load_mesh_scene
 from fieldfuse.simulate.settings import read_scene_file
 from fieldfuse.tsdf.mesh import Mesh
+from tests.stability.hard.captures import scene_of
+from tests.stability.hard.fields import small_field
 
 
 def test_numbers_of_400_digits_in_a_stored_capture() -> None:

@@ -11,12 +11,12 @@ from fieldfuse import memory
 from fieldfuse.camera import Similarity
 from fieldfuse.config import PosesSettings, TsdfSettings
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.selftest.fits import texture, views_of
 from fieldfuse.pipelines import room
 from fieldfuse.poses import sfm
 from fieldfuse.stereo.match import stereo_depths
 from fieldfuse.tsdf.fuse import fuse_capture
 from fieldfuse.tsdf.volume import BYTES_PER_BLOCK, TsdfVolume
+from tests.stability.hard.captures import texture, views_of
 from tests.stability.runs import OPTIONS, make_source
 from tests.stability.stops import fieldfuse
 from tests.tsdf.scenes import CAMERA

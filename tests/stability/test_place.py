@@ -17,12 +17,12 @@ from fieldfuse.capture.prepare import prepare_views
 from fieldfuse.capture.types import Views
 from fieldfuse.config import CaptureSettings, load_settings
 from fieldfuse.evaluation.images import psnr
-from fieldfuse.evaluation.selftest.place import rotation
 from fieldfuse.poses.given import given_poses
 from fieldfuse.poses.scene import Scene, describe_scene
 from fieldfuse.render.image import make_renderer, render_view
 from fieldfuse.training.fit import fit_field
 from tests.pipelines.made import CAMERA, make_room
+from tests.stability.hard.places import rotation
 from tests.stability.runs import TICK
 
 FAR = np.array([6.0e6, -1.0e6, 3.0e5])  # metres in an earth-centred frame

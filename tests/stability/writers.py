@@ -23,9 +23,6 @@ from fieldfuse.capture.types import Views
 from fieldfuse.capture.views_file import save_views
 from fieldfuse.errors import OutputError
 from fieldfuse.evaluation.report import write_report
-from fieldfuse.evaluation.selftest.data import poses, texture
-from fieldfuse.evaluation.selftest.edit import small_field
-from fieldfuse.evaluation.selftest.place_files import ball
 from fieldfuse.export.cameras import write_cameras
 from fieldfuse.export.mesh import write_mesh
 from fieldfuse.export.ply import write_points
@@ -34,6 +31,9 @@ from fieldfuse.files import write_json
 from fieldfuse.pipelines.rendered import Picture, Pictures, save_pictures, write_png, write_pngs
 from fieldfuse.tsdf.frames import DepthFrame
 from fieldfuse.tsdf.volume import TsdfVolume
+from tests.stability.hard.captures import poses, texture
+from tests.stability.hard.fields import small_field
+from tests.stability.hard.places import ball
 from tests.stability.writers_more import more_writers
 
 Write = Callable[[Path], object]

@@ -23,8 +23,6 @@ from fieldfuse.capture.select import select_frames
 from fieldfuse.capture.video import read_video
 from fieldfuse.config import CaptureSettings, Settings
 from fieldfuse.evaluation.compare_page import write_comparison
-from fieldfuse.evaluation.selftest.data import texture
-from fieldfuse.evaluation.selftest.edit import small_field
 from fieldfuse.evaluation.tradeoff_page import write_tradeoff
 from fieldfuse.export.page import Tour, write_page
 from fieldfuse.nerfusion.training.caution import Caution
@@ -48,6 +46,8 @@ from tests.evaluation.test_compare_page import made, pictures
 from tests.evaluation.test_tradeoff import ladder
 from tests.nerfusion.training.tiny import tiny_settings
 from tests.simulate.test_simulate import SMALL
+from tests.stability.hard.captures import texture
+from tests.stability.hard.fields import small_field
 
 Write = Callable[[Path], object]
 

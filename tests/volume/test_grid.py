@@ -11,8 +11,6 @@ import numpy as np
 import open3d as o3d
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fieldfuse.errors import InputError
 from fieldfuse.memory import madvise
@@ -215,25 +213,6 @@ def test_slots_of_a_fresh_table_are_the_same_every_time() -> None:
         slots = grid.activate(keys[torch.randperm(len(keys))])
         assert torch.equal(grid.find(keys), torch.arange(len(keys))) and len(slots) == len(keys)
         grid.close()
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.lists(st.tuples(st.booleans(), st.integers(-3, 3), st.integers(-3, 3)), max_size=30))
-def test_grid_holds_what_a_dictionary_holds(steps: list[tuple[bool, int, int]]) -> None:
-    grid, expected = small_grid(2), {}
-    for number, (add, x, y) in enumerate(steps):
-        key = torch.tensor([[x, y, 0]])
-        if add:
-            slot = int(grid.activate(key)[0])
-            block = grid.rows("value").view(-1, VOXELS)[slot]
-            assert float(block.max()) == float(expected.get((x, y), 0))
-            block.fill_(number + 1)
-            expected[(x, y)] = number + 1
-        else:
-            assert grid.erase(key) == ((x, y) in expected)
-            expected.pop((x, y), None)
-    values = grid.gather("value")[:-1].view(-1, VOXELS)
-    assert {(k[0], k[1]): int(v) for k, v in zip(grid.keys().tolist(), values[:, -1].tolist(), strict=True)} == expected
 
 
 def test_gather_and_scatter_follow_the_topology() -> None:

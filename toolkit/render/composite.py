@@ -1,7 +1,7 @@
 """Volume rendering over flattened samples: weights, sums along rays, distortion. Gradients are autograd's.
 
 Samples of all rays lie in one list, ray after ray and near to far; `first` (samples,) is the index of the first sample of a sample's
-own ray. Everything is a pure function; each has a slow float64 loop as its reference in `tests/render/test_composite.py`.
+own ray. Everything is a pure function; each has a slow float64 loop as its reference in `tests/stability/hard/reference.py`.
 """
 
 from __future__ import annotations

@@ -10,7 +10,6 @@ import torch
 
 from fieldfuse.camera import Intrinsics
 from fieldfuse.evaluation import budget
-from fieldfuse.evaluation.selftest.edit import small_field
 from fieldfuse.files import write_json
 from fieldfuse.nerfusion.model import ModelConfig, NerfusionModel
 from fieldfuse.nerfusion.training.caution import Caution
@@ -26,6 +25,7 @@ from fieldfuse.stereo.left_out import LeftOut, load_left_out, save_left_out
 from fieldfuse.stereo.maps import load_stereo, save_stereo
 from fieldfuse.stereo.match import StereoDepth
 from tests.nerfusion.training.tiny import tiny_settings
+from tests.stability.hard.fields import small_field
 
 
 def make_models(root: Path) -> None:

@@ -24,7 +24,6 @@ from fieldfuse.capture.types import Capture, Views
 from fieldfuse.capture.video import iterate_video, read_video
 from fieldfuse.capture.views_file import load_views, save_views
 from fieldfuse.config import CaptureSettings, load_settings
-from fieldfuse.evaluation.selftest.edit import aimed_rays, small_field
 from fieldfuse.files import read_json, write_json
 from fieldfuse.poses.given import given_poses
 from fieldfuse.render.field import Field
@@ -46,6 +45,7 @@ from tests.stability.fuzz.given import (
 from tests.stability.fuzz.models import make_models, make_training, read_baked_field, read_models, read_training
 from tests.stability.fuzz.results import FILES as RESULT_FILES
 from tests.stability.fuzz.results import MEASURED, make_measured, make_results, read_measured, read_results
+from tests.stability.hard.fields import aimed_rays, small_field
 
 Act = Callable[[Path, int], object]
 

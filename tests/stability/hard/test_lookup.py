@@ -3,33 +3,25 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
+import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
-from fieldfuse.evaluation.selftest import reference
-from fieldfuse.evaluation.selftest.case import Measure, absolute, by_size, case, not_finite
 from fieldfuse.volume.lookup import corners, gather, scatter
-from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
+from fieldfuse.volume.topology import VOXELS, Topology
+from tests.stability.hard import reference
+from tests.stability.hard.errors import absolute, by_size, not_finite
+from tests.stability.hard.fields import lattice, scattered_blocks
+from tests.stability.hard.ranges import KEYS, QUICK
+from tests.stability.hard.within import Within
 
 GROUP = "lookup"
 VALUE = 1e-6
 ABSENT = 1e-4  # thousands of terms of both signs, and nobody uses the sum
-
-
-def lattice(topology: Topology) -> Tensor:
-    """(M · 512, 3) int64 lattice coordinates (x, y, z) of every row."""
-    row = torch.arange(topology.zero_row)
-    local = torch.stack([row % 8, row // 8 % 8, row // 64 % 8], 1)
-    return topology.keys.long()[row // VOXELS] * BLOCK + local
-
-
-def scattered_blocks(count: int, seed: int, reach: int = 2) -> Topology:
-    """Random blocks round the origin: some touch by faces, edges or corners, others stand alone."""
-    generator = torch.Generator().manual_seed(seed)
-    keys = torch.unique(torch.randint(-reach, reach + 1, (4 * count, 3), generator=generator), dim=0)
-    return Topology(keys[torch.randperm(len(keys), generator=generator)[:count]])
+BOUNDS = {"values that are not finite": 0.0, "gradient of all that is absent": ABSENT}
 
 
 def random_places(topology: Topology, count: int, seed: int) -> tuple[Tensor, Tensor]:
@@ -78,40 +70,33 @@ def lookup_errors(topology: Topology, cell: Tensor, inside: Tensor, values: Tens
     }
 
 
-def _measures(errors: dict[str, float]) -> list[Measure]:
-    bounds = {"values that are not finite": 0.0, "gradient of all that is absent": ABSENT}
-    return [Measure(name, error, bounds.get(name, VALUE)) for name, error in errors.items()]
-
-
 def _rows(topology: Topology, slope: Tensor) -> Tensor:
     """(M · 512 + 1,) float32 values that rise by `slope` (3,) along the axes, and the zero row."""
     return torch.cat([(lattice(topology).double() @ slope).float(), torch.zeros(1)])
 
 
-@case(GROUP, "random places, absent neighbours read as zero")
-def random_lookup(folder: Path) -> list[Measure]:
+def test_random_lookup(within: Within) -> None:
+    """Random places, absent neighbours read as zero."""
     topology = scattered_blocks(12, 3)
     values = torch.cat([torch.randn(topology.zero_row), torch.zeros(1)])
-    return _measures(lookup_errors(topology, *random_places(topology, 1500, 4), values))
+    within.each(lookup_errors(topology, *random_places(topology, 1500, 4), values), VALUE, BOUNDS)
 
 
-@case(GROUP, "one block alone in the world")
-def lonely_block(folder: Path) -> list[Measure]:
+def test_lonely_block(within: Within) -> None:
+    """One block alone in the world."""
     topology = Topology(torch.tensor([[-(2**31) + 1, 2**31 - 2, 0]]))
     values = torch.cat([torch.randn(topology.zero_row), torch.zeros(1)])
     rows, _ = corners(topology, torch.arange(VOXELS), torch.full((VOXELS, 3), 0.5))
     at_far_side = rows[-1, 1:]  # the last voxel: all but its own corner lie in absent blocks
     moved = Topology(torch.zeros((1, 3), dtype=torch.int64))
     same = absolute(rows.double(), corners(moved, torch.arange(VOXELS), torch.full((VOXELS, 3), 0.5))[0].double())
-    return [
-        Measure("corners of absent blocks that are not the zero row", float((at_far_side != topology.zero_row).sum()), 0.0),
-        Measure("rows that depend on where the block lies", same, 0.0),
-        *_measures(lookup_errors(moved, *random_places(moved, 600, 5), values)),
-    ]
+    within("corners of absent blocks that are not the zero row", float((at_far_side != topology.zero_row).sum()), 0.0)
+    within("rows that depend on where the block lies", same, 0.0)
+    within.each(lookup_errors(moved, *random_places(moved, 600, 5), values), VALUE, BOUNDS)
 
 
-@case(GROUP, "exactly on lattice points, from every voxel that touches them")
-def on_lattice(folder: Path) -> list[Measure]:
+def test_on_lattice(within: Within) -> None:
+    """Exactly on lattice points, from every voxel that touches them."""
     topology = Topology(torch.stack(torch.meshgrid(*[torch.arange(-1, 1)] * 3, indexing="ij"), -1).view(-1, 3))
     values = torch.cat([torch.randn(topology.zero_row), torch.zeros(1)])
     places = lattice(topology)
@@ -124,27 +109,27 @@ def on_lattice(folder: Path) -> list[Measure]:
         cell = topology.find(below >> 3) * VOXELS + (local[:, 2] * 8 + local[:, 1]) * 8 + local[:, 0]
         got = gather(values, *corners(topology, cell, step.float().expand(len(cell), 3)))
         worst = max(worst, absolute(got, values[inner]))
-    return [Measure("stored value, read from eight sides", worst, 0.0)]
+    within("stored value, read from eight sides", worst, 0.0)
 
 
-@case(GROUP, "linear fields across block borders")
-def linear_fields(folder: Path) -> list[Measure]:
+def test_linear_fields(within: Within) -> None:
+    """Linear fields across block borders."""
     topology = Topology(torch.stack(torch.meshgrid(*[torch.arange(-2, 2)] * 3, indexing="ij"), -1).view(-1, 3))
     cell, inside = random_places(topology, 20_000, 6)
     places = lattice(topology)[cell]
     known = (places < 15).all(1)  # the last layer's upper corners have no block
     cell, inside, places = cell[known], inside[known], places[known]
-    out = []
+    worst = 0.0
     for slope in ([1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0.3, -2.0, 0.7], [1e-6, 1e-6, 1e-6], [1e4, -1e4, 3e3]):
         direction = torch.tensor(slope, dtype=torch.float64)
         values = _rows(topology, direction)
         got = gather(values, *corners(topology, cell, inside))
-        out.append(by_size(got, (places + inside.double()) @ direction))
-    return [Measure("linear field, by its largest value", max(out), VALUE)]
+        worst = max(worst, by_size(got, (places + inside.double()) @ direction))
+    within("linear field, by its largest value", worst, VALUE)
 
 
-@case(GROUP, "continuity where two voxels meet")
-def continuity(folder: Path) -> list[Measure]:
+def test_continuity(within: Within) -> None:
+    """Continuity where two voxels meet."""
     topology = Topology(torch.stack(torch.meshgrid(*[torch.arange(-1, 1)] * 3, indexing="ij"), -1).view(-1, 3))
     values = torch.cat([torch.randn(topology.zero_row), torch.zeros(1)])
     places = lattice(topology)
@@ -164,11 +149,12 @@ def continuity(folder: Path) -> list[Measure]:
                 worst = max(worst, absolute(a, b))
             else:
                 slope = max(slope, absolute(a, b))
-    return [Measure("jump at the border", worst, VALUE), Measure("change over 2e-4 of a voxel", slope, 2e-3)]
+    within("jump at the border", worst, VALUE)
+    within("change over 2e-4 of a voxel", slope, 2e-3)
 
 
-@case(GROUP, "gradcheck in double")
-def double_gradcheck(folder: Path) -> list[Measure]:
+def test_double_gradcheck(within: Within) -> None:
+    """Gradcheck in double."""
     topology = scattered_blocks(2, 9, 1)
     cell, inside = random_places(topology, 6, 2)
     rows, weights = corners(topology, cell, inside.double())
@@ -177,11 +163,11 @@ def double_gradcheck(folder: Path) -> list[Measure]:
     flat = torch.randn(len(used), dtype=torch.float64, requires_grad=True)
     good = torch.autograd.gradcheck(lambda v: gather(v, index.int(), weights), (small,), raise_exception=False)
     good &= torch.autograd.gradcheck(lambda v: gather(v, index, weights), (flat,), raise_exception=False)
-    return [Measure("gradcheck failures", float(not good), 0.0)]
+    within("gradcheck failures", float(not good), 0.0)
 
 
-@case(GROUP, "100,000 gradients into one row")
-def many_into_one(folder: Path) -> list[Measure]:
+def test_many_into_one(within: Within) -> None:
+    """100,000 gradients into one row."""
     topology = Topology(torch.zeros((1, 3), dtype=torch.int64))
     count = 100_000
     cell = torch.full((count,), 5 * 73)
@@ -192,19 +178,16 @@ def many_into_one(folder: Path) -> list[Measure]:
     exact = torch.zeros(topology.zero_row + 1, dtype=torch.float64)
     exact.index_add_(0, rows.reshape(-1).long(), (weights.double() * pull.double()[:, None]).reshape(-1))
     again, (same,) = scatter(rows, weights, (pull,))
-    return [
-        Measure("sums of 100,000 terms", by_size(share, exact[touched]), 2e-5),
-        Measure("difference between two runs", absolute(same, share) + absolute(again, touched), 0.0),
-        Measure("rows touched, beyond 8", float(len(touched) - 8), 0.0),
-    ]
+    within("sums of 100,000 terms", by_size(share, exact[touched]), 2e-5)
+    within("difference between two runs", absolute(same, share) + absolute(again, touched), 0.0)
+    within("rows touched, beyond 8", float(len(touched) - 8), 0.0)
 
 
-@case(GROUP, "values in bfloat16 and float16, and under autocast")
-def half_values(folder: Path) -> list[Measure]:
+def test_half_values(within: Within) -> None:
+    """Values in bfloat16 and float16, and under autocast."""
     topology = scattered_blocks(8, 5)
     cell, inside = random_places(topology, 2000, 8)
     rows, weights = corners(topology, cell, inside)
-    out = []
     for kind in (torch.bfloat16, torch.float16):
         values = torch.cat([torch.randn(topology.zero_row), torch.zeros(1)]).to(kind)
         exact = gather(values.double(), rows, weights.double())
@@ -213,7 +196,23 @@ def half_values(folder: Path) -> list[Measure]:
             mixed = gather(values.float(), rows, weights)
             _, (share,) = scatter(rows, weights, (torch.ones(len(cell)),))
         _, (plain,) = scatter(rows, weights, (torch.ones(len(cell)),))
-        out.append(Measure(f"values stored in {name}", by_size(gather(values, rows, weights), exact), 4 * float(torch.finfo(kind).eps)))
-        out.append(Measure(f"values under {name} autocast", by_size(mixed, exact), VALUE))
-        out.append(Measure(f"gradients under {name} autocast", absolute(share, plain), 0.0))
-    return out
+        within(f"values stored in {name}", by_size(gather(values, rows, weights), exact), 4 * float(torch.finfo(kind).eps))
+        within(f"values under {name} autocast", by_size(mixed, exact), VALUE)
+        within(f"gradients under {name} autocast", absolute(share, plain), 0.0)
+
+
+@QUICK
+@given(st.lists(KEYS, min_size=1, max_size=8, unique=True), st.integers(0, 1000))
+def test_lookup(keys: list[tuple[int, int, int]], seed: int) -> None:
+    topology = Topology(torch.tensor(keys))
+    values = torch.cat([torch.randn(topology.zero_row, generator=torch.Generator().manual_seed(seed)), torch.zeros(1)])
+    errors = lookup_errors(topology, *random_places(topology, 60, seed), values)
+    for name, error in errors.items():
+        assert error <= (0 if "finite" in name else ABSENT if "absent" in name else VALUE), (name, error)
+
+
+def test_a_wrong_corner_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = corners
+    monkeypatch.setitem(globals(), "corners", lambda *given: (plain(*given)[0].roll(1, 1), plain(*given)[1]))
+    test_linear_fields(within := Within())
+    assert within.missed

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from fieldfuse.evaluation.selftest.case import Measure, absolute, case, not_finite
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.cross_view_consistency import AGAINST, FOR, SHARE, consistency, cross_view
 from fieldfuse.nerfusion.extras.matching import LARGE, SMALL, TEMPERATURE, UNKNOWN, patch_descriptors
 from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, carved, cost_volume, sweep_planes, to_probability
+from tests.stability.hard.errors import absolute, not_finite
+from tests.stability.hard.within import Within
 
 GROUP = "networks"
 WIDTH, HEIGHT, FOCAL = 24, 18, 22.0
@@ -72,9 +72,8 @@ def awkward() -> dict[str, tuple[Tensor, Cameras]]:
     }
 
 
-@case(GROUP, "plane sweep: constant pictures, one view, no baseline, neighbours that see nothing, places that nobody sees")
-def nothing_to_match(folder: Path) -> list[Measure]:
-    out = []
+def test_nothing_to_match(within: Within) -> None:
+    """Plane sweep: constant pictures, one view, no baseline, neighbours that see nothing, places that nobody sees."""
     points = places()
     for name, (images, cameras) in awkward().items():
         wrong, beyond, rising = 0.0, 0.0, 0.0
@@ -87,15 +86,13 @@ def nothing_to_match(folder: Path) -> list[Measure]:
                 for value, low in ((read.expected_sdf, -1), (read.visibility, 0), (read.confidence, 0)):
                     wrong += not_finite(value)
                     beyond += float(((value < low) | (value > 1)).sum())
-        out.append(Measure(f"{name}: values that are not finite", wrong, 0.0))
-        out.append(Measure(f"{name}: values out of their range", beyond, 0.0))
-        out.append(Measure(f"{name}: likelihoods that rise towards the camera", rising, 0.0))
-    return out
+        within(f"{name}: values that are not finite", wrong, 0.0)
+        within(f"{name}: values out of their range", beyond, 0.0)
+        within(f"{name}: likelihoods that rise towards the camera", rising, 0.0)
 
 
-@case(GROUP, "plane sweep: what tells nothing about depth is not sure of one")
-def unsure(folder: Path) -> list[Measure]:
-    out = []
+def test_unsure(within: Within) -> None:
+    """Plane sweep: what tells nothing about depth is not sure of one."""
     points = torch.tensor([[0.0, 0.0, depth] for depth in (0.6, 1.0, 2.0, 7.0)])
     for name in (
         "black",
@@ -111,9 +108,8 @@ def unsure(folder: Path) -> list[Measure]:
         likely = -torch.diff(made.table[0], dim=0)[:, HEIGHT // 4, WIDTH // 4]  # a pixel in the middle, which neighbours see at all depths
         even = 5 / made.table.shape[1]  # of five planes about a peak, where all are alike
         read = made.look(points, torch.full((len(points),), TRUNCATION))
-        out.append(Measure(f"{name}: likeliest plane against an even share, less one", float(likely.max()) * made.table.shape[1] - 1, 1e-4))
-        out.append(Measure(f"{name}: sure beyond an even share", max(0.0, float(read.confidence.max()) - even), 1e-6))
-    return out
+        within(f"{name}: likeliest plane against an even share, less one", float(likely.max()) * made.table.shape[1] - 1, 1e-4)
+        within(f"{name}: sure beyond an even share", max(0.0, float(read.confidence.max()) - even), 1e-6)
 
 
 # ------------------------------------------------------------------------------------------------ float64
@@ -185,9 +181,8 @@ def slow_likelihood(cost: Tensor) -> Tensor:
     return weight / weight.sum(0)
 
 
-@case(GROUP, "plane sweep: costs and likelihoods of each plane against float64")
-def sweep_exact(folder: Path) -> list[Measure]:
-    out = []
+def test_sweep_exact(within: Within) -> None:
+    """Plane sweep: costs and likelihoods of each plane against float64."""
     chosen = {
         "beside, above": poses((0, 0, 0), (0.23, 0.02, 0), (-0.03, 0.21, 0.05)),
         "turned": turned(poses((0, 0, 0), (0.3, 0, 0)), 1, -0.15),
@@ -201,39 +196,39 @@ def sweep_exact(folder: Path) -> list[Measure]:
         likely = slow_likelihood(cost)
         nearer = likely.flip(0).cumsum(0).flip(0) - 0.5 * likely
         sure = ~unsure.any()
-        out.append(Measure(f"{name}: places on a picture's border", float(~sure), 0.0))
-        out.append(Measure(f"{name}: likelihood that the surface is nearer", absolute(made.table[0], nearer), 2e-5))
-    return out
+        within(f"{name}: places on a picture's border", float(~sure), 0.0)
+        within(f"{name}: likelihood that the surface is nearer", absolute(made.table[0], nearer), 2e-5)
 
 
-@case(GROUP, "plane sweep: silhouettes that leave nothing, one plane, or what pictures say is impossible")
-def sweep_carved(folder: Path) -> list[Measure]:
-    """Likelihoods still sum to one, none is where it is empty, and places at the ends of the earth can be read."""
+def test_sweep_carved(within: Within) -> None:
+    """Plane sweep: silhouettes that leave nothing, one plane, or what pictures say is impossible.
+
+    Likelihoods still sum to one, none is where it is empty, and places at the ends of the earth can be read.
+    """
     planes = 32
     one_left = torch.ones(planes, 1, 2, dtype=torch.bool)
     one_left[7] = False
     sharp = torch.zeros(planes, 1, 2)
     sharp[3] = 1
     never = torch.full((planes, 1, 2), 1e-30)
-    out = []
     for name, likely in {"sharp": sharp, "denormal": never, "even": torch.full((planes, 1, 2), 1 / planes)}.items():
         for holes, empty in {"all": torch.ones_like(one_left), "all but one": one_left, "none": torch.zeros_like(one_left)}.items():
             left = carved(likely, empty)
-            out.append(Measure(f"{name}, empty {holes}: values that are not finite", not_finite(left), 0.0))
-            out.append(Measure(f"{name}, empty {holes}: sum", absolute(left.sum(0), torch.ones(1, 2)), 1e-6))
+            within(f"{name}, empty {holes}: values that are not finite", not_finite(left), 0.0)
+            within(f"{name}, empty {holes}: sum", absolute(left.sum(0), torch.ones(1, 2)), 1e-6)
             if holes == "all but one":
-                out.append(Measure(f"{name}, empty {holes}: likely where it is empty", float((left * empty).max()), 0.0))
+                within(f"{name}, empty {holes}: likely where it is empty", float((left * empty).max()), 0.0)
     for name, (images, cameras) in awkward().items():
         made = sweep_planes(list(patch_descriptors(images)), cameras, NEAR, FAR, empty=lambda points: points[:, 2] < 1)
         seen = made.look(places(), torch.full((len(places()),), TRUNCATION))
-        out.append(Measure(f"{name}: values that are not finite", not_finite(seen.expected_sdf, seen.visibility, seen.confidence), 0.0))
-    return out
+        within(f"{name}: values that are not finite", not_finite(seen.expected_sdf, seen.visibility, seen.confidence), 0.0)
 
 
-@case(GROUP, "plane sweep: witnesses that know nothing, look away, stand in the picture or at the ends of the earth")
-def sweep_witnessed(folder: Path) -> list[Measure]:
-    """What is said stays within its bounds, likelihoods are numbers, and who does not look changes none."""
-    out = []
+def test_sweep_witnessed(within: Within) -> None:
+    """Plane sweep: witnesses that know nothing, look away, stand in the picture or at the ends of the earth.
+
+    What is said stays within its bounds, likelihoods are numbers, and who does not look changes none.
+    """
     images, cameras = awkward()["one neighbour"]
     costs = cost_volume(list(patch_descriptors(images)), cameras, NEAR, FAR)
     own_estimate = to_probability(costs).table[0]
@@ -245,13 +240,12 @@ def sweep_witnessed(folder: Path) -> list[Measure]:
             assert correction is not None
             made = to_probability(costs, correction=correction)
             ends = f"{name}, {near:g} to {far:g}"
-            out.append(Measure(f"{ends}: values that are not finite", not_finite(correction, made.table), 0.0))
+            within(f"{ends}: values that are not finite", not_finite(correction, made.table), 0.0)
             beyond = max(0.0, float(correction.max()) - high, low - float(correction.min()))
-            out.append(Measure(f"{ends}: said beyond its bounds", beyond, 1e-5))
+            within(f"{ends}: said beyond its bounds", beyond, 1e-5)
             rising = float((torch.diff(made.table[0], dim=0) > 1e-6).sum())
-            out.append(Measure(f"{ends}: likelihoods that rise towards the camera", rising, 0.0))
+            within(f"{ends}: likelihoods that rise towards the camera", rising, 0.0)
     silent = consistency(costs, [cross_view(sweep_planes(list(patch_descriptors(images)), turned(cameras, 0, math.pi), NEAR, FAR))])
     assert silent is not None
     changed = absolute(to_probability(costs, correction=silent).table[0], own_estimate)
-    out.append(Measure("one that looks away: change of likelihoods", changed, 1e-6))
-    return out
+    within("one that looks away: change of likelihoods", changed, 1e-6)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from functools import cache
 
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
-from fieldfuse.evaluation.selftest.case import Measure, absolute, case, not_finite, relative
-from fieldfuse.evaluation.selftest.rays import lattice_grid, random_rays, unit
 from fieldfuse.render.march import MarchGrid, march
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import VOXELS
+from tests.stability.hard.errors import absolute, not_finite, relative
+from tests.stability.hard.fields import lattice_grid, random_rays, unit
+from tests.stability.hard.ranges import FEW
+from tests.stability.hard.within import Within
 
 GROUP = "rays with a background"
 
@@ -68,53 +72,46 @@ BOUNDS = {
 }
 
 
-def measures(errors: dict[str, float]) -> list[Measure]:
-    return [Measure(name, errors[name], bound) for name, bound in BOUNDS.items()]
-
-
-@case(GROUP, "from inside and from outside the region")
-def inside_and_outside(folder: Path) -> list[Measure]:
+def test_inside_and_outside(within: Within) -> None:
+    """From inside and from outside the region."""
     grid = lattice_grid(256, 1.0, shell=1.0)
     origins, directions = random_rays(12, 3)
     more, ways = random_rays(12, 4, away=0.4)
-    return measures(background_errors(grid, torch.cat([origins, more]), torch.cat([directions, ways])))
+    within.each(background_errors(grid, torch.cat([origins, more]), torch.cat([directions, ways])), others=BOUNDS)
 
 
-@case(GROUP, "along axes and diagonals, away from the region")
-def axes_and_away(folder: Path) -> list[Measure]:
+def test_axes_and_away(within: Within) -> None:
+    """Along axes and diagonals, away from the region."""
     grid = lattice_grid(256, 1.0, shell=1.0)
     directions = unit(torch.tensor([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0], [1.0, 1.0, 0], [-1.0, 1.0, 1.0], [1.0, 1e-9, -1e-20]]))
     origins = torch.cat([torch.zeros(6, 3), 0.9 * directions, -3 * directions])
-    return measures(background_errors(grid, origins, directions.repeat(3, 1)))
+    within.each(background_errors(grid, origins, directions.repeat(3, 1)), others=BOUNDS)
 
 
-@case(GROUP, "thin and thick shells, small and large regions, from inside")
-def shells(folder: Path) -> list[Measure]:
+def test_shells(within: Within) -> None:
+    """Thin and thick shells, small and large regions, from inside."""
     worst = dict.fromkeys(BOUNDS, 0.0)
     for shell, half in ((0.5, 1e-3), (1.0, 1e4), (2.0, 5.0)):
         origins, directions = random_rays(8, 7, away=0.5)
         errors = background_errors(lattice_grid(256, 1.0, 1, half, shell), origins * half, directions, 0.05 * half)
         worst = {name: max(worst[name], errors[name]) for name in worst}
-    return measures(worst)
+    within.each(worst, others=BOUNDS)
 
 
-@case(GROUP, "starting 5 and 10 half sizes away")
-def far_start(folder: Path) -> list[Measure]:
+def test_far_start(within: Within) -> None:
+    """Starting 5 and 10 half sizes away."""
     grid = lattice_grid(256, 1.0, shell=1.0)
-    out = []
     for away in (5.0, 10.0):
         origins, directions = random_rays(10, 8, away)
         samples = march(grid, origins, directions)
         crossing = torch.zeros(10, dtype=torch.int64).index_add_(0, samples.ray, (samples.distance - away).abs().lt(1).long())
-        out.append(Measure(f"rays from {away:g} away without a sample near the region", float((crossing == 0).sum()), 0.0))
-        out.append(Measure(f"not finite from {away:g} away", not_finite(samples.distance, samples.length, samples.inside), 0.0))
-    return out
+        within(f"rays from {away:g} away without a sample near the region", float((crossing == 0).sum()), 0.0)
+        within(f"not finite from {away:g} away", not_finite(samples.distance, samples.length, samples.inside), 0.0)
 
 
-@case(GROUP, "contraction and its inverse, and gradients at its seams")
-def contraction(folder: Path) -> list[Measure]:
+def test_contraction(within: Within) -> None:
+    """Contraction and its inverse, and gradients at its seams."""
     generator = torch.Generator().manual_seed(0)
-    out = []
     for shell in (0.25, 1.0, 3.0):
         space = Space((0.0, 0.0, 0.0), 1.0, shell)
         size = 10 ** (torch.rand(4000, 1, generator=generator, dtype=torch.float64) * 8 - 4)
@@ -122,17 +119,37 @@ def contraction(folder: Path) -> list[Measure]:
         wanted = contracted(points, shell)
         got = space.contract(points.float())
         near = points.abs().amax(1) < 100
-        out.append(Measure(f"contracted, shell {shell:g}", absolute(got, wanted), 1e-6 * (1 + shell)))
+        within(f"contracted, shell {shell:g}", absolute(got, wanted), 1e-6 * (1 + shell))
         back = space.expand(space.contract(points[near]))
         away = (back - points[near]).abs().amax(1) / points[near].abs().amax(1)
-        out.append(Measure(f"there and back within 100 half sizes, shell {shell:g}, relative", float(away.max()), 1e-9))
-        out.append(Measure(f"outside the lattice, shell {shell:g}", float((got.abs().amax(1) - 1 - shell).clamp_min(0).max()), 0.0))
+        within(f"there and back within 100 half sizes, shell {shell:g}, relative", float(away.max()), 1e-9)
+        within(f"outside the lattice, shell {shell:g}", float((got.abs().amax(1) - 1 - shell).clamp_min(0).max()), 0.0)
         seams = torch.tensor([[1.0, 1.0, 1.0], [1.0, -1.0, 0], [1.0, 0, 0], [0, 0, 0], [1e-30, 0, 0], [3e38, 1, 1]], requires_grad=True)
         space.contract(seams).sum().backward()
         assert seams.grad is not None
-        out.append(Measure(f"gradients at seams that are not finite, shell {shell:g}", not_finite(seams.grad), 0.0))
+        within(f"gradients at seams that are not finite, shell {shell:g}", not_finite(seams.grad), 0.0)
         inner = torch.tensor([[0.2, -0.7, 0.99]], dtype=torch.float64, requires_grad=True)
         outer = torch.tensor([[1.7, -0.4, 0.3], [-9.0, 2.0, 40.0]], dtype=torch.float64, requires_grad=True)
         good = all(torch.autograd.gradcheck(space.contract, (leaf,), raise_exception=False) for leaf in (inner, outer))
-        out.append(Measure(f"gradcheck failures, shell {shell:g}", float(not good), 0.0))
-    return out
+        within(f"gradcheck failures, shell {shell:g}", float(not good), 0.0)
+
+
+@FEW
+@given(st.floats(0.05, 6), st.integers(0, 1000), st.floats(-3, 3))
+def test_marching_beyond_the_region(away: float, seed: int, power: float) -> None:
+    half = 10.0**power
+    origins, directions = random_rays(4, seed, away)
+    errors = background_errors(background_grid(half), origins * half, directions, 0.01 * half)
+    for name, bound in BOUNDS.items():
+        assert errors[name] <= bound, (name, errors[name])
+
+
+@cache
+def full_grid() -> MarchGrid:
+    return lattice_grid(256, 1.0, 0, 1.0, 1.0)
+
+
+def background_grid(half: float) -> MarchGrid:
+    grid = full_grid()
+    grid.space = Space((0.0, 0.0, 0.0), half, 1.0)
+    return grid

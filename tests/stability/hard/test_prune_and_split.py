@@ -6,21 +6,23 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.selftest.case import Measure, absolute, by_size, case, not_finite, refused
-from fieldfuse.evaluation.selftest.lookup import lattice, scattered_blocks
-from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.field import Field, density
 from fieldfuse.render.rays import render_rays
+from fieldfuse.training.step import Optimiser, Rates
 from fieldfuse.volume.edit import corner_nodes, erase_empty_blocks, prune, resample, split, trilinear_density, with_corner_blocks
 from fieldfuse.volume.lookup import corners, gather
-from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import VOXELS, Topology
+from tests.stability.hard.errors import absolute, by_size, not_finite, refused
+from tests.stability.hard.fields import aimed_rays, lattice, scattered_blocks, small_field
+from tests.stability.hard.ranges import FEW
+from tests.stability.hard.within import Within
 
 GROUP = "prune and split"
-CHANNELS = 16  # of a field, as by default: kernels are compiled for each number of them
 
 
 def sparse_volume(seed: int, blocks: int = 6, share: float = 0.1) -> tuple[Topology, Tensor, Tensor]:
@@ -61,14 +63,15 @@ def split_errors(seed: int, mode: str) -> dict[str, float]:
     }
 
 
-@case(GROUP, "a trilinear split leaves the field as it was")
-def trilinear_split(folder: Path) -> list[Measure]:
+def test_trilinear_split(within: Within) -> None:
+    """A trilinear split leaves the field as it was."""
     errors = split_errors(3, "trilinear")
-    return [Measure(name, error, 1e-6 if name.startswith("value in") else 0.0) for name, error in errors.items()]
+    for name, error in errors.items():
+        within(name, error, 1e-6 if name.startswith("value in") else 0.0)
 
 
-@case(GROUP, "a nearest split copies, eight to one")
-def nearest_split(folder: Path) -> list[Measure]:
+def test_nearest_split(within: Within) -> None:
+    """A nearest split copies, eight to one."""
     topology, occupied, values = sparse_volume(5)
     finer, finer_occupied, (finer_values,) = split(topology, occupied, [values], "nearest")
     used = corner_nodes(finer, finer_occupied).nonzero().squeeze(1)
@@ -78,74 +81,48 @@ def nearest_split(folder: Path) -> list[Measure]:
     parent = lattice(finer)[even] // 2
     slot, local = topology.find(parent >> 3), parent & 7
     row = slot * VOXELS + (local[:, 2] * 8 + local[:, 1]) * 8 + local[:, 0]
-    return [
-        Measure("values that no parent has", float(foreign), 0.0),
-        Measure("values on the parents' lattice", absolute(finer_values[even], values[row]), 0.0),
-        *[Measure(name, error, 0.0) for name, error in split_errors(5, "nearest").items()],
-    ]
+    within("values that no parent has", float(foreign), 0.0)
+    within("values on the parents' lattice", absolute(finer_values[even], values[row]), 0.0)
+    for name, error in split_errors(5, "nearest").items():
+        within(name, error, 0.0)
 
 
-@case(GROUP, "resampling to another voxel size and back to the same one")
-def resampled(folder: Path) -> list[Measure]:
+def test_resampled(within: Within) -> None:
+    """Resampling to another voxel size and back to the same one."""
     topology, occupied, values = sparse_volume(7, share=1.0)
     (same,) = resample(topology, occupied, [values], topology.keys, 1.0)
     nodes = corner_nodes(topology, occupied)
     constant = torch.ones_like(values)
-    out = [Measure("same voxel size", absolute(same[:-1][nodes], values[:-1][nodes]), 0.0)]
+    within("same voxel size", absolute(same[:-1][nodes], values[:-1][nodes]), 0.0)
     for scale in (0.37, 0.5, 0.9, 1.7):
         keys = torch.unique((topology.keys.double() / scale).floor().long(), dim=0)
         (other,) = resample(topology, occupied, [constant], keys, scale)
         away = torch.minimum((other - 1).abs(), other.abs())  # a constant stays the constant, or zero where nothing is near
-        out.append(Measure(f"a constant at {scale} of the voxel size", float(away.max()), 1e-6))
-        out.append(Measure(f"not finite at {scale}", not_finite(other), 0.0))
-    return out
+        within(f"a constant at {scale} of the voxel size", float(away.max()), 1e-6)
+        within(f"not finite at {scale}", not_finite(other), 0.0)
 
 
-@case(GROUP, "pruning does not depend on the unit of length")
-def prune_scale(folder: Path) -> list[Measure]:
+def test_prune_scale(within: Within) -> None:
+    """Pruning does not depend on the unit of length."""
     topology, occupied, values = sparse_volume(9, share=0.5)
     sigma = values[:, 0].exp() * 4
     sigma[-1] = 0
     kept = prune(occupied, trilinear_density(topology, sigma), 0.1)
-    out = [Measure("pruned nothing or everything", float(int(kept.sum()) in (0, int(occupied.sum()))), 0.0)]
+    within("pruned nothing or everything", float(int(kept.sum()) in (0, int(occupied.sum()))), 0.0)
     for factor in (1e-6, 1e-3, 1e3, 1e6):
         other = prune(occupied, trilinear_density(topology, sigma / factor), 0.1 * factor)
-        out.append(Measure(f"voxels that differ at ×{factor:g}", float((kept != other).sum()), 2.0))
+        within(f"voxels that differ at ×{factor:g}", float((kept != other).sum()), 2.0)
     thick = prune(occupied, trilinear_density(topology, torch.full_like(sigma, 1e30)), 0.1)
     thin = prune(occupied, trilinear_density(topology, torch.zeros_like(sigma)), 0.1)
-    out.append(Measure("opaque voxels dropped", float((thick != occupied).sum()), 0.0))
-    out.append(Measure("empty voxels kept", float(thin.sum()), 0.0))
-    return out
+    within("opaque voxels dropped", float((thick != occupied).sum()), 0.0)
+    within("empty voxels kept", float(thin.sum()), 0.0)
 
 
-def small_field(seed: int = 0, share: float = 0.3, resolution: int = 32, shell: float = 0.0, decoder: str = "deferred") -> Field:
-    """A random field round the origin, dense enough to stop some of the light."""
-    generator = torch.Generator().manual_seed(seed)
-    torch.manual_seed(seed)
-    side = resolution // 8
-    line = torch.arange(side)
-    topology = Topology(torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1).view(-1, 3))
-    topology, occupied = with_corner_blocks(topology, torch.rand(topology.zero_row, generator=generator) < share)
-    raw = torch.randn(topology.zero_row + 1, generator=generator) - 1
-    features = torch.randn(topology.zero_row + 1, CHANNELS, generator=generator)
-    raw[-1], features[-1] = 0, 0
-    net = make_decoder(decoder, CHANNELS, 16)
-    for parameter in net.parameters():
-        parameter.data.add_(0.1 * torch.randn(parameter.shape, generator=generator))
-    return Field(Space((0.1, -0.2, 0.3), 1.2, shell), resolution, topology, occupied, raw, features, net, torch.tensor([0.2, 0.5, 0.7]))
+def test_pictures_agree(within: Within) -> None:
+    """Pictures before and after a split and a clean-up.
 
-
-def aimed_rays(count: int, seed: int = 0, away: float = 4.0) -> tuple[Tensor, Tensor]:
-    """(B, 3) origins on a sphere and unit directions to places near its centre."""
-    generator = torch.Generator().manual_seed(seed)
-    origins = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1) * away
-    aims = torch.randn(count, 3, generator=generator) * 0.5
-    return origins, torch.nn.functional.normalize(aims - origins, dim=1)
-
-
-@case(GROUP, "pictures before and after a split and a clean-up")
-def pictures_agree(folder: Path) -> list[Measure]:
-    """With twice as many samples a brick before the split as after it, both march through the same places, but in a ray's last step."""
+    With twice as many samples a brick before the split as after it, both march through the same places, but in a ray's last step.
+    """
     field = replace(small_field(2), fine=16)
     origins, directions = aimed_rays(300, 3)
     before = render_rays(field, origins, directions)
@@ -153,16 +130,14 @@ def pictures_agree(folder: Path) -> list[Measure]:
     topology, occupied, (raw, features) = split(field.topology, field.occupied, [field.density_rows, field.feature_rows])
     finer = Field(field.space, 64, topology, occupied, raw, features, field.decoder, field.background, field.near, field.fine // 2)
     after = render_rays(finer, origins, directions)
-    return [
-        Measure("colour after dropping empty blocks", absolute(settled.colour, before.colour), 1e-6),
-        Measure("colour after a split, mean", float((after.colour - before.colour).abs().mean()), 1e-3),
-        Measure("opacity after a split, mean", float((after.opacity - before.opacity).abs().mean()), 1e-3),
-        Measure("values that are not finite", not_finite(after.colour, after.distance, after.opacity), 0.0),
-    ]
+    within("colour after dropping empty blocks", absolute(settled.colour, before.colour), 1e-6)
+    within("colour after a split, mean", float((after.colour - before.colour).abs().mean()), 1e-3)
+    within("opacity after a split, mean", float((after.opacity - before.opacity).abs().mean()), 1e-3)
+    within("values that are not finite", not_finite(after.colour, after.distance, after.opacity), 0.0)
 
 
-@case(GROUP, "nothing left: pruned to the last voxel, split, saved, read, rendered")
-def nothing_left(folder: Path) -> list[Measure]:
+def test_nothing_left(within: Within, tmp_path: Path) -> None:
+    """Nothing left: pruned to the last voxel, split, saved, read, rendered."""
     field = small_field(1)
     none = torch.zeros_like(field.occupied)
     topology, occupied, rows = erase_empty_blocks(field.topology, none, [field.density_rows, field.feature_rows])
@@ -170,17 +145,15 @@ def nothing_left(folder: Path) -> list[Measure]:
     empty = Field(field.space, 32, topology, occupied, rows[0], rows[1], field.decoder, field.background)
     origins, directions = aimed_rays(10)
     seen = render_rays(empty, origins, directions)
-    path = folder / "field.safetensors"
+    path = tmp_path / "field.safetensors"
     empty.save(path)
     again = render_rays(Field.load(path), origins, directions)
-    return [
-        Measure("blocks left", float(topology.blocks + finer.blocks), 0.0),
-        Measure("rows left besides the zero row", float(sum(len(values) - 1 for values in (*rows, *finer_rows))), 0.0),
-        Measure("colour that is not the background", absolute(seen.colour, field.background.expand(10, 3)), 0.0),
-        Measure("colour after saving and reading", absolute(again.colour, seen.colour), 1e-6),
-        Measure("opacity", float(seen.opacity.abs().max() + again.opacity.abs().max()), 0.0),
-        Measure("a damaged file is taken", refused(lambda: _damaged(path), InputError), 0.0),
-    ]
+    within("blocks left", float(topology.blocks + finer.blocks), 0.0)
+    within("rows left besides the zero row", float(sum(len(values) - 1 for values in (*rows, *finer_rows))), 0.0)
+    within("colour that is not the background", absolute(seen.colour, field.background.expand(10, 3)), 0.0)
+    within("colour after saving and reading", absolute(again.colour, seen.colour), 1e-6)
+    within("opacity", float(seen.opacity.abs().max() + again.opacity.abs().max()), 0.0)
+    within("a damaged file is taken", refused(lambda: _damaged(path), InputError), 0.0)
 
 
 def _damaged(path: Path) -> Field:
@@ -188,17 +161,55 @@ def _damaged(path: Path) -> Field:
     return Field.load(path)
 
 
-@case(GROUP, "densities at the clamp through a file and back")
-def extreme_file(folder: Path) -> list[Measure]:
+def test_extreme_file(within: Within, tmp_path: Path) -> None:
+    """Densities at the clamp through a file and back."""
     field = small_field(4)
     field.density_rows[:-1] = torch.where(torch.rand(len(field.density_rows) - 1) < 0.5, 80.0, -80.0)
     field.feature_rows[:-1] *= 1e5  # float16 ends at 65504
-    field.save(folder / "field.safetensors")
-    again = Field.load(folder / "field.safetensors")
+    field.save(tmp_path / "field.safetensors")
+    again = Field.load(tmp_path / "field.safetensors")
     origins, directions = aimed_rays(200, 1)
     before, after = render_rays(field, origins, directions), render_rays(again, origins, directions)
-    return [
-        Measure("opacity", absolute(after.opacity, before.opacity), 1e-6),
-        Measure("colour", absolute(after.colour, before.colour), 5e-3),
-        Measure("values that are not finite", not_finite(before.colour, after.colour, density(again.density_rows)), 0.0),
-    ]
+    within("opacity", absolute(after.opacity, before.opacity), 1e-6)
+    within("colour", absolute(after.colour, before.colour), 5e-3)
+    within("values that are not finite", not_finite(before.colour, after.colour, density(again.density_rows)), 0.0)
+
+
+def test_optimiser_state(within: Within) -> None:
+    """The optimiser's state survives pruning, and starts afresh at a split."""
+    from fieldfuse.training.levels import finer, pruned
+    from fieldfuse.training.rays import Batch
+    from fieldfuse.volume.host import TorchHost
+
+    field = small_field(3, 0.4)
+    origins, directions = aimed_rays(200, 2)
+    batch = Batch(origins, directions, torch.rand(200, 3), torch.zeros(200, dtype=torch.int64))
+    rates, generator = Rates(0.05, 0.02, 1e-3, 0.01), torch.Generator().manual_seed(0)
+    optimiser = Optimiser(replace(field, density_rows=field.density_rows.clone(), feature_rows=field.feature_rows.clone()))
+    for _ in range(3):
+        optimiser.step(batch, rates, generator)
+    before = [optimiser.density.state.clone(), optimiser.feature.state.clone(), optimiser.field.density_rows.clone()]
+    keep = torch.rand(len(field.occupied), generator=generator) < 0.5
+    optimiser.go_on_with(pruned(optimiser.field, keep))
+    after = [optimiser.density.state, optimiser.feature.state, optimiser.field.density_rows]
+    lost = sum(absolute(new, old) for new, old in zip(after, before, strict=True))
+    optimiser.step(batch, rates, generator)
+    grown = finer(optimiser.field, optimiser.field.occupied, 2 * field.resolution, TorchHost())
+    optimiser.renew_rows(grown)
+    fresh = float(optimiser.density.state.abs().sum() + optimiser.feature.state.abs().sum())
+    optimiser.step(batch, rates, generator)
+    states = optimiser.decoder.state.values()
+    decoder = [state[name] for state in states for name in ("exp_avg", "exp_avg_sq")]
+    forgotten = min(int(state["step"]) for state in states) < 5 or not all(bool(value.any()) for value in decoder)
+    within("rows' moments changed by pruning", lost, 0.0)
+    within("rows' moments left at a split", fresh, 0.0)
+    within("decoder's moments lost", float(forgotten), 0.0)
+    within("values that are not finite", not_finite(*after, grown.density_rows, grown.feature_rows, *decoder), 0.0)
+
+
+@FEW
+@given(st.integers(0, 10_000), st.sampled_from(["trilinear", "nearest"]))
+def test_splits(seed: int, mode: str) -> None:
+    errors = split_errors(seed, mode)
+    assert errors.pop("value in occupied voxels") < 1e-6
+    assert not any(errors.values()), errors

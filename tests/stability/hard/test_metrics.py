@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.types import Views
@@ -18,8 +20,10 @@ from fieldfuse.evaluation.depth import KEYS, depth_metrics
 from fieldfuse.evaluation.images import PSNR_CAP, psnr, ssim
 from fieldfuse.evaluation.perceptual import lpips, lpips_available
 from fieldfuse.evaluation.score import score_views
-from fieldfuse.evaluation.selftest import reference
-from fieldfuse.evaluation.selftest.case import Measure, case, refused
+from tests.stability.hard import reference
+from tests.stability.hard.errors import refused
+from tests.stability.hard.ranges import QUICK
+from tests.stability.hard.within import Within
 
 GROUP = "metrics"
 SHAPE = (24, 32, 3)
@@ -53,22 +57,22 @@ def unclear(value: Any) -> int:
     return int(isinstance(value, float) and not math.isfinite(value))
 
 
-@case(GROUP, "PSNR and SSIM of every pair of awkward pictures")
-def pairs(folder: Path) -> list[Measure]:
+def test_pairs(within: Within) -> None:
+    """PSNR and SSIM of every pair of awkward pictures."""
     shown = pictures()
     numbers = [f(a, b) for f in (psnr, ssim) for a in shown.values() for b in shown.values()]
     missing = float(sum(number is None for number in numbers))
-    out = [Measure("NaN or infinity", float(unclear([number or 0.0 for number in numbers])), 0.0), Measure("no number", missing, 0.0)]
+    within("NaN or infinity", float(unclear([number or 0.0 for number in numbers])), 0.0)
+    within("no number", missing, 0.0)
     for name, picture in shown.items():
         same, alike = psnr(picture, picture), ssim(picture, picture)
         assert same is not None and alike is not None
-        out.append(Measure(f"{name} with itself: PSNR below the cap", PSNR_CAP - same, 0.0))
-        out.append(Measure(f"{name} with itself: SSIM below 1", abs(1 - alike), 1e-12))
-    return out
+        within(f"{name} with itself: PSNR below the cap", PSNR_CAP - same, 0.0)
+        within(f"{name} with itself: SSIM below 1", abs(1 - alike), 1e-12)
 
 
-@case(GROUP, "PSNR and SSIM against sums written out")
-def written_out(folder: Path) -> list[Measure]:
+def test_written_out(within: Within) -> None:
+    """PSNR and SSIM against sums written out."""
     rng = np.random.default_rng(4)
     smooth = 0.5 + 0.4 * np.sin(np.arange(20)[:, None] / 3) * np.cos(np.arange(17) / 4)
     pictures = {
@@ -77,42 +81,37 @@ def written_out(folder: Path) -> list[Measure]:
         "constant": (np.full((20, 17), 0.3), np.full((20, 17), 0.30001)),
         "dark": (smooth * 1e-4, smooth * 1.2e-4),
     }
-    out = []
     for name, (first, second) in pictures.items():
         a, b = np.repeat(first[..., None], 3, axis=2), np.repeat(second[..., None], 3, axis=2)
         error = math.fsum((x - y) ** 2 for x, y in zip(first.ravel().tolist(), second.ravel().tolist(), strict=True)) / first.size
         wanted = min(PSNR_CAP, -10 * math.log10(max(error, 1e-30)))
         got, alike = psnr(a, b), ssim(a, b)
         assert got is not None and alike is not None
-        out.append(Measure(f"{name}: PSNR, dB", abs(got - wanted), 1e-9))
-        out.append(Measure(f"{name}: SSIM", abs(alike - reference.ssim(first.tolist(), second.tolist())), 1e-9))
-    return out
+        within(f"{name}: PSNR, dB", abs(got - wanted), 1e-9)
+        within(f"{name}: SSIM", abs(alike - reference.ssim(first.tolist(), second.tolist())), 1e-10)
 
 
-@case(GROUP, "empty masks, single rows and columns, one pixel, nothing at all")
-def nothing_to_compare(folder: Path) -> list[Measure]:
+def test_nothing_to_compare(within: Within) -> None:
+    """Empty masks, single rows and columns, one pixel, nothing at all."""
     a, b = pictures()["noise"], pictures()["grey"]
     empty, full = np.zeros(SHAPE[:2], bool), np.ones(SHAPE[:2], bool)
     one = empty.copy()
     one[5, 7] = True
-    out = [
-        Measure("numbers for an empty mask", float(sum(f(a, b, empty) is not None for f in (psnr, ssim, lpips))), 0.0),
-        Measure("SSIM of one pixel", float(ssim(a, b, one) is not None), 0.0),
-        Measure("no PSNR of one pixel", float(psnr(a, b, one) is None), 0.0),
-        Measure("a full mask changes PSNR", abs((psnr(a, b, full) or 0) - (psnr(a, b) or 1)), 0.0),
-        Measure("a mask of another size taken", refused(lambda: psnr(a, b, full[:-1]), InputError), 0.0),
-        Measure("pictures of two sizes taken", refused(lambda: ssim(a, b[:-1]), InputError), 0.0),
-    ]
+    within("numbers for an empty mask", float(sum(f(a, b, empty) is not None for f in (psnr, ssim, lpips))), 0.0)
+    within("SSIM of one pixel", float(ssim(a, b, one) is not None), 0.0)
+    within("no PSNR of one pixel", float(psnr(a, b, one) is None), 0.0)
+    within("a full mask changes PSNR", abs((psnr(a, b, full) or 0) - (psnr(a, b) or 1)), 0.0)
+    within("a mask of another size taken", refused(lambda: psnr(a, b, full[:-1]), InputError), 0.0)
+    within("pictures of two sizes taken", refused(lambda: ssim(a, b[:-1]), InputError), 0.0)
     for shape in ((1, 32, 3), (24, 1, 3), (1, 1, 3), (10, 40, 3)):
         first, second = np.zeros(shape), np.full(shape, 0.25)
-        out.append(Measure(f"{shape[1]}×{shape[0]}: PSNR, dB", abs((psnr(first, second) or 0) - 12.041199826559248), 1e-9))
-        out.append(Measure(f"{shape[1]}×{shape[0]}: SSIM given", float(ssim(first, second) is not None), 0.0))
-    out.append(Measure("numbers for pictures without pixels", float(psnr(np.zeros((0, 5, 3)), np.zeros((0, 5, 3))) is not None), 0.0))
-    return out
+        within(f"{shape[1]}×{shape[0]}: PSNR, dB", abs((psnr(first, second) or 0) - 12.041199826559248), 1e-9)
+        within(f"{shape[1]}×{shape[0]}: SSIM given", float(ssim(first, second) is not None), 0.0)
+    within("numbers for pictures without pixels", float(psnr(np.zeros((0, 5, 3)), np.zeros((0, 5, 3))) is not None), 0.0)
 
 
-@case(GROUP, "depth with NaN, infinities, 0 and 65535")
-def depths(folder: Path) -> list[Measure]:
+def test_depths(within: Within) -> None:
+    """Depth with NaN, infinities, 0 and 65535."""
     truth = np.linspace(0.5, 8, 300).reshape(15, 20)
     awkward = {
         "NaN": np.full_like(truth, np.nan),
@@ -124,25 +123,23 @@ def depths(folder: Path) -> list[Measure]:
         "huge": np.full_like(truth, 1e308),
         "good": truth,
     }
-    out = []
     for name, depth in awkward.items():
         results = [depth_metrics(depth, other) for other in awkward.values()] + [depth_metrics(other, depth) for other in awkward.values()]
-        out.append(Measure(f"{name} against all: NaN or infinity", float(unclear(results)), 0.0))
+        within(f"{name} against all: NaN or infinity", float(unclear(results)), 0.0)
     same = depth_metrics(truth, truth)
-    out.append(Measure("the same depth: errors", sum(same[key] for key in ("abs_err", "abs_rel", "rmse", "median_rel")), 0.0))
-    out.append(Measure("the same depth: shares below 1", sum(1 - same[key] for key in ("delta_1", "delta_2", "delta_3", "coverage")), 0.0))
+    within("the same depth: errors", sum(same[key] for key in ("abs_err", "abs_rel", "rmse", "median_rel")), 0.0)
+    within("the same depth: shares below 1", sum(1 - same[key] for key in ("delta_1", "delta_2", "delta_3", "coverage")), 0.0)
     none = depth_metrics(truth, truth, np.zeros_like(truth, dtype=bool))
-    out.append(Measure("numbers for an empty mask", float(sum(none[key] is not None for key in KEYS)), 0.0))
+    within("numbers for an empty mask", float(sum(none[key] is not None for key in KEYS)), 0.0)
     mixed = truth.copy()
     mixed[0], mixed[1], mixed[2] = np.nan, np.inf, 0
     seen = depth_metrics(mixed, truth)
-    out.append(Measure("three of fifteen rows missing: coverage", abs(seen["coverage"] - 0.8), 1e-12))
-    out.append(Measure("three of fifteen rows missing: error of the others", seen["abs_err"], 0.0))
-    return out
+    within("three of fifteen rows missing: coverage", abs(seen["coverage"] - 0.8), 1e-12)
+    within("three of fifteen rows missing: error of the others", seen["abs_err"], 0.0)
 
 
-@case(GROUP, "scores of views without depth, mask, training picture or pixel are JSON")
-def scores(folder: Path) -> list[Measure]:
+def test_scores(within: Within) -> None:
+    """Scores of views without depth, mask, training picture or pixel are JSON."""
     camera = Intrinsics(32, 24, 30.0, 30.0, 16.0, 12.0)
     shown = list(pictures().values())
     truth = [shown[index] for index in (0, 1, 3, 4)]
@@ -167,22 +164,33 @@ def scores(folder: Path) -> list[Measure]:
     nearest = nearest_image_scores(views, range(4))
     json.dumps(nearest, allow_nan=False)
     nothing = score_views([], views, [])
-    return [
-        Measure("NaN or infinity", float(wrong + unclear(nearest) + unclear(nothing)), 0.0),
-        Measure("a nearest picture where none is for training", float(nearest["psnr"] is not None), 0.0),
-        Measure("a mean of nothing", float(nothing["psnr"] is not None), 0.0),
-    ]
+    within("NaN or infinity", float(wrong + unclear(nearest) + unclear(nothing)), 0.0)
+    within("a nearest picture where none is for training", float(nearest["psnr"] is not None), 0.0)
+    within("a mean of nothing", float(nothing["psnr"] is not None), 0.0)
 
 
-@case(GROUP, "LPIPS of constant, identical and damaged pictures")
-def perceptual(folder: Path) -> list[Measure]:
+def test_perceptual(within: Within) -> None:
+    """LPIPS of constant, identical and damaged pictures."""
     if not lpips_available():
-        return [Measure("numbers without weights", float(lpips(pictures()["black"], pictures()["white"]) is not None), 0.0)]
+        within("numbers without weights", float(lpips(pictures()["black"], pictures()["white"]) is not None), 0.0)
     big = {name: np.tile(picture, (2, 2, 1)) for name, picture in pictures().items()}
     numbers = [lpips(a, b) for a in list(big.values())[:6] for b in list(big.values())[5:]]
     own = [lpips(picture, picture) or 0.0 for picture in big.values()]
-    return [
-        Measure("NaN or infinity", float(unclear(numbers) + sum(number is None for number in numbers)), 0.0),
-        Measure("pictures with themselves", float(max(own)), 1e-6),
-        Measure("numbers of pictures too small", float(lpips(np.zeros((8, 8, 3)), np.ones((8, 8, 3))) is not None), 0.0),
-    ]
+    within("NaN or infinity", float(unclear(numbers) + sum(number is None for number in numbers)), 0.0)
+    within("pictures with themselves", float(max(own)), 1e-6)
+    within("numbers of pictures too small", float(lpips(np.zeros((8, 8, 3)), np.ones((8, 8, 3))) is not None), 0.0)
+
+
+NUMBERS = st.sampled_from([0.0, -0.0, 1.0, 0.5, -1.0, 255.0, 65535.0, 1e-310, 1e-20, 1e20, 1e308, math.nan, math.inf, -math.inf])
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@QUICK
+@given(st.lists(NUMBERS, min_size=2, max_size=2), st.integers(1, 14), st.integers(1, 14), st.booleans())
+def test_metrics_are_numbers_or_none(values: list[float], height: int, width: int, striped: bool) -> None:
+    first, second = (np.full((height, width, 3), value) for value in values)
+    if striped:
+        first[::2] = 0.25
+    results = [psnr(first, second), ssim(first, second), depth_metrics(first[..., 0], second[..., 0])]
+    assert unclear(results) == 0
+    json.dumps(results, allow_nan=False)

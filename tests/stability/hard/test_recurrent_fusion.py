@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
+import pytest
 import torch
 from torch import Tensor
 
-from fieldfuse.evaluation.selftest.case import Measure, absolute, by_size, case, not_finite
 from fieldfuse.nerfusion.gru import LEAST, FusionGRU, RunningMean
 from fieldfuse.nerfusion.training.health import saturation
 from fieldfuse.volume.topology import Topology
+from tests.stability.hard.errors import absolute, by_size, not_finite
+from tests.stability.hard.within import Within
 
 GROUP = "networks"
 SIZE = 512  # corners of one block
@@ -41,19 +41,24 @@ def recurrence_errors(frames: int) -> dict[str, float]:
     return {"state beyond ±1": max(0.0, largest - 1), "values that are not finite": wrong}
 
 
-@case(GROUP, "recurrent fusion: 200 frames stay held")
-def recurrence(folder: Path) -> list[Measure]:
-    return [Measure(name, error, 1e-6 if name.startswith("state") else 0.0) for name, error in recurrence_errors(200).items()]
+def test_recurrence(within: Within) -> None:
+    """Recurrent fusion: 200 frames stay bounded."""
+    for name, error in recurrence_errors(200).items():
+        within(name, error, 1e-6 if name.startswith("state") else 0.0)
 
 
-@case(GROUP, "recurrent fusion: 10,000 frames stay held", slow=True)
-def long_recurrence(folder: Path) -> list[Measure]:
-    return [Measure(name, error, 1e-6 if name.startswith("state") else 0.0) for name, error in recurrence_errors(10_000).items()]
+@pytest.mark.long
+def test_long_recurrence(within: Within) -> None:
+    """Recurrent fusion: 10,000 frames stay bounded."""
+    for name, error in recurrence_errors(10_000).items():
+        within(name, error, 1e-6 if name.startswith("state") else 0.0)
 
 
-@case(GROUP, "recurrent fusion: ten frames against weighted means and float64, gradients too")
-def recurrence_exact(folder: Path) -> list[Measure]:
-    """With gates that say nothing the state is the weighted mean of the frames: its value and its slopes are known in closed form."""
+def test_recurrence_exact(within: Within) -> None:
+    """Recurrent fusion: ten frames against weighted means and float64, gradients too.
+
+    With gates that say nothing the state is the weighted mean of the frames: its value and its slopes are known in closed form.
+    """
     topology, inside, mask = one_block()
     frames = 10
     raw, weight = torch.randn(frames, SIZE + 1, 4) * mask, (torch.rand(frames, SIZE) * 0.9 + 0.1) * inside
@@ -61,7 +66,6 @@ def recurrence_exact(folder: Path) -> list[Measure]:
     share = weight.double() / weight.double().sum(0).clamp_min(1e-30)
     exact = (wide[:, :-1] * share[:, :, None]).sum(0)
     slope = (1 - wide[:, :-1] ** 2) * share[:, :, None]
-    out = []
     silent = FusionGRU(4, 8)
     for gate in (silent.update, silent.reset, silent.candidate):
         for parameter in list(gate.parameters())[-2:]:
@@ -71,8 +75,8 @@ def recurrence_exact(folder: Path) -> list[Measure]:
         state = _run(fusion, leaf, weight, topology, inside, mask)
         state.sum().backward()
         assert leaf.grad is not None
-        out.append(Measure(f"{name}: value", absolute(state[:-1][inside], exact[inside]), 1e-6))
-        out.append(Measure(f"{name}: gradient, by the largest", by_size(leaf.grad[:, :-1][:, inside], slope[:, inside]), 5e-6))
+        within(f"{name}: value", absolute(state[:-1][inside], exact[inside]), 1e-6)
+        within(f"{name}: gradient, by the largest", by_size(leaf.grad[:, :-1][:, inside], slope[:, inside]), 5e-6)
     gru = FusionGRU(4, 8)
     double = FusionGRU(4, 8).double()
     double.load_state_dict({key: value.double() for key, value in gru.state_dict().items()})
@@ -81,11 +85,10 @@ def recurrence_exact(folder: Path) -> list[Measure]:
     state.sum().backward()
     truth.sum().backward()
     assert leaf.grad is not None and twin.grad is not None
-    out.append(Measure("open gates: value", absolute(state, truth), 2e-6))
-    out.append(Measure("open gates: gradient, by the largest", by_size(leaf.grad, twin.grad), 1e-5))
+    within("open gates: value", absolute(state, truth), 2e-6)
+    within("open gates: gradient, by the largest", by_size(leaf.grad, twin.grad), 1e-5)
     weights = zip(gru.parameters(), double.parameters(), strict=True)
-    out.append(Measure("open gates: gradient of the weights, by the largest", max(by_size(a.grad, b.grad) for a, b in weights), 1e-5))
-    return out
+    within("open gates: gradient of the weights, by the largest", max(by_size(a.grad, b.grad) for a, b in weights), 1e-5)
 
 
 def _run(fusion: FusionGRU | RunningMean, raw: Tensor, weight: Tensor, topology: Topology, inside: Tensor, mask: Tensor) -> Tensor:
@@ -97,8 +100,8 @@ def _run(fusion: FusionGRU | RunningMean, raw: Tensor, weight: Tensor, topology:
     return state
 
 
-@case(GROUP, "recurrent fusion: first frame, saturated gates, the same frame twice, an empty local volume, weights from 0 to 1e6")
-def recurrence_edges(folder: Path) -> list[Measure]:
+def test_recurrence_edges(within: Within) -> None:
+    """Recurrent fusion: first frame, saturated gates, the same frame twice, an empty local volume, weights from 0 to 1e6."""
     topology, inside, mask = one_block()
     gru, mean = FusionGRU(4, 8), RunningMean()
     none, once = torch.zeros(SIZE), inside.float()
@@ -119,22 +122,21 @@ def recurrence_edges(folder: Path) -> list[Measure]:
     unseen = mean(held, once, value, value, none, topology, inside)
     drift = LEAST / (LEAST + 1)
     heavy = [module(held, once, value, raw.detach(), once * 1e6, topology, inside) for module in (gru, mean)]
-    return [
-        Measure("values that are not finite", not_finite(first, saturated, empty, raw.grad, large.grad, unseen, *heavy), 0.0),
-        Measure("first frame without a gradient", float(raw.grad[:-1][inside].abs().sum() == 0), 0.0),
-        Measure("mean of the same frame twice", absolute(twice, value), 2e-7),
-        Measure("known by a frame that weighs nothing", absolute(unseen, (1 - drift) * held.double() + drift * value.double()), 1e-6),
-        Measure("mean with a frame of a million", absolute(heavy[1], value), 3e-6),
-        Measure("state beyond ±1", max(0.0, *(float(state.detach().abs().max()) - 1 for state in (*heavy, saturated))), 1e-6),
-    ]
+    within("values that are not finite", not_finite(first, saturated, empty, raw.grad, large.grad, unseen, *heavy), 0.0)
+    within("first frame without a gradient", float(raw.grad[:-1][inside].abs().sum() == 0), 0.0)
+    within("mean of the same frame twice", absolute(twice, value), 2e-7)
+    within("known by a frame that weighs nothing", absolute(unseen, (1 - drift) * held.double() + drift * value.double()), 1e-6)
+    within("mean with a frame of a million", absolute(heavy[1], value), 3e-6)
+    within("state beyond ±1", max(0.0, *(float(state.detach().abs().max()) - 1 for state in (*heavy, saturated))), 1e-6)
 
 
-@case(GROUP, "recurrent fusion: stuck gates are reported, open ones pass a gradient")
-def stuck_gates(folder: Path) -> list[Measure]:
-    """A gate at its end passes hardly any gradient: what counts is that its share is measured and shown (`GateWatch`)."""
+def test_stuck_gates(within: Within) -> None:
+    """Recurrent fusion: stuck gates are reported, open ones pass a gradient.
+
+    A gate at its end passes hardly any gradient: what counts is that its share is measured and shown (`GateWatch`).
+    """
     topology = Topology(torch.zeros((1, 3), dtype=torch.int64))
     inside, once = torch.ones(SIZE, dtype=torch.bool), torch.ones(SIZE)
-    out = []
     for name, bias, wanted in (("open", 0.0, 0.0), ("stuck", 1e3, 1.0), ("shut", -1e3, 1.0)):
         torch.manual_seed(0)
         gru = FusionGRU(4, 8)
@@ -147,8 +149,7 @@ def stuck_gates(folder: Path) -> list[Measure]:
         state[:-1].sum().backward()
         hook.remove()
         assert raw.grad is not None
-        out.append(Measure(f"{name}: share of saturated gates, off by", abs(seen[0] - wanted), 0.05))
-        out.append(Measure(f"{name}: values that are not finite", not_finite(state, raw.grad), 0.0))
+        within(f"{name}: share of saturated gates, off by", abs(seen[0] - wanted), 0.05)
+        within(f"{name}: values that are not finite", not_finite(state, raw.grad), 0.0)
         if name == "open":
-            out.append(Measure("open: no gradient", float(raw.grad.abs().sum() == 0), 0.0))
-    return out
+            within("open: no gradient", float(raw.grad.abs().sum() == 0), 0.0)

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from itertools import pairwise
-from pathlib import Path
 
+import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
-from fieldfuse.evaluation.selftest import reference
-from fieldfuse.evaluation.selftest.case import Measure, case, not_finite
-from fieldfuse.render.march import MarchGrid, march
-from fieldfuse.volume.space import Space
-from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
+from fieldfuse.render.march import MarchGrid, Samples, march
+from fieldfuse.volume.topology import BLOCK, VOXELS
+from tests.stability.hard import reference
+from tests.stability.hard.errors import not_finite
+from tests.stability.hard.fields import lattice_grid, random_rays, unit
+from tests.stability.hard.ranges import QUICK
+from tests.stability.hard.within import Within
 
 GROUP = "rays"
 ROUNDING = 2e-3  # of a voxel: how far float32 may move a sample over a border
@@ -26,15 +31,6 @@ BOUNDS = {
     "length in occupied voxels, in steps a piece": 1.0 + SPLIT,
     "values that are not finite": 0.0,
 }
-
-
-def lattice_grid(resolution: int, share: float, seed: int = 0, half: float = 1.0, shell: float = 0.0) -> MarchGrid:
-    """A lattice round the origin with `share` of its voxels occupied."""
-    generator = torch.Generator().manual_seed(seed)
-    line = torch.arange(resolution // BLOCK)
-    topology = Topology(torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1).view(-1, 3))
-    occupied = torch.rand(topology.zero_row, generator=generator) < share
-    return MarchGrid(Space((0.0, 0.0, 0.0), half, shell), resolution, topology, occupied)
 
 
 def march_errors(
@@ -102,52 +98,38 @@ def _compare(
             worst[key] = max(worst[key], abs((following - t) * speed - 0.5 * (length + other)) / step)
 
 
-def measures(errors: dict[str, float]) -> list[Measure]:
-    return [Measure(name, errors[name], bound) for name, bound in BOUNDS.items()]
+def test_random_half_empty(within: Within) -> None:
+    """Random rays through half-empty blocks."""
+    within.each(march_errors(lattice_grid(32, 0.5, 1), *random_rays(60, 2), fine=8), others=BOUNDS)
 
 
-def unit(directions: Tensor) -> Tensor:
-    return torch.nn.functional.normalize(directions.double(), dim=1).float()
+def test_random_full(within: Within) -> None:
+    """Random rays through full blocks: nothing lost or doubled at borders."""
+    within.each(march_errors(lattice_grid(64, 1.0), *random_rays(60, 3)), others=BOUNDS)
 
 
-def random_rays(count: int, seed: int, away: float = 3.0, spread: float = 0.6) -> tuple[Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    origins = unit(torch.randn(count, 3, generator=generator)) * away
-    return origins, unit(torch.randn(count, 3, generator=generator) * spread - origins)
+def test_jittered(within: Within) -> None:
+    """Jittered lattices of steps.
 
-
-@case(GROUP, "random rays through half-empty blocks")
-def random_half_empty(folder: Path) -> list[Measure]:
-    return measures(march_errors(lattice_grid(32, 0.5, 1), *random_rays(60, 2), fine=8))
-
-
-@case(GROUP, "random rays through full blocks: nothing lost or doubled at borders")
-def random_full(folder: Path) -> list[Measure]:
-    return measures(march_errors(lattice_grid(64, 1.0), *random_rays(60, 3)))
-
-
-@case(GROUP, "jittered lattices of steps")
-def jittered(folder: Path) -> list[Measure]:
-    """A ray's first step begins up to a whole step before the lattice: its first sample lies at most half a step outside."""
+    A ray's first step begins up to a whole step before the lattice: its first sample lies at most half a step outside.
+    """
     grid = lattice_grid(32, 0.7, 5)
     origins, directions = random_rays(40, 4)
     samples = march(grid, origins, directions, jitter=torch.linspace(0, 0.999, 40))
     outside = (origins[samples.ray] + samples.distance[:, None] * directions[samples.ray]).abs().amax(1) - 1
-    return [
-        Measure("first sample before the lattice, in steps", float(outside.max()) / grid.voxel, 0.5),
-        *measures(march_errors(grid, origins, directions, jitter=torch.linspace(0, 0.49, 40))),
-    ]
+    within("first sample before the lattice, in steps", float(outside.max()) / grid.voxel, 0.5)
+    within.each(march_errors(grid, origins, directions, jitter=torch.linspace(0, 0.49, 40)), others=BOUNDS)
 
 
-@case(GROUP, "parallel to faces, both ways along each axis")
-def parallel(folder: Path) -> list[Measure]:
+def test_parallel(within: Within) -> None:
+    """Parallel to faces, both ways along each axis."""
     axes = torch.cat([torch.eye(3), -torch.eye(3)]).repeat_interleave(4, 0)
     offset = torch.rand(24, 3, generator=torch.Generator().manual_seed(0)) * 1.8 - 0.9
-    return measures(march_errors(lattice_grid(32, 0.6, 6), -3 * axes + offset * (axes == 0), axes))
+    within.each(march_errors(lattice_grid(32, 0.6, 6), -3 * axes + offset * (axes == 0), axes), others=BOUNDS)
 
 
-@case(GROUP, "along edges of voxels and blocks, and through corners")
-def edges_and_corners(folder: Path) -> list[Measure]:
+def test_edges_and_corners(within: Within) -> None:
+    """Along edges of voxels and blocks, and through corners."""
     grid = lattice_grid(32, 1.0)
     voxel = grid.voxel
     along = [
@@ -161,83 +143,83 @@ def edges_and_corners(folder: Path) -> list[Measure]:
         for y in (-1.0, 1.0):
             directions += [torch.tensor([x, y, 1.0]), torch.tensor([x, y, 0.0])]
             origins += [-2 * directions[-2], -2 * directions[-1]]
-    return measures(march_errors(grid, torch.stack(origins), unit(torch.stack(directions))))
+    within.each(march_errors(grid, torch.stack(origins), unit(torch.stack(directions))), others=BOUNDS)
 
 
-@case(GROUP, "starting inside, on a face, on a corner")
-def starting_inside(folder: Path) -> list[Measure]:
+def test_starting_inside(within: Within) -> None:
+    """Starting inside, on a face, on a corner."""
     starts = torch.tensor(
         [[0.0, 0, 0], [0.31, -0.2, 0.77], [1.0, 0.1, 0.2], [-1.0, 0.1, 0.2], [0.25, 0.25, -1.0], [1.0, 1.0, 1.0], [-1.0, -1.0, -1.0]]
     )
     aims = unit(torch.randn(6, 3, generator=torch.Generator().manual_seed(3)))
     origins, directions = starts.repeat_interleave(6, 0), aims.repeat(len(starts), 1)
-    return measures(march_errors(lattice_grid(32, 0.8, 2), origins, directions))
+    within.each(march_errors(lattice_grid(32, 0.8, 2), origins, directions), others=BOUNDS)
 
 
-@case(GROUP, "pointing away, missing by a hair, no ray at all")
-def missing(folder: Path) -> list[Measure]:
+def test_missing(within: Within) -> None:
+    """Pointing away, missing by a hair, no ray at all."""
     grid = lattice_grid(32, 1.0)
     origins, directions = random_rays(50, 9)
     hair = torch.tensor([[-3.0, 1.0001, 0], [-3.0, 0, -1.0001], [1.0001, 3.0, 0.5]])
     ahead = torch.tensor([[1.0, 0, 0], [1.0, 0, 0], [0, -1.0, 0]])
     none = torch.zeros((0, 3))
-    return [
-        Measure("samples behind the start", float(len(march(grid, origins, -directions))), 0.0),
-        Measure("samples of rays that miss", float(len(march(grid, hair, ahead))), 0.0),
-        Measure("samples without rays", float(len(march(grid, none, none))), 0.0),
-    ]
+    within("samples behind the start", float(len(march(grid, origins, -directions))), 0.0)
+    within("samples of rays that miss", float(len(march(grid, hair, ahead))), 0.0)
+    within("samples without rays", float(len(march(grid, none, none))), 0.0)
 
 
-@case(GROUP, "directions with zero, negative zero and tiny components")
-def zero_components(folder: Path) -> list[Measure]:
+def test_zero_components(within: Within) -> None:
+    """Directions with zero, negative zero and tiny components."""
     tiny = [0.0, -0.0, 1e-45, -1e-38, 1e-20, -1e-12, 1e-9, 1.1e-9, 1e-6]
     directions = torch.tensor([[1.0, a, b] for a in tiny for b in tiny[::2]])
     origins = torch.tensor([[-2.0, 0.11, -0.37]]).repeat(len(directions), 1)
-    return measures(march_errors(lattice_grid(32, 0.6, 8), origins, unit(directions)))
+    within.each(march_errors(lattice_grid(32, 0.6, 8), origins, unit(directions)), others=BOUNDS)
 
 
-@case(GROUP, "grazing the outer faces")
-def grazing(folder: Path) -> list[Measure]:
+def test_grazing(within: Within) -> None:
+    """Grazing the outer faces."""
     offsets = [1 - 1e-3, 1 - 1e-5, -1 + 1e-3, -1 + 1e-5, -1.0]
     origins = torch.tensor([[-3.0, offset, 0.2] for offset in offsets] + [[0.4, -3.0, offset] for offset in offsets])
     directions = torch.tensor([[1.0, 0, 0]] * len(offsets) + [[0, 1.0, 0]] * len(offsets))
     tilted = unit(directions + torch.tensor([0.0, 0, 1e-4]))
     grid = lattice_grid(32, 1.0)
-    return measures(march_errors(grid, torch.cat([origins, origins]), torch.cat([directions, tilted])))
+    within.each(march_errors(grid, torch.cat([origins, origins]), torch.cat([directions, tilted])), others=BOUNDS)
 
 
-@case(GROUP, "tiny and huge extents")
-def extents(folder: Path) -> list[Measure]:
+def test_extents(within: Within) -> None:
+    """Tiny and huge extents."""
     worst = dict.fromkeys(BOUNDS, 0.0)
     for half in (1e-6, 1e-3, 1e3, 1e6):
         origins, directions = random_rays(20, 11)
         errors = march_errors(lattice_grid(32, 0.7, 3, half), origins * half, directions)
         worst = {name: max(worst[name], errors[name]) for name in worst}
-    return measures(worst)
+    within.each(worst, others=BOUNDS)
 
 
-@case(GROUP, "8³ to 256³ voxels")
-def resolutions(folder: Path) -> list[Measure]:
+def test_resolutions(within: Within) -> None:
+    """8³ to 256³ voxels."""
     worst = dict.fromkeys(BOUNDS, 0.0)
     for resolution in (8, 16, 128, 256):
         errors = march_errors(lattice_grid(resolution, 0.9, 4), *random_rays(8, resolution))
         worst = {name: max(worst[name], errors[name]) for name in worst}
-    return measures(worst)
+    within.each(worst, others=BOUNDS)
 
 
-@case(GROUP, "nothing nearer than `near`")
-def nearest(folder: Path) -> list[Measure]:
+def test_nearest(within: Within) -> None:
+    """Nothing nearer than `near`."""
     grid = lattice_grid(32, 1.0)
     origins, directions = random_rays(30, 6, away=0.5)
     samples = march(grid, origins, directions, 0.4)
     early = (0.4 - samples.distance).clamp_min(0).max() / grid.voxel
-    return [Measure("before it, in voxels", float(early), 0.5 + ROUNDING), *measures(march_errors(grid, origins, directions, 0.4))]
+    within("before it, in voxels", float(early), 0.5 + ROUNDING)
+    within.each(march_errors(grid, origins, directions, 0.4), others=BOUNDS)
 
 
-@case(GROUP, "from 1e2 to 1e5 half sizes away")
-def far_away(folder: Path) -> list[Measure]:
-    """float32 places the samples of a ray that starts 1e5 away only to 0.008: what is stopped in all must still be right."""
-    out = []
+def test_far_away(within: Within) -> None:
+    """From 1e2 to 1e5 half sizes away.
+
+    float32 places the samples of a ray that starts 1e5 away only to 0.008: what is stopped in all must still be right.
+    """
     for away, steps in ((1e2, 1.0), (1e3, 1.0), (1e5, 2.0)):
         grid = lattice_grid(32, 1.0)
         origins, directions = random_rays(40, 5, away, 0.3)
@@ -248,6 +230,35 @@ def far_away(folder: Path) -> list[Measure]:
             for o, d in zip(origins.double().tolist(), directions.double().tolist(), strict=True)
         ]
         worst = (covered - torch.tensor(exact, dtype=torch.float64)).abs().max() / (grid.voxel)
-        out.append(Measure(f"length from {away:g} away, in steps", float(worst), steps + SPLIT))
-        out.append(Measure(f"not finite from {away:g} away", not_finite(samples.distance, samples.length, samples.inside), 0.0))
-    return out
+        within(f"length from {away:g} away, in steps", float(worst), steps + SPLIT)
+        within(f"not finite from {away:g} away", not_finite(samples.distance, samples.length, samples.inside), 0.0)
+
+
+@QUICK
+@given(st.sampled_from([8, 16, 32]), st.floats(0, 1), st.integers(0, 1000), st.floats(0.2, 30), st.floats(-6, 6), st.integers(1, 8))
+def test_marching(resolution: int, share: float, seed: int, away: float, power: float, fine: int) -> None:
+    half = 10.0**power
+    origins, directions = random_rays(6, seed, away)
+    errors = march_errors(lattice_grid(resolution, share, seed, half), origins * half, directions, fine=fine)
+    for name, bound in BOUNDS.items():
+        assert errors[name] <= bound, (name, errors[name])
+
+
+def test_lost_and_doubled_samples_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = march
+
+    def losing(*arguments: object, **options: object) -> Samples:
+        samples = plain(*arguments, **options)  # type: ignore[arg-type]
+        return samples.keep(torch.arange(len(samples)) % 97 != 0)
+
+    def doubling(*arguments: object, **options: object) -> Samples:
+        samples = plain(*arguments, **options)  # type: ignore[arg-type]
+        twice = torch.arange(len(samples)).repeat_interleave(1 + (torch.arange(len(samples)) % 97 == 0).long())
+        return Samples(*(getattr(samples, field.name)[twice] for field in fields(samples)))
+
+    monkeypatch.setitem(globals(), "march", losing)
+    test_random_full(within := Within())
+    assert "gap or overlap between samples, in steps" in within.missed
+    monkeypatch.setitem(globals(), "march", doubling)
+    test_random_full(within := Within())
+    assert "gap or overlap between samples, in steps" in within.missed

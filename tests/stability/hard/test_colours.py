@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
 from fieldfuse.camera import Array
 from fieldfuse.capture.types import Views
-from fieldfuse.evaluation.selftest.case import Measure, absolute, case, not_finite
 from fieldfuse.evaluation.sphere import around, lens, sphere_field
 from fieldfuse.render.composite import RAW_MAX
 from fieldfuse.render.recolour import COLOURS, MOST, recoloured
 from fieldfuse.render.sky import sky_colours
 from fieldfuse.training.behind import sky_behind
+from tests.stability.hard.errors import absolute, not_finite
+from tests.stability.hard.within import Within
 
 GROUP = "colours of pictures"
 SIDE, DISTANCE = 24, 2.4  # pixels of a picture, and how far its camera is from the middle
@@ -28,9 +28,11 @@ def pictures(colours: list[int], poses: Array | None = None, side: int = SIDE) -
     return Views([f"{i}" for i in range(len(colours))], images, [lens(side, side)] * len(colours), poses, np.zeros(len(colours), bool))
 
 
-@case(GROUP, "looked up again in black, white and contradicting pictures; at the clamp, saturated and empty")
-def looked_up_again(folder: Path) -> list[Measure]:
-    """A weighted mean of what rays ask for moves no logit further than a ray may, however steep the way to a colour is."""
+def test_looked_up_again(within: Within) -> None:
+    """Looked up again in black, white and contradicting pictures; at the clamp, saturated and empty.
+
+    A weighted mean of what rays ask for moves no logit further than a ray may, however steep the way to a colour is.
+    """
     sphere = sphere_field(24)
     fields = {
         "as it is": sphere,
@@ -39,28 +41,27 @@ def looked_up_again(folder: Path) -> list[Measure]:
         "features of 1e4": replace(sphere, feature_rows=1e4 * sphere.feature_rows),
         "no voxels": replace(sphere, occupied=torch.zeros_like(sphere.occupied)),
     }
-    out = []
     for name, field in fields.items():
         for shown, views in (("black", pictures([0] * 6)), ("white", pictures([255] * 6)), ("both", pictures([0, 255] * 3))):
             features = recoloured(field, views, DISTANCE).field.feature_rows
             moved = (features.double() - field.feature_rows.double())[:, :COLOURS].abs()
             rounding = 1e-6 * field.feature_rows.abs().max()
-            out.append(Measure(f"{name}, {shown}: values that are not finite", not_finite(features), 0.0))
-            out.append(Measure(f"{name}, {shown}: logits moved too far", float((moved - MOST - rounding).clamp_min(0).max()), 1e-5))
+            within(f"{name}, {shown}: values that are not finite", not_finite(features), 0.0)
+            within(f"{name}, {shown}: logits moved too far", float((moved - MOST - rounding).clamp_min(0).max()), 1e-5)
             others = absolute(features[:, COLOURS:], field.feature_rows[:, COLOURS:])
-            out.append(Measure(f"{name}, {shown}: other features changed", others, 0.0))
+            within(f"{name}, {shown}: other features changed", others, 0.0)
     for name in ("all but empty", "no voxels"):
         features = recoloured(fields[name], pictures([255] * 6), DISTANCE).field.feature_rows
-        out.append(Measure(f"{name}: changed", absolute(features, fields[name].feature_rows), 0.0))
-    return out
+        within(f"{name}: changed", absolute(features, fields[name].feature_rows), 0.0)
 
 
-@case(GROUP, "behind everything: one colour, one direction, a single pixel, pictures that contradict")
-def behind_everything(folder: Path) -> list[Measure]:
-    """Nine harmonics of directions that do not tell them apart: only the ridge holds them."""
+def test_behind_everything(within: Within) -> None:
+    """Behind everything: one colour, one direction, a single pixel, pictures that contradict.
+
+    Nine harmonics of directions that do not tell them apart: only the ridge holds them.
+    """
     everywhere = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     same = np.repeat(around(1), 6, axis=0)
-    out = []
     for grey in (0, 1, 128, 255):
         for name, views in (
             ("all around", pictures([grey] * 6)),
@@ -70,7 +71,7 @@ def behind_everything(folder: Path) -> list[Measure]:
         ):
             sky = sky_behind(views)
             assert sky is not None
-            out.append(Measure(f"{grey}, {name}", absolute(sky_colours(sky, everywhere), torch.full((2000, 3), grey / 255)), 1e-5))
+            within(f"{grey}, {name}", absolute(sky_colours(sky, everywhere), torch.full((2000, 3), grey / 255)), 1e-5)
     for name, views in (
         ("black and white from one place", pictures([0, 255] * 3, same)),
         ("black and white around", pictures([0, 255] * 4)),
@@ -81,7 +82,6 @@ def behind_everything(folder: Path) -> list[Measure]:
         assert sky is not None
         colours = sky_colours(sky, everywhere)
         mean = float(np.mean([picture.mean() for picture in views.images]) / 255)
-        out.append(Measure(f"{name}: values that are not finite", not_finite(sky, colours), 0.0))
+        within(f"{name}: values that are not finite", not_finite(sky, colours), 0.0)
         # Pictures that contradict each other say nothing of directions, so it is their mean colour.
-        out.append(Measure(f"{name}: away from the mean colour", float((colours - mean).abs().max()), 0.02))
-    return out
+        within(f"{name}: away from the mean colour", float((colours - mean).abs().max()), 0.02)

@@ -6,40 +6,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
-from fieldfuse.camera import Array, Intrinsics, Similarity
 from fieldfuse.capture.types import Views
 from fieldfuse.config import load_settings
-from fieldfuse.evaluation.selftest.case import Measure, case, not_finite
-from fieldfuse.evaluation.selftest.data import flat, one_pixel, poses, saturated, texture
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import make_renderer, render_view
 from fieldfuse.training.fit import fit_field
+from tests.stability.hard.captures import CAMERA, flat, noise, one_pixel, saturated, scene_of, texture, views_of
+from tests.stability.hard.errors import not_finite
+from tests.stability.hard.within import Within
 
 GROUP = "fits"
 SECONDS = 0.4
-CAMERA = Intrinsics(40, 32, 44.0, 44.0, 20.0, 16.0)
-Paint = Callable[[int, int, int], Array]
-
-
-def noise(index: int, height: int, width: int) -> Array:
-    return np.asarray(np.random.default_rng(index).integers(0, 255, (height, width, 3)), dtype=np.uint8)
-
-
-def views_of(paint: Paint, count: int = 6, tested: int = 0, alpha: bool = False) -> Views:
-    """Views on an arc, the first `tested` held out; with `alpha` nothing is opaque."""
-    pictures = [paint(index, CAMERA.height, CAMERA.width) for index in range(count)]
-    views = Views([str(i) for i in range(count)], pictures, [CAMERA] * count, poses(count), np.arange(count) < tested)
-    if alpha:
-        views.alpha, views.background = [np.zeros(pictures[0].shape[:2], np.uint8)] * count, (1.0, 1.0, 1.0)
-    return views
-
-
-def scene_of(half: Array | None = None, centre: Array | None = None, background: bool = False) -> Scene:
-    half = np.full(3, 1.2) if half is None else half
-    return Scene(Similarity.identity(), np.zeros(3) if centre is None else centre, half, 3.0, 0.5, 6.0, 0.1, background, True)
 
 
 def fit_errors(views: Views, scene: Scene, engine: str, folder: Path) -> dict[str, float]:
@@ -72,19 +53,8 @@ CAPTURES: dict[str, Callable[[], tuple[Views, Scene]]] = {
 }
 
 
-@case(GROUP, "black, white, noise, one bright pixel, one view, no opacity, no region (torch)")
-def with_torch(folder: Path) -> list[Measure]:
-    return _all(folder, "torch")
-
-
-@case(GROUP, "the same with the compiled engine", slow=True)
-def compiled(folder: Path) -> list[Measure]:
-    return _all(folder, "numba")
-
-
-def _all(folder: Path, engine: str) -> list[Measure]:
-    return [
-        Measure(f"{name}: {what}", error, 0.0)
-        for name, make in CAPTURES.items()
-        for what, error in fit_errors(*make(), engine, folder).items()
-    ]
+@pytest.mark.parametrize("engine", ["torch", pytest.param("numba", marks=pytest.mark.long)])
+def test_fits(within: Within, tmp_path: Path, engine: str) -> None:
+    """Black, white, noise, one bright pixel, one view, no opacity, no region."""
+    for name, make in CAPTURES.items():
+        within.each(fit_errors(*make(), engine, tmp_path), name=f"{name}: {{}}")

@@ -1,20 +1,20 @@
-"""Two engines, one field: torch and the compiled one against sums written out, and against each other where fields are awkward."""
+"""Two engines, one field: torch and the compiled one against sums written out and each other; gradients: `tests/training`."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from fieldfuse.evaluation.selftest import reference
-from fieldfuse.evaluation.selftest.case import Measure, case, not_finite
-from fieldfuse.evaluation.selftest.edit import aimed_rays, small_field
 from fieldfuse.render.field import Field, density
 from fieldfuse.render.numba_renderer import NumbaRenderer
 from fieldfuse.render.rays import render_rays
+from tests.stability.hard import reference
+from tests.stability.hard.errors import not_finite
+from tests.stability.hard.fields import aimed_rays, small_field
+from tests.stability.hard.within import Within
 
 GROUP = "engines"
 OPACITY = 1e-6
@@ -36,21 +36,19 @@ def even(thickness: float, resolution: int = 128) -> tuple[Field, Tensor, Tensor
     return replace(field, density_rows=torch.full_like(field.density_rows, raw)), origin, torch.tensor([[1.0, 0.0, 0.0]])
 
 
-@case(GROUP, "haze to solid: opacity of a ray through 128 even samples")
-def haze_to_solid(folder: Path) -> list[Measure]:
-    out = []
+def test_haze_to_solid(within: Within) -> None:
+    """Haze to solid: opacity of a ray through 128 even samples."""
     for thickness in (1e-9, 1e-6, 1e-4, 1e-2, 1.0, 30.0):
         field, origin, direction = even(thickness)
         exact = 1 - reference.composite([thickness] * 128)[2]
         for name, values in both(field, origin, direction, 0.0).items():
             # The compiled engine ends a ray where a ten-thousandth of the light is left.
             bound = OPACITY if exact < 0.999 else 2e-4
-            out.append(Measure(f"{name}, τ = {thickness:g} a sample", abs(float(values[0, 4]) - exact), bound))
-    return out
+            within(f"{name}, τ = {thickness:g} a sample", abs(float(values[0, 4]) - exact), bound)
 
 
-@case(GROUP, "densities at and beyond the clamp, empty and solid side by side")
-def clamped(folder: Path) -> list[Measure]:
+def test_clamped(within: Within) -> None:
+    """Densities at and beyond the clamp, empty and solid side by side."""
     field = small_field(7, 0.5)
     raw = torch.where(torch.rand(len(field.density_rows)) < 0.5, 1e30, -1e30)
     raw[-1] = 0
@@ -58,39 +56,21 @@ def clamped(folder: Path) -> list[Measure]:
     values = both(replace(field, density_rows=raw), origins, directions, 1e-3)
     colour = (values["torch"][:, :3] - values["compiled"][:, :3]).abs().amax(1)
     opacity = (values["torch"][:, 4] - values["compiled"][:, 4]).abs()
-    return [
-        Measure("values that are not finite", not_finite(*values.values()), 0.0),
-        Measure("colours outside [0, 1]", float(sum(((v[:, :3] < 0) | (v[:, :3] > 1)).sum() for v in values.values())), 0.0),
-        # A sample that float32 puts on the other side of a voxel's border changes its ray, and only it.
-        Measure("colours of the two engines apart, 95% of rays", float(colour.quantile(0.95)), 1e-3),
-        Measure("opacities of the two engines apart, 95% of rays", float(opacity.quantile(0.95)), 1e-3),
-    ]
+    within("values that are not finite", not_finite(*values.values()), 0.0)
+    within("colours outside [0, 1]", float(sum(((v[:, :3] < 0) | (v[:, :3] > 1)).sum() for v in values.values())), 0.0)
+    # A sample that float32 puts on the other side of a voxel's border changes its ray, and only it.
+    within("colours of the two engines apart, 95% of rays", float(colour.quantile(0.95)), 1e-3)
+    within("opacities of the two engines apart, 95% of rays", float(opacity.quantile(0.95)), 1e-3)
 
 
-@case(GROUP, "random fields, bounded and with a background: the two agree")
-def agree(folder: Path) -> list[Measure]:
-    out = []
-    for name, shell, share in (("bounded", 0.0, 0.4), ("with a background", 1.0, 0.4), ("almost empty", 0.0, 0.01)):
-        field = small_field(3, share, 64, shell)
-        origins, directions = aimed_rays(300, 4, 2.0)
-        values = both(field, origins, directions, 1e-3)
-        apart = (values["torch"][:, [0, 1, 2, 4]] - values["compiled"][:, [0, 1, 2, 4]]).abs().amax(1)
-        out.append(Measure(f"{name}: apart, 95% of rays", float(apart.quantile(0.95)), 1e-3))
-        out.append(Measure(f"{name}: apart, mean", float(apart.mean()), 2e-3))
-        out.append(Measure(f"{name}: not finite", not_finite(*values.values()), 0.0))
-    return out
-
-
-@case(GROUP, "nothing to see: no rays, rays that miss, a field without voxels")
-def nothing(folder: Path) -> list[Measure]:
+def test_nothing(within: Within) -> None:
+    """Nothing to see: no rays, rays that miss, a field without voxels."""
     field = small_field(1)
     origins, directions = aimed_rays(20, 5)
     empty = replace(field, occupied=torch.zeros_like(field.occupied)).settled()
-    out = []
     for what, seen, ways in (("missing", field, -directions), ("no voxels", empty, directions)):
         for name, values in both(seen, origins, ways, 1e-3).items():
             apart = float((values[:, :3] - field.background).abs().max())
-            out.append(Measure(f"{name}, {what}: not the background", apart + float(values[:, 3:].abs().max()), 1e-6))
+            within(f"{name}, {what}: not the background", apart + float(values[:, 3:].abs().max()), 1e-6)
     none = both(field, origins[:0], directions[:0], 1e-3)
-    out.append(Measure("pictures of no rays", float(sum(len(values) for values in none.values())), 0.0))
-    return out
+    within("pictures of no rays", float(sum(len(values) for values in none.values())), 0.0)
