@@ -19,7 +19,7 @@ from benchmarks.experiment import Experiment, Folder, Row, application, markdown
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError
-from fieldfuse.nerfusion.extras.keyframe_depth import beside
+from fieldfuse.nerfusion.extras.keyframe_depth import overlapping
 from fieldfuse.nerfusion.fusion import FusionOptions, fuse_views, fusion_lattice
 from fieldfuse.nerfusion.keyframes import KeyFrames, select_keyframes
 from fieldfuse.nerfusion.lattice import Lattice
@@ -117,7 +117,7 @@ def walk(key_frames: int, width: int, voxel: float, levels: int, seed: int, devi
     half = float((high - low).max() / 2)
     middle, box = (low + high) / 2, (high - low) / 2 / half
     space = Space((float(middle[0]), float(middle[1]), float(middle[2])), half, 0.0, (float(box[0]), float(box[1]), float(box[2])))
-    return Walk(views, keys, beside(keys, poses, views.intrinsics, median), fusion_lattice(space, voxel, levels))
+    return Walk(views, keys, overlapping(keys, poses, views.intrinsics, median), fusion_lattice(space, voxel, levels))
 
 
 def _path(scene: Scene, random: np.random.Generator, count: int) -> Array:

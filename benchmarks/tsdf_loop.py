@@ -13,7 +13,7 @@ import open3d.core as o3c
 from fieldfuse.camera import invert
 from fieldfuse.errors import InputError
 from fieldfuse.tsdf.frames import DepthFrame
-from fieldfuse.tsdf.volume import BLOCK, DEVICE, TsdfVolume
+from fieldfuse.tsdf.volume import BLOCK, DEVICE, TRUNCATION, TsdfVolume
 
 
 def bare_loop_seconds(
@@ -21,7 +21,6 @@ def bare_loop_seconds(
     frames: Sequence[DepthFrame],
     voxel_size: float,
     depth_max: float,
-    truncation: float,
     blocks: int,
 ) -> tuple[float, float]:
     """Seconds of the shortest loop one can write, by the wall and by all threads' processor time.
@@ -42,14 +41,12 @@ def bare_loop_seconds(
         depth_image, colour_image = o3d.t.geometry.Image(depth), o3d.t.geometry.Image(colour)
         matrix, colour_matrix = o3c.Tensor(frame.depth_intrinsics.matrix()), o3c.Tensor(frame.colour_intrinsics.matrix())
         extrinsic = o3c.Tensor(invert(frame.world_from_camera))
-        keys = grid.compute_unique_block_coordinates(depth_image, matrix, extrinsic, 1000.0, depth_max, truncation)
-        grid.integrate(keys, depth_image, colour_image, matrix, colour_matrix, extrinsic, 1000.0, depth_max, truncation)
+        keys = grid.compute_unique_block_coordinates(depth_image, matrix, extrinsic, 1000.0, depth_max, TRUNCATION)
+        grid.integrate(keys, depth_image, colour_image, matrix, colour_matrix, extrinsic, 1000.0, depth_max, TRUNCATION)
     return _since(started)
 
 
-def compare_with_bare_loop(
-    frames: Sequence[DepthFrame], voxel_size: float, depth_max: float, rounds: int = 5, truncation: float = 4.0
-) -> dict[str, float]:
+def compare_with_bare_loop(frames: Sequence[DepthFrame], voxel_size: float, depth_max: float, rounds: int = 5) -> dict[str, float]:
     """Frames a second of `TsdfVolume.integrate` and of the bare loop on the same frames (metres, already decoded), and their ratio.
 
     Both run `rounds` times in turns, each first in every other round, so that a busy machine slows both; medians count. Set the number of
@@ -61,7 +58,7 @@ def compare_with_bare_loop(
     """
     if not frames:
         raise InputError("there are no depth frames to measure with; choose a capture with depth")
-    scratch = TsdfVolume(voxel_size, depth_max, truncation)
+    scratch = TsdfVolume(voxel_size, depth_max)
     for frame in frames:
         scratch.integrate(frame)
     blocks = scratch.blocks + max(len(scratch.touched(frame)) for frame in frames) + 1000
@@ -74,9 +71,9 @@ def compare_with_bare_loop(
     for turn in range(rounds):
         for which in ("ours", "bare") if turn % 2 else ("bare", "ours"):
             if which == "bare":
-                bare.append(bare_loop_seconds(raw, frames, voxel_size, depth_max, truncation, blocks))
+                bare.append(bare_loop_seconds(raw, frames, voxel_size, depth_max, blocks))
             else:
-                volume = TsdfVolume(voxel_size, depth_max, truncation, expected_blocks=blocks)
+                volume = TsdfVolume(voxel_size, depth_max, expected_blocks=blocks)
                 started = _clocks()
                 for frame in frames:
                     volume.integrate(frame)

@@ -15,7 +15,7 @@ Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for everything th
 OptionalOut = Annotated[
     Path | None, typer.Option("--out", "-o", help="Folder of the run, when the first argument is a source.", show_default=False)
 ]
-Preset = Annotated[str | None, typer.Option(help="fast, balanced (default) or quality.", show_default=False)]
+Preset = Annotated[str | None, typer.Option(help="fast, balanced (default), quality, or paper (as NeRFusion does it).", show_default=False)]
 Budget = Annotated[float | None, typer.Option(help="Seconds of optimisation.", show_default=False)]
 ImageSize = Annotated[int | None, typer.Option(help="Long side of the pictures in pixels.", show_default=False)]
 Holdout = Annotated[

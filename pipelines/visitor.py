@@ -90,6 +90,6 @@ def picture(rendered: Any, what: str) -> Array:
 
 def pose_of(wxyz: Any, position: Any) -> Array:
     """(4, 4) world_from_camera of a viewer's camera, whose axes are ours."""
-    from fieldfuse.capture.quaternion import rigid
+    from fieldfuse.capture.poses import rigid
 
     return rigid(np.asarray(wxyz, dtype=np.float64), np.asarray(position, dtype=np.float64), "the viewer's camera")

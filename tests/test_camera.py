@@ -19,7 +19,6 @@ from fieldfuse.camera import (
     Array,
     Intrinsics,
     Similarity,
-    checked_pose,
     distort,
     invert,
     lens_limit,
@@ -33,6 +32,7 @@ from fieldfuse.camera import (
     world_from_llff,
     world_from_opengl,
 )
+from fieldfuse.capture.poses import checked_pose
 from fieldfuse.errors import InputError
 from tests.capture.board import bend, unbend
 

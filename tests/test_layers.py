@@ -7,6 +7,7 @@ import configparser
 import shutil
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -82,6 +83,41 @@ def test_the_layers_name_only_what_may_exist() -> None:
     beside = ("pipelines", "configs")
     missing = [place.name for place in places if not (place.name in beside or place.is_dir() or place.with_suffix(".py").is_file())]
     assert not missing
+
+
+# Run as a program, it is the process of one of its runs; what is gone from here must not come back.
+CIRCLES = ("cli bench_captures",)
+
+
+def imports(name: str, path: Path, modules: dict[str, Path]) -> set[str]:
+    """The modules among `modules` that this one imports, anywhere in it, but for types alone."""
+    found = set()
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            node.body.clear()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{path} imports by dots; the others do not"
+            of = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= of & modules.keys() if of & modules.keys() else {str(node.module)}
+    return {other for other in found if other in modules and other != name}
+
+
+def test_no_modules_import_each_other() -> None:
+    """Not even late, inside functions, or by way of others."""
+    modules = {}
+    for folder, package in (("toolkit", "fieldfuse"), ("pipelines", "fieldfuse.pipelines"), ("configs", "fieldfuse.configs")):
+        for path in (ROOT / folder).rglob("*.py"):
+            parts = (package, *path.relative_to(ROOT / folder).with_suffix("").parts)
+            modules[".".join(parts).removesuffix(".__init__")] = path
+    assert len(modules) > 300
+    known = [{f"fieldfuse.pipelines.{word}" for word in circle.split()} for circle in CIRCLES]
+    graph = {name: imports(name, path, modules) for name, path in modules.items()}
+    graph = {name: {other for other in found if not any({name, other} <= circle for circle in known)} for name, found in graph.items()}
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 
 def test_no_module_gives_a_constant_two_values() -> None:

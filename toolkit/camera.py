@@ -6,10 +6,7 @@ depth along z. What other tools use is turned into this by the functions below, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -27,8 +24,6 @@ PINHOLE = "pinhole"
 OPENCV = "opencv"  # k1, k2, p1, p2[, k3[, k4, k5, k6]] as in OpenCV
 FISHEYE = "fisheye"  # k1, k2, k3, k4 of OpenCV's equidistant model
 LENSES = (PINHOLE, OPENCV, FISHEYE)
-FARTHEST = 1e12  # of a camera from the origin, in any unit: geocentric millimetres stay below 1e10
-RIGID = 1e-14  # how far RᵀR of a rotation in float64 is from the identity by rounding alone
 
 
 @dataclass(frozen=True)
@@ -196,8 +191,9 @@ def undistort_maps(intrinsics: Intrinsics, width: int, height: int) -> tuple[Int
     return target, *resample_maps(intrinsics, target)
 
 
-def pinhole_share(intrinsics: Intrinsics, across: int = 64) -> float:
+def pinhole_share(intrinsics: Intrinsics) -> float:
     """Share of a distorted image's pixels that the pinhole image of the same size and focal length shows."""
+    across = 64
     height = max(2, round(across * intrinsics.height / intrinsics.width))
     seen = np.zeros((height, across), dtype=bool)
     fine = intrinsics.pinhole().scaled(4 * across, 4 * height)
@@ -228,25 +224,6 @@ def world_from_llff(pose: Array) -> Array:
     return out
 
 
-def _unusable(why: str, notes: PoseNotes | None) -> Array:
-    """NaN and a note, or a refusal."""
-    if notes is None:
-        raise InputError(why)
-    notes.unusable.append(why)
-    return np.full((4, 4), np.nan)
-
-
-def _unscaled(rotation: Array, off: float, notes: PoseNotes) -> tuple[Array, float]:
-    """The rotation without a uniform scale, if that is what makes it no rotation, and how far R'R is then from 1."""
-    scale = float(np.cbrt(np.linalg.det(rotation)))
-    plain = rotation / scale
-    left = float(np.abs(plain.T @ plain - np.eye(3)).max())
-    if left > ROUNDED or off <= ROUNDED:
-        return rotation, off
-    notes.scales.append(scale)
-    return plain, left
-
-
 def invert(pose: Array) -> Array:
     """Inverse of rigid (..., 4, 4) poses."""
     pose = np.asarray(pose, dtype=np.float64)
@@ -258,112 +235,6 @@ def invert(pose: Array) -> Array:
     return out
 
 
-ROUNDED = 0.04  # how far R'R may be from 1 where poses are read leniently: numbers of two digits
-_lenient: ContextVar[PoseNotes | None] = ContextVar("lenient poses", default=None)
-
-
-@dataclass
-class PoseNotes:
-    """What was wrong with poses, and other parts of single frames, that were read leniently."""
-
-    unusable: list[str] = field(default_factory=list)  # a sentence for each pose that came back as NaN
-    scales: list[float] = field(default_factory=list)  # of rotations that were scaled
-    rounding: list[float] = field(default_factory=list)  # how far R'R was from 1 where rotations were made rigid
-    unread: dict[str, str] = field(default_factory=dict)  # frames that could not be read, and why
-
-
-@contextmanager
-def lenient_poses() -> Iterator[PoseNotes]:
-    """Inside, `checked_pose` takes a uniform scale and rounding out of rotations, and answers NaN for a pose that holds nothing usable: one
-    bad pose does not refuse a whole capture. What was done is in the notes."""
-    notes = PoseNotes()
-    token = _lenient.set(notes)
-    try:
-        yield notes
-    finally:
-        _lenient.reset(token)
-
-
-@contextmanager
-def single_frame(name: str) -> Iterator[None]:
-    """What is read inside belongs to one frame: while a capture is read leniently, a failure leaves out this frame and is noted."""
-    notes = _lenient.get()
-    try:
-        yield
-    except InputError as error:
-        if notes is None:
-            raise
-        notes.unread[name] = str(error)
-
-
-def unread_frames() -> dict[str, str]:
-    """Frames of the capture that is being read that could not be, and why."""
-    notes = _lenient.get()
-    return {} if notes is None else notes.unread
-
-
-def reads_leniently() -> bool:
-    """Whether a capture is being read in which single bad parts are left out (`lenient_poses`)."""
-    return _lenient.get() is not None
-
-
-def checked_pose(pose: Array, where: str, tolerance: float = 5e-3) -> Array:
-    """A rigid float64 (4, 4) pose, re-orthonormalised where it is off, or a clear refusal.
-
-    What is rigid to the last digits stays as it is: a pose that was written and read back is the same pose. See `lenient_poses`.
-
-    Raises:
-        InputError: wrong shape, not finite, singular, mirrored, not rigid (beyond `tolerance`) or astronomically far away.
-    """
-    notes = _lenient.get()
-    try:
-        pose = np.asarray(pose, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{where}: the pose is not a matrix of numbers; correct it") from error
-    if pose.shape == (3, 4):
-        pose = np.concatenate([pose, [[0, 0, 0, 1]]])
-    if pose.shape != (4, 4):
-        raise InputError(f"{where}: the pose has shape {pose.shape}, it must be 4×4")
-    if not np.all(np.isfinite(pose)):
-        return _unusable(f"{where}: the pose holds a value that is not finite; remove this frame or correct it", notes)
-    rotation = pose[:3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):  # of damaged files: huge numbers are no rotation either
-        size, off = np.linalg.det(rotation), np.abs(rotation.T @ rotation - np.eye(3)).max()
-    least = 1e-6 if notes is None else 1e-6 * np.abs(rotation).max() ** 3  # where scale is taken out, a small one is no fault
-    if not abs(size) > least:
-        return _unusable(f"{where}: the pose's rotation is singular; remove this frame or correct it", notes)
-    if notes is not None and size > 0 and not off <= tolerance:
-        rotation, off = _unscaled(rotation, off, notes)
-    if size < 0:
-        raise InputError(
-            f"{where}: the pose mirrors space (its rotation has determinant < 0); its axis convention is not what this kind of capture uses"
-        )
-    if notes is not None and tolerance < off <= ROUNDED:
-        notes.rounding.append(float(off))
-    elif not off <= tolerance:  # NaN, too
-        why = f"its rotation is sheared or its axes differ in length: R'R is {off:.2g} off 1"
-        return _unusable(f"{where}: the pose is not rigid ({why}); correct it", notes)
-    checked_place(pose[:3, 3], where)
-    out = np.eye(4)
-    if off > RIGID:
-        u, _, vt = np.linalg.svd(rotation)
-        rotation = u @ vt
-    out[:3, :3] = rotation
-    out[:3, 3] = pose[:3, 3]
-    return out
-
-
-def checked_place(place: Array, where: str) -> None:
-    """Look at the translation (3,) of a pose, or of its inverse: what is astronomically far leaves no digits for all else.
-
-    Raises:
-        InputError: further than `FARTHEST` from the origin.
-    """
-    farthest = float(np.abs(place).max())
-    if not farthest <= FARTHEST:
-        raise InputError(
-            f"{where}: the pose's translation is {farthest:g}, further than {FARTHEST:g} from the origin; remove this frame or correct it"
-        )
 
 
 @dataclass(frozen=True)

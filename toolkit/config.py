@@ -31,7 +31,7 @@ from fieldfuse.checked import (
 )
 from fieldfuse.errors import InputError, brief
 
-PRESETS = ("fast", "balanced", "quality")
+PRESETS = ("fast", "balanced", "quality", "paper")
 ENGINES = ("auto", "numba", "triton", "torch")
 EFFECTS = (
     "exposure",
@@ -87,6 +87,8 @@ class NetworkSettings:
     weights: str | None = None  # file of trained networks; None: the shipped ones
     voxels: PositiveNumber | None = None  # finest ones to the median depth; None: 48, or more: a voxel to some pixels there
     levels: Annotated[int, Field(ge=1, le=4)] = 2  # lattices, each of half the voxel size of the one before; 1: the paper's single one
+    # Voxels with exp(−optical thickness) above it are pruned; the paper's 0.6 cuts holes where networks are in doubt
+    gamma: Annotated[float, Field(gt=0, lt=1)] = 0.95
     depth_from: Annotated[str, one_of("sensor", "off")] = "sensor"  # sensor (if the capture has one; the paper has none) | off
     agreement: bool = True  # key frames' plane sweeps are held against each other, but where there is alpha (not in the paper)
     recolour: bool = True  # colours of the result are looked up again in the training pictures, on finer lattices (not in the paper)
@@ -107,6 +109,7 @@ class FieldSettings:
     background: Annotated[str, one_of("auto", "on", "off")] = "auto"  # auto | on | off: contract what lies outside the region of interest
     resolution: Positive | None = None  # voxels along the longest side of the volume; None: by preset and picture size
     init: Annotated[str, one_of("auto", "network", "classical")] = "auto"  # auto (network: few training views) | network | classical
+    start_resolution: Positive = 32  # voxels a side at which the networks' field enters a fit: what few images tell is smooth first
 
     @property
     def width(self) -> int:
@@ -118,6 +121,8 @@ class FieldSettings:
 class FitSettings:
     finetune: bool = True  # False: the networks' field is the result, nothing is fitted
     budget: PositiveNumber | None = None  # seconds; None: by preset
+    iterations: Positive | None = None  # at most; None: as many as the budget has (the paper: 25,000)
+    split_every: Positive | None = None  # iterations from one prune-and-split to the next (the paper: 10,000); None: by validation views
     max_rays: Positive = 4096  # rays a step at most, which the fifth level reaches; many small steps beat few large ones
     rate_density: Share = 0.15
     rate_feature: Share = 0.05

@@ -14,8 +14,8 @@ from typing import TypeVar
 
 T = TypeVar("T")
 R = TypeVar("R")
-MOST = 64  # threads beside the calling one
-_helpers = ThreadPoolExecutor(MOST, "helper")  # threads are made when they are first wanted
+MAX_HELPERS = 64  # threads beside the calling one
+_helpers = ThreadPoolExecutor(MAX_HELPERS, "helper")  # threads are made when they are first wanted
 
 
 def share(work: Callable[[T], R], pieces: Sequence[T], threads: int) -> list[R]:

@@ -10,7 +10,7 @@ import pytest
 
 from fieldfuse.camera import Array, Intrinsics, Similarity
 from fieldfuse.capture import Capture, open_capture
-from fieldfuse.capture.alpha import HEADERS, cut_out
+from fieldfuse.capture.images import HEADERS, cut_out
 from fieldfuse.capture.prepare import prepare_views
 from fieldfuse.capture.types import Frame
 from fieldfuse.config import CaptureSettings

@@ -16,7 +16,7 @@ from fieldfuse.capture import open_capture
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.headers import orientation_of, read_bytes, read_header
 from fieldfuse.capture.images import load_image, read_picture, turns_by_exif
-from fieldfuse.capture.listing import picture_header
+from fieldfuse.capture.sizes import picture_header
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
 from fieldfuse.capture.tiff import read_tiff, unturned
 from fieldfuse.capture.types import Frame

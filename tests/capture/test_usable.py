@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fieldfuse.camera import checked_pose, lenient_poses
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.poses import checked_pose, lenient_poses
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.capture.usable import without
 from fieldfuse.errors import InputError

@@ -67,7 +67,7 @@ def test_the_similarity_is_undone_for_poses_and_points(tmp_path: Path) -> None:
 
 def test_transforms_share_intrinsics_where_they_can(tmp_path: Path) -> None:
     names, intrinsics, poses = cameras()
-    write_cameras(tmp_path, names, [intrinsics[1]] * 7, poses, files=[f"images/{i}.png" for i in range(7)])
+    write_cameras(tmp_path, names, [intrinsics[1]] * 7, poses)
     data = json.loads((tmp_path / "transforms.json").read_text())
     assert {key: data[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "p2")} == {
         "w": 640,
@@ -81,7 +81,7 @@ def test_transforms_share_intrinsics_where_they_can(tmp_path: Path) -> None:
     }
     assert data["camera_angle_x"] == pytest.approx(2 * np.arctan(320 / 500.5))
     assert data["camera_model"] == "OPENCV"
-    assert data["frames"][3]["file_path"] == "images/3.png"
+    assert data["frames"][3]["file_path"] == names[3]
     assert set(data["frames"][0]) == {"file_path", "transform_matrix"}
     write_cameras(tmp_path, names, intrinsics, poses)
     data = json.loads((tmp_path / "transforms.json").read_text())
@@ -127,7 +127,7 @@ def test_quaternions_of_any_rotation(numbers: list[float]) -> None:
 
 def test_lists_of_different_length_are_refused(tmp_path: Path) -> None:
     names, intrinsics, poses = cameras()
-    with pytest.raises(InputError, match="7 names, 6 intrinsics, 7 poses"):
+    with pytest.raises(InputError, match="7 names, 6 intrinsics and 7 poses"):
         write_cameras(tmp_path, names, intrinsics[:6], poses)
     assert not list(tmp_path.iterdir())
 

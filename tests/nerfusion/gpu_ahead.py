@@ -30,8 +30,8 @@ from fieldfuse.backends.triton import volumes as volumes_gpu
 from fieldfuse.backends.triton.gru import Step
 from fieldfuse.backends.triton.observe import Observer
 from fieldfuse.nerfusion.cull import all_blocks
-from fieldfuse.nerfusion.extras.cross_view_consistency import Witness
-from fieldfuse.nerfusion.extras.plane_sweep import Sweep
+from fieldfuse.nerfusion.extras.cross_view_consistency import CrossView
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution
 from fieldfuse.nerfusion.head import FieldHead
 from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
 from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids, upright
@@ -83,7 +83,7 @@ def sweeps(views: int, planes: int, height: int, width: int, count: int) -> None
     for said in (None, cost):
         matching.decided(cost, said, 0.1, 0.8, 0.05, 0.01, 2)
     reading.look(torch.rand(count, 3), torch.rand(count), table, seen_by[views - 1], 0.1, 0.01)
-    one = Witness(seen_by[0], reading.says(table, 4.0, 0.1, 2), 0.1, 0.01)
+    one = CrossView(seen_by[0], reading.says(table, 4.0, 0.1, 2), 0.1, 0.01)
     surface = reading.surest(table, rays, inverses, seen_by.positions[0], 0.7)
     matching.alone(cost, rays, inverses, seen_by[views - 1], 0.1, 0.01, (0.1, 0.8, 0.05), 2, (4.0, 0.1, 2), 0.7)
     asked = reading.Asked([replace(one, camera=seen_by[k % views]) for k in range(views)])
@@ -131,11 +131,11 @@ def corners(views: int, side: int, planes: int) -> None:
     model, seen_by = small_model(config=replace(SIZES, hidden=16)), cameras(views)
     with torch.no_grad():
         encoded = model.encode(pictures(views, size=(side, side + 16)), seen_by)
-    swept = Sweep(seen_by[0], torch.rand(6, 7, planes, 3).permute(3, 2, 0, 1), 0.1, 0.01)
+    distribution = DepthDistribution(seen_by[0], torch.rand(6, 7, planes, 3).permute(3, 2, 0, 1), 0.1, 0.01)
     for shell in (0.0, 1.0):
         space = lattice(16, shell)
         keys = all_blocks(space)[:2]
-        observer = Observer(encoded, seen_by, 0.1, 4.0, swept, (2.0, 0.02, 0.1, 4.0, 0.35, 0.9))
+        observer = Observer(encoded, seen_by, 0.1, 4.0, distribution, (2.0, 0.02, 0.1, 4.0, 0.35, 0.9))
         observer.choose(space, keys, None)
         found = observer.choose(space, keys, torch.ones(2 * 512, dtype=torch.bool))
         found = replace(found, rows=torch.arange(planes), filled=np.ones(2, bool), busy=np.ones(2, bool))

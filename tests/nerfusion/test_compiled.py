@@ -11,9 +11,9 @@ import torch
 from benchmarks.timing import pinned
 from fieldfuse.nerfusion import compiled
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.extras.cross_view_consistency import Witness, certain, evidence, witness
-from fieldfuse.nerfusion.extras.matching import LARGE, SMALL, distribution, semi_global
-from fieldfuse.nerfusion.extras.plane_sweep import Sweep, _table, carved, compare, decide, sweep
+from fieldfuse.nerfusion.extras.cross_view_consistency import CrossView, confident_points, consistency, cross_view
+from fieldfuse.nerfusion.extras.matching import LARGE, SMALL, semi_global, smoothed_softmax
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, _table, carved, cost_volume, sweep_planes, to_probability
 from tests.nerfusion.test_plane_sweep import slow_paths, wall
 
 NEAR, FAR = 0.8, 6.0
@@ -27,24 +27,24 @@ def places(count: int = 20_000, seed: int = 0) -> torch.Tensor:
 
 def everything(views: int = 4, asked: int = 20_000) -> dict[str, torch.Tensor]:
     """What a key frame and its witness come to."""
-    described, seen_by = wall(views)
-    compared = compare(described, seen_by, NEAR, FAR)
-    alone = decide(compared)
+    descriptors, seen_by = wall(views)
+    costs = cost_volume(descriptors, seen_by, NEAR, FAR)
+    own_estimate = to_probability(costs)
     order = [1, 0, *range(2, views)] if views > 1 else [0]
-    other = witness(sweep([described[k] for k in order], seen_by[order], NEAR, FAR))
-    said = evidence(compared, [other, witness(alone)], certain(compared, alone))
-    made = decide(compared, said=said)
-    assert said is not None
+    other = cross_view(sweep_planes([descriptors[k] for k in order], seen_by[order], NEAR, FAR))
+    correction = consistency(costs, [other, cross_view(own_estimate)], confident_points(costs, own_estimate))
+    made = to_probability(costs, correction=correction)
+    assert correction is not None
     read = made.look(places(asked), torch.full((asked,), 0.1))
-    spoken, seen = other.ask(places(asked))
+    spoken, seen = other.log_odds_at(places(asked))
     return {
-        "cost": compared.cost,
-        "alone": alone.table,
-        "said": said,
+        "cost": costs.cost,
+        "alone": own_estimate.table,
+        "said": correction,
         "table": made.table,
-        "signed": read.signed,
-        "open": read.open,
-        "sure": read.sure,
+        "signed": read.expected_sdf,
+        "open": read.visibility,
+        "sure": read.confidence,
         "spoken": spoken,
         "seen": seen.float(),
     }
@@ -57,10 +57,10 @@ def boxed(points: torch.Tensor) -> torch.Tensor:
 
 def within() -> dict[str, torch.Tensor]:
     """The same with silhouettes."""
-    described, seen_by = wall(3)
-    compared = compare(described, seen_by, NEAR, FAR, boxed)
-    assert compared.empty is not None and 0 < float(compared.empty.float().mean()) < 1
-    return {"cost": compared.cost, "likely": carved(distribution(compared.cost), compared.empty), "table": decide(compared).table}
+    descriptors, seen_by = wall(3)
+    costs = cost_volume(descriptors, seen_by, NEAR, FAR, boxed)
+    assert costs.empty is not None and 0 < float(costs.empty.float().mean()) < 1
+    return {"cost": costs.cost, "likely": carved(smoothed_softmax(costs.cost), costs.empty), "table": to_probability(costs).table}
 
 
 @pytest.mark.parametrize("views", [1, 2, 4])
@@ -115,14 +115,14 @@ def no_number(camera: Cameras) -> Cameras:
 
 
 def test_cameras_out_of_this_world_are_read_as_seeing_nothing() -> None:
-    described, seen_by = wall(3)
+    descriptors, seen_by = wall(3)
     lost = Cameras.together([seen_by[0], no_number(seen_by[1]), seen_by[2]])
-    honest = compare([described[0], described[2]], seen_by[[0, 2]], NEAR, FAR)
-    comparison = compiled.Comparison(described[0].flatten(1).T, honest.rays, honest.inverses, 8.0)
-    comparison.add(described[1], lost.world_from_camera[1, :3, :3], lost.world_from_camera[1, :3, 3], lost.lens(1))
+    honest = cost_volume([descriptors[0], descriptors[2]], seen_by[[0, 2]], NEAR, FAR)
+    comparison = compiled.Comparison(descriptors[0].flatten(1).T, honest.rays, honest.inverses, 8.0)
+    comparison.add(descriptors[1], lost.world_from_camera[1, :3, :3], lost.world_from_camera[1, :3, 3], lost.lens(1))
     assert float(comparison.seen.max()) == 0 and float((comparison.result(0.6) - 0.6).abs().max()) < 1e-6
-    one = witness(decide(honest))
-    spoken, seen = replace(one, camera=no_number(one.camera)).ask(places())
+    one = cross_view(to_probability(honest))
+    spoken, seen = replace(one, camera=no_number(one.camera)).log_odds_at(places())
     assert not bool(seen.any()) and float(spoken.abs().max()) == 0
 
 
@@ -130,18 +130,18 @@ def test_cameras_out_of_this_world_are_read_as_seeing_nothing() -> None:
 def test_extreme_places_and_tiny_tables_are_not_read_beyond(scale: float) -> None:
     camera = Cameras.same_size(torch.tensor([[10.0, 10.0, 0.5, 0.5]]), torch.eye(4)[None], 1, 1)
     table = torch.tensor([[0.9, 0.1], [0.0, 0.1], [1.0, 1.0]]).view(3, 2, 1, 1)
-    made, told = Sweep(camera, table, 0.2 / scale, 0.5 / scale), Witness(camera, table[0], 0.2 / scale, 0.5 / scale)
+    made, told = DepthDistribution(camera, table, 0.2 / scale, 0.5 / scale), CrossView(camera, table[0], 0.2 / scale, 0.5 / scale)
     far = torch.tensor([[0.0, 0, -1], [0, 0, 0], [1e9, -1e9, 1], [0, 0, 1e9], [1e-9, 0, 1e-9], [torch.nan, 0, 1]]) * scale
     read = made.look(far, torch.full((6,), 0.1 * scale))
-    for values in (read.signed, read.open, read.sure):
+    for values in (read.expected_sdf, read.visibility, read.confidence):
         assert bool(torch.isfinite(values[:5]).all()) and float(values[:5].abs().max()) <= 1
-    spoken, seen = told.ask(far)
+    spoken, seen = told.log_odds_at(far)
     assert bool(torch.isfinite(spoken).all()) and not bool(seen[[0, 2, 5]].any()) and bool(seen[3])
 
 
 def test_where_planes_lie_is_told_in_full_precision() -> None:
-    described, seen_by = wall(3)
-    full = compare(described, seen_by, NEAR, FAR)
+    descriptors, seen_by = wall(3)
+    full = cost_volume(descriptors, seen_by, NEAR, FAR)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        reduced = compare(described, seen_by, NEAR, FAR)
+        reduced = cost_volume(descriptors, seen_by, NEAR, FAR)
     assert torch.equal(reduced.cost, full.cost) and torch.equal(reduced.rays, full.rays)

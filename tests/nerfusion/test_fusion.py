@@ -12,13 +12,12 @@ from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError, Interrupted
 from fieldfuse.nerfusion.block_conv import BlockConv3d
 from fieldfuse.nerfusion.cameras import Cameras
+from fieldfuse.nerfusion.extras.known_terms import INSIDE
 from fieldfuse.nerfusion.fusion import KEPT_PICTURES, Fused, Fusion, FusionOptions, fuse_views, fusion_lattice
 from fieldfuse.nerfusion.head import SCALE, START
 from fieldfuse.nerfusion.keyframes import KeyFrames
-from fieldfuse.nerfusion.lattice import Lattice
+from fieldfuse.nerfusion.lattice import Lattice, part
 from fieldfuse.nerfusion.model import NerfusionModel
-from fieldfuse.nerfusion.refine import part
-from fieldfuse.nerfusion.volume_net import INSIDE
 from fieldfuse.progress import Progress
 from fieldfuse.volume.space import Space
 from tests.nerfusion.made import HEIGHT, INTRINSICS, WIDTH, poses, small_model

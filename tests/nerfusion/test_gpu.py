@@ -30,9 +30,9 @@ from fieldfuse.backends.triton import volumes as volumes_gpu
 from fieldfuse.nerfusion import compiled, compiled_lookup
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d
 from fieldfuse.nerfusion.cull import all_blocks
-from fieldfuse.nerfusion.extras.cross_view_consistency import alone, evidence, witness
-from fieldfuse.nerfusion.extras.matching import describe, distribution, semi_global
-from fieldfuse.nerfusion.extras.plane_sweep import _table, compare, decide
+from fieldfuse.nerfusion.extras.cross_view_consistency import consistency, cross_view, own_estimate
+from fieldfuse.nerfusion.extras.matching import patch_descriptors, semi_global, smoothed_softmax
+from fieldfuse.nerfusion.extras.plane_sweep import _table, cost_volume, to_probability
 from fieldfuse.nerfusion.fusion import Fusion, FusionOptions
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, cells, rows_of
 from fieldfuse.nerfusion.unproject import look_up, project
@@ -97,11 +97,11 @@ def forced(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_matching(shape: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     cost = torch.rand(shape, generator=torch.Generator().manual_seed(0))
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
-    smooth, likely = semi_global(cost), distribution(cost)
+    smooth, likely = semi_global(cost), smoothed_softmax(cost)
     table = _table(likely, 0.1)
     forced(monkeypatch)
     torch.testing.assert_close(semi_global(cost), smooth, atol=1e-6, rtol=0)
-    torch.testing.assert_close(distribution(cost), likely, atol=1e-5, rtol=0)
+    torch.testing.assert_close(smoothed_softmax(cost), likely, atol=1e-5, rtol=0)
     made = _table(likely, 0.1)
     torch.testing.assert_close(made, table, atol=1e-5, rtol=0)
     assert made.stride() == table.stride()
@@ -123,9 +123,9 @@ def test_what_pictures_are_compared_by(size: tuple[int, int], last: bool, monkey
     """Also of pictures whose colours lie next to each other in memory, and of such that are made smaller first."""
     images = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0))
     images = images.contiguous(memory_format=torch.channels_last) if last else images
-    slow = describe(images)
+    slow = patch_descriptors(images)
     forced(monkeypatch)
-    quick = describe(images)
+    quick = patch_descriptors(images)
     assert quick.is_contiguous()
     torch.testing.assert_close(quick, slow, atol=1e-5, rtol=0)
 
@@ -134,13 +134,13 @@ def test_pictures_of_several_sizes_and_silhouettes(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("fieldfuse.nerfusion.extras.plane_sweep.WITHIN", 7)
     monkeypatch.setattr("fieldfuse.nerfusion.extras.plane_sweep.PLANES", (8, 16))
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
-    described, seen_by = wall(3)
-    described = [described[0], described[1][:, ::2].contiguous(), described[2][:, :, ::3]]
+    descriptors, seen_by = wall(3)
+    descriptors = [descriptors[0], descriptors[1][:, ::2].contiguous(), descriptors[2][:, :, ::3]]
 
     def everything() -> list[torch.Tensor]:
-        compared = compare(described, seen_by, NEAR, FAR, boxed)
-        assert compared.empty is not None
-        return [compared.rays, compared.inverses, compared.cost, compared.empty.float(), decide(compared).table]
+        costs = cost_volume(descriptors, seen_by, NEAR, FAR, boxed)
+        assert costs.empty is not None
+        return [costs.rays, costs.inverses, costs.cost, costs.empty.float(), to_probability(costs).table]
 
     slow = everything()
     forced(monkeypatch)
@@ -154,12 +154,12 @@ def test_what_a_sensor_measured(within: bool, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("fieldfuse.nerfusion.extras.plane_sweep.WITHIN", 7)
     monkeypatch.setattr("fieldfuse.nerfusion.extras.plane_sweep.PLANES", (8, 16))
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
-    described, seen_by = wall(2)
+    descriptors, seen_by = wall(2)
     depth = 1.5 + torch.rand(31, 45, generator=torch.Generator().manual_seed(0))
     depth[::3], depth[1, ::2], depth[2, ::3], depth[4, 5], depth[5, 7] = 0, torch.inf, torch.nan, 0.1, 99.0
 
     def made() -> torch.Tensor:
-        return decide(compare(described, seen_by, NEAR, FAR, boxed if within else None), depth).table
+        return to_probability(cost_volume(descriptors, seen_by, NEAR, FAR, boxed if within else None), depth).table
 
     slow = made()
     forced(monkeypatch)
@@ -174,17 +174,17 @@ def test_what_witnesses_say_together(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiled, "fits", lambda *values: False)
     monkeypatch.setattr(reading, "BLOCK", 32)
     monkeypatch.setattr(reading, "PARTS", 2)
-    described, seen_by = wall(3)
+    descriptors, seen_by = wall(3)
 
     def everything() -> list[torch.Tensor]:
-        compared = compare(described, seen_by, NEAR, FAR)
-        mine, surface = alone(compared)
-        other = witness(decide(compare([described[1], described[0]], seen_by[[1, 0]], NEAR, 2 * FAR)))
+        costs = cost_volume(descriptors, seen_by, NEAR, FAR)
+        mine, surface = own_estimate(costs)
+        other = cross_view(to_probability(cost_volume([descriptors[1], descriptors[0]], seen_by[[1, 0]], NEAR, 2 * FAR)))
         theirs = [mine, other, replace(mine, camera=seen_by[2])]
-        believed, weighed = (evidence(compared, [theirs[k] for k in (2, 0, 1)], at) for at in (None, surface))
+        believed, weighed = (consistency(costs, [theirs[k] for k in (2, 0, 1)], at) for at in (None, surface))
         assert believed is not None and weighed is not None
         sure = surface[surface.isfinite().all(1)]
-        return [mine.says, sure, believed, weighed, decide(compared, said=weighed).table]
+        return [mine.log_odds, sure, believed, weighed, to_probability(costs, correction=weighed).table]
 
     slow = everything()
     assert len(slow[1]) and slow[2].shape[1] % 2 == 1
@@ -312,16 +312,16 @@ def test_a_local_volume(shell: float, variance: bool, count: int, monkeypatch: p
         for parameter in model.local.parameters():
             parameter.normal_(0, 0.2, generator=torch.Generator().manual_seed(1))
         views = model.encode(pictures(count), seen_by)
-        swept = model.sweep(views, seen_by, 0.8, 4.0)
+        distribution = model.sweep_planes(views, seen_by, 0.8, 4.0)
         keys = all_blocks(space)[:3]
         few = torch.rand(len(keys) * 512, generator=torch.Generator().manual_seed(2)) < 0.4
         for wanted in (None, few):
-            slow = model.local_volume(views, seen_by, space, Topology(keys), wanted, 0.1, 4.0, swept)
+            slow = model.local_volume(views, seen_by, space, Topology(keys), wanted, 0.1, 4.0, distribution)
             with monkeypatch.context() as patch:
                 on_device(patch)
                 topology = Topology(keys, bounds=space.bounds("cpu"))
-                quick = model.local_volume(views, seen_by, space, topology, wanted, 0.1, 4.0, swept)
-                assert quick.busy.blocks == slow.busy.blocks > 0
+                quick = model.local_volume(views, seen_by, space, topology, wanted, 0.1, 4.0, distribution)
+                assert quick.near_surface.blocks == slow.near_surface.blocks > 0
                 same(quick, slow, ("rows", "count", "raw", "weight"))
 
 
@@ -333,12 +333,12 @@ def test_key_frames_are_fused(monkeypatch: pytest.MonkeyPatch) -> None:
         for parameter in (*model.local.parameters(), *model.fusion.parameters()):
             parameter.add_(0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(parameter.numel())))
         views = model.encode(pictures(4), seen_by)
-        swept = [model.sweep([views[k] for k in group], seen_by[group], 0.8, 4.0) for group in ([0, 1], [3, 2])]
+        distribution = [model.sweep_planes([views[k] for k in group], seen_by[group], 0.8, 4.0) for group in ([0, 1], [3, 2])]
 
     def fused() -> Fusion:
         fusion = Fusion(model, space, FusionOptions(2, 0.1, 4.0))
-        for group, sweep in zip(([0, 1], [3, 2]), swept, strict=True):
-            fusion.add([views[k] for k in group], seen_by[group], None, sweep)
+        for group, sweep_planes in zip(([0, 1], [3, 2]), distribution, strict=True):
+            fusion.add([views[k] for k in group], seen_by[group], None, sweep_planes)
         return fusion
 
     slow = fused()

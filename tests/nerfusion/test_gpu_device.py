@@ -16,10 +16,10 @@ if not torch.cuda.is_available():
     pytest.skip("needs a CUDA device", allow_module_level=True)
 
 from fieldfuse.nerfusion.block_conv import block_conv3d
-from fieldfuse.nerfusion.extras.cross_view_consistency import alone as by_itself
-from fieldfuse.nerfusion.extras.cross_view_consistency import certain, evidence, witness
-from fieldfuse.nerfusion.extras.matching import describe, distribution, semi_global
-from fieldfuse.nerfusion.extras.plane_sweep import _table, compare, decide, sweep
+from fieldfuse.nerfusion.extras.cross_view_consistency import confident_points, consistency, cross_view
+from fieldfuse.nerfusion.extras.cross_view_consistency import own_estimate as by_itself
+from fieldfuse.nerfusion.extras.matching import patch_descriptors, semi_global, smoothed_softmax
+from fieldfuse.nerfusion.extras.plane_sweep import _table, cost_volume, sweep_planes, to_probability
 from fieldfuse.nerfusion.unproject import EncodedView, look_up, project
 from fieldfuse.volume.topology import Topology
 from tests.nerfusion.made import cameras, pictures, small_model
@@ -50,31 +50,32 @@ def both(name: str, work: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) ->
 
 def test_matching(monkeypatch: pytest.MonkeyPatch) -> None:
     cost = torch.rand((96, 128, 180), generator=torch.Generator().manual_seed(0)).to(DEVICE).permute(2, 0, 1)
-    for name, work in (("paths", lambda: semi_global(cost)), ("likelihood", lambda: distribution(cost))):
+    for name, work in (("paths", lambda: semi_global(cost)), ("likelihood", lambda: smoothed_softmax(cost))):
         quick, slow = both(name, work, monkeypatch)
         torch.testing.assert_close(quick, slow, atol=1e-4, rtol=0)
-    likely = distribution(cost)
+    likely = smoothed_softmax(cost)
     quick, slow = both("table", lambda: _table(likely, 0.01), monkeypatch)
     torch.testing.assert_close(quick, slow, atol=1e-4, rtol=0)
 
 
 def test_a_sweep_and_its_witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
-    described, seen_by = wall(3)
-    described, seen_by = [one.to(DEVICE) for one in described], seen_by.to(DEVICE)
+    descriptors, seen_by = wall(3)
+    descriptors, seen_by = [one.to(DEVICE) for one in descriptors], seen_by.to(DEVICE)
     points = (torch.rand((100_000, 3), generator=torch.Generator().manual_seed(0)) * 8 - 3).to(DEVICE)
     depth = (torch.rand((72, 96), generator=torch.Generator().manual_seed(1)) * 8 - 1).to(DEVICE)
 
     def everything() -> dict[str, torch.Tensor]:
-        compared = compare(described, seen_by, 0.8, 6.0)
-        alone = decide(compared)
-        other = witness(sweep([described[1], described[0], described[2]], seen_by[[1, 0, 2]], 0.8, 6.0))
-        said = evidence(compared, [other, witness(alone)], certain(compared, alone))
-        assert said is not None
-        made = decide(compared, said=said)
+        costs = cost_volume(descriptors, seen_by, 0.8, 6.0)
+        own_estimate = to_probability(costs)
+        other = cross_view(sweep_planes([descriptors[1], descriptors[0], descriptors[2]], seen_by[[1, 0, 2]], 0.8, 6.0))
+        correction = consistency(costs, [other, cross_view(own_estimate)], confident_points(costs, own_estimate))
+        assert correction is not None
+        made = to_probability(costs, correction=correction)
         read = made.look(points, torch.full((len(points),), 0.1, device=DEVICE))
-        out = {"cost": compared.cost, "alone": alone.table, "said": said, "table": made.table, "says": by_itself(compared)[0].says}
-        out["measured"] = decide(compared, depth).table
-        return out | {"signed": read.signed, "open": read.open, "sure": read.sure}
+        own = by_itself(costs)[0]
+        out = {"cost": costs.cost, "alone": own_estimate.table, "said": correction, "table": made.table, "says": own.log_odds}
+        out["measured"] = to_probability(costs, depth).table
+        return out | {"signed": read.expected_sdf, "open": read.visibility, "sure": read.confidence}
 
     quick, slow = both("sweep and witnesses", everything, monkeypatch)
     for name, expected in slow.items():
@@ -84,7 +85,7 @@ def test_a_sweep_and_its_witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("size", [(144, 192), (480, 640)])
 def test_what_pictures_are_compared_by(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     images = torch.rand(3, *size, 3, generator=torch.Generator().manual_seed(0)).to(DEVICE).permute(0, 3, 1, 2)
-    quick, slow = both(f"descriptors of {size[0]} x {size[1]}", lambda: describe(images), monkeypatch)
+    quick, slow = both(f"descriptors of {size[0]} x {size[1]}", lambda: patch_descriptors(images), monkeypatch)
     torch.testing.assert_close(quick, slow, atol=1e-4, rtol=0)
 
 

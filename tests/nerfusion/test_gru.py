@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 
+from fieldfuse.nerfusion.extras.known_terms import colour_latent, sdf_latent
 from fieldfuse.nerfusion.gru import FusionGRU, RunningMean
 from fieldfuse.nerfusion.head import FieldHead
-from fieldfuse.nerfusion.volume_net import LocalReconstruction, colour_latent, inside_latent
+from fieldfuse.nerfusion.volume_net import LocalReconstruction
 from fieldfuse.volume.topology import Topology
 from tests.nerfusion.test_block_conv import cube, dense_of, rows_of
 
@@ -150,7 +151,7 @@ def test_what_the_sweep_is_sure_of_stays_whatever_was_learned() -> None:
     seen = torch.ones(topology.zero_row, dtype=torch.bool)
     for signed, thinnest, thickest in ((1.0, 0.0, 0.1), (-1.0, 4.0, torch.inf)):
         start = torch.zeros(topology.zero_row + 1, 8)
-        start[:-1, 3] = inside_latent(torch.tensor(signed))
+        start[:-1, 3] = sdf_latent(torch.tensor(signed))
         raw = network(torch.rand(topology.zero_row + 1, 6), start, topology, seen)
         none, weight = torch.zeros_like(start), torch.ones(topology.zero_row)
         state, count = none, torch.zeros(topology.zero_row)

@@ -12,9 +12,9 @@ import torch
 
 from fieldfuse.camera import Array
 from fieldfuse.capture.types import Views
-from fieldfuse.nerfusion.extras import keyframe_depth as key_sweeps
-from fieldfuse.nerfusion.extras.keyframe_depth import LEAST_OVERLAP, MOST, KeySweeps, beside
-from fieldfuse.nerfusion.extras.plane_sweep import Sweep
+from fieldfuse.nerfusion.extras import keyframe_depth
+from fieldfuse.nerfusion.extras.keyframe_depth import LEAST_OVERLAP, MOST, KeyframeDepth, overlapping
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution
 from fieldfuse.nerfusion.fusion import FusionOptions, fuse_views
 from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.poses.overlap import overlap
@@ -45,41 +45,41 @@ def around(count: int, radius: float = 2.0) -> Array:
 def test_witnesses_overlap_and_do_not_stand_opposite() -> None:
     poses = around(28)
     keys = KeyFrames(np.arange(0, 28, 2), np.zeros((14, 2), np.int64))
-    found = beside(keys, poses, [INTRINSICS] * 28, 2.0)
+    found = overlapping(keys, poses, [INTRINSICS] * 28, 2.0)
     assert len(found) == 14
     for at, others in enumerate(found):
         steps = [min((other - at) % 14, (at - other) % 14) for other in others]
         assert sorted(steps) == [1, 1, 2, 2], "26 and 51 degrees on either side"
     shares = overlap(poses[keys.indices], [INTRINSICS] * 14, 2.0)
     assert all(shares[at, other] > LEAST_OVERLAP < shares[other, at] for at, others in enumerate(found) for other in others)
-    assert beside(KeyFrames(np.array([3]), np.array([[2, 4]])), poses, [INTRINSICS] * 28, 2.0) == [[]]
-    rows = beside(KeyFrames(np.arange(12), np.zeros((12, 2), np.int64)), poses_in_line(12, 0.05), [INTRINSICS] * 12, 2.0)
+    assert overlapping(KeyFrames(np.array([3]), np.array([[2, 4]])), poses, [INTRINSICS] * 28, 2.0) == [[]]
+    rows = overlapping(KeyFrames(np.arange(12), np.zeros((12, 2), np.int64)), poses_in_line(12, 0.05), [INTRINSICS] * 12, 2.0)
     assert all(len(row) == MOST and at not in row for at, row in enumerate(rows))
 
 
 def test_each_sweep_is_made_once_and_again_only_when_it_was_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[int] = []
-    compare = key_sweeps.compare
+    cost_volume = keyframe_depth.cost_volume
 
     def counted(*args: object) -> object:
         made.append(1)
-        return compare(*args)  # type: ignore[arg-type]
+        return cost_volume(*args)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(key_sweeps, "compare", counted)
+    monkeypatch.setattr(keyframe_depth, "cost_volume", counted)
     views, keys = captured(5)
     witnesses = [[j for j in range(5) if j != i] for i in range(5)]
-    kept = KeySweeps(views, keys, witnesses, NEAR, FAR)
+    kept = KeyframeDepth(views, keys, witnesses, NEAR, FAR)
     tables = [kept(at).table for at in range(5)]
     assert len(made) == 5
     assert torch.equal(kept(2).table, tables[2]) and len(made) == 6, "a second time it is compared again, and its witnesses are not"
-    monkeypatch.setattr(key_sweeps, "KEPT", 2)
-    forgetful = KeySweeps(views, keys, witnesses, NEAR, FAR)
+    monkeypatch.setattr(keyframe_depth, "KEPT", 2)
+    forgetful = KeyframeDepth(views, keys, witnesses, NEAR, FAR)
     assert all(torch.equal(forgetful(at).table, table) for at, table in enumerate(tables)) and len(made) > 11
 
 
 def test_what_it_keeps_goes_with_it() -> None:
     views, keys = captured(3)
-    kept = KeySweeps(views, keys, [[1], [0], [1]], NEAR, FAR)
+    kept = KeyframeDepth(views, keys, [[1], [0], [1]], NEAR, FAR)
     kept(0)
     gone = weakref.ref(kept)
     gc.disable()
@@ -102,14 +102,14 @@ def test_witnesses_mend_a_key_frame_that_sees_no_texture() -> None:
         neighbours[index] = pair
     keys = KeyFrames(keys.indices, neighbours)
 
-    def wrong(swept: Sweep) -> float:
-        likely = -torch.diff(swept.table[0], dim=0)
-        inverse = swept.lowest + (likely.argmax(0) + 0.5) * swept.step
+    def wrong(distribution: DepthDistribution) -> float:
+        likely = -torch.diff(distribution.table[0], dim=0)
+        inverse = distribution.lowest + (likely.argmax(0) + 0.5) * distribution.step
         return float((inverse * 2.0 - 1).abs().median())
 
-    alone = KeySweeps(views, keys, [[]] * 7, NEAR, FAR)(3)
-    held = KeySweeps(views, keys, [[0, 1, 5, 6]] * 7, NEAR, FAR)(3)
-    assert wrong(held) < 0.1 < wrong(alone)
+    own_estimate = KeyframeDepth(views, keys, [[]] * 7, NEAR, FAR)(3)
+    held = KeyframeDepth(views, keys, [[0, 1, 5, 6]] * 7, NEAR, FAR)(3)
+    assert wrong(held) < 0.1 < wrong(own_estimate)
 
 
 def test_the_fusion_takes_them() -> None:
@@ -123,10 +123,10 @@ def test_the_fusion_takes_them() -> None:
             rows = state.volume.rows.clone()
         return rows
 
-    alone = fused(None)
-    torch.testing.assert_close(fused([[]] * 4), alone, atol=1e-5, rtol=1e-4)
+    own_estimate = fused(None)
+    torch.testing.assert_close(fused([[]] * 4), own_estimate, atol=1e-5, rtol=1e-4)
     held = fused([[1, 2], [0, 3], [0, 3], [1, 2]])
-    assert bool(torch.isfinite(held).all()) and (held.shape != alone.shape or not torch.allclose(held, alone, atol=1e-3))
+    assert bool(torch.isfinite(held).all()) and (held.shape != own_estimate.shape or not torch.allclose(held, own_estimate, atol=1e-3))
 
 
 def test_a_sensor_speaks_through_its_key_frame() -> None:
@@ -136,7 +136,7 @@ def test_a_sensor_speaks_through_its_key_frame() -> None:
     point = torch.tensor([[0.0, 0.0, 0.5]])  # behind the wall at z = 0
 
     def open_there(measured: bool) -> float:
-        return float(KeySweeps(flat, keys, [[1], [], [1]], NEAR, FAR, measured)(0).look(point, torch.tensor([0.1])).open)
+        return float(KeyframeDepth(flat, keys, [[1], [], [1]], NEAR, FAR, measured)(0).look(point, torch.tensor([0.1])).visibility)
 
     assert open_there(True) < 0.2 < open_there(False)
 
@@ -144,7 +144,7 @@ def test_a_sensor_speaks_through_its_key_frame() -> None:
 def test_no_depth_at_all_is_refused() -> None:
     views, keys = captured(3)
     with pytest.raises(ValueError, match="nearest or a farthest"):
-        KeySweeps(views, keys, [[]] * 3, 0.0, float("inf"))
+        KeyframeDepth(views, keys, [[]] * 3, 0.0, float("inf"))
 
 
 def test_witnesses_and_silhouettes_together_are_refused() -> None:

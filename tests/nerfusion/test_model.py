@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
 from fieldfuse.nerfusion.model import ModelConfig, NerfusionModel
-from fieldfuse.nerfusion.refine import solid_cells
+from fieldfuse.nerfusion.prune import solid_cells
 from fieldfuse.volume.topology import VOXELS, Topology
 from tests.nerfusion.made import SMALL, cameras, lattice, pictures, small_model
 

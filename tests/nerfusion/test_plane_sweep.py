@@ -12,8 +12,18 @@ import torch
 import torch.nn.functional as F
 
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.extras.matching import LARGE, SIDE, SMALL, describe, difference, distribution, semi_global, together
-from fieldfuse.nerfusion.extras.plane_sweep import LOST, PLANES, Sweep, _table, carved, compare, decide, measured, sweep
+from fieldfuse.nerfusion.extras.matching import LARGE, SIDE, SMALL, difference, patch_descriptors, semi_global, smoothed_softmax, together
+from fieldfuse.nerfusion.extras.plane_sweep import (
+    LOST,
+    PLANES,
+    DepthDistribution,
+    _table,
+    carved,
+    cost_volume,
+    measured,
+    sweep_planes,
+    to_probability,
+)
 from tests.nerfusion.made import cameras
 
 WALL = 2.0
@@ -40,7 +50,7 @@ def wall(count: int = 3, depth: float = WALL, scale: float = 1.0) -> tuple[list[
         x = (u - width / 2) / focal * depth + poses[view, 0, 3] / scale
         y = (v - height / 2) / focal * depth + poses[view, 1, 3] / scale
         images.append(F.grid_sample(texture[None], torch.stack([x, y], -1)[None].float() / 1.6, align_corners=False)[0])
-    return list(describe(torch.stack(images))), seen_by
+    return list(patch_descriptors(torch.stack(images))), seen_by
 
 
 def on_axis(depths: torch.Tensor) -> torch.Tensor:
@@ -76,7 +86,7 @@ def test_semi_global_matching_against_its_recurrence() -> None:
     cost = np.random.default_rng(0).random((7, 5, 6))
     found = semi_global(torch.from_numpy(cost))
     np.testing.assert_allclose(found.numpy(), slow_paths(cost), atol=1e-12)
-    likely = distribution(torch.from_numpy(cost))
+    likely = smoothed_softmax(torch.from_numpy(cost))
     torch.testing.assert_close(likely.sum(0), torch.ones_like(likely[0]))
 
 
@@ -85,7 +95,7 @@ def test_what_a_voxel_reads_against_the_expectation_itself() -> None:
     planes, low, step = 60, 0.2, 0.02
     likely = torch.softmax(3 * torch.randn((planes, 1, 1), generator=generator), 0)
     one = Cameras.same_size(torch.tensor([[10.0, 10.0, 4.0, 3.0]]), torch.eye(4)[None], 8, 6)
-    made = Sweep(one, _table(likely, step), low, step)
+    made = DepthDistribution(one, _table(likely, step), low, step)
     depth = torch.tensor([0.9, 1.1, 1.5, 2.5, 4.0])
     truncation = 0.25 * depth
     found = made.look(on_axis(depth), truncation)
@@ -96,15 +106,15 @@ def test_what_a_voxel_reads_against_the_expectation_itself() -> None:
     for k in range(len(depth)):
         half = truncation[k] / depth[k] ** 2
         expected = (weight * ((1 / depth[k] - surface) / half).clamp(-1, 1)).sum()
-        assert float(found.signed[k]) == pytest.approx(float(expected), abs=0.01)
-        assert float(found.open[k]) == pytest.approx(float(weight[surface < 1 / depth[k] + half].sum()), abs=0.02)
+        assert float(found.expected_sdf[k]) == pytest.approx(float(expected), abs=0.01)
+        assert float(found.visibility[k]) == pytest.approx(float(weight[surface < 1 / depth[k] + half].sum()), abs=0.02)
 
 
 @pytest.mark.parametrize("count", [2, 3, 4])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_a_wall_is_found_where_it_is(count: int, scale: float) -> None:
-    described, seen_by = wall(count, scale=scale)
-    made = sweep(described, seen_by, 0.7 * scale, 8.0 * scale)
+    descriptors, seen_by = wall(count, scale=scale)
+    made = sweep_planes(descriptors, seen_by, 0.7 * scale, 8.0 * scale)
     assert PLANES[0] <= made.table.shape[1] <= PLANES[1]
     likely = -torch.diff(made.table[0], dim=0)
     inverse = made.lowest + (likely.argmax(0) + 0.5) * made.step
@@ -112,53 +122,53 @@ def test_a_wall_is_found_where_it_is(count: int, scale: float) -> None:
     assert float(error.median()) < 1 and float((error < 1.6).float().mean()) > 0.9
     before, there, behind = 1.7 * scale, WALL * scale, 2.4 * scale
     read = made.look(on_axis(torch.tensor([before, there, behind])), torch.full((3,), 0.15 * scale))
-    assert float(read.signed[0]) > 0.9 and abs(float(read.signed[1])) < 0.4 and float(read.signed[2]) < -0.9
-    assert float(read.open[0]) > 0.95 and float(read.open[1]) > 0.8 and float(read.open[2]) < 0.1
-    assert float(read.sure.min()) > 0.5
+    assert float(read.expected_sdf[0]) > 0.9 and abs(float(read.expected_sdf[1])) < 0.4 and float(read.expected_sdf[2]) < -0.9
+    assert float(read.visibility[0]) > 0.95 and float(read.visibility[1]) > 0.8 and float(read.visibility[2]) < 0.1
+    assert float(read.confidence.min()) > 0.5
 
 
 def test_the_order_of_the_other_views_does_not_matter() -> None:
-    described, seen_by = wall(4)
+    descriptors, seen_by = wall(4)
     order = [0, 3, 1, 2]
-    one = sweep(described, seen_by, 0.7, 8.0)
-    two = sweep([described[k] for k in order], seen_by[order], 0.7, 8.0)
+    one = sweep_planes(descriptors, seen_by, 0.7, 8.0)
+    two = sweep_planes([descriptors[k] for k in order], seen_by[order], 0.7, 8.0)
     torch.testing.assert_close(one.table, two.table, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("still", [False, True])
 def test_without_parallax_no_depth_is_likelier_than_another(still: bool) -> None:
-    described, seen_by = wall(3)
+    descriptors, seen_by = wall(3)
     if still:  # three pictures from one place
         seen_by = replace(seen_by, world_from_camera=torch.eye(4)[None].repeat(3, 1, 1))
-        described = [described[0]] * 3
+        descriptors = [descriptors[0]] * 3
     else:
-        described, seen_by = described[:1], seen_by[0]
-    made = sweep(described, seen_by, 0.5, 8.0)
+        descriptors, seen_by = descriptors[:1], seen_by[0]
+    made = sweep_planes(descriptors, seen_by, 0.5, 8.0)
     read = made.look(on_axis(torch.tensor([0.4, 0.9, 2.0, 9.0])), torch.full((4,), 0.1))
     assert bool(torch.isfinite(made.table).all())
-    assert float(read.sure.max()) < 0.5, "nothing is sure"
-    assert float(read.open[0]) > 0.95 and float(read.open[3]) < 0.1 and bool((torch.diff(read.open) < 0).all())
+    assert float(read.confidence.max()) < 0.5, "nothing is sure"
+    assert float(read.visibility[0]) > 0.95 and float(read.visibility[3]) < 0.1 and bool((torch.diff(read.visibility) < 0).all())
 
 
 def test_extreme_places_read_finite_numbers() -> None:
-    described, seen_by = wall(3)
-    made = sweep(described, seen_by, 0.5, math.inf)
+    descriptors, seen_by = wall(3)
+    made = sweep_planes(descriptors, seen_by, 0.5, math.inf)
     points = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [1e6, -1e6, 1.0], [0.0, 0.0, 1e9], [1e-9, 0.0, 1e-9]])
     read = made.look(points, torch.full((5,), 0.1))
-    for value in (read.signed, read.open, read.sure):
+    for value in (read.expected_sdf, read.visibility, read.confidence):
         assert bool(torch.isfinite(value).all()) and float(value.min()) >= -1 and float(value.max()) <= 1
     with pytest.raises(ValueError, match="nearest or a farthest"):
-        sweep(described, seen_by, 0.0, math.inf)
+        sweep_planes(descriptors, seen_by, 0.0, math.inf)
     for near, far in ((1.0, 1.0), (2.0, 1.0)):
         with pytest.raises(ValueError, match="looks at nothing"):
-            sweep(described, seen_by, near, far)
+            sweep_planes(descriptors, seen_by, near, far)
 
 
 def test_descriptors_forgive_exposure_and_are_small() -> None:
     images = torch.stack([textured(300)[:, :200], textured(300)[:, :200] * 0.6 + 0.1])
-    described = describe(images)
-    assert described.shape == (2, 21, round(SIDE * 2 / 3), SIDE) and not described.requires_grad
-    flat = described.flatten(2).transpose(1, 2)
+    descriptors = patch_descriptors(images)
+    assert descriptors.shape == (2, 21, round(SIDE * 2 / 3), SIDE) and not descriptors.requires_grad
+    flat = descriptors.flatten(2).transpose(1, 2)
     patches = flat[..., 3:]
     apart = (patches[0] - patches[1]).square().mean()
     other = (patches[0] - patches[0].roll(997, 0)).square().mean()
@@ -177,7 +187,7 @@ def test_costs_go_together_in_any_order_and_say_when_nobody_sees() -> None:
 
 
 def test_planes_follow_the_parallax() -> None:
-    few, many = (sweep(wall(2)[0], _apart(by), 0.7, 8.0).table.shape[1] for by in (0.05, 0.6))
+    few, many = (sweep_planes(wall(2)[0], _apart(by), 0.7, 8.0).table.shape[1] for by in (0.05, 0.6))
     assert few < many <= PLANES[1]
 
 
@@ -190,76 +200,76 @@ def _apart(by: float) -> Cameras:
 
 def test_it_runs_on_cameras_of_the_other_tests() -> None:
     seen_by = cameras(3)
-    described = list(describe(torch.rand(3, 3, int(seen_by.size[0, 1]), int(seen_by.size[0, 0]))))
-    made = sweep(described, seen_by, 0.3, 3.0)
+    descriptors = list(patch_descriptors(torch.rand(3, 3, int(seen_by.size[0, 1]), int(seen_by.size[0, 0]))))
+    made = sweep_planes(descriptors, seen_by, 0.3, 3.0)
     assert bool((torch.diff(made.table[0], dim=0) <= 1e-6).all()), "what lies nearer is hidden less"
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_a_measured_depth_is_where_the_surface_is(scale: float) -> None:
     """One view alone: pictures say nothing, the sensor tells two surfaces on the left, and on the right nothing."""
-    described, seen_by = wall(1, scale=scale)
+    descriptors, seen_by = wall(1, scale=scale)
     depth = torch.full((72, 96), torch.nan)
     depth[:, :24], depth[:, 24:48], depth[:36, 48:] = 1.5 * scale, 3.0 * scale, 0.0
-    found, blind = (sweep(described, seen_by, 0.8 * scale, 5.0 * scale, given) for given in (depth, None))
+    found, blind = (sweep_planes(descriptors, seen_by, 0.8 * scale, 5.0 * scale, given) for given in (depth, None))
     truncation = torch.full((3,), 0.2 * scale)
     for column, surface in ((12.0, 1.5), (36.0, 3.0)):
         z = surface * scale * torch.tensor([0.97, 1.0, 1.03])
         points = torch.stack([(column - 48) / 90 * z, torch.zeros(3), z], 1)
         told = found.look(points, truncation)
-        assert torch.allclose(told.signed * 0.2, surface * torch.tensor([0.03, 0.0, -0.03]), atol=0.02 * surface), column
-        assert float(told.sure.min()) > 0.9
+        assert torch.allclose(told.expected_sdf * 0.2, surface * torch.tensor([0.03, 0.0, -0.03]), atol=0.02 * surface), column
+        assert float(told.confidence.min()) > 0.9
         beyond, before = found.look(points * 1.4, truncation), found.look(points * 0.7, truncation)
-        assert float(beyond.open.max()) < 0.05 and float(before.open.min()) > 0.95
+        assert float(beyond.visibility.max()) < 0.05 and float(before.visibility.min()) > 0.95
     unknown = torch.tensor([[0.25, 0.05, 1.0], [0.25, -0.05, 1.0], [0.6, 0.1, 2.0]]) * scale
     for one, other in zip(vars(found.look(unknown, truncation)).values(), vars(blind.look(unknown, truncation)).values(), strict=True):
         assert torch.allclose(one, other, atol=0.02)  # of another grid, else the same
 
 
 def test_measured_depths_out_of_range_count_as_its_ends() -> None:
-    described, seen_by = wall(2)
+    descriptors, seen_by = wall(2)
     truncation = torch.full((1,), 0.1)
-    far, near, junk = (sweep(described, seen_by, 1.0, 4.0, torch.full((72, 96), value)) for value in (1e4, 1e-4, -torch.inf))
-    assert float(far.look(on_axis(torch.tensor([3.0])), truncation).open) > 0.95
-    assert float(near.look(on_axis(torch.tensor([1.5])), truncation).open) < 0.05
-    without = sweep(described, seen_by, 1.0, 4.0)
+    far, near, junk = (sweep_planes(descriptors, seen_by, 1.0, 4.0, torch.full((72, 96), value)) for value in (1e4, 1e-4, -torch.inf))
+    assert float(far.look(on_axis(torch.tensor([3.0])), truncation).visibility) > 0.95
+    assert float(near.look(on_axis(torch.tensor([1.5])), truncation).visibility) < 0.05
+    without = sweep_planes(descriptors, seen_by, 1.0, 4.0)
     places = on_axis(torch.linspace(1.0, 4.0, 31))
-    assert torch.allclose(junk.look(places, truncation).signed, without.look(places, truncation).signed, atol=0.15)
+    assert torch.allclose(junk.look(places, truncation).expected_sdf, without.look(places, truncation).expected_sdf, atol=0.15)
 
 
 def test_a_sensor_mends_what_pictures_do_not_tell() -> None:
     """Without texture the sweep finds no wall; the sensor does, and where both speak the wall stays where it is."""
-    described, seen_by = wall(3)
-    flat = [torch.full_like(one, 0.0) for one in described]
+    descriptors, seen_by = wall(3)
+    flat = [torch.full_like(one, 0.0) for one in descriptors]
     depth, places = torch.full((72, 96), WALL), on_axis(torch.linspace(0.9, 3.5, 53))
     truncation = torch.full((53,), 0.15)
     wanted = ((WALL - places[:, 2]) / 0.15).clamp(-1, 1)
 
     def wrong(pictures: list[torch.Tensor], given: torch.Tensor | None) -> float:
-        return float((sweep(pictures, seen_by, 0.8, 4.0, given).look(places, truncation).signed - wanted).abs().mean())
+        return float((sweep_planes(pictures, seen_by, 0.8, 4.0, given).look(places, truncation).expected_sdf - wanted).abs().mean())
 
     assert wrong(flat, depth) < 0.05 < 0.3 < wrong(flat, None)
-    assert wrong(described, depth) < 0.05
+    assert wrong(descriptors, depth) < 0.05
 
 
 def test_a_silhouette_tells_where_no_surface_is() -> None:
     """Without texture, but with all empty that is not near the wall, it is found; what is ahead of an empty place is left as it was."""
-    described, seen_by = wall(3)
-    flat = [torch.full_like(one, 0.0) for one in described]
+    descriptors, seen_by = wall(3)
+    flat = [torch.full_like(one, 0.0) for one in descriptors]
     places, truncation = on_axis(torch.linspace(0.9, 3.5, 53)), torch.full((53,), 0.15)
     wanted = ((WALL - places[:, 2]) / 0.15).clamp(-1, 1)
 
     def thin(points: torch.Tensor) -> torch.Tensor:
         return (points[:, 2] - WALL).abs() > 0.1
 
-    found = sweep(flat, seen_by, 0.8, 4.0, empty=thin).look(places, truncation)
-    assert float((found.signed - wanted).abs().mean()) < 0.1
-    plain = sweep(described, seen_by, 0.8, 4.0)
-    held = sweep(described, seen_by, 0.8, 4.0, empty=lambda points: points[:, 2] < 1.0)  # nothing was likely there
-    torch.testing.assert_close(held.look(places, truncation).signed, plain.look(places, truncation).signed, atol=0.02, rtol=0)
-    nothing = sweep(described, seen_by, 0.8, 4.0, empty=lambda points: torch.ones(len(points), dtype=torch.bool))
+    found = sweep_planes(flat, seen_by, 0.8, 4.0, empty=thin).look(places, truncation)
+    assert float((found.expected_sdf - wanted).abs().mean()) < 0.1
+    plain = sweep_planes(descriptors, seen_by, 0.8, 4.0)
+    held = sweep_planes(descriptors, seen_by, 0.8, 4.0, empty=lambda points: points[:, 2] < 1.0)  # nothing was likely there
+    torch.testing.assert_close(held.look(places, truncation).expected_sdf, plain.look(places, truncation).expected_sdf, atol=0.02, rtol=0)
+    nothing = sweep_planes(descriptors, seen_by, 0.8, 4.0, empty=lambda points: torch.ones(len(points), dtype=torch.bool))
     free = nothing.look(places[:45], truncation[:45])  # up to a truncation before the farthest plane
-    assert float(free.signed.min()) > 0.99 and float(free.open.min()) > 0.99
+    assert float(free.expected_sdf.min()) > 0.99 and float(free.visibility.min()) > 0.99
 
 
 def slab(left: float, right: float) -> Callable[[torch.Tensor], torch.Tensor]:
@@ -273,8 +283,8 @@ def slab(left: float, right: float) -> Callable[[torch.Tensor], torch.Tensor]:
 
 def test_only_what_silhouettes_leave_is_compared() -> None:
     """The table covers the part of the picture about it, and says of all places what a table of the whole picture says."""
-    described, seen_by = wall(3)
-    part, all_of_it = (compare(described, seen_by, 0.8, 4.0, slab(*edges)) for edges in ((0.1, 0.4), (-9.0, 9.0)))
+    descriptors, seen_by = wall(3)
+    part, all_of_it = (cost_volume(descriptors, seen_by, 0.8, 4.0, slab(*edges)) for edges in ((0.1, 0.4), (-9.0, 9.0)))
     assert all_of_it.window == (0.0, 0.0, 1.0, 1.0) and all_of_it.cost.shape[1:] == (72, 96)
     left, upper, right, lower = part.window
     assert (upper, lower) == (0.0, 1.0) and part.cost.shape[1:] == (72, round((right - left) * 96))
@@ -285,10 +295,10 @@ def test_only_what_silhouettes_leave_is_compared() -> None:
     points, truncation = points * torch.tensor([2.4, 1.8, 3.0]) - torch.tensor([1.2, 0.9, -0.9]), torch.full((4000,), 0.1)
     nothing = slab(0.1, 0.4)((all_of_it.rays[:, None] / all_of_it.inverses[:, None]).view(-1, 3))
     whole = replace(all_of_it, empty=nothing.view(72, 96, -1).permute(2, 0, 1))
-    one, other = decide(part).look(points, truncation), decide(whole).look(points, truncation)
-    apart = (one.signed - other.signed).abs()
+    one, other = to_probability(part).look(points, truncation), to_probability(whole).look(points, truncation)
+    apart = (one.expected_sdf - other.expected_sdf).abs()
     assert float((apart < 0.02).float().mean()) > 0.98  # pixels beside the window are matched in one, and left out in the other
-    assert float((one.open - other.open).abs().mean()) < 0.01
+    assert float((one.visibility - other.visibility).abs().mean()) < 0.01
 
 
 @pytest.mark.parametrize("window", [(0.25, 0.5, 0.75, 1.0), (0.0, 0.0, 1.0, 1.0)])
@@ -303,11 +313,11 @@ def test_a_measured_depth_is_cut_as_the_window_is(window: tuple[float, float, fl
 
 
 def test_where_silhouettes_leave_nothing_all_is_free() -> None:
-    described, seen_by = wall(3)
-    made = sweep(described, seen_by, 0.8, 4.0, empty=slab(2.0, 1.0))
+    descriptors, seen_by = wall(3)
+    made = sweep_planes(descriptors, seen_by, 0.8, 4.0, empty=slab(2.0, 1.0))
     assert made.table.shape[2:] == (1, 1)
     seen = made.look(on_axis(torch.linspace(0.9, 3.0, 9)), torch.full((9,), 0.1))
-    assert float(seen.open.min()) > 0.99 and float(seen.signed.min()) > 0.99
+    assert float(seen.visibility.min()) > 0.99 and float(seen.expected_sdf.min()) > 0.99
 
 
 def test_likelihoods_within_silhouettes_against_a_loop() -> None:

@@ -9,8 +9,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldfuse.nerfusion.lattice import LatentVolume, cells, empty_volume
-from fieldfuse.nerfusion.refine import INHERITED, adopt, children, part, solid_cells, split_volume
+from fieldfuse.nerfusion.extras.two_lattices import INHERITED, adopt, children, split_volume
+from fieldfuse.nerfusion.lattice import LatentVolume, cells, empty_volume, part
+from fieldfuse.nerfusion.prune import solid_cells
 from fieldfuse.nerfusion.store import GlobalStore
 from fieldfuse.volume.lookup import corners, gather
 from fieldfuse.volume.topology import VOXELS, Topology

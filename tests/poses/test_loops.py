@@ -97,7 +97,7 @@ def test_without_it_the_way_is_folded_and_all_frames_seem_well(walked):
     """What the mapper makes of the same matches: the reason for `without_folds`."""
     assert len(walked.folded.registered) == FRAMES and walked.folded.reconstruction.compute_mean_reprojection_error() < 1
     assert aligned_error(centres(walked.folded), POSES[:, :3, 3]) > 0.05
-    assert loops.contradictions(walked.before, loops.axes(walked.folded)) >= loops.LEAST
+    assert loops.contradictions(walked.before, loops.axes(walked.folded)) >= loops.MIN_FOLD_PAIRS
     assert walked.facts is not None and walked.facts["dropped"] > 10 and walked.facts["left"] == 0
     assert aligned_error(centres(walked.better), POSES[:, :3, 3]) < 0.005
 
@@ -178,7 +178,7 @@ def test_one_fold_parts_at_least_three_pairs_of_neighbours(seed, count, at, angl
     seen, rotations = made_up(seed, count, 0.02)
     turned = Rotation.from_rotvec([0, np.radians(angle), 0]).as_matrix()
     folded = {i: rotation @ turned if i >= at * count else rotation for i, rotation in rotations.items()}
-    assert loops.contradictions(seen, folded) >= loops.LEAST
+    assert loops.contradictions(seen, folded) >= loops.MIN_FOLD_PAIRS
 
 
 @settings(max_examples=25, deadline=None)

@@ -109,9 +109,9 @@ def learnt(misled: float = 0.0) -> tuple[list[float], list[float], float]:
     for _ in range(60):
         pick = torch.randint(len(origins), (256,), generator=generator)
         views = model.encode(images, seen_by)
-        swept = model.sweep(views, seen_by, 1.0, 2.8)
-        swept = replace(swept, lowest=swept.lowest + misled)
-        local = model.local_volume(views, seen_by, where, near=1.0, far=2.8, swept=swept)
+        distribution = model.sweep_planes(views, seen_by, 1.0, 2.8)
+        distribution = replace(distribution, lowest=distribution.lowest + misled)
+        local = model.local_volume(views, seen_by, where, near=1.0, far=2.8, distribution=distribution)
         field = make_field(model, local, torch.full((3,), 0.5))
         jitter, behind = torch.rand(256, generator=generator), torch.rand((256, 3), generator=generator)
         seen = render_with_gradients(field, origins[pick], directions[pick], jitter, behind)

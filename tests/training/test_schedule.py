@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-from fieldfuse.config import FitSettings
+from fieldfuse.config import FitSettings, load_settings
+from fieldfuse.training.from_network import NetworkOptions
 from fieldfuse.training.schedule import (
     COARSE_GAIN,
     FINE_MOST,
@@ -102,3 +103,28 @@ def test_a_fit_ends_with_its_seconds_or_its_rays_whichever_are_spent_first() -> 
 @pytest.mark.parametrize(("ladder", "rays"), [([32, 64], 256), ([64, 128], 512), ([480], 3840), ([1024], 4096), ([16], 256)])
 def test_rays_of_a_step_follow_from_the_lattice_wherever_a_fit_begins(ladder: list[int], rays: int) -> None:
     assert Schedule(ladder, 10.0, FitSettings(), True).rays == rays
+
+
+def test_the_paper_prunes_and_splits_by_iterations() -> None:
+    """`--preset paper`: at 10,000 and 20,000 of 25,000, whatever the seconds."""
+    settings = load_settings("paper").fit
+    schedule = Schedule([128, 256, 512, 1024], settings.budget or 0, settings, True)
+    splits, prunings = [], []
+    while (done := schedule.position(1.0)) < 1:
+        if schedule.wants_finer(done):
+            splits.append(schedule.steps)
+            schedule.climb()
+        elif schedule.wants_pruning(done):
+            prunings.append(schedule.steps)
+        schedule.steps += 1
+        schedule.steps_here += 1
+    assert splits == [10_000, 20_000] and not prunings and schedule.steps == 25_000 and schedule.resolution == 512
+
+
+def test_the_papers_preset_has_none_of_the_extras() -> None:
+    settings = load_settings("paper")
+    network, fit = settings.network, settings.fit
+    assert (network.levels, network.gamma, network.agreement, network.recolour, network.depth_from) == (1, 0.6, False, False, "off")
+    assert (settings.keyframes.method, settings.field.decoder, settings.field.init) == ("uniform", "per_sample", "network")
+    assert not any((fit.distortion, fit.opacity, fit.slow_within, fit.depth, fit.soften)) and fit.depth_from == fit.moving == "off"
+    assert settings.effects.mode == "off" and NetworkOptions.of(network).gamma == 0.6

@@ -105,7 +105,7 @@ def test_prune_keeps_what_is_opaque_anywhere_inside() -> None:
     topology, occupied = world(3, 0.1, 5)
     density = torch.rand(topology.zero_row + 1, dtype=torch.float64) ** 4 * 40
     density[-1] = 0
-    kept = prune(occupied, trilinear_density(topology, density), 0.05, samples=3)
+    kept = prune(occupied, trilinear_density(topology, density), 0.05)
     cells = occupied.nonzero().view(-1)
     offsets = [(i + 0.5) / 3 for i in range(3)]
     inside = torch.tensor([[x, y, z] for x in offsets for y in offsets for z in offsets], dtype=torch.float64)

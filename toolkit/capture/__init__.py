@@ -23,11 +23,11 @@ def open_capture(source: Path | str, masks: str = "auto", choose: Callable[[Sequ
         InputError: nothing there, nothing known, or the layout's own files are broken.
     """
     # Imported late: training and rendering need the types above on machines without Pillow.
-    from fieldfuse.camera import lenient_poses
     from fieldfuse.capture.beside import with_remark
     from fieldfuse.capture.colmap import model_captures
     from fieldfuse.capture.detect import read_source
     from fieldfuse.capture.masks import with_masks
+    from fieldfuse.capture.poses import lenient_poses
     from fieldfuse.capture.usable import turned_by_exif, with_usable_poses
 
     with lenient_poses() as notes:

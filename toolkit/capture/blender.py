@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from fieldfuse.capture import nerf_json
-from fieldfuse.capture.listing import assemble, picture_header, read_object, require_folder, unique_names
+from fieldfuse.capture.listing import assemble, read_object, require_folder, unique_names
 from fieldfuse.capture.resolve import CaptureFiles
+from fieldfuse.capture.sizes import picture_header
 from fieldfuse.capture.types import Capture, Frame
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from fieldfuse.camera import Array, Intrinsics
-from fieldfuse.capture.listing import fitted, read_matrix, read_object
+from fieldfuse.capture.listing import read_matrix, read_object
 from fieldfuse.capture.nerf_json import MAX_SIDE, number
+from fieldfuse.capture.sizes import fitted
 from fieldfuse.errors import InputError
 
 JSON_NAMES = (

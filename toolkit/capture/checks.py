@@ -16,8 +16,9 @@ from fieldfuse.capture.depth_checks import check_depth
 from fieldfuse.capture.duplicates import copies, suspects
 from fieldfuse.capture.headers import PANORAMA, Header, is_panorama, read_bytes, read_header
 from fieldfuse.capture.images import decode, largest, read_picture, turns_by_exif, upright
-from fieldfuse.capture.listing import TIFFS, counted, fitted, natural_key, unique_names
+from fieldfuse.capture.listing import counted, natural_key, unique_names
 from fieldfuse.capture.photos import size_from_exif
+from fieldfuse.capture.sizes import TIFFS, fitted
 from fieldfuse.capture.tiff import unturned
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.capture.usable import with_usable_depth, without

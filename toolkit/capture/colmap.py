@@ -17,19 +17,10 @@ import numpy as np
 
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture.colmap_model import Model, holds_model, read_model
-from fieldfuse.capture.listing import (
-    assemble,
-    counted,
-    fits_shape,
-    fitted,
-    natural_key,
-    picture_header,
-    pictures_in,
-    require_folder,
-    unique_names,
-)
+from fieldfuse.capture.listing import assemble, counted, natural_key, pictures_in, require_folder, unique_names
 from fieldfuse.capture.masks import masks_among
 from fieldfuse.capture.resolve import CaptureFiles, Found
+from fieldfuse.capture.sizes import fits_shape, fitted, picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, checked_place, invert
+from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, invert
 from fieldfuse.capture.listing import read_text
-from fieldfuse.capture.quaternion import rigid
+from fieldfuse.capture.poses import checked_place, rigid
 from fieldfuse.errors import InputError, first_line
 
 MAX_TEXT = 2**30

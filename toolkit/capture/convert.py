@@ -13,7 +13,8 @@ from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.headers import orientation_of
 from fieldfuse.capture.heif import file_is_heif
 from fieldfuse.capture.images import read_picture, turns_by_exif, upright
-from fieldfuse.capture.listing import counted, picture_header, unique_names
+from fieldfuse.capture.listing import counted, unique_names
+from fieldfuse.capture.sizes import picture_header
 from fieldfuse.capture.stored import MIRRORED
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError, OutputError, first_line

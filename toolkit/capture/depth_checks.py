@@ -9,7 +9,7 @@ import numpy as np
 
 from fieldfuse.camera import Array, Intrinsics, invert
 from fieldfuse.capture.images import load_depth
-from fieldfuse.capture.listing import fitted
+from fieldfuse.capture.sizes import fitted
 from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
 from fieldfuse.progress import SILENT, Progress

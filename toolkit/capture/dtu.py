@@ -16,9 +16,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from fieldfuse.camera import Array, Intrinsics, checked_pose, single_frame
+from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.calibration import from_matrix
-from fieldfuse.capture.listing import assemble, counted, pictures_in, require_folder, same_count, size_of, unique_names
+from fieldfuse.capture.listing import assemble, counted, pictures_in, require_folder, same_count, unique_names
+from fieldfuse.capture.poses import checked_pose, single_frame
+from fieldfuse.capture.sizes import size_of
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError, first_line
 

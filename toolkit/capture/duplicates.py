@@ -13,7 +13,7 @@ from fieldfuse.capture.types import Frame
 
 # Saved again (a quarter of the size, JPEG of quality 30), images differ by up to 1.3 grey levels on average and 14 at most, at 48 × 48;
 # neighbours of eight captures by at least 6.6 and 83.
-MEAN, MOST = 2.0, 24.0
+MEAN_DIFFERENCE, MAX_DIFFERENCE = 2.0, 24.0
 CONTRAST = 40.0  # grey levels of standard deviation; of images of less, the limits are less in proportion
 COPIED = re.compile(r"(([ _-]*\([0-9]{1,3}\))|([ _-]+(copy|kopie|copie|copia)([ _-]*[0-9]{1,3})?))+$")  # what programs add to a copy's name
 
@@ -39,10 +39,10 @@ def copies(tiny: Sequence[Array], sizes: Sequence[int], names: Sequence[str]) ->
     out: dict[int, int] = {}
     stays = np.ones(len(order), dtype=bool)
     for place in range(1, len(order)):
-        near = np.flatnonzero(stays[:place] & (np.abs(means[:place] - means[place]) < MEAN))
+        near = np.flatnonzero(stays[:place] & (np.abs(means[:place] - means[place]) < MEAN_DIFFERENCE))
         if len(near):
             off = np.abs(flat[near] - flat[place])
-            same = (off.mean(axis=1) < MEAN * contrast[place]) & (off.max(axis=1) < MOST * contrast[place])
+            same = (off.mean(axis=1) < MEAN_DIFFERENCE * contrast[place]) & (off.max(axis=1) < MAX_DIFFERENCE * contrast[place])
             if same.any():
                 out[order[place]] = order[int(near[np.argmax(same)])]
                 stays[place] = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -14,9 +15,9 @@ from fieldfuse.camera import Array
 from fieldfuse.capture import heif, lzfse
 from fieldfuse.capture.colours import to_srgb
 from fieldfuse.capture.headers import MAX_PIXELS, Header, orientation_of, read_bytes, read_header
-from fieldfuse.capture.listing import picture_header
 from fieldfuse.capture.sens import is_sens
 from fieldfuse.capture.sens_frames import sens_depth
+from fieldfuse.capture.sizes import picture_header
 from fieldfuse.capture.tiff import unturned
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.capture.video import iterate_video
@@ -26,6 +27,7 @@ EXIF_TURNS = "exif_turns"  # in `Capture.extra`: the cameras are those of images
 LOSSY = ("JPEG", "MPO", "WEBP", heif.FORMAT)  # formats whose black and white come out as greys
 WHITE = 255
 FEW_LEVELS = 32  # grey levels of a mask up to which they are labels, not soft edges
+HEADERS, PICTURES = 100, 5  # looked at at most, evenly spread: decoding all of a large capture would take minutes
 
 
 def turns_by_exif(capture: Capture) -> bool:
@@ -90,6 +92,29 @@ def see_through(path: Path) -> bool:
     """
     picture = to_rgba(decode(path)[0])
     return picture.shape[2] == 4 and bool((picture[:, :, 3] < 255).any())
+
+
+def cut_out(frames: Sequence[Frame]) -> bool:
+    """Whether alpha cuts an object out of a capture's images: some pixel of those looked at is not opaque. Screenshots and many programs'
+    PNGs have an alpha that is full everywhere. What cannot be read is left to whoever reads it all."""
+    paths = [frame.image for frame in frames if frame.video_index is None]
+    with_alpha = [path for path in _spread(paths, HEADERS) if _tells(_has_alpha, path)]
+    return any(_tells(see_through, path) for path in _spread(with_alpha, PICTURES))
+
+
+def _has_alpha(path: Path) -> bool:
+    return picture_header(path).alpha
+
+
+def _tells(question: Callable[[Path], bool], path: Path) -> bool:
+    try:
+        return question(path)
+    except InputError:
+        return False
+
+
+def _spread(paths: list[Path], most: int) -> list[Path]:
+    return [paths[int(place)] for place in np.unique(np.linspace(0, len(paths) - 1, most).round())] if paths else []
 
 
 def load_depth(frame: Frame, capture: Capture) -> Array:

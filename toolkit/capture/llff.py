@@ -10,10 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import Array, Intrinsics, checked_pose, single_frame, world_from_llff
-from fieldfuse.capture.listing import assemble, counted, fitted, picture_header, pictures_in, require_folder, unique_names
+from fieldfuse.camera import Array, Intrinsics, world_from_llff
+from fieldfuse.capture.listing import assemble, counted, pictures_in, require_folder, unique_names
 from fieldfuse.capture.masks import is_mask_folder, masks_among
+from fieldfuse.capture.poses import checked_pose, single_frame
 from fieldfuse.capture.resolve import BESIDE, CaptureFiles
+from fieldfuse.capture.sizes import fitted, picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError, first_line
 

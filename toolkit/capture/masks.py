@@ -19,7 +19,8 @@ import numpy as np
 
 from fieldfuse.capture import heif
 from fieldfuse.capture.images import LOSSY, decode, load_image, load_mask, turns_by_exif, usable_pixels
-from fieldfuse.capture.listing import counted, natural_key, picture_header, pictures_in
+from fieldfuse.capture.listing import counted, natural_key, pictures_in
+from fieldfuse.capture.sizes import picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 

@@ -20,7 +20,7 @@ from fieldfuse.errors import InputError
 IMAGES, SIDE, FEATURES = 10, 640, 3000
 NEAR = 0.005  # of the focal length, from the epipolar line: about three pixels
 RATIO = 0.8  # of the distances of the nearest and the second descriptor
-LEAST, CLEAR = 40, 2.5  # matches on their lines, and how many times as many as for any other axes
+MIN_MATCHES, CLEAR = 40, 2.5  # matches on their lines, and how many times as many as for any other axes
 AXES = {
     "all camera axes": np.diag([-1.0, -1.0, -1.0]),
     "the cameras' x axis": np.diag([-1.0, 1.0, 1.0]),
@@ -53,7 +53,7 @@ def unmirrored(poses: Sequence[Array], images: Sequence[Path], cameras: Sequence
             votes[name] += int(on_line.sum())
             before[name] += int((on_line & in_front).sum())
     best, second = sorted(votes, key=lambda name: -votes[name])[:2]
-    if votes[best] < LEAST or votes[best] < CLEAR * votes[second]:
+    if votes[best] < MIN_MATCHES or votes[best] < CLEAR * votes[second]:
         return None
     turned = np.eye(4)
     turned[:3, :3] = AXES[best]

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, checked_pose, world_from_opengl
+from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, world_from_opengl
 from fieldfuse.capture.headers import PANORAMA
-from fieldfuse.capture.listing import UNREADABLE, counted, fitted, picture_header
+from fieldfuse.capture.listing import counted
 from fieldfuse.capture.mirrored import mirrors, unmirrored
+from fieldfuse.capture.poses import checked_pose
 from fieldfuse.capture.resolve import Found
+from fieldfuse.capture.sizes import UNREADABLE, fitted, picture_header
 from fieldfuse.capture.types import Frame
 from fieldfuse.errors import InputError
 

@@ -18,8 +18,9 @@ from typing import Any
 from PIL import Image
 
 from fieldfuse.capture.heif import SUFFIXES as HEIF_SUFFIXES
-from fieldfuse.capture.listing import assemble, counted, natural_key, picture_header, pictures_in, require_folder, unique_names
+from fieldfuse.capture.listing import assemble, counted, natural_key, pictures_in, require_folder, unique_names
 from fieldfuse.capture.masks import is_mask_folder, masks_among
+from fieldfuse.capture.sizes import picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 from fieldfuse.files import require_utf8

@@ -11,19 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import Array, Intrinsics, checked_pose, single_frame, world_from_opengl
-from fieldfuse.capture.listing import (
-    assemble,
-    files_in,
-    fitted,
-    is_file,
-    picture_header,
-    pictures_in,
-    read_object,
-    require_folder,
-    unique_names,
-)
+from fieldfuse.camera import Array, Intrinsics, world_from_opengl
+from fieldfuse.capture.listing import assemble, files_in, is_file, pictures_in, read_object, require_folder, unique_names
 from fieldfuse.capture.nerf_json import MAX_SIDE, number
+from fieldfuse.capture.poses import checked_pose, single_frame
+from fieldfuse.capture.sizes import fitted, picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 

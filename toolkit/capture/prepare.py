@@ -11,7 +11,8 @@ import numpy as np
 from fieldfuse import memory
 from fieldfuse.camera import Array, Intrinsics, Similarity, resample_maps, undistort_maps
 from fieldfuse.capture.images import load_depth, load_image, load_mask, turns_by_exif
-from fieldfuse.capture.listing import fitted, natural_key
+from fieldfuse.capture.listing import natural_key
+from fieldfuse.capture.sizes import fitted
 from fieldfuse.capture.types import Capture, Frame, Views
 from fieldfuse.config import CaptureSettings
 from fieldfuse.errors import InputError

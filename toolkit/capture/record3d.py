@@ -25,9 +25,10 @@ from typing import Any
 from fieldfuse.capture import lzfse
 from fieldfuse.capture.archive import members, read_member
 from fieldfuse.capture.headers import read_bytes, read_header
-from fieldfuse.capture.listing import assemble, counted, files_in, fitted, is_file, pictures_in, read_object
+from fieldfuse.capture.listing import assemble, counted, files_in, is_file, pictures_in, read_object
 from fieldfuse.capture.nerf_json import number
 from fieldfuse.capture.record3d_metadata import cameras, depth_size, poses, up_of, world_from_camera
+from fieldfuse.capture.sizes import fitted
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError, first_line
 from fieldfuse.files import MAX_JSON_BYTES

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from fieldfuse.camera import Array, Intrinsics, checked_pose, world_from_opengl
+from fieldfuse.camera import Array, Intrinsics, world_from_opengl
 from fieldfuse.capture.calibration import from_matrix
-from fieldfuse.capture.listing import fitted
 from fieldfuse.capture.lzfse import MOST_PIXELS
 from fieldfuse.capture.nerf_json import MAX_SIDE, number
-from fieldfuse.capture.quaternion import rigid
+from fieldfuse.capture.poses import checked_pose, rigid
+from fieldfuse.capture.sizes import fitted
 from fieldfuse.errors import InputError
 
 LENS, POSE = 4, 7  # numbers of a frame: fx, fy, cx, cy; qx, qy, qz, qw, x, y, z
@@ -21,14 +21,14 @@ TURNED = 0.02  # radians by which a first frame is turned whose pose is not simp
 SAME_SHAPE = 0.02  # difference of two aspect ratios
 
 
-def number_of(data: dict[str, Any], key: str, where: str, most: float = MAX_SIDE) -> int | None:
-    """`data[key]` as a whole number from 1 to `most`, None when absent.
+def number_of(data: dict[str, Any], key: str, where: str) -> int | None:
+    """`data[key]` as a whole number from 1 to `MAX_SIDE`, None when absent.
 
     Raises:
         InputError: something else stands there.
     """
     value = number(data, key, where)
-    if value is not None and not (1 <= value <= most and value == int(value)):
+    if value is not None and not (1 <= value <= MAX_SIDE and value == int(value)):
         raise InputError(f"{where}: {key!r} is {value:g}, which cannot be; export the recording again")
     return None if value is None else int(value)
 

@@ -15,22 +15,22 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import Array, checked_pose, single_frame
+from fieldfuse.camera import Array
 from fieldfuse.capture.calibration import PRIMESENSE, find_json
 from fieldfuse.capture.listing import (
     assemble,
     counted,
     files_in,
-    fitted,
-    picture_header,
     pictures_in,
+    posed_frame,
     read_numbers,
     require_folder,
     same_count,
     unique_names,
 )
 from fieldfuse.capture.nerf_json import number
-from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.capture.poses import single_frame
+from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
 
 LOG = "trajectory.log"
@@ -101,20 +101,8 @@ def read_redwood(path: Path | str) -> Capture:
     frames = []
     for index, (picture, name) in enumerate(zip(pictures, unique_names(pictures), strict=True)):
         with single_frame(name):
-            size = picture_header(picture).size
-            intrinsics = fitted(camera, size, str(picture))
             depth = depths[index] if depths else None
-            depth_size = picture_header(depth).size if depth is not None else size
-            frames.append(
-                Frame(
-                    name=name,
-                    image=picture,
-                    intrinsics=intrinsics,
-                    world_from_camera=checked_pose(poses[index], f"{log}, entry {index}"),
-                    depth=depth,
-                    depth_intrinsics=None if depth_size == size else fitted(intrinsics, depth_size, str(depth)),
-                )
-            )
+            frames.append(posed_frame(name, picture, camera, poses[index], f"{log}, entry {index}", depth))
     return assemble("redwood", root, frames, warnings, ordered=True, metric=True, depth_scale=scale or 1000.0)
 
 

@@ -10,21 +10,13 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from fieldfuse.camera import Array, Intrinsics, checked_pose, single_frame
+from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.calibration import sensor
-from fieldfuse.capture.listing import (
-    assemble,
-    first_size,
-    fitted,
-    picture_header,
-    pictures_in,
-    read_numbers,
-    read_object,
-    require_folder,
-    same_count,
-)
+from fieldfuse.capture.listing import assemble, pictures_in, posed_frame, read_numbers, read_object, require_folder, same_count
 from fieldfuse.capture.nerf_json import MAX_SIDE, number
-from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.capture.poses import single_frame
+from fieldfuse.capture.sizes import first_size
+from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
 
 POSES, PICTURES, CAMERA = "traj.txt", "results", "cam_params.json"
@@ -58,19 +50,8 @@ def read_replica(path: Path | str) -> Capture:
     frames = []
     for picture, (line, pose) in zip(pictures, _poses(root, pictures), strict=True):
         with single_frame(picture.stem):
-            size = picture_header(picture).size
             depth = depths.get(picture.stem.removeprefix("frame"))
-            depth_size = size if depth is None else picture_header(depth).size
-            frames.append(
-                Frame(
-                    name=picture.stem,
-                    image=picture,
-                    intrinsics=fitted(camera, size, str(picture)),
-                    world_from_camera=checked_pose(pose, f"{root / POSES}, pose {line + 1}"),
-                    depth=depth,
-                    depth_intrinsics=None if depth_size == size else fitted(camera, depth_size, str(depth)),
-                )
-            )
+            frames.append(posed_frame(picture.stem, picture, camera, pose, f"{root / POSES}, pose {line + 1}", depth))
     return assemble("replica", root, frames, warnings, ordered=True, metric=True, depth_scale=scale, up=(0.0, 0.0, 1.0))
 
 

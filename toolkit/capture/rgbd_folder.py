@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import OPENCV, Array, Intrinsics, checked_pose
+from fieldfuse.camera import OPENCV, Array, Intrinsics
 from fieldfuse.capture.calibration import from_matrix, sensor
 from fieldfuse.capture.depth_checks import Sample, unit_factor
 from fieldfuse.capture.images import load_depth
@@ -24,18 +24,17 @@ from fieldfuse.capture.listing import (
     assemble,
     counted,
     files_in,
-    first_size,
-    fitted,
     natural_key,
-    picture_header,
     pictures_in,
+    posed_frame,
     read_text,
     require_folder,
     unique_names,
 )
 from fieldfuse.capture.masks import is_mask_folder
-from fieldfuse.capture.quaternion import rigid
-from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.capture.poses import rigid
+from fieldfuse.capture.sizes import first_size, fitted
+from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
 
 DEPTH_WORDS, COLOUR_WORDS = {"depth", "depths"}, {"rgb", "color", "colors", "colour", "colours", "image", "images", "img", "imgs", "frames"}
@@ -94,20 +93,7 @@ def read_rgbd(path: Path | str) -> Capture:
     for index, (image, name) in enumerate(zip(images, unique_names(images), strict=True)):
         if index not in poses or not np.isfinite(poses[index]).all():
             continue
-        size = picture_header(image).size
-        depth = depths.get(index)
-        depth_size = size if depth is None or depth.suffix.lower() in (".pfm", ".exr") else picture_header(depth).size
-        intrinsics = fitted(camera, size, str(image))
-        frames.append(
-            Frame(
-                name=name,
-                image=image,
-                intrinsics=intrinsics,
-                world_from_camera=checked_pose(poses[index], f"{layout.poses.file}, the pose of {image.name}"),
-                depth=depth,
-                depth_intrinsics=None if depth_size == size else fitted(intrinsics, depth_size, str(depth)),
-            )
-        )
+        frames.append(posed_frame(name, image, camera, poses[index], f"{layout.poses.file}, the pose of {image.name}", depths.get(index)))
     places = f"{layout.colour.relative_to(root)}/, {layout.depth.relative_to(root)}/, {layout.poses.file.relative_to(root)} and {source}"
     warnings = [f"read as RGB-D from {places}; poses are taken as camera-to-world"]
     if len(frames) < len(images):

@@ -14,9 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from fieldfuse.camera import Array, Intrinsics, checked_pose, single_frame, world_from_opengl
+from fieldfuse.camera import Array, Intrinsics, world_from_opengl
 from fieldfuse.capture.calibration import from_matrix
-from fieldfuse.capture.listing import assemble, fitted, is_file, picture_header, pictures_in, read_object, require_folder, size_of
+from fieldfuse.capture.listing import assemble, is_file, pictures_in, read_object, require_folder
+from fieldfuse.capture.poses import checked_pose, single_frame
+from fieldfuse.capture.sizes import fitted, picture_header, size_of
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 

@@ -13,13 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import Intrinsics, checked_pose
+from fieldfuse.camera import Intrinsics
 from fieldfuse.capture.calibration import from_matrix, read_matrix_for, sensor
-from fieldfuse.capture.listing import assemble, counted, files_in, fitted, picture_header, pictures_in, require_folder, same_count
+from fieldfuse.capture.listing import assemble, counted, files_in, pictures_in, require_folder, same_count
+from fieldfuse.capture.poses import checked_pose
 from fieldfuse.capture.sens import SUFFIX, Sens, scan
 from fieldfuse.capture.sens_frames import sens_size
 from fieldfuse.capture.seven_scenes import FrameFiles, first_sizes, frame_files, frame_folders, frame_names, lost_frames, posed_frames
 from fieldfuse.capture.seven_scenes_cameras import INFO
+from fieldfuse.capture.sizes import fitted, picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 

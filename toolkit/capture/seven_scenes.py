@@ -12,20 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import Intrinsics, checked_pose, single_frame
-from fieldfuse.capture.listing import (
-    assemble,
-    counted,
-    first_size,
-    fitted,
-    picture_header,
-    pictures_in,
-    read_matrix,
-    require_folder,
-    same_count,
-    unique_names,
-)
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture.listing import assemble, counted, pictures_in, read_matrix, require_folder, same_count, unique_names
+from fieldfuse.capture.poses import checked_pose, single_frame
 from fieldfuse.capture.seven_scenes_cameras import read_cameras
+from fieldfuse.capture.sizes import first_size, fitted, picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 

@@ -16,10 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import Array, Intrinsics, checked_pose, single_frame
+from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.calibration import from_matrix
-from fieldfuse.capture.listing import assemble, fitted, is_file, picture_header, read_text, require_folder
-from fieldfuse.capture.quaternion import rigid
+from fieldfuse.capture.listing import assemble, is_file, read_text, require_folder
+from fieldfuse.capture.poses import checked_pose, rigid, single_frame
+from fieldfuse.capture.sizes import fitted, picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.capture.video import read_video
 from fieldfuse.errors import InputError, first_line

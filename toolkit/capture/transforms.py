@@ -15,9 +15,10 @@ from typing import Any
 
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture import nerf_json
-from fieldfuse.capture.listing import assemble, counted, fitted, picture_header, read_object, require_folder, unique_names
+from fieldfuse.capture.listing import assemble, counted, read_object, require_folder, unique_names
 from fieldfuse.capture.ply_points import read_ply_points
 from fieldfuse.capture.resolve import DEPTH, MASK, POINTS, CaptureFiles
+from fieldfuse.capture.sizes import fitted, picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 

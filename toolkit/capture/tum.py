@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import OPENCV, Array, Intrinsics, checked_pose
+from fieldfuse.camera import OPENCV, Array, Intrinsics
 from fieldfuse.capture.calibration import PRIMESENSE, find_json
-from fieldfuse.capture.listing import assemble, counted, fitted, picture_header, read_text, require_folder, unique_names
-from fieldfuse.capture.quaternion import rigid
+from fieldfuse.capture.listing import assemble, counted, posed_frame, read_text, require_folder, unique_names
+from fieldfuse.capture.poses import rigid
 from fieldfuse.capture.resolve import DEPTH, CaptureFiles
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
@@ -68,19 +68,8 @@ def read_tum(path: Path | str) -> Capture:
     maps, remarks = folder.find_beside(listed_depth, DEPTH, images, "depth.txt")
     frames: list[Frame] = []
     for (time, image, pose), depth in zip(posed, maps, strict=True):
-        size = picture_header(image).size
-        intrinsics = fitted(camera, size, str(image))
-        depth_size = picture_header(depth).size if depth is not None else size
-        frames.append(
-            Frame(
-                name="",
-                image=image,
-                intrinsics=intrinsics,
-                world_from_camera=_pose(pose, f"{root / 'groundtruth.txt'} at {time:.4f} s"),
-                depth=depth,
-                depth_intrinsics=None if depth_size == size else fitted(intrinsics, depth_size, str(depth)),
-            )
-        )
+        where = f"{root / 'groundtruth.txt'} at {time:.4f} s"
+        frames.append(posed_frame("", image, camera, _pose(pose, where), where, depth))
     total = len(colours.values)
     if not frames:
         raise InputError(
@@ -136,4 +125,4 @@ def _pose(words: list[str], where: str) -> Array:
         x, y, z, qx, qy, qz, qw = (float(word) for word in words[:7])
     except ValueError as error:
         raise InputError(f"{where}: the pose holds a word that is not a number; correct or remove this line") from error
-    return checked_pose(rigid(np.array([qw, qx, qy, qz]), np.array([x, y, z]), where), where)
+    return rigid(np.array([qw, qx, qy, qz]), np.array([x, y, z]), where)

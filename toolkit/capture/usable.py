@@ -7,15 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from fieldfuse.camera import PoseNotes
 from fieldfuse.capture.headers import orientation_of, read_bytes, read_header
 from fieldfuse.capture.images import EXIF_TURNS
-from fieldfuse.capture.listing import LYING, PICTURES, counted, picture_header
+from fieldfuse.capture.listing import PICTURES, counted
+from fieldfuse.capture.poses import PoseNotes
+from fieldfuse.capture.sizes import LYING, picture_header
 from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
 
 MOST_BAD = 0.2  # share of the frames that may be left out; with more of them something is wrong with the capture
-LEAST = 3  # frames that have to stay
+MIN_FRAMES = 3  # frames that have to stay
 BESIDE = ("transforms", "blender", "colmap", "llff")  # kinds whose images may be photos as a camera wrote them
 NAMED = 3  # frames that a remark names
 
@@ -36,7 +37,7 @@ def without(capture: Capture, bad: Mapping[str, str], refusal: str | None = None
     lost = len(bad)
     total = len(kept) + lost
     first = next(iter(bad.values()))
-    if lost > MOST_BAD * total or len(kept) < LEAST:
+    if lost > MOST_BAD * total or len(kept) < MIN_FRAMES:
         raise InputError(refusal or (f"{first} ({lost} of {total} frames are like this)" if lost > 1 else first))
     names = ", ".join(list(bad)[:NAMED]) + (", …" if lost > NAMED else "")
     cause = first.rsplit("; ", 1)[0]

@@ -22,6 +22,7 @@ from fieldfuse.effects.evidence import TUNING
 LENS, ROWS, POSES = "distortion", "rolling_shutter", "poses"
 UNKNOWNS = (LENS, ROWS, POSES)
 STEPS = 12
+RESECTION_STEPS = 20
 POINTS_A_CHUNK = 512
 SLACK = 1e-3  # relative fall of the cost below which a fit is done
 
@@ -293,7 +294,7 @@ def _cross(v: Array) -> Array:
     return np.asarray(np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3))
 
 
-def resect(problem: Problem, frame: int, steps: int = 20) -> tuple[Array, Array]:
+def resect(problem: Problem, frame: int) -> tuple[Array, Array]:
     """The pose of one frame against points that stay where they are, by damped Gauss-Newton steps from the pose it has.
 
     Returns:
@@ -312,7 +313,7 @@ def resect(problem: Problem, frame: int, steps: int = 20) -> tuple[Array, Array]
         depth=None,
     )
     left, damping = residuals(alone), 1e-3
-    for _ in range(steps):
+    for _ in range(RESECTION_STEPS):
         width = TUNING * max(scatter(left), 1e-3)
         _, slope, _, _ = _slopes(alone, frozenset({POSES}))
         weight = _weights(left, width)

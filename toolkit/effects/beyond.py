@@ -26,7 +26,7 @@ from fieldfuse.poses.points import undistorted
 from fieldfuse.tone import LINEAR
 
 THRESHOLD = 0.002  # share of the patches that tell
-LEAST = 5  # far ones: fewer may be chance
+MIN_FAR = 5  # far ones: fewer may be chance
 FEWEST = 50  # patches that tell
 NEAR_LIMIT = 10.0  # times as far as the scene usually is
 REFERENCES, OTHERS = 8, 8  # pictures whose patches are looked at, and in how many others each
@@ -62,7 +62,7 @@ def far(seen: Sightings, problem: Problem, usual: float) -> HeldOut:
         if len(others) >= 4:
             told, gone, off = _look(seen, problem, near, int(one), others, picture)
             tells, distant, errors = tells + told, distant + gone, np.concatenate([errors, off])
-    share = distant / tells if tells >= FEWEST and distant >= LEAST else 0.0
+    share = distant / tells if tells >= FEWEST and distant >= MIN_FAR else 0.0
     before, after = np.sqrt(np.median(errors, axis=0)) if len(errors) else (None, None)
     reason = (
         f"{100 * share:.1f}% of the patches lie more than {2 * NEAR_LIMIT:g} times as far as the scene usually is: other pictures show them"

@@ -15,7 +15,7 @@ import numpy as np
 
 from fieldfuse.camera import Array, Intrinsics, distort
 from fieldfuse.capture.images import load_depth
-from fieldfuse.capture.listing import fitted
+from fieldfuse.capture.sizes import fitted
 from fieldfuse.capture.types import Capture
 from fieldfuse.poses.points import undistorted
 from fieldfuse.progress import SILENT, Progress

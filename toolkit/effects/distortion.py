@@ -48,11 +48,11 @@ def forward(effect: Distortion, points: Tensor) -> Tensor:
     return torch.stack([bent_x, bent_y], dim=-1)
 
 
-def invert(effect: Distortion, points: Tensor, steps: int = 20) -> Tensor:
+def invert(effect: Distortion, points: Tensor) -> Tensor:
     """Distorted image-plane points (..., 2) → ideal ones, by Newton's method in float64 (exact to rounding where one-to-one)."""
     target = points.double()
     ideal = target.clone()
-    for _ in range(steps):
+    for _ in range(20):
         x, y = ideal[..., 0], ideal[..., 1]
         r2 = x * x + y * y
         radial = 1 + r2 * (effect.k1 + r2 * (effect.k2 + r2 * effect.k3))

@@ -17,7 +17,7 @@ HELD_OUT = 4  # every so manieth point is kept out of the fits
 FEWEST = 60  # points without which nothing is told
 OUTLIER = 6.0  # deviations of a point's worst observation beyond which it is taken for a wrong match, once nothing explains it
 MARGIN = {LENS: 0.08, POSES: 0.4, ROWS: 0.15}  # least relative fall of the held-out residual, larger for what has more numbers
-LEAST = 0.003  # working pixels by which it has to fall at least
+MIN_FALL = 0.003  # working pixels by which it has to fall at least
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def explain(seen: Sightings) -> Explained | None:
         return tried[unknown][0]
 
     def score(unknown: frozenset[str]) -> float:
-        return attempt(unknown) * float(np.prod([1 / (1 - MARGIN[name]) for name in unknown])) + LEAST * len(unknown)
+        return attempt(unknown) * float(np.prod([1 / (1 - MARGIN[name]) for name in unknown])) + MIN_FALL * len(unknown)
 
     before = adjust(whole)
     kept = min([frozenset[str](), *(frozenset({name}) for name in UNKNOWNS)], key=score)

@@ -14,7 +14,7 @@ EXPOSURE, VIGNETTING = "exposure", "vignetting"
 HELD_OUT = 4  # every so manieth point is kept out of the fits
 MARGIN = {EXPOSURE: 0.24, VIGNETTING: 0.1}  # least relative fall of the held-out deviation: less did not pay on real pictures
 BOTH = 0.25  # … by both: each hides some of the other, so that alone neither may come as far as it does beside the other
-LEAST = 0.0015  # stops by which it has to fall at least
+MIN_FALL = 0.0015  # stops by which it has to fall at least
 FEWEST_POINTS = 10  # that a held-out frame's gain is measured by
 TORN = 1.5  # times the usual disagreement of points about a frame's gain, from which it is doubtful …
 APART = 0.2  # … if it lies so many stops outside of its neighbours' gains as well
@@ -59,7 +59,7 @@ def explain(tracks: Tracks, frames: int) -> Light:
         for kept in deviations
         if (VIGNETTING not in kept or falloff.found) and (EXPOSURE not in kept or found[kept - {EXPOSURE}].found)
     ]
-    kept = min(allowed, key=lambda one: deviations[one] / (1 - _margin(one)) + LEAST * len(one))
+    kept = min(allowed, key=lambda one: deviations[one] / (1 - _margin(one)) + MIN_FALL * len(one))
     final = vignetting.evidence(tracks, frames)
     corner = float(final.parameters.get("corner", 1.0))
     drift = exposure.evidence(vignetting.corrected(tracks, corner) if VIGNETTING in kept else tracks, frames)

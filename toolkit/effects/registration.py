@@ -21,9 +21,9 @@ from fieldfuse.progress import SILENT, Progress
 
 DEPTH_OFFSET = "depth_offset"
 MARGIN = 0.12  # least relative fall of what held-out points are off …
-LEAST = 0.0005  # … and least fall, as a share of depth
+MIN_FALL = 0.0005  # … and least fall, as a share of depth
 MAPS = 120  # depth maps that are looked at
-FEWEST, MOST = 300, 6000  # observations
+FEWEST, MAX_OBSERVATIONS = 300, 6000  # observations
 FOLDS = 2  # each of which is judged by what fits the others
 MEETS = 2.0  # times the median distance between where a point is seen and where it should be: what is off by more is no point
 SURE = 0.005  # share of its depth within which rays must meet
@@ -51,7 +51,7 @@ class Registration:
 
     @property
     def there(self) -> bool:
-        return self.gain > MARGIN and self.before - self.after > LEAST
+        return self.gain > MARGIN and self.before - self.after > MIN_FALL
 
     @property
     def reason(self) -> str:
@@ -156,7 +156,7 @@ def quickly(found: Observations) -> Array:
 
 def _fitted(found: Observations, usual: float, free: Array) -> Array:
     """(7,) a turn, a move in usual depths, the logarithm of the scale; 0 but for those `free`."""
-    some = found.some(np.linspace(0, len(found.point) - 1, min(MOST, len(found.point))).astype(int))
+    some = found.some(np.linspace(0, len(found.point) - 1, min(MAX_OBSERVATIONS, len(found.point))).astype(int))
     x = np.zeros(7)
     for cut, over in STAGES:
         x = _descend(some, x, usual, cut, over, free)

@@ -26,7 +26,7 @@ from fieldfuse.effects.sightings import Sightings
 from fieldfuse.tone import LINEAR, share, square_radius
 
 THRESHOLD = 0.0014  # share of the patches
-LEAST = 3  # shiny ones
+MIN_SHINY = 3  # shiny ones
 FEWEST = 150  # patches
 BRIGHTER = 0.1  # stops
 GAIN = 0.2  # least relative fall of the held-out error
@@ -70,7 +70,7 @@ def shiny(seen: Sightings, problem: Problem, depth: Array, found: Light) -> Held
         _, expected, _ = _around(excess[1])
         off = np.stack([np.abs(excess[2][hit]), np.abs(excess[2][hit] - expected[hit])], axis=1)
         total, hits, errors = total + int(told.sum()), hits + int(hit.sum()), np.concatenate([errors, off])
-    share = hits / total if total >= FEWEST and hits >= LEAST else 0.0
+    share = hits / total if total >= FEWEST and hits >= MIN_SHINY else 0.0
     errors = errors[np.isfinite(errors).all(1)]
     before, after = (float(value) for value in np.median(errors, axis=0)) if len(errors) else (None, None)
     reason = (

@@ -26,7 +26,7 @@ LONG_SIDE = 480  # pixels that features are looked for on
 FEATURES = 700  # a picture
 NEIGHBOURS = 5
 LOOSE = 0.025  # of the long side: how far off its epipolar line a match may lie
-LEAST = 3  # pictures that show a point
+MIN_IMAGES = 3  # pictures that show a point
 WINDOW = 4.0  # working pixels: deviation of the window that slopes are weighted with
 LEVELS = 8  # of blur for colours, each √2 of the one before
 FIRST = 0.8  # working pixels: the least of them
@@ -142,7 +142,7 @@ def gather(
             links.append(np.stack([found[:, 0] + starts[i], found[:, 1] + starts[j]], axis=1))
     owner = np.repeat(np.arange(len(frames)), [len(look.pixel) for look in seen])
     point, node = tracks(np.concatenate(links) if links else np.zeros((0, 2), np.int64), owner)
-    often = np.bincount(point)[point] >= LEAST if len(point) else np.zeros(0, bool)
+    often = np.bincount(point)[point] >= MIN_IMAGES if len(point) else np.zeros(0, bool)
     point, node = np.unique(point[often], return_inverse=True)[1], node[often]
     columns = {name: np.concatenate([getattr(look, name) for look in seen])[node] for name in ("pixel", "linear", "slope", "size")}
     return Sightings(

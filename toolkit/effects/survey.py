@@ -82,7 +82,6 @@ def survey(
     capture: Capture,
     indices: list[int] | None = None,
     progress: Progress = SILENT,
-    most: int | None = MOST_FRAMES,
     known: dict[int, Look] | None = None,
     quick: bool = True,
 ) -> Survey:
@@ -90,7 +89,6 @@ def survey(
 
     Args:
         indices: the frames that may be looked at (training frames); None: all.
-        most: how many of them are; None: all.
         known: what is found in pictures, for `gather`.
         quick: begin with a quick look at few pictures, and end there when nothing speaks for any effect.
 
@@ -106,7 +104,7 @@ def survey(
         first = look(sightings, began, paid)
         if first.explained is not None and not any(near_to(finding) for finding in first.findings.values()):
             return first
-    chosen = allowed if most is None else [allowed[k] for k in choose(len(allowed), most)]
+    chosen = [allowed[k] for k in choose(len(allowed), MOST_FRAMES)]
     with paid.by(POINTS):
         sightings = gather(capture, chosen, progress, known=known)
     return look(sightings, began, paid)

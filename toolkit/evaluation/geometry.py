@@ -124,7 +124,6 @@ def seen_surface(
     voxel_size: float,
     region: Region | None = None,
     samples: int = SAMPLES,
-    seed: int = 0,
 ) -> tuple[Array, float]:
     """Points of the true surface that a reconstruction is asked for: those that some camera saw, in the region.
 
@@ -134,7 +133,7 @@ def seen_surface(
     Raises:
         InputError: the cameras saw nothing of it, so mesh and poses do not belong together.
     """
-    points = surface_points(truth, samples, seed)
+    points = surface_points(truth, samples)
     kept = inside(points, region)
     kept[kept] = seen_points(points[kept], truth, cameras, world_from_camera, MARGIN * voxel_size)
     if not kept.any():
@@ -149,7 +148,6 @@ def geometry_metrics(
     voxel_size: float,
     region: Region | None = None,
     samples: int = SAMPLES,
-    seed: int = 0,
 ) -> dict[str, Any]:
     """Compare a mesh with the true one; all lengths in the meshes' unit.
 
@@ -165,7 +163,7 @@ def geometry_metrics(
         `precision_n` and `recall_n`, the shares of both within that distance, and `f_score_n`, their harmonic mean; `voxel_size`.
         Without a surface: accuracy None, scores 0.
     """
-    own, triangle = _spread(mesh, samples, seed + 1)
+    own, triangle = _spread(mesh, samples, 1)
     kept = inside(own, region)
     own, triangle = own[kept], triangle[kept]
     to_truth, nearest = _nearest(own, truth)

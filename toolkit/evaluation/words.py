@@ -13,13 +13,13 @@ def decimal(value: float | None, digits: int = 2) -> str:
     return NONE if value is None else f"{value:.{digits}f}"
 
 
-def significant(value: float | None, digits: int = 3) -> str:
-    """`digits` significant digits, without an exponent where people would not write one."""
+def significant(value: float | None) -> str:
+    """Three significant digits, without an exponent where people would not write one."""
     if value is None:
         return NONE
-    if abs(value) >= 10**digits:
+    if abs(value) >= 1000:
         return f"{value:,.0f}"
-    return f"{value:.{digits}g}" if value == 0 or abs(value) >= 1e-4 else f"{value:.{digits - 1}e}"
+    return f"{value:.3g}" if value == 0 or abs(value) >= 1e-4 else f"{value:.2e}"
 
 
 def whole(value: float | None) -> str:

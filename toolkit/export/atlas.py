@@ -17,7 +17,7 @@ from fieldfuse.tsdf.mesh import Mesh
 
 SMALLEST, LARGEST = 4, 1024  # texels along a square
 GUTTER = 3  # texels of a square's side that lie outside of its triangles, so that looking up between texels never leaves them
-LEAST = 256  # texels along a texture
+MIN_TEXELS = 256  # texels along a texture
 SEARCH = 24  # halvings that find how large texels are
 
 
@@ -56,7 +56,7 @@ def make_atlas(mesh: Mesh, density: float, largest: int) -> Atlas:
         InputError: not even the smallest squares fit.
     """
     wanted = np.sqrt(2 * mesh.areas())  # along a square that two such triangles fill
-    size = LEAST
+    size = MIN_TEXELS
     while size < largest and _room(_sides(wanted * density)) > size * size:
         size *= 2
     low, high = 0.0, density

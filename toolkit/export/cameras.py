@@ -28,7 +28,6 @@ def write_cameras(
     points: Array | None = None,
     colours: Array | None = None,
     working_from_input: Similarity | None = None,
-    files: Sequence[str] | None = None,
 ) -> None:
     """Write `folder/transforms.json` and `folder/colmap/{cameras,images,points3D}.txt`; where there are points, `folder/points3D.ply` as
     well, which the json names as other programs look for it.
@@ -39,7 +38,6 @@ def write_cameras(
         world_from_camera: (N, 4, 4) in OpenCV axes.
         points, colours: (P, 3) sparse points and their colours (None: grey).
         working_from_input: when given, poses and points are in the working frame and are brought back to the input's.
-        files: paths of the pictures for `file_path`; None: the names.
 
     Raises:
         InputError: lists of different length.
@@ -47,15 +45,14 @@ def write_cameras(
     """
     folder = Path(folder)
     poses = np.asarray(world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
-    files = list(names) if files is None else list(files)
-    if not len(names) == len(intrinsics) == len(poses) == len(files):
-        counts = f"{len(names)} names, {len(intrinsics)} intrinsics, {len(poses)} poses and {len(files)} files"
+    if not len(names) == len(intrinsics) == len(poses):
+        counts = f"{len(names)} names, {len(intrinsics)} intrinsics and {len(poses)} poses"
         raise InputError(f"cameras need one of each, but there are {counts}; give lists of one length")
     if working_from_input is not None:
         back = working_from_input.inverse()
         poses = back.poses(poses)
         points = None if points is None else back.points(points)
-    data = transforms(files, intrinsics, poses)
+    data = transforms(names, intrinsics, poses)
     if points is not None and len(points):
         write_points(folder / POINTS, points, colours)
         data["ply_file_path"] = POINTS

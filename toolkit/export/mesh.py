@@ -24,7 +24,7 @@ from fieldfuse.tsdf.mesh import Mesh
 FORMATS = (".ply", ".obj", ".glb")
 JPEG_QUALITY = 95
 ROWS_AT_ONCE = 100_000
-COLOUR, MOST = "_COLOUR", 2**16 - 1  # what trimesh calls them, and full light
+COLOUR, FULL_LIGHT = "_COLOUR", 2**16 - 1  # what trimesh calls them, and full light
 
 
 def write_mesh(path: Path | str, mesh: Mesh, working_from_input: Similarity | None = None) -> None:
@@ -144,8 +144,8 @@ def _write_glb(path: Path, mesh: Mesh) -> None:
     solid = to_trimesh(mesh, offset)
     solid.visual = TextureVisuals(material=PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0))
     # glTF multiplies light by them, so they are linear; in 8 bits the dark ones would lie in bands.
-    linear = np.round(LINEAR[mesh.colours].astype(np.float64) * MOST).astype(np.uint16)
-    solid.vertex_attributes[COLOUR] = np.concatenate([linear, np.full((len(linear), 1), MOST, np.uint16)], axis=1)
+    linear = np.round(LINEAR[mesh.colours].astype(np.float64) * FULL_LIGHT).astype(np.uint16)
+    solid.vertex_attributes[COLOUR] = np.concatenate([linear, np.full((len(linear), 1), FULL_LIGHT, np.uint16)], axis=1)
 
     def name_colours(tree: dict[str, Any]) -> None:
         """trimesh writes colours of vertices in 8 bits, and other numbers of vertices as they are."""

@@ -25,16 +25,17 @@ Polish = Callable[[Array], tuple[Array, Array]]  # depth (H, W) → better depth
 Settle = Callable[[list[Array], list[Array], list[Array]], list[Array]]
 
 STEEPEST = 4.0  # tangent of the angle between view and surface normal (76°) beyond which a depth step is taken as an edge
+OPAQUE = 0.7  # opacity from which a pixel has a surface
 SMALLEST_EDGE = 0.02  # share of depth: smaller steps are never an edge
 AFTERWARDS = 0.2  # of the time that rendering takes, for the progress
 
 
-def reliable_depth(depth: Array, opacity: Array, focal: float, min_opacity: float = 0.7) -> Array:
+def reliable_depth(depth: Array, opacity: Array, focal: float) -> Array:
     """(H, W) depth with 0 where it cannot be trusted: little opacity, or beside a depth edge, where it lies between two surfaces.
 
     An edge is a range over 3×3 pixels larger than a plane seen at 76° would have. Missing neighbours do not make an edge.
     """
-    depth = np.where(np.isfinite(depth) & (depth > 0) & (opacity >= min_opacity), depth, 0).astype(np.float32)
+    depth = np.where(np.isfinite(depth) & (depth > 0) & (opacity >= OPAQUE), depth, 0).astype(np.float32)
     window = np.ones((3, 3), np.uint8)
     farthest = cv2.dilate(depth, window)
     nearest = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), window)
@@ -43,7 +44,7 @@ def reliable_depth(depth: Array, opacity: Array, focal: float, min_opacity: floa
 
 
 def rendered_frame(
-    render: Render, intrinsics: Intrinsics, world_from_camera: Array, min_opacity: float = 0.7, polish: Polish | None = None
+    render: Render, intrinsics: Intrinsics, world_from_camera: Array, polish: Polish | None = None
 ) -> tuple[DepthFrame, Array, Array]:
     """Render one view: a frame of its reliable depth, polished before; (H, W) all depth that is opaque enough; where pictures tell it.
 
@@ -57,8 +58,8 @@ def rendered_frame(
         depth = enlarged(np.asarray(depth), *size)
         opacity = cv2.resize(np.asarray(opacity, dtype=np.float32), size, interpolation=cv2.INTER_LINEAR)
     depth, told = (np.asarray(depth), np.ones(np.shape(depth), bool)) if polish is None else polish(np.asarray(depth))
-    opaque = np.where(np.isfinite(depth) & (np.asarray(opacity) >= min_opacity), depth, 0).astype(np.float32)
-    depth = reliable_depth(depth, np.asarray(opacity), camera.fx, min_opacity)
+    opaque = np.where(np.isfinite(depth) & (np.asarray(opacity) >= OPAQUE), depth, 0).astype(np.float32)
+    depth = reliable_depth(depth, np.asarray(opacity), camera.fx)
     return DepthFrame(depth, as_bytes(np.asarray(rgb)), camera, small, np.asarray(world_from_camera, dtype=np.float64)), opaque, told
 
 
@@ -81,7 +82,6 @@ def field_volume(
     voxel_size: float | None = None,
     depth_max: float | None = None,
     *,
-    min_opacity: float = 0.7,
     region: tuple[Array, Array] | None = None,
     carve: bool = True,
     polish: Sequence[Polish] | None = None,
@@ -113,7 +113,7 @@ def field_volume(
     told: list[Array] = []
     for camera, pose, how in zip(cameras, poses, better, strict=True):
         progress.check()
-        frame, all_depth, where = rendered_frame(render, camera, pose, min_opacity, how)
+        frame, all_depth, where = rendered_frame(render, camera, pose, how)
         made.append(frame)
         opaque.append(all_depth)
         told.append(where)

@@ -1,4 +1,4 @@
-"""The plane sweep on the CPU, compiled: what `sweep.py`, `matching.py` and `witness.py` do with whole tensors, pixel by pixel.
+"""The plane sweep on the CPU, compiled: what `plane_sweep.py` and `matching.py` do with whole tensors, pixel by pixel.
 
 In tensors a sweep writes what another view shows of every pixel at every plane, 21 numbers each, and reads it back; here they are compared
 where they are looked up. Volumes lie in memory pixel by pixel, planes next to each other, since all that follows goes along planes.
@@ -91,10 +91,10 @@ def _combine(cost: Any, least: Any, seen: Any, unknown: Any) -> None:
             cost[p, d] = F(0.5) * (cost[p, d] / F(seen[p, d]) + least[p, d]) if seen[p, d] else unknown
 
 
-def widened(described: Tensor) -> Tensor:
+def widened(descriptors: Tensor) -> Tensor:
     """(N, 21) descriptors as they are kept here, (N, 28)."""
-    out = described.new_zeros((len(described), WHOLE))
-    out[:, :PATCH], out[:, WIDE : WIDE + COLOURS] = described[:, COLOURS:], described[:, :COLOURS]
+    out = descriptors.new_zeros((len(descriptors), WHOLE))
+    out[:, :PATCH], out[:, WIDE : WIDE + COLOURS] = descriptors[:, COLOURS:], descriptors[:, :COLOURS]
     return out
 
 
@@ -113,7 +113,7 @@ class Comparison:
         shape = (len(own), len(inverses))
         self.cost, self.least, self.seen = np.zeros(shape, np.float32), np.ones(shape, np.float32), np.zeros(shape, np.uint16)
 
-    def add(self, described: Tensor, turn: Tensor, shift: Tensor, lens: Tensor) -> None:
+    def add(self, descriptors: Tensor, turn: Tensor, shift: Tensor, lens: Tensor) -> None:
         """One more view.
 
         Args:
@@ -121,7 +121,7 @@ class Comparison:
             turn, shift: (3, 3), (3,): camera axes → the other's, row vectors, the shift for points at unit depth.
             lens: (6,) fx, fy, cx, cy, width, height of its pictures.
         """
-        other = array(widened(described.flatten(1).T).view(*described.shape[1:], WHOLE))
+        other = array(widened(descriptors.flatten(1).T).view(*descriptors.shape[1:], WHOLE))
         given = [other, *(array(values) for values in (turn, shift, lens))]
 
         def part(p: slice) -> None:
@@ -225,7 +225,7 @@ def between(table: Any, x: Any, y: Any, d: Any, channel: int) -> Any:
 
 @njit(**OPTIONS)
 def _look(points: Any, truncation: Any, table: Any, pose: Any, lens: Any, lowest: Any, step: Any, out: Any) -> None:
-    """`Sweep.look`: signed, open, sure into `out` (N, 3)."""
+    """`DepthDistribution.look`: expected SDF, visibility, confidence into `out` (N, 3)."""
     height, width = F(table.shape[0]), F(table.shape[1])
     for n in range(len(points)):
         px, py, pz = points[n, 0] - pose[0, 3], points[n, 1] - pose[1, 3], points[n, 2] - pose[2, 3]

@@ -1,4 +1,4 @@
-"""What `witness.py` does with whole tensors, compiled for the CPU: witnesses asked place by place, or along the rays of another."""
+"""`cross_view_consistency.py` compiled for the CPU: log odds of surface read at points, or along the rays of another key frame."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fieldfuse.nerfusion.compiled import OPTIONS, F, array, between, spread
 
 @njit(**OPTIONS)
 def _ask(points: Any, says: Any, pose: Any, lens: Any, lowest: Any, step: Any, said: Any, seen: Any) -> None:
-    """`Witness.ask`."""
+    """`CrossView.log_odds_at`."""
     height, width = F(says.shape[0]), F(says.shape[1])
     for n in range(len(points)):
         said[n], seen[n] = F(0), False
@@ -63,7 +63,7 @@ def _question(
 
 
 class Question:
-    """Asks witnesses about places along rays; `Witness.ask` for all of them without writing them down.
+    """Asks witnesses about places along rays; `CrossView.log_odds_at` for all of them without writing them down.
 
     Args:
         rays: (P, 3) of unit depth of the one who asks, working axes.

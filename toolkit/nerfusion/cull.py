@@ -10,7 +10,7 @@ from fieldfuse.backends.dispatch import is_cpu, to_device_async
 from fieldfuse.camera import Array
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.lattice import Lattice
-from fieldfuse.volume.topology import BLOCK
+from fieldfuse.volume.topology import BLOCK, Topology
 
 SLACK = 1.25  # balls grow by this much: views tell of a voxel beside their pictures, and blocks of the contracted shell are bent
 
@@ -81,3 +81,19 @@ def _planes(cameras: Cameras, near: float, far: float) -> tuple[Array, Array]:
     ends = np.array([0, 0, 0, 0, -near, min(far, 1e30)], np.float32)
     offsets = ends - (world * poses[:, None, :3, 3]).sum(2)
     return world.reshape(-1, 3), offsets.reshape(-1).astype(np.float32)
+
+
+def frustum(lattice: Lattice, cameras: Cameras, near: float, far: float) -> Topology:
+    """The blocks of the lattice in the first camera's frustum."""
+    keys = all_blocks(lattice, cameras.intrinsics.device)
+    keys = keys[visible_blocks(*block_balls(lattice, keys), cameras[0], near, far)]
+    return Topology(keys, bounds=lattice.bounds(keys.device))
+
+
+def depth_range(lattice: Lattice, topology: Topology, cameras: Cameras) -> tuple[float, float]:
+    """Where the blocks begin (0: at the camera) and end along the first camera's axis, working units."""
+    if topology.blocks == 0:
+        return 1.0, 2.0
+    centres, radii = block_balls(lattice, topology.keys)
+    depth = cameras[0].local(centres)[0, :, 2]
+    return max(float((depth - radii).amin()), 0.0), max(float((depth + radii).amax()), 1e-6)

@@ -20,17 +20,18 @@ from fieldfuse.backends.dispatch import is_cpu, to_device_async
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.cull import all_blocks, block_balls, visible_at_once, visible_blocks
-from fieldfuse.nerfusion.extras.keyframe_depth import Brought, KeySweeps, Recent, picture, sensed, together
+from fieldfuse.nerfusion.cull import all_blocks, block_balls, depth_range, visible_at_once, visible_blocks
+from fieldfuse.nerfusion.extras.keyframe_depth import KeyframeDepth
 from fieldfuse.nerfusion.extras.matching import SIDE, SIDE_WITHIN
-from fieldfuse.nerfusion.extras.plane_sweep import Empty, Sweep
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, Empty
+from fieldfuse.nerfusion.extras.two_lattices import allowed_cells, split_volume
+from fieldfuse.nerfusion.images import ImageCache, Recent, image_of, sensor_depth, with_neighbours
 from fieldfuse.nerfusion.keyframes import KeyFrames
-from fieldfuse.nerfusion.lattice import LatentVolume, Lattice
+from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume, merged
 from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.nerfusion.precision import FLOAT32, computing
-from fieldfuse.nerfusion.refine import children, merged, solid_cells, split_volume
-from fieldfuse.nerfusion.store import GlobalStore
-from fieldfuse.nerfusion.unproject import EncodedView
+from fieldfuse.nerfusion.store import GlobalStore, ValueStore
+from fieldfuse.nerfusion.unproject import EncodedView, KeyFrame
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
@@ -50,7 +51,7 @@ class FusionOptions:
         gamma: coarse cells in which exp(−optical thickness) exceeds this are not looked at finer.
         prune_every: key frames after which blocks without such cells are forgotten.
         measured: the depth that a sensor measured for key frames goes into their sweep, where there is one (not in the paper).
-        precision: of the networks' arithmetic (`networks.precision`).
+        precision: of the networks' arithmetic (`nerfusion.precision`).
     """
 
     levels: int = 2
@@ -106,6 +107,46 @@ def fusion_lattice(space: Space, voxel_size: float, levels: int) -> Lattice:
     return Lattice(space, resolution)
 
 
+def fuse_key_frame(
+    model: NerfusionModel,
+    frame: KeyFrame,
+    stores: Sequence[GlobalStore | ValueStore],
+    topology: Topology | None,
+    chosen: Callable[[LatentVolume, Tensor], Tensor],
+    meanwhile: Callable[[], None] | None = None,
+) -> LocalVolume:
+    """One step of the loop, in inference and training alike: V = J(…), H' = GRU(H, V) on the coarsest lattice, then on finer ones.
+
+    Args:
+        stores: the global volumes, coarsest first; changed.
+        topology: blocks of the coarsest lattice to work on; None: those in the key frame's frustum.
+        chosen: (volume, (M · 512,) bool corners that the key frame sees) → (M · 512,) bool cells to work on finer (not in the paper).
+        meanwhile: see `Fusion.add`.
+
+    Returns:
+        the local volume on the coarsest lattice.
+    """
+    coarsest: LocalVolume | None = None
+    finer: LatentVolume | None = None
+    for level, store in enumerate(stores):
+        wanted, limits = None if finer is None else finer.known, (frame.near, frame.far)
+        local = model.local_volume(frame.views, frame.cameras, store.lattice, topology, wanted, *limits, frame.distribution)
+        coarsest = coarsest or local
+        if meanwhile is not None and level + 1 == len(stores):
+            meanwhile()
+        before, seen = store.part(local.topology, finer), local.known
+        after = model.fuse_part(before, local)
+        store.write(after, seen)
+        if level + 1 < len(stores):
+            with torch.no_grad():  # each lattice is trained by its own loss
+                # What was known before but is not seen now still makes cells whole.
+                here = merged(before, after, seen)
+                finer = split_volume(here, chosen(here, seen))
+            topology = finer.topology
+    assert coarsest is not None
+    return coarsest
+
+
 class Fusion:
     """The global volumes of all levels, and one step of the loop."""
 
@@ -134,34 +175,25 @@ class Fusion:
         views: Sequence[EncodedView],
         cameras: Cameras,
         depth: Tensor | None = None,
-        swept: Sweep | None = None,
+        distribution: DepthDistribution | None = None,
         meanwhile: Callable[[], None] | None = None,
     ) -> None:
         """Fuse one key frame (first) and its neighbours.
 
         Args:
             depth: (H, W) of the key frame where a sensor measured it, working units.
-            swept: of the key frame, where it was made already (`KeySweeps`), depth and all; None: made here.
+            distribution: of the key frame's depth, where it was made already (`KeyframeDepth`); None: made here.
             meanwhile: called once a device of its own has been asked the last question, so that what it does delays no answer.
         """
-        options = self.options
-        topology, finer = self._visible(cameras), None
-        bounded = options.near > 0 or math.isfinite(options.far)
-        if swept is None and bounded:
-            swept = self.model.sweep(views, cameras, options.near, options.far, depth, self.empty)
-        for level, store in enumerate(self.stores):
-            wanted = None if finer is None else finer.known
-            local = self.model.local_volume(views, cameras, store.lattice, topology, wanted, options.near, options.far, swept)
-            if meanwhile is not None and level + 1 == options.levels:
-                meanwhile()
-            before, seen = store.part(local.topology, finer), local.known
-            after = self.model.fuse_part(before, local)
-            store.write(after, seen)
-            if level + 1 < options.levels:
-                # What was known before but is not seen now still makes cells whole.
-                here = merged(before, after, seen)
-                finer = split_volume(here, self.model.surface_cells(here, seen, options.gamma))
-                topology = finer.topology
+        options, model = self.options, self.model
+        topology = self._visible(cameras)
+        if distribution is None:
+            bounded = options.near > 0 or math.isfinite(options.far)
+            limits = (options.near, options.far) if bounded else depth_range(self.stores[0].lattice, topology, cameras)
+            distribution = model.sweep_planes(views, cameras, *limits, depth, self.empty)
+        frame = KeyFrame(views, cameras, options.near, options.far, distribution)
+        chosen = partial(model.surface_cells, gamma=options.gamma)
+        fuse_key_frame(model, frame, self.stores, topology, chosen, meanwhile)
 
     def _visible(self, cameras: Cameras) -> Topology:
         """Blocks of the coarsest lattice in the frustum of the key frame."""
@@ -185,8 +217,7 @@ class Fusion:
         if level == 0:
             return torch.ones(fine.zero_row, dtype=torch.bool, device=fine.device)
         coarse = self.stores[level - 1].volume()
-        kept = solid_cells(coarse, self.model.thickness(coarse), self.options.gamma)
-        return children(coarse.topology, kept, fine)
+        return allowed_cells(coarse, self.model.thickness(coarse), self.options.gamma, fine)
 
     def prune(self) -> None:
         """Forget blocks of the finer levels in which no cell is allowed any more."""
@@ -200,7 +231,7 @@ class _Pictures:
     def __init__(self, model: NerfusionModel, views: Views, side: int | None, precision: str) -> None:
         self.model, self.views, self.side, self.precision = model, views, side, precision
         self.ahead = 1 if is_cpu(model.device) else AHEAD
-        self.brought = None if self.ahead == 1 else Brought(views, model.device)
+        self.brought = None if self.ahead == 1 else ImageCache(views, model.device)
         self._kept: Recent[tuple[EncodedView, Cameras]] = Recent(KEPT_PICTURES if self.ahead == 1 else KEPT_ON_DEVICE)
 
     def __call__(self, groups: Sequence[Sequence[int]]) -> list[tuple[EncodedView, Cameras]]:
@@ -230,7 +261,7 @@ class _Pictures:
         views, device = self.views, self.model.device
         lenses = [views.intrinsics[index] for index in indices]
         cameras = Cameras.of(lenses, views.world_from_camera[list(indices)], device)
-        pictures = [picture(views, index, device) if self.brought is None else self.brought(index) for index in indices]
+        pictures = [image_of(views, index, device) if self.brought is None else self.brought(index) for index in indices]
         images = pictures[0] if len(pictures) == 1 else torch.cat(pictures)
         with computing(self.precision, device):
             encoded = self.model.encode(images, cameras, self.side)
@@ -251,8 +282,9 @@ def fuse_views(
 
     Args:
         empty: see `Fusion`.
-        witnesses: of each key frame, other ones (places among them, `key_sweeps.beside`) that its sweep is held against (not in the paper);
-            needs a nearest or a farthest depth, and goes without `empty` (docs/measured/few_views.md, "Within silhouettes").
+        witnesses: of each key frame, other ones (places among them, `keyframe_depth.overlapping`) that its depth distribution is checked
+            against (not in the paper); needs a nearest or a farthest depth, and goes without `empty` (docs/measured/few_views.md,
+            "Within silhouettes").
 
     Raises:
         InputError: no key frames, or a lattice that does not fit the options.
@@ -267,18 +299,18 @@ def fuse_views(
     side = None if witnesses is not None else SIDE if empty is None else SIDE_WITHIN
     encoded = _Pictures(model, views, side, fusion.options.precision)
     near, far, measured = fusion.options.near, fusion.options.far, fusion.options.measured
-    sweeps = None if witnesses is None else KeySweeps(views, key_frames, witnesses, near, far, measured, model.device, encoded.brought)
-    groups = [together(int(key), neighbours) for key, neighbours in zip(key_frames.indices, key_frames.neighbours, strict=True)]
+    sweeps = None if witnesses is None else KeyframeDepth(views, key_frames, witnesses, near, far, measured, model.device, encoded.brought)
+    groups = [with_neighbours(int(key), neighbours) for key, neighbours in zip(key_frames.indices, key_frames.neighbours, strict=True)]
     for done, key in enumerate(key_frames.indices):
         progress.check()
         begin = time.perf_counter()
         group = encoded(groups[done:])
         encode_seconds = time.perf_counter() - begin
-        depth = sensed(views, int(key), model.device) if measured else None
-        swept = None if sweeps is None else sweeps(done)
+        depth = sensor_depth(views, int(key), model.device) if measured else None
+        distribution = None if sweeps is None else sweeps(done)
         with computing(fusion.options.precision, model.device):
             cameras, coming = Cameras.together([camera for _, camera in group]), partial(encoded.prepare, groups[done + 1 :])
-            fusion.add([view for view, _ in group], cameras, depth, swept, coming)
+            fusion.add([view for view, _ in group], cameras, depth, distribution, coming)
         if (done + 1) % fusion.options.prune_every == 0:
             fusion.prune()
         seconds = time.perf_counter() - begin

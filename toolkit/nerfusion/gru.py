@@ -20,8 +20,9 @@ from torch import Tensor, nn
 
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d
 from fieldfuse.nerfusion.compiled_gru import Step
+from fieldfuse.nerfusion.extras.bounded_outputs import CHANGE, bounded
+from fieldfuse.nerfusion.extras.known_terms import INSIDE
 from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
-from fieldfuse.nerfusion.volume_net import CHANGE, INSIDE, held
 from fieldfuse.volume.topology import Topology
 
 LEAST = 1e-3  # of a local volume's weight
@@ -88,41 +89,41 @@ class FusionGRU(nn.Module):
         known = torch.cat([known, known.new_full((1,), -torch.inf)])[:, None]
         update, reset = self._gates(both, topology, inside)
         z, r = torch.sigmoid(update - known), torch.sigmoid(reset)
-        candidate = torch.tanh(raw + held(self.candidate(_beside(r * state, local), topology, inside)))
+        candidate = torch.tanh(raw + bounded(self.candidate(_beside(r * state, local), topology, inside)))
         return torch.lerp(state, candidate, z)
 
     def compiled(self, part: LatentVolume, local: LocalVolume) -> tuple[Tensor, Tensor]:
-        """The running mean on all rows of `part` (the global volume on the local one's blocks) and `forward` on those of busy blocks,
+        """The running mean on all rows of `part` (the global volume on the local one's blocks) and `forward` on blocks near surfaces,
         without gradients, by kernels (float32; convolutions in what autocast says).
 
         Returns:
             (M · 512 + 1, C), zero outside the local volume, and (M · 512,) weights so far, likewise.
         """
-        kind, busy = part.rows.device.type, local.busy
+        kind, near_surface = part.rows.device.type, local.near_surface
         numbers = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
         if not on_cpu(part.rows.device):
             return self._on_device(part, local, numbers)
         step = Step(local.place[:-1], part, local, LEAST, self.most)
         rows = step.average()
-        if busy.blocks:
+        if near_surface.blocks:
             inside = local.known[local.place[:-1]]
             both = step.beside(numbers)
-            update, reset = self._gates(both, busy, inside)
+            update, reset = self._gates(both, near_surface, inside)
             step.forget(reset, both)
-            step.update(update, self.candidate(both, busy, inside), INSIDE, CHANGE, rows)
+            step.update(update, self.candidate(both, near_surface, inside), INSIDE, CHANGE, rows)
         return rows, part.count * local.known + local.weight
 
     def _on_device(self, part: LatentVolume, local: LocalVolume, numbers: torch.dtype) -> tuple[Tensor, Tensor]:
         """`compiled` on CUDA: both gates' convolutions go side by side."""
         from fieldfuse.backends.triton import gru
 
-        step, busy = gru.Step(part, local, LEAST, self.most), local.busy
+        step, near_surface = gru.Step(part, local, LEAST, self.most), local.near_surface
         rows, count = step.average()
-        if busy.blocks:
+        if near_surface.blocks:
             both, inside = step.beside(numbers)
-            gates = self._gates_prepared.convolve(list(zip(self.update.layers, self.reset.layers, strict=True)), both, busy, inside)
+            gates = self._gates_prepared.convolve(list(zip(self.update.layers, self.reset.layers, strict=True)), both, near_surface, inside)
             step.forget(gates, both)
-            candidate = self._candidate_prepared.convolve([[layer] for layer in self.candidate.layers], both, busy, inside)
+            candidate = self._candidate_prepared.convolve([[layer] for layer in self.candidate.layers], both, near_surface, inside)
             step.update(gates, candidate, INSIDE, CHANGE, rows)
         return rows, count
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from fieldfuse.nerfusion.volume_net import COLOUR_SCALE, INSIDE, within
+from fieldfuse.nerfusion.extras.bounded_outputs import soft_bound
+from fieldfuse.nerfusion.extras.known_terms import COLOUR_SCALE, INSIDE
 
 START = -0.5  # log optical thickness of a voxel on the surface at the start
 SCALE = 3.0  # the density output's gain
@@ -53,5 +54,5 @@ class FieldHead(nn.Module):
         return self._thickness(latent, self.body(latent))
 
     def _thickness(self, latent: Tensor, hidden: Tensor) -> Tensor:
-        learned = within(self.density(hidden).squeeze(1), CHANGE)
+        learned = soft_bound(self.density(hidden).squeeze(1), CHANGE)
         return START + SCALE * (learned + self.steep * latent[:, INSIDE])

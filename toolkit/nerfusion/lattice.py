@@ -64,6 +64,14 @@ class Lattice:
         inner = torch.stack([local & 7, (local >> 3) & 7, local >> 6], 1)
         return (keys[slot].long() * BLOCK + inner).float() * self.voxel - self.space.extent
 
+    def inside(self, contracted: Tensor) -> Tensor:
+        """(N, 3) contracted places → (N,) bool, in the box of the space or less than about a voxel beside it; with a shell all."""
+        if self.space.shell > 0:
+            return torch.ones_like(contracted[:, 0], dtype=torch.bool)
+        x, y, z = contracted.abs().unbind(1)
+        across, along, up = (side + 1.01 * self.voxel for side in self.space.box)
+        return (x <= across) & (y <= along) & (z <= up)
+
     def working(self, contracted: Tensor) -> tuple[Tensor, Tensor]:
         """Contracted places (N, 3) → working frame (N, 3), and the length (N,) of a voxel there across the direction from the centre."""
         space = self.space
@@ -108,19 +116,19 @@ class LocalVolume(LatentVolume):
 
     Attributes:
         weight: (M · 512,) in (0, 1] where the corner is known: how much the key frame can say of it.
-        busy: blocks about surfaces. The networks work on these alone; the others hold what the known terms say.
-        among: (M',) int64 slots of the busy blocks.
+        near_surface: blocks about surfaces. The networks work on these alone; the others hold the known terms.
+        slots: (M',) int64 slots of the blocks near surfaces.
     """
 
     raw: Tensor  # (M · 512 + 1, C)
     weight: Tensor
-    busy: Topology
-    among: Tensor
+    near_surface: Topology
+    slots: Tensor
 
     @cached_property
     def place(self) -> Tensor:
-        """(M' · 512 + 1,) rows of the busy blocks, the zero row last (the same way back)."""
-        return rows_of(self.among, self.topology.zero_row)
+        """(M' · 512 + 1,) rows of the blocks near surfaces, the zero row last (the same way back)."""
+        return rows_of(self.slots, self.topology.zero_row)
 
     def detached(self) -> LocalVolume:
         return replace(self, rows=self.rows.detach(), raw=self.raw.detach())
@@ -162,3 +170,71 @@ def cells(topology: Topology, corners: Tensor, every: bool) -> Tensor:
             mask = low & high if every else low | high
         out[start * VOXELS : stop * VOXELS] = mask.reshape(-1)
     return out
+
+
+def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
+    """A copy of some blocks of a volume; where it has no such block, nothing is known."""
+    slots = volume.topology.slots_of(topology)
+    if volume.topology.blocks and dispatch.can_use_triton(volume.rows):
+        from fieldfuse.backends.triton import blocks as blocks
+
+        return LatentVolume(volume.lattice, topology, *blocks.take(volume.rows, volume.count, slots.int(), topology))
+    place = (slots.clamp_min(0)[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
+    here = (slots >= 0).repeat_interleave(VOXELS)
+    if volume.topology.blocks == 0:
+        place = torch.zeros_like(place)
+    count = torch.cat([volume.count, volume.count.new_zeros(1)])[place] * here
+    rows = volume.rows[place] * here[:, None]
+    return LatentVolume(volume.lattice, topology, torch.cat([rows, rows.new_zeros((1, rows.shape[1]))]), count)
+
+
+def merged(before: LatentVolume, after: LatentVolume, changed: Tensor) -> LatentVolume:
+    """`after` where `changed` (M · 512,), else `before`; both have the same blocks."""
+    if dispatch.can_use_triton(before.rows, after.rows):
+        from fieldfuse.backends.triton import volumes
+
+        rows, count = volumes.merge(before.rows, before.count, after.rows, after.count, changed)
+        return replace(before, rows=rows, count=count)
+    rows = torch.where(corner_mask(changed), after.rows, before.rows)
+    return replace(before, rows=rows, count=torch.where(changed, after.count, before.count))
+
+
+def corner_mask(corners: Tensor) -> Tensor:
+    """(M · 512,) bool → (M · 512 + 1, 1), false in the zero row."""
+    return torch.cat([corners, corners.new_zeros(1)])[:, None]
+
+
+def with_blocks(state: LatentVolume, keys: Tensor) -> tuple[LatentVolume, Tensor]:
+    """The volume with at least these blocks — its own keep their slots, new ones follow, of which nothing is known — and their slots."""
+    slots = state.topology.find(keys)
+    fresh = (slots < 0).nonzero().view(-1)
+    if len(fresh) == 0:
+        return state, slots
+    slots[fresh] = state.topology.blocks + torch.arange(len(fresh), device=keys.device)
+    new = len(fresh) * VOXELS
+    rows, count = state.rows, state.count
+    return (
+        replace(
+            state,
+            topology=state.topology.alike(torch.cat([state.topology.keys, keys[fresh].to(torch.int32)])),
+            rows=torch.cat([rows[:-1], rows.new_zeros((new + 1, rows.shape[1]))]),
+            count=torch.cat([count, count.new_zeros(new)]),
+        ),
+        slots,
+    )
+
+
+def some_blocks(topology: Topology, kept: Tensor) -> tuple[Topology, Tensor, Tensor]:
+    """The blocks of the mask (M,) alone, their slots, and their rows, the zero row last (the same way back)."""
+    blocks = kept.nonzero().view(-1)
+    return topology.alike(topology.keys[blocks]), blocks, rows_of(blocks, topology.zero_row)
+
+
+def without_empty_blocks(topology: Topology, rows: Tensor) -> tuple[Topology, Tensor]:
+    """The blocks that own at least one of the rows, in their order, and the same rows in them."""
+    slot = rows.div(VOXELS, rounding_mode="floor")
+    filled = torch.zeros(topology.blocks, dtype=torch.bool, device=rows.device).index_fill(0, slot, True)
+    kept = filled.nonzero().view(-1)
+    if len(kept) == topology.blocks:
+        return topology, rows
+    return topology.alike(topology.keys[kept]), rows + ((torch.cumsum(filled, 0) - 1)[slot] - slot) * VOXELS

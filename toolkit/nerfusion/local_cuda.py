@@ -13,7 +13,7 @@ from fieldfuse.backends.dispatch import to_device_async
 from fieldfuse.backends.triton.observe import Observer
 from fieldfuse.backends.triton.volumes import settle
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.extras.plane_sweep import Sweep
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution
 from fieldfuse.nerfusion.lattice import Lattice, LocalVolume
 from fieldfuse.nerfusion.unproject import EncodedView
 from fieldfuse.nerfusion.volume_net import LocalReconstruction
@@ -29,7 +29,7 @@ def local_volume(
     wanted: Tensor | None,
     near: float,
     far: float,
-    swept: Sweep,
+    swept: DepthDistribution,
     numbers: tuple[float, ...],
     sizes: tuple[int, bool, int],
 ) -> LocalVolume:

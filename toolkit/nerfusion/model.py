@@ -1,13 +1,14 @@
-"""NeRFusion's networks as one module with functional methods, in the order of the paper.
+"""NeRFusion's networks in the paper's order (Zhang et al., CVPR 2022, section 3), in plain torch.
 
-    views  = model.encode(images, cameras)                          # once a picture
-    local  = model.local_volume(views[:K], cameras[:K], lattice)    # a key frame and its neighbours
-    state  = model.fuse(state, local)                               # H' from H; start with `model.start(lattice)`
-    values = model.head(state)                                      # rows of a radiance field; also of a local volume
-    model.decoder                                                   # R, shared by local and global volumes
+    views  = model.encode(images, cameras)                         # F_i = CNN(I_i) and G(d): once an image
+    local  = model.local_volume(views[:K], cameras[:K], lattice)   # V = J([mean U_i, var U_i]), U_i = [F_i(u_i), G(d_i)]: eq. 1 and 2
+    state  = model.fuse(state, local)                              # H' = GRU(H, V): eq. 3; before the first, `model.start(lattice)`
+    values = model.head(state)                                     # R, eq. 5: density and features, of a global or a local volume …
+    model.decoder                                                  # … and colour from them
 
-No method changes anything: gradients flow through all of them, and a state is an ordinary value. `fieldfuse.render.fused.make_field` turns
-a volume into a field that can be rendered, with or without gradients; `fieldfuse.nerfusion.fusion` runs the loop over key frames.
+No method changes anything: gradients flow through all of them, and a state is an ordinary value. `render/fused.py` turns a volume into a
+field that can be rendered, `fusion.py` is the loop over key frames. What is not in the paper says so, and lies in `extras/`. Where nothing
+is learned kernels do the same steps faster: in `local_volume`, `fuse_part`, `surface_cells` and what these call.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -23,37 +24,35 @@ from torch import Tensor, nn
 
 from fieldfuse.backends import dispatch
 from fieldfuse.backends.dispatch import is_cpu
-from fieldfuse.nerfusion.aggregate import CUES, FLAGS, aggregate, agreement, direction_spread, evidence
+from fieldfuse.nerfusion.aggregate import CUES, FLAGS, aggregate, agreement, evidence
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.compiled import fits
-from fieldfuse.nerfusion.cull import all_blocks, block_balls, visible_blocks
+from fieldfuse.nerfusion.cull import depth_range, frustum
 from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.nerfusion.direction import DirectionCode
 from fieldfuse.nerfusion.encoder import DEEPEST, STRIDE, ImageEncoder, Sampled, padded
-from fieldfuse.nerfusion.extras.matching import SIDE, describe
-from fieldfuse.nerfusion.extras.plane_sweep import Empty, Sighted, Sweep, sweep
+from fieldfuse.nerfusion.extras import known_terms
+from fieldfuse.nerfusion.extras.matching import SIDE, patch_descriptors
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, Empty, sweep_planes
+from fieldfuse.nerfusion.extras.two_lattices import surface_cells
 from fieldfuse.nerfusion.gru import FusionGRU, RunningMean, mean_gate
 from fieldfuse.nerfusion.head import FieldHead
-from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume, empty_volume, rows_of
+from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume, empty_volume, some_blocks, without_empty_blocks
+from fieldfuse.nerfusion.prune import least_thickness
 from fieldfuse.nerfusion.pyramid import Pyramid, levelled, middles, sizes_of
-from fieldfuse.nerfusion.recorded import Recorded
-from fieldfuse.nerfusion.refine import least_thickness, surface_cells, with_blocks
-from fieldfuse.nerfusion.unproject import COLOURED, EncodedView, look_up, project
-from fieldfuse.nerfusion.volume_net import INSIDE, LocalReconstruction, colour_latent, inside_latent
-from fieldfuse.volume.topology import VOXELS, Topology
+from fieldfuse.nerfusion.recorded import Recorded, addresses, worth_recording
+from fieldfuse.nerfusion.store import ValueStore
+from fieldfuse.nerfusion.unproject import COLOURED, EncodedView, KeyFrame, look_up, project, scales
+from fieldfuse.nerfusion.volume_net import LocalReconstruction
+from fieldfuse.volume.topology import Topology
 
-CHUNK = 2**15  # voxels at a time: what the views show of them is many times larger than what is kept
+CHUNK = 2**15  # voxels at a time: what the views show of them is many times larger than what is cached
 AT_ONCE = 2**19  # where there is memory for that: 0.4 kB a voxel and view
 COLOURS = 3
-COLOUR_GAIN = 4.0  # pictures' RGB as numbers of about unit deviation
-RECORDED = 2**23  # numbers in pictures up to which encoding them is recorded on CUDA: recordings keep the memory that they need
+COLOUR_GAIN = 4.0  # images' RGB as numbers of about unit deviation
 LEVELS = 3  # of the feature maps
 COLOUR_LEVELS = 5
-SIGHTED = 3  # numbers that the plane sweep says of a voxel
-TRUNCATION = 2.0  # voxels about the surface within which distances are told apart
-HIDDEN = 0.02  # voxels that are open with less likelihood are not known
-BLIND = 0.1  # weight of a local volume where no depth stands out
-FREE = 0.9  # signed distances beyond which a voxel is free space for sure
+ESTIMATES = 3  # numbers that the plane sweep gives a voxel
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ class ModelConfig:
 
 
 class NerfusionModel(nn.Module):
-    """Encoder, direction code, local reconstruction, fusion, head and decoder."""
+    """CNN, G, J, GRU and R. Shapes: V images; K views of a key frame; N voxels; M blocks of 512 voxels; C channels."""
 
     def __init__(self, config: ModelConfig | None = None) -> None:
         super().__init__()
@@ -84,7 +83,7 @@ class NerfusionModel(nn.Module):
         self.encoder = ImageEncoder(config.image_channels, config.encoder)
         self.sample = Sampled(config.image_channels, self.encoder.widths[0], config.sampled)
         self.direction = DirectionCode(config.direction) if config.direction else None
-        inputs = 3 * (config.sampled + config.direction + 2 * COLOURS) + FLAGS + CUES + SIGHTED
+        inputs = 3 * (config.sampled + config.direction + 2 * COLOURS) + FLAGS + CUES + ESTIMATES
         self.local = LocalReconstruction(inputs, config.hidden, config.channels)
         self.fusion: FusionGRU | RunningMean = FusionGRU(config.channels, config.gru_hidden) if config.fusion == "gru" else RunningMean()
         self.to_field = FieldHead(config.channels, config.head_hidden, config.features)
@@ -95,63 +94,42 @@ class NerfusionModel(nn.Module):
     def device(self) -> torch.device:
         return next(self.parameters()).device
 
+    # Encode -----------------------------------------------------------------------------------------------------------------------
+
     def encode(self, images: Tensor, cameras: Cameras, side: int | None = SIDE) -> list[EncodedView]:
-        """Everything that voxels look up in pictures.
+        """F_i = CNN(I_i) and G(d), as pyramids that voxels look up.
 
         A viewing direction is the same for a pixel and for every voxel behind it, so G is evaluated for the cells of the maps and not
         for each voxel and view.
 
         Args:
             images: (V, 3, H, W) RGB in [0, 1], undistorted; of one size.
-            cameras: V cameras for exactly these pictures.
-            side: pixels of the long side at which they are compared; None: they are not (their sweep is made elsewhere).
+            cameras: V cameras for exactly these images.
+            side: pixels of the long side at which the plane sweep compares them; None: it does not.
         """
-        given = images, cameras.intrinsics, cameras.size, cameras.world_from_camera
-        if self._repeats(images):
-            features, colours, described = self._recorded(partial(self._shown, side=side), (side, self._state()), *given)
-        else:
-            features, colours, described = self._shown(*given, side=side)
+        given, work = (images, cameras.intrinsics, cameras.size, cameras.world_from_camera), partial(self._maps, side=side)
+        parts = (self.encoder, self.sample, self.direction)
+        maps = self._recorded(work, (side, addresses(parts)), *given) if worth_recording(images) else work(*given)
         height, width = (length + -length % DEEPEST for length in images.shape[2:])
         sizes, fine = sizes_of(height // STRIDE, width // STRIDE, LEVELS), sizes_of(height, width, COLOUR_LEVELS)
         return [
-            EncodedView(Pyramid(feature, sizes, STRIDE), Pyramid(colour, fine, 1), of)
-            for feature, colour, of in zip(features, colours, described, strict=True)
+            EncodedView(Pyramid(feature, sizes, STRIDE), Pyramid(colour, fine, 1), descriptors)
+            for feature, colour, descriptors in zip(*maps, strict=True)
         ]
 
-    def _shown(self, images: Tensor, intrinsics: Tensor, size: Tensor, poses: Tensor, side: int | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Rows of `encode`'s pyramids (V, R, C) and (V, R', 3), and what pictures are compared by (V, …)."""
+    def _maps(self, images: Tensor, intrinsics: Tensor, size: Tensor, poses: Tensor, side: int | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Rows of `encode`'s pyramids, (V, R, C) features and codes and (V, R', 3) colours, and (V, 21, h, w) for the plane sweep."""
         cameras = Cameras(intrinsics, size, poses)
-        maps = self.sample(*self.encoder.maps(images)).float()  # variances are looked for in them
-        whole = padded((images - 0.5) * COLOUR_GAIN)
-        described = images.new_zeros((len(images), 0, 0, 0)) if side is None else describe(images, side)
-        features, colours = levelled(maps, LEVELS), levelled(whole, COLOUR_LEVELS)
+        maps = self.sample(*self.encoder.maps(images)).float()  # variances are computed of them
+        features, colours = levelled(maps, LEVELS), levelled(padded((images - 0.5) * COLOUR_GAIN), COLOUR_LEVELS)
         if self.direction is not None:
             pixels = middles(sizes_of(maps.shape[2], maps.shape[3], LEVELS), STRIDE, features.device, features.dtype)
             codes = self.direction(torch.stack([cameras.directions(index, pixels) for index in range(len(images))]))
             features = torch.cat([features, codes.to(features.dtype)], 2)
-        return features.contiguous(), colours.contiguous(), described
+        descriptors = images.new_zeros((len(images), 0, 0, 0)) if side is None else patch_descriptors(images, side)
+        return features.contiguous(), colours.contiguous(), descriptors
 
-    def _repeats(self, images: Tensor) -> bool:
-        """Whether encoding such pictures is worth recording: hundreds of launches, of which the processor makes one that way."""
-        free = not torch.is_grad_enabled() and not torch.is_autocast_enabled(images.device.type)
-        return free and images.is_cuda and images.numel() <= RECORDED
-
-    def _state(self) -> tuple[int, ...]:
-        """Where parameters of encoding lie, which recordings read there; all are moved together."""
-        return tuple(next(part.parameters()).data_ptr() for part in (self.encoder, self.sample, self.direction) if part is not None)
-
-    def sweep(
-        self,
-        views: Sequence[EncodedView],
-        cameras: Cameras,
-        near: float,
-        far: float,
-        depth: Tensor | None = None,
-        empty: Empty | None = None,
-    ) -> Sweep:
-        """Where along the pixels of the key frame (first) the surface is likely to be, its measured `depth` (H, W) and what is known to be
-        `empty` included; asked once for all lattices. Not differentiable."""
-        return sweep([view.described for view in views], cameras, near, far, depth, empty)
+    # Unproject, mean and variance, J ----------------------------------------------------------------------------------------------
 
     def local_volume(
         self,
@@ -162,106 +140,90 @@ class NerfusionModel(nn.Module):
         wanted: Tensor | None = None,
         near: float = 0.0,
         far: float = math.inf,
-        swept: Sweep | None = None,
+        distribution: DepthDistribution | None = None,
     ) -> LocalVolume:
-        """The local volume of a key frame and its neighbours (section 3.1). Any number of views ≥ 1, the neighbours in any order.
+        """V = J([mean U_i, var U_i]) of a key frame and its neighbours (section 3.1). Any number of views ≥ 1, the neighbours in any order.
 
         Args:
             views, cameras: K of each.
-            topology: blocks to work on; None: every block that a view can see.
+            topology: blocks to work on; None: every block in the key frame's frustum.
             wanted: (M · 512,) bool, corners of these blocks to work on; None: all.
-            near, far: depths along z within which views are asked, working units.
-            swept: `sweep` of these views; None: made here.
+            near, far: depths along z within which views count, working units.
+            distribution: `sweep_planes` of these views; None: made here.
 
         Returns:
             a volume of those of the blocks in which the key frame sees a corner.
         """
         if topology is None:
-            keys = all_blocks(lattice, cameras.intrinsics.device)
-            keys = keys[visible_blocks(*block_balls(lattice, keys), cameras[0], near, far)]
-            topology = Topology(keys, bounds=lattice.bounds(keys.device))
-        if swept is None:
+            topology = frustum(lattice, cameras, near, far)
+        if distribution is None:
             bounded = near > 0 or math.isfinite(far)
-            swept = self.sweep(views, cameras, *((near, far) if bounded else _depths(lattice, topology, cameras)))
-        if self._on_device(views, swept):
+            distribution = self.sweep_planes(views, cameras, *((near, far) if bounded else depth_range(lattice, topology, cameras)))
+        frame = KeyFrame(views, cameras, near, far, distribution)
+        if self._on_device(frame):
             from fieldfuse.nerfusion.local_cuda import local_volume
 
-            numbers = TRUNCATION, HIDDEN, BLIND, COLOUR_GAIN, COLOURED, FREE
+            numbers = known_terms.TRUNCATION, known_terms.HIDDEN, known_terms.BLIND, COLOUR_GAIN, COLOURED, known_terms.FREE
             sizes = self.config.sampled, self.config.variance, self.config.channels
-            return local_volume(self.local, views, cameras, lattice, topology, wanted, near, far, swept, numbers, sizes)
-        where, projected, starts, counts, weights = self._seen(views, cameras, lattice, topology, wanted, near, far, swept)
-        topology, where = _without_empty_blocks(topology, where)
-        config, size = self.config, topology.zero_row
-        count = torch.zeros(size, device=topology.device).index_copy(0, where, counts)
-        weight = torch.zeros(size, device=topology.device).index_copy(0, where, weights)
-        start = starts.new_zeros((size + 1, config.channels)).index_copy(0, where, F.pad(starts, (0, config.channels - starts.shape[1])))
-        # Convolutions cost most, and free space needs none.
-        active = torch.zeros(topology.blocks + 1, dtype=torch.bool, device=topology.device)
-        slots = where.div(VOXELS, rounding_mode="floor")
-        busy_rows = starts[:, INSIDE] > _latent_of(FREE)
-        # One more block takes those that are free: to choose the others would be to wait for the device.
-        active = active.index_fill(0, torch.where(busy_rows, slots, topology.blocks), True)[:-1]
-        latent = projected.new_zeros((size + 1, config.hidden)).index_copy(0, where, projected)
-        busy, among, place = _blocks(topology, active)
-        raw = start.index_copy(0, place, self.local(latent[place], start[place], busy, count[place[:-1]] > 0))
-        return LocalVolume(lattice, topology, torch.tanh(raw), count, raw, weight, busy, among)
-
-    def _on_device(self, views: Sequence[EncodedView], swept: Sweep) -> bool:
-        """Whether kernels on CUDA make local volumes."""
-        wide = self.config.hidden in (16, 32) and self.config.channels > INSIDE
-        return not torch.is_grad_enabled() and wide and dispatch.can_use_triton(swept.table, *(view.features.rows for view in views))
-
-    def _seen(
-        self,
-        views: Sequence[EncodedView],
-        cameras: Cameras,
-        lattice: Lattice,
-        topology: Topology,
-        wanted: Tensor | None,
-        near: float,
-        far: float,
-        swept: Sweep,
-    ) -> tuple[Tensor, ...]:
-        """`_observe` of all corners that are `wanted`, None: of all."""
+            return local_volume(self.local, views, cameras, lattice, topology, wanted, near, far, distribution, numbers, sizes)
         rows = torch.arange(topology.zero_row, device=topology.device) if wanted is None else wanted.nonzero().view(-1)
-        few = CHUNK if is_cpu(rows.device) else AT_ONCE
-        parts = [self._observe(views, cameras, lattice, topology, part, near, far, swept) for part in rows.split(few)]
-        return tuple(torch.cat(values) for values in zip(*parts, strict=True))
+        chunks = rows.split(CHUNK if is_cpu(rows.device) else AT_ONCE)
+        parts = [self._unproject(frame, lattice, topology, chunk) for chunk in chunks]
+        indices, projected, starts, counts, weights = (torch.cat(values) for values in zip(*parts, strict=True))
+        topology, indices = without_empty_blocks(topology, indices)
+        size, channels = topology.zero_row, self.config.channels
+        count = torch.zeros(size, device=topology.device).index_copy(0, indices, counts)
+        weight = torch.zeros(size, device=topology.device).index_copy(0, indices, weights)
+        start = starts.new_zeros((size + 1, channels)).index_copy(0, indices, F.pad(starts, (0, channels - starts.shape[1])))
+        latent = projected.new_zeros((size + 1, self.config.hidden)).index_copy(0, indices, projected)
+        near_surface, slots, place = some_blocks(topology, known_terms.blocks_near_surface(topology, indices, starts))
+        raw = start.index_copy(0, place, self.local(latent[place], start[place], near_surface, count[place[:-1]] > 0))
+        return LocalVolume(lattice, topology, torch.tanh(raw), count, raw, weight, near_surface, slots)
 
-    def _observe(
+    def _unproject(self, frame: KeyFrame, lattice: Lattice, topology: Topology, rows: Tensor) -> tuple[Tensor, ...]:
+        """Eq. 1 and the input of J in eq. 2, at the corners `rows` (N,) of the blocks.
+
+        Returns:
+            of the N' corners that the key frame sees: rows (N',), J's first layer (N', hidden), known terms (N', 4), number of views (N',)
+            and weight (N',).
+        """
+        contracted = lattice.contracted(topology.keys, rows)
+        points, size = lattice.working(contracted)  # v
+        projection = project(points, size, frame.cameras, frame.near, frame.far)  # u_i
+        estimate = frame.distribution.look(points, known_terms.TRUNCATION * size)  # of the plane sweep (not in the paper)
+        seen = projection.visible[0] & lattice.inside(contracted) & (estimate.visibility > known_terms.HIDDEN)
+        kept = seen.nonzero().view(-1)
+        rows, points, projection, estimate = rows[kept], points[kept], projection[kept], estimate[kept]
+        footprint, step = scales(points, projection, frame.cameras)
+        values = look_up(frame.views, projection, step)  # U_i(v) = [F_i(u_i), G(d_i)], and colours: (K, N', C)
+        mean, variance, count = aggregate(values, projection.visible, self.config.variance)  # over the views i
+        disagreement = agreement(variance, count, (slice(self.config.sampled), slice(-2 * COLOURS, -COLOURS)))
+        inputs = [evidence(mean, variance, count, footprint, step), disagreement, estimate.stacked]
+        projected = torch.relu(self.local.project(torch.cat(inputs, 1)))
+        colour = (mean[:, -COLOURS:] / COLOUR_GAIN + 0.5).clamp(0, 1)
+        start = known_terms.start(colour, estimate.expected_sdf)
+        return rows, projected, start, count.to(torch.float32), known_terms.weight(estimate)
+
+    def _on_device(self, frame: KeyFrame) -> bool:
+        """Whether kernels on CUDA make local volumes."""
+        wide = self.config.hidden in (16, 32) and self.config.channels > known_terms.INSIDE
+        tables = [frame.distribution.table, *(view.features.rows for view in frame.views)]
+        return not torch.is_grad_enabled() and wide and dispatch.can_use_triton(*tables)
+
+    def sweep_planes(
         self,
         views: Sequence[EncodedView],
         cameras: Cameras,
-        lattice: Lattice,
-        topology: Topology,
-        rows: Tensor,
         near: float,
         far: float,
-        swept: Sweep,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Of the corners `rows`: those that the key frame sees, their evidence projected to few channels, what latents start from (mean
-        colour, distance behind the surface), view count and weight."""
-        contracted = lattice.contracted(topology.keys, rows)
-        points, size = lattice.working(contracted)
-        projection = project(points, size, cameras, near, far)
-        seen = projection.visible[0]
-        if lattice.space.shell == 0:
-            x, y, z = contracted.abs().unbind(1)
-            across, along, up = (side + 1.01 * lattice.voxel for side in lattice.space.box)
-            seen = seen & (x <= across) & (y <= along) & (z <= up)
-        sighted = swept.look(points, TRUNCATION * size)
-        kept = (seen & (sighted.open > HIDDEN)).nonzero().view(-1)
-        rows, points, projection, sighted = rows[kept], points[kept], projection[kept], sighted[kept]
-        visible = projection.visible
-        footprint = torch.exp((torch.log(projection.footprint) * visible).sum(0) / visible.sum(0).clamp_min(1))
-        step = footprint * direction_spread(points, cameras.positions, visible)
-        mean, variance, count = aggregate(look_up(views, projection, step), visible, self.config.variance)
-        cues = agreement(variance, count, (slice(self.config.sampled), slice(-2 * COLOURS, -COLOURS)))
-        swept_cues = torch.stack([sighted.signed, sighted.open, sighted.sure], 1)
-        projected = torch.relu(self.local.project(torch.cat([evidence(mean, variance, count, footprint, step), cues, swept_cues], 1)))
-        colour = colour_latent((mean[:, -COLOURS:] / COLOUR_GAIN + 0.5).clamp(0, 1))
-        start = torch.cat([colour, inside_latent(sighted.signed)[:, None]], 1)
-        return rows, projected, start, count.to(torch.float32), _weight(sighted)
+        depth: Tensor | None = None,
+        empty: Empty | None = None,
+    ) -> DepthDistribution:
+        """Where along the pixels of the key frame (first) the surface is likely to be, its measured `depth` (H, W) and what is known to be
+        `empty` included; once for all lattices. Not differentiable, and not in the paper."""
+        return sweep_planes([view.descriptors for view in views], cameras, near, far, depth, empty)
+
+    # Fuse -------------------------------------------------------------------------------------------------------------------------
 
     def start(self, lattice: Lattice) -> LatentVolume:
         """The global volume before the first key frame."""
@@ -272,14 +234,9 @@ class NerfusionModel(nn.Module):
 
         Blocks keep their slots; new ones come after them.
         """
-        state, slots = with_blocks(state, local.topology.keys)
-        place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
-        zero = state.rows.new_zeros((1, state.rows.shape[1]))
-        part = replace(state, topology=local.topology, rows=torch.cat([state.rows[place], zero]), count=state.count[place])
-        after = self.fuse_part(part, local)
-        changed = local.known.nonzero().view(-1)
-        rows = state.rows.index_copy(0, place[changed], after.rows[changed].to(state.rows.dtype))
-        return replace(state, rows=rows, count=state.count.index_copy(0, place[changed], after.count[changed]))
+        store = ValueStore(state)
+        store.write(self.fuse_part(store.part(local.topology), local), local.known)
+        return store.volume()
 
     def fuse_part(self, part: LatentVolume, local: LocalVolume) -> LatentVolume:
         """One step of the recurrence on the blocks of a local volume alone: `part` is the global volume there."""
@@ -293,13 +250,16 @@ class NerfusionModel(nn.Module):
         before = part.rows * mask
         z = mean_gate(count, local.weight)
         rows = torch.lerp(before, local.rows, z)
-        busy, place, inner = local.busy, local.place, local.place[:-1]
-        after = self.fusion(before[place], count[inner], local.rows[place], local.raw[place], local.weight[inner], busy, inside[inner])
+        near_surface, place, inner = local.near_surface, local.place, local.place[:-1]
+        given = before[place], count[inner], local.rows[place], local.raw[place], local.weight[inner]
+        after = self.fusion(*given, near_surface, inside[inner])
         return replace(part, rows=rows.index_copy(0, place, after), count=count + local.weight)
 
+    # R ----------------------------------------------------------------------------------------------------------------------------
+
     def surface_cells(self, volume: LatentVolume, seen: Tensor, gamma: float) -> Tensor:
-        """`refine.surface_cells` of what the head says."""
-        if not torch.is_grad_enabled() and self.config.channels > INSIDE and dispatch.can_use_triton(volume.rows):
+        """`two_lattices.surface_cells` of the head's thickness."""
+        if not torch.is_grad_enabled() and self.config.channels > known_terms.INSIDE and dispatch.can_use_triton(volume.rows):
             from fieldfuse.backends.triton import volumes
 
             return volumes.surface_cells(volume.topology, volume.rows, volume.count, seen, self.to_field, least_thickness(gamma))
@@ -327,39 +287,3 @@ class NerfusionModel(nn.Module):
             torch.zeros(size, device=known.device).index_copy(0, known, thickness.float()),
             torch.zeros((size, features.shape[1]), device=known.device).index_copy(0, known, features.float()),
         )
-
-
-@lru_cache(maxsize=4)
-def _latent_of(signed: float) -> float:
-    """`inside_latent` of one number."""
-    return float(inside_latent(torch.tensor([signed])))
-
-
-def _weight(sighted: Sighted) -> Tensor:
-    """How much a key frame can say of voxels: little of what is hidden, and where the pictures fit at no depth better than at others."""
-    return sighted.open.clamp_min(HIDDEN) * (BLIND + (1 - BLIND) * sighted.sure)
-
-
-def _depths(lattice: Lattice, topology: Topology, cameras: Cameras) -> tuple[float, float]:
-    """Where the blocks begin (0: at the camera) and end along the key frame's axis."""
-    if topology.blocks == 0:
-        return 1.0, 2.0
-    centres, radii = block_balls(lattice, topology.keys)
-    depth = cameras[0].local(centres)[0, :, 2]
-    return max(float((depth - radii).amin()), 0.0), max(float((depth + radii).amax()), 1e-6)
-
-
-def _blocks(topology: Topology, kept: Tensor) -> tuple[Topology, Tensor, Tensor]:
-    """The blocks of the mask (M,) alone, their slots, and their rows, the zero row last (the same way back)."""
-    blocks = kept.nonzero().view(-1)
-    return topology.alike(topology.keys[blocks]), blocks, rows_of(blocks, topology.zero_row)
-
-
-def _without_empty_blocks(topology: Topology, rows: Tensor) -> tuple[Topology, Tensor]:
-    """The blocks that own at least one of the rows, in their order, and the same rows in them."""
-    slot = rows.div(VOXELS, rounding_mode="floor")
-    filled = torch.zeros(topology.blocks, dtype=torch.bool, device=rows.device).index_fill(0, slot, True)
-    kept = filled.nonzero().view(-1)
-    if len(kept) == topology.blocks:
-        return topology, rows
-    return topology.alike(topology.keys[kept]), rows + ((torch.cumsum(filled, 0) - 1)[slot] - slot) * VOXELS

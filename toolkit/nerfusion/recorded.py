@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from fieldfuse.backends.dispatch import OTHERS_GO_ON
 
 MOST = 4  # recordings that are kept
+RECORDED = 2**23  # numbers in images up to which encoding them is recorded on CUDA: recordings keep the memory that they need
 Work = Callable[..., tuple[Tensor, ...]]
 Recording = tuple[torch.cuda.CUDAGraph, list[Tensor], tuple[Tensor, ...]]  # with where it reads and what it writes
 
@@ -71,3 +72,14 @@ class Recorded:
         with torch.cuda.graph(graph, pool=self._pool, capture_error_mode=OTHERS_GO_ON):
             results = work(*inputs)
         return graph, inputs, results
+
+
+def worth_recording(images: Tensor) -> bool:
+    """Whether encoding such images is recorded: hundreds of launches, of which the processor makes one that way."""
+    free = not torch.is_grad_enabled() and not torch.is_autocast_enabled(images.device.type)
+    return free and images.is_cuda and images.numel() <= RECORDED
+
+
+def addresses(modules: Iterable[nn.Module | None]) -> tuple[int, ...]:
+    """Where the modules' parameters lie, which recordings read there; all of a module are moved together."""
+    return tuple(next(module.parameters()).data_ptr() for module in modules if module is not None)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -9,8 +11,8 @@ from torch import Tensor
 from fieldfuse.backends import dispatch
 from fieldfuse.backends.dispatch import is_cpu, to_device_async
 from fieldfuse.camera import Array
-from fieldfuse.nerfusion.lattice import LatentVolume, Lattice
-from fieldfuse.nerfusion.refine import adopt, part
+from fieldfuse.nerfusion.extras.two_lattices import adopt
+from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, part, rows_of, with_blocks
 from fieldfuse.volume.topology import VOXELS, Topology
 
 CODE = np.array([1, 2**21, 2**42], np.int64)  # keys of lattices are small
@@ -148,3 +150,36 @@ class GlobalStore:
             rows, count = self._rows.new_zeros((room + 1, self._rows.shape[1])), self._count.new_zeros(room)
             rows[: len(self._rows)], count[: len(self._count)] = self._rows, self._count
             self._rows, self._count = rows, count
+
+
+class ValueStore:
+    """A `GlobalStore` of ordinary values, for training: gradients flow through it, and volumes given out never change."""
+
+    def __init__(self, volume: LatentVolume) -> None:
+        self._volume = volume
+        self._rows = torch.zeros(0, dtype=torch.int64)  # of the part that was last given out
+
+    @property
+    def lattice(self) -> Lattice:
+        return self._volume.lattice
+
+    def volume(self) -> LatentVolume:
+        """Everything."""
+        return self._volume
+
+    def part(self, topology: Topology, inherited: LatentVolume | None = None) -> LatentVolume:
+        """See `GlobalStore.part`; all of `inherited` is taken over where nothing is known. Blocks keep their slots, new ones follow."""
+        state = self._volume if inherited is None else adopt(self._volume, inherited)
+        state, slots = with_blocks(state, topology.keys)
+        self._volume = state
+        self._rows = rows_of(slots, 0)[:-1]
+        zero = state.rows.new_zeros((1, state.rows.shape[1]))
+        return replace(state, topology=topology, rows=torch.cat([state.rows[self._rows], zero]), count=state.count[self._rows])
+
+    def write(self, values: LatentVolume, changed: Tensor) -> None:
+        """Take over the corners `changed` (M · 512,) of the part that was last given out; all others keep every bit."""
+        state, chosen = self._volume, changed.nonzero().view(-1)
+        place = self._rows[chosen]
+        rows = state.rows.index_copy(0, place, values.rows[chosen].to(state.rows.dtype))
+        self._volume = replace(state, rows=rows, count=state.count.index_copy(0, place, values.count[chosen]))
+

@@ -10,7 +10,9 @@ from torch import Tensor
 
 from fieldfuse.backends import dispatch
 from fieldfuse.nerfusion import compiled_lookup
+from fieldfuse.nerfusion.aggregate import direction_spread
 from fieldfuse.nerfusion.cameras import Cameras
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution
 from fieldfuse.nerfusion.pyramid import Pyramid
 
 MARGIN = 1.0  # voxels
@@ -20,11 +22,11 @@ COLOURED = 0.35  # of a voxel's side: with a whole one pictures of fern and of a
 @dataclass(frozen=True)
 class EncodedView:
     """What is looked up of a view: `features` (image features and direction codes), `colours` (RGB in [−2, 2]), and what it is compared
-    with others by (`matching.describe`)."""
+    with others by (`matching.patch_descriptors`)."""
 
     features: Pyramid
     colours: Pyramid
-    described: Tensor
+    descriptors: Tensor
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,23 @@ class Projection:
     def __getitem__(self, kept: Tensor) -> Projection:
         """The voxels at `kept`."""
         return Projection(self.pixels[:, kept], self.visible[:, kept], self.footprint[:, kept])
+
+
+@dataclass(frozen=True)
+class KeyFrame:
+    """A key frame (first) and its K − 1 neighbours.
+
+    Attributes:
+        views, cameras: K of each.
+        near, far: depths along z within which views count, working units.
+        distribution: of depth along the key frame's pixels (not in the paper).
+    """
+
+    views: Sequence[EncodedView]
+    cameras: Cameras
+    near: float
+    far: float
+    distribution: DepthDistribution
 
 
 def project(points: Tensor, size: Tensor, cameras: Cameras, near: float, far: float) -> Projection:
@@ -67,6 +86,14 @@ def project(points: Tensor, size: Tensor, cameras: Cameras, near: float, far: fl
     visible = deep & ((pixels >= -margin) & (pixels <= cameras.size[:, None] + margin)).all(2)
     footprint = torch.where(visible, footprint, torch.ones_like(safe))
     return Projection(torch.where(visible[..., None], pixels, torch.zeros_like(pixels)), visible, footprint)
+
+
+def scales(points: Tensor, projection: Projection, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """(N,) pixels that each voxel covers, a geometric mean over the views that see it, and (N,) pixels by which these disagree about its
+    neighbour in depth."""
+    visible = projection.visible
+    footprint = torch.exp((torch.log(projection.footprint) * visible).sum(0) / visible.sum(0).clamp_min(1))
+    return footprint, footprint * direction_spread(points, cameras.positions, visible)
 
 
 def look_up(views: Sequence[EncodedView], projection: Projection, step: Tensor) -> Tensor:

@@ -8,37 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from fieldfuse.backends import dispatch
-from fieldfuse.backends.constants import CHANGE as CHANGE
-from fieldfuse.backends.constants import INSIDE as INSIDE
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared
+from fieldfuse.nerfusion.extras.bounded_outputs import bounded
+from fieldfuse.nerfusion.extras.known_terms import INSIDE
 from fieldfuse.volume.topology import Topology
-
-COLOUR_SCALE = 4.0  # a latent colour of ±1 is a colour logit of ±4
-MOST = 0.93  # latent colours are kept inside this, so that tanh is not driven to its ends
-
-
-def within(learned: Tensor, most: float) -> Tensor:
-    """What is learned, kept within ± `most` without a kink."""
-    return most * torch.tanh(learned / most)
-
-
-def held(learned: Tensor) -> Tensor:
-    """(N, channels) learned additions to a latent; that to the distance behind the surface is kept within ± `CHANGE`.
-
-    Without it networks paint pictures right before the cameras of key frames, which explains neighbouring views just as well as surfaces.
-    """
-    return torch.cat([learned[:, :INSIDE], within(learned[:, INSIDE : INSIDE + 1], CHANGE), learned[:, INSIDE + 1 :]], 1)
-
-
-def inside_latent(signed: Tensor) -> Tensor:
-    """(N,) signed distances in [−1, 1], positive in front of the surface → p with tanh p = −signed, within what `MOST` allows."""
-    return torch.atanh((-signed).clamp(-MOST, MOST))
-
-
-def colour_latent(colour: Tensor) -> Tensor:
-    """(N, 3) RGB in [0, 1] → p with sigmoid(COLOUR_SCALE · tanh p) = colour, within what `MOST` allows."""
-    latent = torch.logit(colour, eps=1e-4) / COLOUR_SCALE
-    return torch.atanh(latent.clamp(-MOST, MOST))
 
 
 class LocalReconstruction(nn.Module):
@@ -76,7 +49,7 @@ class LocalReconstruction(nn.Module):
         Returns:
             (M · 512 + 1, channels), zero where nothing is seen.
         """
-        return held(self.learned(rows, topology, seen)) + start
+        return bounded(self.learned(rows, topology, seen)) + start
 
     def learned(self, rows: Tensor, topology: Topology, seen: Tensor) -> Tensor:
         """(M · 512 + 1, channels) what the convolutions give, before it is `held` and added to the start."""

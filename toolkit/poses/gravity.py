@@ -14,6 +14,7 @@ TURNED = 0.01  # least share of the x axes' second direction: about 6° of turni
 UNDECIDED = 0.15  # length of a mean of unit vectors below which it points nowhere
 SHORT = 0.5  # and below which it does not overrule the x axes
 STEEP = 0.7  # cosine between a camera's axis and up above which that axis tells no heading
+PERCENTILES = (0.5, 99.5)  # of points, that a footprint spans
 
 
 def up_direction(world_from_camera: Array, given: tuple[float, float, float] | None = None) -> tuple[Array, str]:
@@ -69,22 +70,22 @@ def camera_frame(world_from_camera: Array, given: tuple[float, float, float] | N
     return np.stack([x, np.cross(up, x), up]), reason
 
 
-def tight_turn(points: Array, percents: tuple[float, float] = (0.5, 99.5)) -> float:
+def tight_turn(points: Array) -> float:
     """Degrees to turn (P, 3) points about z for the smallest axis-aligned footprint, within ±45°, to a tenth of a degree.
 
     The footprint spans percentiles, so that stray points do not decide.
     """
     coarse = np.arange(-45.0, 45.0, 1.5)
-    best = float(coarse[np.argmin(_footprints(points, coarse, percents))])
+    best = float(coarse[np.argmin(_footprints(points, coarse))])
     fine = best + np.arange(-1.4, 1.45, 0.1)
-    return float(fine[np.argmin(_footprints(points, fine, percents))])
+    return float(fine[np.argmin(_footprints(points, fine))])
 
 
-def _footprints(points: Array, degrees: Array, percents: tuple[float, float]) -> Array:
+def _footprints(points: Array, degrees: Array) -> Array:
     """(A,) areas of the axis-aligned footprints of points that are turned by each of the angles (A,)."""
     areas = []
     for angle in degrees:
-        low, high = np.percentile(points[:, :2] @ turn_about_z(float(angle))[:2, :2].T, percents, axis=0)
+        low, high = np.percentile(points[:, :2] @ turn_about_z(float(angle))[:2, :2].T, PERCENTILES, axis=0)
         areas.append(float(np.prod(high - low)))
     return np.array(areas)
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from fieldfuse.camera import Array
 from fieldfuse.poses.job import GLOBAL, LOOSE
@@ -17,7 +19,7 @@ BARE = 0.6  # of the usual number of keypoints, below which missing texture is n
 SAME = 1.0  # grey levels between thumbnails of pictures that count as identical
 BLACK = 2.0  # grey deviation of a picture without content
 FLAT_SHARE = 0.8  # of verified pairs explained by a homography before the scene or the motion is called degenerate
-MOST = 0.5  # of verified pairs, the same: enough where COLMAP's own rules have found nothing
+FLAT_SHARE_LOOSE = 0.5  # of verified pairs, the same: enough where COLMAP's own rules have found nothing
 ROTATION_RESIDUAL = 0.06  # distance of K⁻¹HK from a rotation, relative
 STILL = 0.004  # features moved by less than this share of the long side: the camera stood still
 SMALL_ANGLE = 1.5  # degrees; the median triangulation angle below which depth is guesswork
@@ -147,7 +149,7 @@ def failure(facts: dict[str, Any]) -> str | None:
         )
     # Where homographies explain the pairs, looser rules nearly always find something, whatever the camera did.
     loose = model is not None and model["attempt"] in (LOOSE, GLOBAL)
-    if loose and turned_only(facts, MOST):
+    if loose and turned_only(facts, FLAT_SHARE_LOOSE):
         return (
             "the camera turned on the spot for the most part (rotations explain most matches), so depth cannot be told; move sideways "
             "around the scene while recording"
@@ -191,21 +193,11 @@ def way(facts: dict[str, Any]) -> float:
 
 def components(count: int, pairs: Sequence[dict[str, Any]], least: int = 15) -> list[list[int]]:
     """Groups of pictures connected by verified pairs with `least` inliers or more, largest first."""
-    parent = list(range(count))
-
-    def root(i: int) -> int:
-        while parent[i] != i:
-            parent[i] = parent[parent[i]]
-            i = parent[i]
-        return i
-
-    for pair in pairs:
-        if pair["inliers"] >= least:
-            parent[root(pair["first"])] = root(pair["second"])
-    groups: dict[int, list[int]] = {}
-    for i in range(count):
-        groups.setdefault(root(i), []).append(i)
-    return sorted(groups.values(), key=lambda group: (-len(group), group[0]))
+    linked = [(pair["first"], pair["second"]) for pair in pairs if pair["inliers"] >= least]
+    graph = coo_array((np.ones(len(linked)), np.array(linked, dtype=np.int64).reshape(-1, 2).T), shape=(count, count))
+    number, label = connected_components(graph, directed=False)
+    groups = [np.flatnonzero(label == group).tolist() for group in range(number)]
+    return sorted(groups, key=lambda group: (-len(group), group[0]))
 
 
 def shortfalls(facts: dict[str, Any]) -> list[str]:

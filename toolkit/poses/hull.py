@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from scipy.ndimage import binary_erosion
 
 from fieldfuse.camera import Array, project
 from fieldfuse.capture.images import load_image, turns_by_exif
@@ -39,7 +40,7 @@ def silhouette_cloud(capture: Capture, progress: Progress = SILENT) -> Cloud:
         full = _carved(capture, chosen, silhouettes, grid.reshape(-1, 3)).reshape(GRID, GRID, GRID)
         if not full.any():
             return Cloud(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), "silhouettes")
-        cells = grid[_surface(full)]
+        cells = grid[full & ~binary_erosion(full)]  # those that have an empty neighbour
         low, high = cells.min(axis=0) - 1.5 * size, cells.max(axis=0) + 1.5 * size
     return cloud_of_points(capture, cells, "silhouettes")
 
@@ -67,18 +68,3 @@ def _carved(capture: Capture, chosen: list[int], silhouettes: list[Array], cells
         looked += inside
         hit[inside] += silhouette[row, column]
     return (looked >= 0.5 * len(chosen)) & (looked - hit <= MISSES * looked)
-
-
-def _surface(full: Array) -> Array:
-    """Cells of a (G, G, G) bool grid that have an empty neighbour."""
-    padded = np.pad(full, 1)
-    inner = (
-        padded[2:, 1:-1, 1:-1]
-        & padded[:-2, 1:-1, 1:-1]
-        & padded[1:-1, 2:, 1:-1]
-        & padded[1:-1, :-2, 1:-1]
-        & padded[1:-1, 1:-1, 2:]
-        & padded[1:-1, 1:-1, :-2]
-    )
-    surface: Array = full & ~inner
-    return surface

@@ -31,7 +31,7 @@ from fieldfuse.poses.overlap import guessed_depth, overlap, parallax
 
 NEIGHBOURS = 2  # frames apart that show the same side of things
 CONTRADICTS = np.radians(60.0)  # between the turn that a pair of pictures tells and the model's: a few blurred points are off by less
-LEAST = 3  # such pairs of neighbours that make a fold: one fold between two frames parts so many
+MIN_FOLD_PAIRS = 3  # such pairs of neighbours that make a fold: one fold between two frames parts so many
 NEAR = (10, 5, 3)  # frames apart whose matches are believed when a model is folded; fewer when the model of these is folded, too
 AGREES = np.radians(30.0)  # matches farther apart stay within this: what a long way adds up to without loops
 CHAINED = 5  # frames apart whose turns are put one after the other before anything is mapped
@@ -85,12 +85,12 @@ def never_folded(job: Job, report: Report) -> Mapped | None:
         near = _by_neighbours(job, seen, reach, alone)
         if near is None or len(near.registered) < KEPT_PHOTOS * count:
             return None
-        if contradictions(seen, axes(near)) >= LEAST:
+        if contradictions(seen, axes(near)) >= MIN_FOLD_PAIRS:
             continue  # what looks alike is so near that it is among the neighbours
         if contradicted(seen, axes(near)) < BORNE_OUT:
             return None
         found, tried, facts = _held_against(job, near, reach, report)
-        if found is None or len(found.registered) < KEPT_PHOTOS * len(near.registered) or facts["left"] >= LEAST:
+        if found is None or len(found.registered) < KEPT_PHOTOS * len(near.registered) or facts["left"] >= MIN_FOLD_PAIRS:
             return None
         return found, tried, facts | {"contradicting": int((seen.apart > NEAR[0]).sum())}
     return None
@@ -106,7 +106,7 @@ def without_folds(job: Job, model: Model, attempts: list[dict[str, Any]], report
     """
     seen = turns(job, model.reconstruction.cameras)
     before = contradictions(seen, axes(model))
-    if before < LEAST:
+    if before < MIN_FOLD_PAIRS:
         return model, attempts, None
 
     def again(done: float, total: float, note: str) -> None:
@@ -114,12 +114,12 @@ def without_folds(job: Job, model: Model, attempts: list[dict[str, Any]], report
 
     for reach in NEAR:
         near = _by_neighbours(job, seen, reach, again)
-        if near is None or contradictions(seen, axes(near)) >= LEAST:
+        if near is None or contradictions(seen, axes(near)) >= MIN_FOLD_PAIRS:
             continue  # what looks alike is so near that it is among the neighbours
         found, tried, facts = _held_against(job, near, reach, again)
         if found is None or len(found.registered) < (KEPT if job.sequential else KEPT_PHOTOS) * len(model.registered):
             break
-        if facts["left"] < LEAST:
+        if facts["left"] < MIN_FOLD_PAIRS:
             return found, tried, facts | {"contradicting": before}
     return model, attempts, {"contradicting": before, "left": before, "far": int((seen.apart > NEAR[0]).sum()), "dropped": 0}
 

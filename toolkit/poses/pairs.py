@@ -6,8 +6,6 @@ cost of matching all (preemptive matching, Wu 2013, "Towards linear-time increme
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from fieldfuse.camera import Array
@@ -18,6 +16,7 @@ MIN_COMMON = 4  # coarse matches that hint at overlap
 # Frames of a video from one to the other of a pair. Tracks go on from pair to pair: with all of 1 to 10, poses are as good, and matching
 # takes half as long again (docs/measured/performance.md).
 STEPS = (1, 2, 3, 5, 7, 10, 20, 40, 80, 160)
+LOOPS = 3  # such pairs of a frame at most
 LOOP_GAP = 20  # frames apart before a pair counts as a loop
 
 
@@ -59,27 +58,21 @@ def common(first: Array, second: Array) -> int:
     return int(np.count_nonzero(angle[:, 1] < RATIO * angle[:, 0]))
 
 
-def loop_pairs(
-    sketches: list[Array], stride: int, each: int = 3, gap: int = LOOP_GAP, tick: Callable[[], None] | None = None
-) -> list[tuple[int, int]]:
+def loop_pairs(sketches: list[Array], stride: int) -> list[tuple[int, int]]:
     """Pairs of far-apart frames of an ordered capture that look alike: every `stride`-th frame against every other such frame."""
     anchors = list(range(0, len(sketches), max(1, stride)))
     pairs = set()
     for a, i in enumerate(anchors):
-        if tick is not None:
-            tick()
-        scored = [(common(sketches[i], sketches[j]), -j) for j in anchors[a + 1 :] if j - i > gap]
-        pairs |= {(i, -j) for score, j in sorted(scored, reverse=True)[:each] if score >= MIN_COMMON}
+        scored = [(common(sketches[i], sketches[j]), -j) for j in anchors[a + 1 :] if j - i > LOOP_GAP]
+        pairs |= {(i, -j) for score, j in sorted(scored, reverse=True)[:LOOPS] if score >= MIN_COMMON}
     return sorted(pairs)
 
 
-def similar_pairs(sketches: list[Array], each: int = 20, tick: Callable[[], None] | None = None) -> list[tuple[int, int]]:
+def similar_pairs(sketches: list[Array], each: int = 20) -> list[tuple[int, int]]:
     """Each picture with the `each` that share most coarse features with it, and with its two neighbours in the list."""
     count = len(sketches)
     scores = np.zeros((count, count), dtype=np.int32)
     for i in range(count):
-        if tick is not None:
-            tick()
         for j in range(i + 1, count):
             scores[i, j] = scores[j, i] = common(sketches[i], sketches[j])
     pairs = set(sequential_pairs(count, (1, 2)))

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from fieldfuse.camera import FISHEYE, Array, Intrinsics, distort, invert
 from fieldfuse.capture.images import load_image, turns_by_exif, usable_pixels
@@ -161,18 +163,10 @@ def tracks(links: Array, owner: Array) -> tuple[Array, Array]:
     Returns:
         (M,) track number from 0, ascending, and (M,) keypoint. Tracks that hold one frame twice are dropped.
     """
-    root = np.arange(len(owner))
-    while len(links):  # the least number reachable spreads along links; halving paths makes this a few rounds
-        low = np.minimum(root[links[:, 0]], root[links[:, 1]])
-        before = root.copy()
-        for side in (0, 1):
-            np.minimum.at(root, root[links[:, side]], low)
-            np.minimum.at(root, links[:, side], low)
-        root = root[root]
-        if np.array_equal(root, before):
-            break
+    graph = coo_array((np.ones(len(links), bool), links.T), shape=(len(owner),) * 2)
+    component = connected_components(graph, directed=False)[1]  # numbered by their first keypoints
     nodes = np.unique(links)
-    number = np.unique(root[nodes], return_inverse=True)[1]
+    number = np.unique(component[nodes], return_inverse=True)[1]
     order = np.lexsort((owner[nodes], number))
     number, nodes = number[order], nodes[order]
     twice = (np.diff(number) == 0) & (np.diff(owner[nodes]) == 0)

@@ -22,7 +22,7 @@ CLEAR = 0.95  # and to the distance of the nearest tenth of the cameras
 MARGIN = 0.05  # of the box on each side
 BEST = (1.0, 99.0)  # weighted percentiles that span the box of an object or a view forward
 ALL = (0.5, 99.5)  # of a room, where the walls are what is looked at
-LEAST = 100  # points that make percentiles meaningful
+MIN_POINTS = 100  # points that make percentiles meaningful
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,6 @@ def points_of_interest(found: Layout, points: Array, views: Array, bounded: bool
         return everything, weights, ALL if found.kind == ROOM or bounded else BEST
     radius = min(REACH * found.distance, CLEAR * found.nearest)
     inside = np.linalg.norm(points - found.focus, axis=1) < radius
-    if np.count_nonzero(inside) < min(LEAST, len(points) // 4):
+    if np.count_nonzero(inside) < min(MIN_POINTS, len(points) // 4):
         return everything, weights, BEST
     return inside, weights, BEST

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fieldfuse.camera import Array, Intrinsics, checked_pose
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.poses import checked_pose
 from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError, first_line
 

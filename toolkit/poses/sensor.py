@@ -12,7 +12,7 @@ from fieldfuse.capture.types import Capture
 from fieldfuse.poses.result import PoseResult
 
 FRAMES = 12  # depth maps that are looked at
-LEAST = 50  # points with depth that make a scale believable
+MIN_POINTS = 50  # points with depth that make a scale believable
 SPREAD = 0.25  # relative spread (half the 20–80% range) of depth ratios above which sensor and model disagree
 
 
@@ -35,7 +35,7 @@ def scale_to_depth(result: PoseResult, capture: Capture) -> PoseResult:
         sensed = depth[pixels[inside, 1].astype(int), pixels[inside, 0].astype(int)]
         ratios.append(sensed[sensed > 0] / z[inside][sensed > 0])
     found = np.concatenate(ratios) if ratios else np.zeros(0)
-    if len(found) < LEAST:
+    if len(found) < MIN_POINTS:
         return replace(
             result,
             warnings=[

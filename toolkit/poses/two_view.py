@@ -24,7 +24,7 @@ ALIKE = 6  # coarse features in common that make a pair worth matching
 STEPS = (1, 2)  # images further on that an image is matched with, where these are the capture's neighbours
 MIN_INLIERS = 20  # matches that a fundamental matrix must explain
 INLIER = 1.5  # working pixels off the epipolar line of the pair's own fundamental matrix
-MOST = 60  # matches of a pair that count, so that no pair outweighs the others
+MAX_MATCHES = 60  # matches of a pair that count, so that no pair outweighs the others
 AGREES = 3 / 640  # of the long side: how far off its epipolar line a match may lie that agrees with the poses
 LEAST_PIXELS = 1.2  # working pixels: the same, at least
 ONE_SPOT = 1e-9  # of the cameras' spread: two cameras nearer to each other stand on one spot
@@ -122,7 +122,7 @@ def find_matches(
         side = max(cameras[i].width, cameras[i].height) * one.scale
         moved = float(np.median(np.linalg.norm(here - there, axis=1))) * focal / side
         facts.append((i, j, focal, max(AGREES * side, LEAST_PIXELS), moved))
-        spread = np.linspace(0, len(here) - 1, min(MOST, len(here))).round().astype(int)
+        spread = np.linspace(0, len(here) - 1, min(MAX_MATCHES, len(here))).round().astype(int)
         columns.append((here[spread], there[spread]))
     table = np.array(facts, dtype=np.float64).reshape(-1, 5)
     empty = np.zeros((0, 2))

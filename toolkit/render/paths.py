@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array
@@ -17,7 +18,7 @@ KEY_CAMERAS = 12
 ARC_MARGIN = 0.02
 
 
-def orbit(world_from_camera: Array, centre: Array | None = None, frames: int = 90, up: tuple[float, float, float] = UP) -> Array:
+def orbit(world_from_camera: Array, centre: Array | None = None, frames: int = 90) -> Array:
     """A smooth closed path of `frames` poses, (F, 4, 4) in OpenCV axes, that stays near the (N, 4, 4) captured cameras.
 
     - Cameras that look the same way: an ellipse in their plane, about as wide as they are spread, looking at one point.
@@ -33,7 +34,6 @@ def orbit(world_from_camera: Array, centre: Array | None = None, frames: int = 9
     poses = _checked(world_from_camera, frames)
     if len(poses) == 1:
         return np.repeat(poses, frames, axis=0)
-    vertical = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     positions, forward = poses[:, :3, 3], poses[:, :3, 2]
     target = focus(poses) if centre is None else np.asarray(centre, dtype=np.float64)
     phase = 2 * np.pi * np.arange(frames) / frames
@@ -42,7 +42,7 @@ def orbit(world_from_camera: Array, centre: Array | None = None, frames: int = 9
     inward = target - positions
     inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
     if np.median((forward * inward).sum(axis=1)) > LOOKING_IN:
-        return _around(positions, target, vertical, phase)
+        return _around(positions, target, np.array(UP), phase)
     return _along(_keys(poses[_tour(positions)]), (1 - np.cos(phase)) / 2)
 
 
@@ -145,16 +145,7 @@ def _hermite(knots: Array, values: Array, at: Array) -> Array:
     # At the ends the slope of the parabola that the neighbour's slope and the first interval ask for.
     first, last = (2 * rise[0] - inner[0], 2 * rise[-1] - inner[-1]) if len(inner) else (rise[0], rise[-1])
     slopes = np.concatenate([first[None], inner, last[None]])
-    part = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
-    span = width[part]
-    t = ((at - knots[part]) / span[:, 0])[:, None]
-    start, end = values[part], values[part + 1]
-    return np.asarray(
-        (2 * t**3 - 3 * t**2 + 1) * start
-        + (t**3 - 2 * t**2 + t) * span * slopes[part]
-        + (3 * t**2 - 2 * t**3) * end
-        + (t**3 - t**2) * span * slopes[part + 1]
-    )
+    return np.asarray(CubicHermiteSpline(knots, values, slopes)(at))
 
 
 def _keys(walk: Array) -> Array:

@@ -20,10 +20,10 @@ LEAST_CONFIDENCE = 0.5  # two other views confirm a depth for each one that sees
 SMOOTH = 0.05  # share by which depths side by side may differ, to be interpolated, besides their noise
 
 
-def depth_at(found: StereoDepth, width: int, height: int, least_confidence: float = LEAST_CONFIDENCE) -> Array:
+def depth_at(found: StereoDepth, width: int, height: int) -> Array:
     """(height, width) float32 depth of a view on more or fewer pixels than it was found on, 0 where it is unknown, not confident enough,
     or beside an edge, where it would lie between two surfaces."""
-    depth = np.where(found.confidence >= least_confidence, found.depth, np.float32(0))
+    depth = np.where(found.confidence >= LEAST_CONFIDENCE, found.depth, np.float32(0))
     if depth.shape == (height, width):
         return np.ascontiguousarray(depth, dtype=np.float32)
     return _interpolated(depth, width, height, found.noise)

@@ -87,7 +87,6 @@ def stereo_depths(
     median_depth: float,
     *,
     long_side: int = LONG_SIDE,
-    matched: int = MATCHED,
     asked: Demands | None = None,
     progress: Progress = SILENT,
 ) -> list[StereoDepth]:
@@ -97,7 +96,6 @@ def stereo_depths(
         near, far: nearest and farthest depth that is looked for, working units.
         median_depth: what parallax and overlap of pictures are judged at.
         long_side: size of the depth maps; larger pictures are shrunk for matching.
-        matched: neighbours that each picture is matched with.
         asked: of neighbours; None: as `demands` has it.
 
     Raises:
@@ -113,7 +111,7 @@ def stereo_depths(
     poses = np.asarray(views.world_from_camera, dtype=np.float64)
     cameras = [view.grey.camera for view in ready]
     asked = asked or demands(len(views))
-    neighbours = usable_neighbours(poses, cameras, median_depth, max(matched, CHECKED), asked)
+    neighbours = usable_neighbours(poses, cameras, median_depth, max(MATCHED, CHECKED), asked)
     if not any(neighbours):
         raise InputError(
             "no two pictures see the same things from places far enough apart to match them for depth; the camera has to move sideways"
@@ -121,7 +119,7 @@ def stereo_depths(
 
     def raw(index: int) -> tuple[Array, float]:
         progress.check()
-        return _matched(ready, index, neighbours[index][:matched], near, far)
+        return _matched(ready, index, neighbours[index][:MATCHED], near, far)
 
     def checked(index: int) -> StereoDepth:
         progress.check()

@@ -10,8 +10,8 @@ import numpy as np
 from fieldfuse.camera import Array
 
 ON = 0.015  # share of its depth by which a point may miss a plane that it is counted to
-LEAST = 0.006  # share of all points that a plane must have
-MOST = 24  # planes
+MIN_SHARE = 0.006  # share of all points that a plane must have
+MAX_PLANES = 24  # planes
 TRIPLES = 400  # planes that are tried in each round …
 SCORED = 6000  # … on so many of the points
 APART = (0.02, 0.3)  # of the picture's long side: a triple's points lie in one picture, no nearer and no farther from each other
@@ -29,7 +29,7 @@ class Points:
     pixel: Array  # (N, 2) float64 x, y in shares of the picture's long side
 
 
-def find_planes(points: Points, seed: int = 0, on: float = ON, least: float = LEAST, most: int = MOST) -> Array:
+def find_planes(points: Points, seed: int = 0, on: float = ON, least: float = MIN_SHARE, most: int = MAX_PLANES) -> Array:
     """(K, 4) float64 planes, those with most points first: n · p = d with a unit normal n in the first three columns, d in the last.
 
     What lies on a plane, within twice `on` (a share of its depth), is no longer asked for the next one. Each has `least` of the points.

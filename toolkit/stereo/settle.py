@@ -31,7 +31,7 @@ T = TypeVar("T")
 # Scenes of planes, where pictures are asked which plane they show
 CONFIRMED = 3  # views beside a view that must have the same point
 ON = 0.003  # share of its depth by which a point may miss a plane that it is counted to: a fifth of what matched depth needs
-LEAST, MOST = 0.003, 40  # share of the points that a plane has, and planes: twice as many as matched depth needs, since depth is better
+MIN_SHARE, MAX_PLANES = 0.003, 40  # share of the points that a plane has, and planes: twice as many as in matched depth, which is worse
 LARGE = 0.05  # share of the points that a large plane has
 PLANAR = 0.6  # share of the points on large planes from which a scene is one of planes: small ones are found in what is round, too
 RATHER = (0.1, -0.1)  # how much more a large plane may cost than a guess, and where a sensor's depth stands behind the guesses …
@@ -126,7 +126,7 @@ def settled(
     maps = _Maps(reliable, guesses, known, views, lenses, poses, others, progress)
     sure = maps.sure(CONFIRMED)
     points = points_of(sure, poses)
-    planes = find_planes(points, on=ON, least=LEAST, most=MOST)
+    planes = find_planes(points, on=ON, least=MIN_SHARE, most=MAX_PLANES)
     share = shares(points, planes, ON)
     if share[share >= LARGE].sum() >= PLANAR:
         rather = np.where(share >= LARGE, RATHER[backed], min(SMALL, RATHER[backed]))

@@ -192,6 +192,7 @@ def fit_field(
             if guard.goes_on(error, result.steps, plan.resolution, now):
                 continue
             break
+        plan.steps += 1
         plan.steps_here += 1
         result.steps += 1
         result.rays += rays

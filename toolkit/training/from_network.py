@@ -19,7 +19,7 @@ from fieldfuse.capture.types import Views
 from fieldfuse.config import NetworkSettings
 from fieldfuse.errors import InputError
 from fieldfuse.nerfusion import weights
-from fieldfuse.nerfusion.extras.keyframe_depth import beside
+from fieldfuse.nerfusion.extras.keyframe_depth import overlapping
 from fieldfuse.nerfusion.fusion import Fused, FusionOptions, fuse_views
 from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.nerfusion.lattice import Lattice
@@ -59,7 +59,7 @@ class NetworkOptions:
         measured: the views' depth goes into the key frames' sweeps.
         agreement: key frames' sweeps are held against each other, but for captures with alpha, where the visual hull is known.
         recolour: `Inference.result` looks colours up again in the training pictures (`finer_colours`).
-        precision: of the networks' arithmetic (`networks.precision`).
+        precision: of the networks' arithmetic (`nerfusion.precision`).
     """
 
     voxels: float | None = None
@@ -75,7 +75,7 @@ class NetworkOptions:
         """As the settings say."""
         measured = settings.depth_from == "sensor"
         switches = {"measured": measured, "agreement": settings.agreement, "recolour": settings.recolour}
-        return cls(settings.voxels, settings.levels, **switches, precision=settings.precision)
+        return cls(settings.voxels, settings.levels, settings.gamma, **switches, precision=settings.precision)
 
 
 def load_networks(path: Path | str | None = None, device: torch.device | str = "cpu") -> NerfusionModel:
@@ -152,7 +152,7 @@ class Inference:
         options = FusionOptions(self.options.levels, self.near, self.far, measured=measured, precision=precision)
         # Things without texture that stand before nothing lead all sweeps astray in the same way; the hull knows better.
         agree = self.options.agreement and self.hull is None and (self.near > 0 or math.isfinite(self.far))
-        witnesses = beside(self.keys, self.train.world_from_camera, self.train.intrinsics, self.median_depth) if agree else None
+        witnesses = overlapping(self.keys, self.train.world_from_camera, self.train.intrinsics, self.median_depth) if agree else None
         for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress, self.hull, witnesses):
             self._latest = fused
             self.seconds += fused.seconds

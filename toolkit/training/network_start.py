@@ -23,7 +23,6 @@ from fieldfuse.volume.edit import resample
 Tensor = torch.Tensor
 # Largest raw density of the start: a fog where surfaces may be, which a wrong guess costs little (docs/measured/few_views.md).
 THICK = 0.0
-RESOLUTION = 32  # level of the fit at which the networks' field comes in: the coarsest, where what few pictures tell is smooth first
 
 
 def widened(decoder: Deferred, hidden: int, generator: torch.Generator) -> Deferred:
@@ -44,7 +43,7 @@ def widened(decoder: Deferred, hidden: int, generator: torch.Generator) -> Defer
 
 
 def network_start(made: Field, views: Views, scene: Scene, settings: Settings) -> Field:
-    """The first field of a fit, at `RESOLUTION` voxels a side (the fit's finest, when that is less), from the networks' field `made`.
+    """The first field of a fit, at `field.start_resolution` voxels a side (the fit's finest, when that is less), from the networks'.
 
     With the deferred decoder and as many features as the networks have, features and decoder come along; otherwise geometry alone.
 
@@ -54,7 +53,7 @@ def network_start(made: Field, views: Views, scene: Scene, settings: Settings) -
     """
     train = views.subset(np.flatnonzero(~np.asarray(views.test)))
     rungs = levels(settings.field.resolution or finest_resolution(made.space, train, scene))
-    resolution = max(rung for rung in rungs if rung <= max(RESOLUTION, rungs[0]))
+    resolution = max(rung for rung in rungs if rung <= max(settings.field.start_resolution, rungs[0]))
     generator = torch.Generator().manual_seed(settings.seed)
     device = made.device
     places = possible(made.space, resolution, all_places(made.space, resolution), views)

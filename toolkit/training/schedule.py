@@ -63,6 +63,7 @@ class Schedule:
         slow_within: distance before a camera up to which things move slowly, working units (`near`).
         trust: how far the pictures' depth is believed.
         rungs: share of the budget at which each level of the ladder ends at the latest.
+        steps, steps_here: taken so far, in all and at this level.
         wider: times as many rays a step as `FIRST_BATCH` and `fit.max_rays` say.
     """
 
@@ -77,6 +78,7 @@ class Schedule:
     rungs: tuple[float, ...] = RUNGS
     wider: int = 1
     level: int = 0
+    steps: int = 0
     steps_here: int = 0
     slower: float = 1.0
     drops: int = 0
@@ -110,7 +112,7 @@ class Schedule:
 
         After patience has ended the search, a fifth of the time spent is left for polish.
         """
-        done = max(seconds / self.budget, rays / self.most_rays)
+        done = max(seconds / self.budget, rays / self.most_rays, self.steps / (self.settings.iterations or math.inf))
         if self.ended is None:
             return done
         return LAST_PRUNE + (done - self.ended) / max(self.ended * (1 / LAST_PRUNE - 1), 1e-9) * (1 - LAST_PRUNE)
@@ -147,7 +149,10 @@ class Schedule:
         return sum(after) / WINDOW - sum(before) / WINDOW < (GAIN if self.finest else COARSE_GAIN)
 
     def wants_finer(self, done: float) -> bool:
-        """Time for the next level: its share is spent, or the validation views gain nothing more here."""
+        """Time for the next level: its share is spent, or the validation views gain nothing more here; or, in the paper's way, a number of
+        steps was taken."""
+        if every := self.settings.split_every:
+            return not self.finest and self.steps_here >= every
         if self.finest or self.steps_here < LEVEL_STEPS or done >= self.rungs[-1]:
             return False
         return done > self.deadline() or self.plateau()
@@ -179,7 +184,8 @@ class Schedule:
         self.looks.clear()
 
     def wants_pruning(self, done: float) -> bool:
-        return self.steps_here > 0 and self.steps_here % PRUNE_EVERY == 0 and done < LAST_PRUNE
+        every = self.settings.split_every or PRUNE_EVERY
+        return self.steps_here > 0 and self.steps_here % every == 0 and done < LAST_PRUNE
 
     def rates(self, done: float, rays: int) -> Rates:
         """Step sizes: they fall with the rays that were fitted, whatever the machine took for them, on plateaus, and at the end."""

@@ -8,7 +8,8 @@ import fast_simplification
 import numpy as np
 import open3d as o3d
 import open3d.core as o3c
-from numba import njit
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from fieldfuse.camera import Array, Similarity
 from fieldfuse.errors import InputError
@@ -76,7 +77,9 @@ class Mesh:
         """(T,) int32: the connected component of each triangle (triangles that share an edge are connected), largest number unknown."""
         edges, order = self._edges()
         shared = np.flatnonzero(np.diff(edges[order]) == 0)
-        return _components(len(self.triangles), order[shared] // 3, order[shared + 1] // 3)
+        pairs = order[shared] // 3, order[shared + 1] // 3
+        graph = coo_array((np.ones(len(shared), bool), pairs), shape=(len(self.triangles),) * 2)
+        return np.asarray(connected_components(graph, directed=False)[1])
 
     def _edges(self) -> tuple[Array, Array]:
         """(3 T,) int64 a number of each triangle's edges, the same for the same two vertices, and the order that sorts them."""
@@ -84,23 +87,19 @@ class Mesh:
         edges = np.minimum(from_, to) * len(self.vertices) + np.maximum(from_, to)
         return edges, np.argsort(edges)
 
-    def cleaned(self, min_share: float = 0.0, min_area_share: float = 0.0) -> Mesh:
+    def cleaned(self, min_area_share: float = 0.0) -> Mesh:
         """Without degenerate and repeated triangles, small components, and vertices that nothing uses.
 
         Args:
-            min_share: components with fewer than this share of all triangles go.
-            min_area_share: components with less than this share of the whole area go.
-
-        The largest component always stays.
+            min_area_share: components with less than this share of the whole area go; the largest one always stays.
         """
         degenerate = (self.triangles[:, [0, 1, 2]] == self.triangles[:, [1, 2, 0]]).any(axis=1) | (self.areas() <= 0)
         mesh = replace(self, triangles=self.triangles[~degenerate])
         mesh = replace(mesh, triangles=mesh.triangles[_first_of_each(np.sort(mesh.triangles, axis=1))])
-        if (min_share > 0 or min_area_share > 0) and len(mesh.triangles):
+        if min_area_share > 0 and len(mesh.triangles):
             label = mesh.components()
-            count = np.bincount(label)
             area = np.bincount(label, weights=mesh.areas())
-            keep = (count >= min_share * count.sum()) & (area >= min_area_share * area.sum())
+            keep = area >= min_area_share * area.sum()
             keep[np.argmax(area)] = True
             mesh = replace(mesh, triangles=mesh.triangles[keep[label]])
         return mesh.compacted()
@@ -204,30 +203,6 @@ def places(positions: Array, *others: Array | None) -> Array:
         columns = np.concatenate([positions, *(np.asarray(other, np.float64) for other in others if other is not None)], axis=1)
         order = np.lexsort(columns.T[::-1])
     return np.asarray(order)
-
-
-@njit(cache=True, nogil=True)
-def _components(count: int, left: Array, right: Array) -> Array:
-    """(count,) int32 numbers of the components of a graph of `count` nodes with the edges left (E,) – right (E,)."""
-    root = np.arange(count)
-    for at in range(len(left)):
-        a, b = left[at], right[at]
-        while root[a] != a:
-            root[a] = root[root[a]]
-            a = root[a]
-        while root[b] != b:
-            root[b] = root[root[b]]
-            b = root[b]
-        root[max(a, b)] = min(a, b)
-    out = np.empty(count, np.int32)
-    found = 0
-    for at in range(count):  # a root comes before what hangs on it
-        if root[at] == at:
-            out[at] = found
-            found += 1
-        else:
-            out[at] = out[root[at]]
-    return out
 
 
 def _first_of_each(rows: Array) -> Array:

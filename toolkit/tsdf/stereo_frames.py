@@ -15,10 +15,10 @@ from fieldfuse.tsdf.held import fuse_held
 from fieldfuse.tsdf.volume import TsdfVolume
 
 
-def stereo_frames(views: Views, depths: Sequence[StereoDepth], least_confidence: float = LEAST_CONFIDENCE) -> Iterator[DepthFrame]:
+def stereo_frames(views: Views, depths: Sequence[StereoDepth]) -> Iterator[DepthFrame]:
     """One frame a view: its depth where it is confident enough, its picture in full size."""
     for index, found in enumerate(depths):
-        depth = np.where(found.confidence >= least_confidence, found.depth, np.float32(0))
+        depth = np.where(found.confidence >= LEAST_CONFIDENCE, found.depth, np.float32(0))
         colour, camera = cover(views.images[index], views.intrinsics[index].pinhole(), found.intrinsics)
         pose = np.asarray(views.world_from_camera[index], dtype=np.float64)
         yield DepthFrame(depth, np.ascontiguousarray(colour), found.intrinsics, camera, pose)
@@ -29,7 +29,6 @@ def fuse_stereo(
     depths: Sequence[StereoDepth],
     voxel_size: float | None = None,
     depth_max: float | None = None,
-    least_confidence: float = LEAST_CONFIDENCE,
     carve: bool = True,
     progress: Progress = SILENT,
 ) -> TsdfVolume:
@@ -38,5 +37,5 @@ def fuse_stereo(
         "no depth could be found by matching the pictures: they show too little texture, or their poses do not fit them; find the poses"
         " again with --poses sfm, or set tsdf.enabled=off"
     )
-    frames = stereo_frames(views, depths, least_confidence)
+    frames = stereo_frames(views, depths)
     return fuse_held(frames, len(depths), voxel_size, depth_max, carve=carve, nothing=nothing, progress=progress)

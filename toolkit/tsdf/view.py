@@ -29,16 +29,11 @@ class MeshView:
 
 
 class SurfaceCaster:
-    """A mesh prepared for ray casting (on the CPU, with Open3D's Embree scene).
+    """A mesh prepared for ray casting (on the CPU, with Open3D's Embree scene)."""
 
-    Args:
-        threads: 0 lets Open3D use all cores.
-    """
-
-    def __init__(self, mesh: Mesh, threads: int = 0) -> None:
+    def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
-        self.threads = threads
-        self.scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
+        self.scene = o3d.t.geometry.RaycastingScene()
         if len(mesh.triangles):
             vertices, triangles = mesh.vertices.astype(np.float32), mesh.triangles.astype(np.uint32)
             self.scene.add_triangles(o3c.Tensor.from_numpy(vertices), o3c.Tensor.from_numpy(triangles))
@@ -62,7 +57,7 @@ class SurfaceCaster:
         camera = np.stack([(u + 0.5 - intrinsics.cx) / intrinsics.fx, (v + 0.5 - intrinsics.cy) / intrinsics.fy, np.ones_like(u)], axis=-1)
         directions = camera @ pose[:3, :3].T
         rays = np.concatenate([np.broadcast_to(pose[:3, 3], directions.shape), directions], axis=-1).astype(np.float32)
-        hits = self.scene.cast_rays(o3c.Tensor.from_numpy(rays), nthreads=self.threads)
+        hits = self.scene.cast_rays(o3c.Tensor.from_numpy(rays))
         distance = hits["t_hit"].numpy()
         hit = np.isfinite(distance) & (distance > 0)
         corner = self.mesh.triangles[hits["primitive_ids"].numpy()[hit]]  # (hits, 3)

@@ -31,6 +31,7 @@ from fieldfuse.tsdf.mesh import Mesh, as_bytes, places
 from fieldfuse.tsdf.view import MeshView, SurfaceCaster
 
 BLOCK = 8
+TRUNCATION = 4.0  # half width of the band around the surface, in voxels
 DEPTH_STEPS = 60000  # 16-bit depth: this value is depth_max, what saturates above it is out of range
 BYTES_PER_BLOCK = BLOCK**3 * (1 + 1 + 3) * 4
 MAX_BYTES = 4 * 2**30
@@ -64,18 +65,15 @@ class TsdfVolume:
 
     Args:
         voxel_size, depth_max: working units; depth beyond depth_max is not fused.
-        truncation: half width of the band around the surface, in voxels.
         expected_blocks: room made beforehand (see `estimate_blocks`); it grows when that was too little.
         max_bytes: bound of the voxels' memory; None: `MAX_BYTES`, or half of what is free when that is less (growing copies everything).
     """
 
-    def __init__(
-        self, voxel_size: float, depth_max: float, truncation: float = 4.0, expected_blocks: int = 4000, max_bytes: int | None = None
-    ) -> None:
-        for name, value in (("voxel size", voxel_size), ("largest depth", depth_max), ("truncation", truncation)):
+    def __init__(self, voxel_size: float, depth_max: float, expected_blocks: int = 4000, max_bytes: int | None = None) -> None:
+        for name, value in (("voxel size", voxel_size), ("largest depth", depth_max)):
             if not SMALLEST <= value <= LARGEST:
                 raise InputError(f"the {name} of the TSDF is {value:g}; it must be a positive number between {SMALLEST:g} and {LARGEST:g}")
-        self.voxel_size, self.depth_max, self.truncation = float(voxel_size), float(depth_max), float(truncation)
+        self.voxel_size, self.depth_max = float(voxel_size), float(depth_max)
         self.max_blocks = max(1, (memory.bounded(MAX_BYTES) if max_bytes is None else max_bytes) // BYTES_PER_BLOCK)
         self.frames = 0
         self.empty_frames = 0
@@ -146,7 +144,7 @@ class TsdfVolume:
         matrix = o3c.Tensor(frame.depth_intrinsics.matrix())
         colour_matrix = o3c.Tensor(_colour_matrix(frame.colour_intrinsics, frame.depth_intrinsics))
         for piece in self._pieces(keys):
-            self.grid.integrate(piece, depth, colour, matrix, colour_matrix, extrinsic, self._read_scale, self.depth_max, self.truncation)
+            self.grid.integrate(piece, depth, colour, matrix, colour_matrix, extrinsic, self._read_scale, self.depth_max, TRUNCATION)
         self.frames += 1
         return True
 
@@ -207,7 +205,7 @@ class TsdfVolume:
     def _touched(self, depth: o3d.t.geometry.Image, intrinsics: Intrinsics, extrinsic: o3c.Tensor) -> o3c.Tensor | None:
         matrix = o3c.Tensor(intrinsics.matrix_integer_centres())
         try:
-            return self.grid.compute_unique_block_coordinates(depth, matrix, extrinsic, self._scale, self.depth_max, self.truncation)
+            return self.grid.compute_unique_block_coordinates(depth, matrix, extrinsic, self._scale, self.depth_max, TRUNCATION)
         except RuntimeError as error:  # Open3D's way to say that no pixel it looked at has depth
             if "No block is touched" not in str(error):
                 raise

@@ -21,6 +21,8 @@ from fieldfuse.volume.topology import BLOCK, VOXELS, Bounds, Topology, constant
 
 CHUNK = 1024  # blocks at a time …
 COPIED = 128  # … and of those that are copied
+PRUNE_GAMMA = 0.6  # γ, the transmittance above which a voxel is see-through
+PRUNE_SAMPLES = 3  # points along each axis of a voxel, k = 3³, evenly spread
 MODES = ("trilinear", "nearest")
 _ELEMENTS = 2**19  # values gathered at a time by `resample`: about what fits into a core's cache …
 _AT_ONCE = 2**27  # … and on another device
@@ -142,7 +144,7 @@ def trilinear_density(topology: Topology, density: Tensor) -> Callable[[Tensor, 
     return function
 
 
-def prune(occupied: Tensor, density: Callable[[Tensor, Tensor], Tensor], voxel_size: float, gamma: float = 0.6, samples: int = 3) -> Tensor:
+def prune(occupied: Tensor, density: Callable[[Tensor, Tensor], Tensor], voxel_size: float) -> Tensor:
     """Occupied voxels that are not see-through, after NeRFusion's pruning rule (its section on fine-tuning) made free of scale.
 
     The paper drops a voxel when the smallest exp(−σ) over k points in it exceeds γ. That depends on the unit of length, so here
@@ -151,13 +153,12 @@ def prune(occupied: Tensor, density: Callable[[Tensor, Tensor], Tensor], voxel_s
     Args:
         density: (N,) int64 voxel rows and (N, 3) places inside them (x, y, z in 0 … 1) → (N,) σ per working unit.
         voxel_size: working units.
-        samples: points along each axis, k = samples³, evenly spread.
 
     Returns:
         (M · 512,) bool, a subset of `occupied`.
     """
     cells = occupied.nonzero().view(-1)
-    line = (torch.arange(samples, device=cells.device) + 0.5) / samples
+    line = (torch.arange(PRUNE_SAMPLES, device=cells.device) + 0.5) / PRUNE_SAMPLES
     z, y, x = torch.meshgrid(line, line, line, indexing="ij")
     points = torch.stack([x, y, z], -1).view(-1, 3)
     out = torch.zeros_like(occupied)
@@ -165,7 +166,7 @@ def prune(occupied: Tensor, density: Callable[[Tensor, Tensor], Tensor], voxel_s
     for start in range(0, len(cells), step):
         part = cells[start : start + step]
         sigma = density(part.repeat_interleave(len(points)), points.repeat(len(part), 1)).view(len(part), -1)
-        out[part] = torch.exp(-sigma * voxel_size).amin(1) <= gamma
+        out[part] = torch.exp(-sigma * voxel_size).amin(1) <= PRUNE_GAMMA
     return out
 
 

@@ -96,9 +96,9 @@ class BlockGrid:
         """Rises whenever rows have moved (growth) or were let go (close): views taken before are void."""
         return self._generation
 
-    def estimate_bytes(self, blocks: int, growing: bool = False) -> int:
-        """Bytes of the attributes of so many blocks; while a table grows to that size, up to three times as many are in use."""
-        return blocks * (VOXELS * 4 * sum(self.attributes.values()) + 64) * (3 if growing else 1)
+    def estimate_bytes(self, blocks: int) -> int:
+        """Bytes of the attributes of so many blocks."""
+        return blocks * (VOXELS * 4 * sum(self.attributes.values()) + 64)
 
     def reserve(self, blocks: int) -> None:
         """Make room for at least `blocks` blocks in all. When that moves rows, the generation rises and views are void.

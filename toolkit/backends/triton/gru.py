@@ -97,11 +97,11 @@ class Step:
     """
 
     def __init__(self, part: LatentVolume, local: LocalVolume, least: float, most: float) -> None:
-        self.among, self.state, self.count, self.local = local.among, part.rows.contiguous(), part.count, local.rows.contiguous()
+        self.among, self.state, self.count, self.local = local.slots, part.rows.contiguous(), part.count, local.rows.contiguous()
         self.raw, self.weight, self.seen = local.raw.contiguous(), local.weight, local.count
         self.least, self.most = least, float(most)
         self.channels = self.state.shape[1]
-        self.rows = local.among.shape[0] * VOXELS
+        self.rows = local.slots.shape[0] * VOXELS
         self._sizes = {"CHANNELS": self.channels, "WIDE": power_of_two(self.channels), "BLOCK": BLOCK}
         self._grid = (pieces(self.rows + 1, BLOCK),)
 

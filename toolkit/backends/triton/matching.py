@@ -284,7 +284,7 @@ def window_of(peak: int, planes: int) -> int:
 
 
 def table(likely: Tensor, step: float, peak: int) -> Tensor:
-    """(D, h, w) likelihoods, farthest first → (3, D, h, w) of `Sweep`; a voxel's three numbers lie next to each other."""
+    """(D, h, w) likelihoods, farthest first → (3, D, h, w) of `DepthDistribution`; a voxel's three numbers lie next to each other."""
     volume = rows(likely)
     height, width, planes = volume.shape
     out = volume.new_empty((height, width, planes, 3))

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
-"""What sweeps and witnesses are asked on CUDA: tables read between pixels and planes (`Sweep.look`, `witness.py` in tensors)."""
+"""Depth distributions and log odds of surface read between pixels and planes on CUDA (`DepthDistribution.look`, `CrossView`)."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def _look(points, truncation, table, pose, lens, size, out, count, height, width
 
 
 def look(points: Tensor, truncation: Tensor, table: Tensor, camera: Any, lowest: float, step: float) -> Tensor:
-    """(3, N): what `Sweep.look` says of voxels (N, 3) with a truncation (N,) each, from a table (3, D, h, w) of `matching.table`."""
+    """(3, N): `DepthDistribution.look` at voxels (N, 3) with a truncation (N,) each, from a table (3, D, h, w) of `matching.table`."""
     rows = table.permute(2, 3, 1, 0).contiguous()
     height, width, planes = rows.shape[:3]
     count = len(points)
@@ -217,7 +217,7 @@ class Asked:
     def __init__(self, witnesses: Sequence[Any]) -> None:
         self.count = len(witnesses)
         # Kept until kernels that go to their addresses are on their way.
-        self._kept = [(matching.rows(one.says), one.numbers()) for one in witnesses]
+        self._kept = [(matching.rows(one.log_odds), one.numbers()) for one in witnesses]
         places = np.array([(says.data_ptr(), row.data_ptr()) for says, row in self._kept], np.int64)
         self._addresses = to_device_async(places, self._kept[0][0].device)
 

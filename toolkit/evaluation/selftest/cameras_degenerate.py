@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import Array, Intrinsics, checked_pose
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.poses import checked_pose
 from fieldfuse.capture.types import Capture, Frame, Views
 from fieldfuse.errors import InputError, PoseError
 from fieldfuse.evaluation.baseline import nearest_training

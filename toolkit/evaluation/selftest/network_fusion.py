@@ -41,12 +41,12 @@ def recurrence_errors(frames: int) -> dict[str, float]:
     return {"state beyond ±1": max(0.0, largest - 1), "values that are not finite": wrong}
 
 
-@case(GROUP, "recurrent fusion: 200 frames stay bounded")
+@case(GROUP, "recurrent fusion: 200 frames stay held")
 def recurrence(folder: Path) -> list[Measure]:
     return [Measure(name, error, 1e-6 if name.startswith("state") else 0.0) for name, error in recurrence_errors(200).items()]
 
 
-@case(GROUP, "recurrent fusion: 10,000 frames stay bounded", slow=True)
+@case(GROUP, "recurrent fusion: 10,000 frames stay held", slow=True)
 def long_recurrence(folder: Path) -> list[Measure]:
     return [Measure(name, error, 1e-6 if name.startswith("state") else 0.0) for name, error in recurrence_errors(10_000).items()]
 

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from fieldfuse.evaluation.selftest.case import Measure, absolute, case, not_finite
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.extras.cross_view_consistency import AGAINST, FOR, SHARE, evidence, witness
-from fieldfuse.nerfusion.extras.matching import LARGE, SMALL, TEMPERATURE, UNKNOWN, describe
-from fieldfuse.nerfusion.extras.plane_sweep import Sweep, carved, compare, decide, sweep
+from fieldfuse.nerfusion.extras.cross_view_consistency import AGAINST, FOR, SHARE, consistency, cross_view
+from fieldfuse.nerfusion.extras.matching import LARGE, SMALL, TEMPERATURE, UNKNOWN, patch_descriptors
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, carved, cost_volume, sweep_planes, to_probability
 
 GROUP = "networks"
 WIDTH, HEIGHT, FOCAL = 24, 18, 22.0
@@ -79,12 +79,12 @@ def nothing_to_match(folder: Path) -> list[Measure]:
     for name, (images, cameras) in awkward().items():
         wrong, beyond, rising = 0.0, 0.0, 0.0
         for near, far in ((NEAR, FAR), (0.0, FAR), (NEAR, math.inf), (1e-6, 1e6), (0.999, 1.001)):
-            made = sweep(list(describe(images)), cameras, near, far)
+            made = sweep_planes(list(patch_descriptors(images)), cameras, near, far)
             wrong += not_finite(made.table)
             rising += float((torch.diff(made.table[0], dim=0) > 1e-6).sum())  # what lies nearer is hidden less
             for truncation in (1e-6, TRUNCATION, 1e3):
                 read = made.look(points, torch.full((len(points),), truncation))
-                for value, low in ((read.signed, -1), (read.open, 0), (read.sure, 0)):
+                for value, low in ((read.expected_sdf, -1), (read.visibility, 0), (read.confidence, 0)):
                     wrong += not_finite(value)
                     beyond += float(((value < low) | (value > 1)).sum())
         out.append(Measure(f"{name}: values that are not finite", wrong, 0.0))
@@ -107,23 +107,23 @@ def unsure(folder: Path) -> list[Measure]:
         "neighbours that look away",
     ):
         images, cameras = awkward()[name]
-        made = sweep(list(describe(images)), cameras, NEAR, FAR)
+        made = sweep_planes(list(patch_descriptors(images)), cameras, NEAR, FAR)
         likely = -torch.diff(made.table[0], dim=0)[:, HEIGHT // 4, WIDTH // 4]  # a pixel in the middle, which neighbours see at all depths
         even = 5 / made.table.shape[1]  # of five planes about a peak, where all are alike
         read = made.look(points, torch.full((len(points),), TRUNCATION))
         out.append(Measure(f"{name}: likeliest plane against an even share, less one", float(likely.max()) * made.table.shape[1] - 1, 1e-4))
-        out.append(Measure(f"{name}: sure beyond an even share", max(0.0, float(read.sure.max()) - even), 1e-6))
+        out.append(Measure(f"{name}: sure beyond an even share", max(0.0, float(read.confidence.max()) - even), 1e-6))
     return out
 
 
 # ------------------------------------------------------------------------------------------------ float64
 
 
-def slow_costs(described: list[Tensor], cameras: Cameras, made: Sweep) -> tuple[Tensor, Tensor]:
+def slow_costs(descriptors: list[Tensor], cameras: Cameras, made: DepthDistribution) -> tuple[Tensor, Tensor]:
     """(D, h, w) float64 costs through points in space, 4×4 matrices and loops; and where a rounding decides whether a view sees a place."""
     planes, height, width = made.table.shape[1:]
     cost, unsure = torch.zeros(planes, height, width, dtype=torch.float64), torch.zeros(planes, height, width, dtype=torch.bool)
-    wide = [each.double() for each in described]
+    wide = [each.double() for each in descriptors]
     matrices = [torch.linalg.inv(pose.double()) for pose in cameras.world_from_camera]
     lens = cameras.intrinsics.double().tolist()
     for y in range(height):
@@ -135,7 +135,7 @@ def slow_costs(described: list[Tensor], cameras: Cameras, made: Sweep) -> tuple[
                 point = torch.tensor([(u - lens[0][2]) / lens[0][0] * depth, (v - lens[0][3]) / lens[0][1] * depth, depth, 1.0])
                 world = cameras.world_from_camera[0].double() @ point.double()
                 found = []
-                for view in range(1, len(described)):
+                for view in range(1, len(descriptors)):
                     a, b, c, _ = (matrices[view] @ world).tolist()
                     if c / depth <= 1e-4:
                         continue
@@ -195,9 +195,9 @@ def sweep_exact(folder: Path) -> list[Measure]:
     }
     for name, cameras in chosen.items():
         images = textured(3, len(cameras))
-        described = list(describe(images))
-        made = sweep(described, cameras, NEAR, FAR)
-        cost, unsure = slow_costs(described, cameras, made)
+        descriptors = list(patch_descriptors(images))
+        made = sweep_planes(descriptors, cameras, NEAR, FAR)
+        cost, unsure = slow_costs(descriptors, cameras, made)
         likely = slow_likelihood(cost)
         nearer = likely.flip(0).cumsum(0).flip(0) - 0.5 * likely
         sure = ~unsure.any()
@@ -224,9 +224,9 @@ def sweep_carved(folder: Path) -> list[Measure]:
             if holes == "all but one":
                 out.append(Measure(f"{name}, empty {holes}: likely where it is empty", float((left * empty).max()), 0.0))
     for name, (images, cameras) in awkward().items():
-        made = sweep(list(describe(images)), cameras, NEAR, FAR, empty=lambda points: points[:, 2] < 1)
+        made = sweep_planes(list(patch_descriptors(images)), cameras, NEAR, FAR, empty=lambda points: points[:, 2] < 1)
         seen = made.look(places(), torch.full((len(places()),), TRUNCATION))
-        out.append(Measure(f"{name}: values that are not finite", not_finite(seen.signed, seen.open, seen.sure), 0.0))
+        out.append(Measure(f"{name}: values that are not finite", not_finite(seen.expected_sdf, seen.visibility, seen.confidence), 0.0))
     return out
 
 
@@ -235,21 +235,23 @@ def sweep_witnessed(folder: Path) -> list[Measure]:
     """What is said stays within its bounds, likelihoods are numbers, and who does not look changes none."""
     out = []
     images, cameras = awkward()["one neighbour"]
-    compared = compare(list(describe(images)), cameras, NEAR, FAR)
-    alone = decide(compared).table[0]
+    costs = cost_volume(list(patch_descriptors(images)), cameras, NEAR, FAR)
+    own_estimate = to_probability(costs).table[0]
     low, high = (SHARE * math.log(value) for value in (AGAINST, FOR + AGAINST))
     for name, (others, seen_by) in awkward().items():
         for near, far in ((NEAR, FAR), (1e-6, 1e6)):
-            one = witness(sweep(list(describe(others)), seen_by, near, far))
-            said = evidence(compared, [one, one])
-            assert said is not None
-            made = decide(compared, said=said)
+            one = cross_view(sweep_planes(list(patch_descriptors(others)), seen_by, near, far))
+            correction = consistency(costs, [one, one])
+            assert correction is not None
+            made = to_probability(costs, correction=correction)
             ends = f"{name}, {near:g} to {far:g}"
-            out.append(Measure(f"{ends}: values that are not finite", not_finite(said, made.table), 0.0))
-            out.append(Measure(f"{ends}: said beyond its bounds", max(0.0, float(said.max()) - high, low - float(said.min())), 1e-5))
+            out.append(Measure(f"{ends}: values that are not finite", not_finite(correction, made.table), 0.0))
+            beyond = max(0.0, float(correction.max()) - high, low - float(correction.min()))
+            out.append(Measure(f"{ends}: said beyond its bounds", beyond, 1e-5))
             rising = float((torch.diff(made.table[0], dim=0) > 1e-6).sum())
             out.append(Measure(f"{ends}: likelihoods that rise towards the camera", rising, 0.0))
-    silent = evidence(compared, [witness(sweep(list(describe(images)), turned(cameras, 0, math.pi), NEAR, FAR))])
+    silent = consistency(costs, [cross_view(sweep_planes(list(patch_descriptors(images)), turned(cameras, 0, math.pi), NEAR, FAR))])
     assert silent is not None
-    out.append(Measure("one that looks away: change of likelihoods", absolute(decide(compared, said=silent).table[0], alone), 1e-6))
+    changed = absolute(to_probability(costs, correction=silent).table[0], own_estimate)
+    out.append(Measure("one that looks away: change of likelihoods", changed, 1e-6))
     return out

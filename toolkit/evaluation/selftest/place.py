@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from fieldfuse.camera import Array, Intrinsics, Similarity, checked_pose, invert, pixel_grid, rays
+from fieldfuse.camera import Array, Intrinsics, Similarity, invert, pixel_grid, rays
+from fieldfuse.capture.poses import checked_pose
 from fieldfuse.evaluation.selftest.case import Measure, absolute, case, not_finite, relative
 from fieldfuse.evaluation.selftest.edit import small_field
 from fieldfuse.render.image import render_view

@@ -1,15 +1,13 @@
-"""The plane sweeps of all key frames, each held against those of the key frames beside it (not in the paper).
+"""Depth distributions of all key frames, each checked against those of overlapping key frames (not in the paper; `network.agreement`).
 
-A key frame's witnesses are wanted before it is fused, whichever of them come later, so sweeps are made as they are asked for and kept for
-those that ask next. The pictures are compared small, which costs little against encoding them.
+Overlapping key frames are needed before a key frame is fused, also those that come later, so distributions are made on demand and cached
+for those that need them next. Images are compared small, which costs little against encoding them.
 """
 
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from typing import Generic, TypeVar
 
 import numpy as np
 import torch
@@ -19,23 +17,22 @@ from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.types import Views
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.extras.cross_view_consistency import Witness, alone, evidence, witness
-from fieldfuse.nerfusion.extras.matching import describe
-from fieldfuse.nerfusion.extras.plane_sweep import Compared, Sweep, compare, decide
+from fieldfuse.nerfusion.extras.cross_view_consistency import CrossView, consistency, cross_view, own_estimate
+from fieldfuse.nerfusion.extras.matching import patch_descriptors
+from fieldfuse.nerfusion.extras.plane_sweep import CostVolume, DepthDistribution, cost_volume, to_probability
+from fieldfuse.nerfusion.images import Recent, image_of, sensor_depth, with_neighbours
 from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.poses.overlap import overlap, parallax
 
-MOST = 8  # witnesses of a key frame
+MOST = 8  # key frames that one is checked against
 LEAST_OVERLAP = 0.1  # either way
-WIDEST = 60.0  # degrees of parallax: two that look at a place from either side say little about each other
-KEPT = 32  # sweeps kept for key frames to come, 13 MB each at most, and as much again until they are asked for
-KEPT_DESCRIPTORS = 16  # pictures, 6 MB each at most
-KEPT_PICTURES = 48  # on a device of its own, as bytes
-T = TypeVar("T")
+WIDEST = 60.0  # degrees of parallax: two that see a place from opposite sides tell little about each other
+KEPT = 32  # distributions cached for key frames to come, 13 MB each at most, and as much again until they are needed
+KEPT_DESCRIPTORS = 16  # images, 6 MB each at most
 
 
-def beside(keys: KeyFrames, world_from_camera: Array, intrinsics: Sequence[Intrinsics], depth: float) -> list[list[int]]:
-    """For each key frame its witnesses, as places in `keys.indices`: those that overlap most.
+def overlapping(keys: KeyFrames, world_from_camera: Array, intrinsics: Sequence[Intrinsics], depth: float) -> list[list[int]]:
+    """For each key frame those that overlap most with it, as positions in `keys.indices`.
 
     Args:
         world_from_camera: (N, 4, 4) of all views that `keys` counts.
@@ -51,8 +48,8 @@ def beside(keys: KeyFrames, world_from_camera: Array, intrinsics: Sequence[Intri
     return [[int(other) for other in row if common[at, other] > LEAST_OVERLAP] for at, row in enumerate(order)]
 
 
-class KeySweeps:
-    """Call with a place in `keys.indices` for the sweep of that key frame."""
+class KeyframeDepth:
+    """Call with a position in `keys.indices` for the depth distribution of that key frame."""
 
     def __init__(
         self,
@@ -67,10 +64,10 @@ class KeySweeps:
     ) -> None:
         """
         Args:
-            witnesses: for each key frame, as `beside` gives them; none: its sweep alone.
+            witnesses: for each key frame those that it is checked against, as `overlapping` gives them; none: its own images alone.
             near, far: depths along z, working units; one of them known.
-            measured: the depth that a sensor measured goes into a key frame's sweep.
-            pictures: gives a view's picture (1, 3, H, W) on the device; None: it is brought there.
+            measured: the depth that a sensor measured goes into a key frame's distribution.
+            pictures: gives a view's image (1, 3, H, W) on the device; None: it is brought there.
 
         Raises:
             ValueError: neither depth is known.
@@ -79,106 +76,35 @@ class KeySweeps:
             raise ValueError("sweeps need a nearest or a farthest depth")
         self.views, self.keys, self.witnesses = views, keys, witnesses
         self.near, self.far, self.measured, self.device = near, far, measured, device
-        self._picture = pictures or (lambda index: picture(views, index, device))
+        self._picture = pictures or (lambda index: image_of(views, index, device))
         self._described: Recent[Tensor] = Recent(KEPT_DESCRIPTORS)
-        self._made: Recent[tuple[Compared | None, Witness, Tensor]] = Recent(KEPT)
+        self._made: Recent[tuple[CostVolume | None, CrossView, Tensor]] = Recent(KEPT)
 
-    def __call__(self, at: int) -> Sweep:
-        compared, says, surface = self._made.get(at, self._make)
-        if compared is None:
-            compared, says, surface = self._make(at)
-        said = evidence(compared, [self._made.get(other, self._make)[1] for other in self.witnesses[at]], surface)
-        self._made.put(at, (None, says, surface))  # a key frame is fused once, and goes on as a witness
-        return decide(compared, self._depth(at), said)
+    def __call__(self, at: int) -> DepthDistribution:
+        costs, log_odds, surface = self._made.get(at, self._make)
+        if costs is None:
+            costs, log_odds, surface = self._make(at)
+        correction = consistency(costs, [self._made.get(other, self._make)[1] for other in self.witnesses[at]], surface)
+        self._made.put(at, (None, log_odds, surface))  # a key frame is fused once, and then only checks others
+        return to_probability(costs, self._depth(at), correction)
 
-    def _make(self, at: int) -> tuple[Compared, Witness, Tensor]:
-        """What the pictures say alone, what this key frame says of others' surfaces, and the places it is sure of."""
-        group = together(int(self.keys.indices[at]), self.keys.neighbours[at])
+    def _make(self, at: int) -> tuple[CostVolume, CrossView, Tensor]:
+        """The cost volume of its images, its evidence for others, and its confident points."""
+        group = with_neighbours(int(self.keys.indices[at]), self.keys.neighbours[at])
         poses = self.views.world_from_camera[group]
         cameras = Cameras.of([self.views.intrinsics[index] for index in group], poses, self.device)
         new = [index for index in group if index not in self._described]
         if len(new) > 1 and not is_cpu(torch.device(self.device)) and len({self.views.images[index].shape for index in new}) == 1:
             # Together they take as many launches as one.
-            for index, made in zip(new, describe(torch.cat([self._picture(index) for index in new])), strict=True):
+            for index, made in zip(new, patch_descriptors(torch.cat([self._picture(index) for index in new])), strict=True):
                 self._described.put(index, made)
-        compared = compare([self._described.get(index, self._describe) for index in group], cameras, self.near, self.far)
-        says, surface = alone(compared)
+        costs = cost_volume([self._described.get(index, self._describe) for index in group], cameras, self.near, self.far)
+        log_odds, surface = own_estimate(costs)
         depth = self._depth(at)
-        return compared, says if depth is None else witness(decide(compared, depth)), surface
+        return costs, log_odds if depth is None else cross_view(to_probability(costs, depth)), surface
 
     def _describe(self, index: int) -> Tensor:
-        return describe(self._picture(index))[0]
+        return patch_descriptors(self._picture(index))[0]
 
     def _depth(self, at: int) -> Tensor | None:
-        return sensed(self.views, int(self.keys.indices[at]), self.device) if self.measured else None
-
-
-class Brought:
-    """Pictures of views on a device, the most recently asked of kept there: call with an index for (1, 3, H, W) RGB in [0, 1]."""
-
-    def __init__(self, views: Views, device: torch.device) -> None:
-        self.views, self.device = views, device
-        self._kept: Recent[Tensor] = Recent(KEPT_PICTURES)
-
-    def __call__(self, index: int) -> Tensor:
-        return shown(self._kept.get(index, lambda index: pixels(self.views, index, self.device)))
-
-
-class Recent(Generic[T]):
-    """The most recently asked of what is made for an index.
-
-    `functools.lru_cache` of a method would refer to its owner, which then stays in memory until the garbage collector comes by.
-    """
-
-    def __init__(self, most: int) -> None:
-        self.most = most
-        self._kept: OrderedDict[int, T] = OrderedDict()
-
-    def __contains__(self, index: int) -> bool:
-        return index in self._kept
-
-    def get(self, index: int, make: Callable[[int], T]) -> T:
-        """What is kept for `index`, or what `make` gives for it."""
-        return self.put(index, self._kept[index] if index in self._kept else make(index))
-
-    def put(self, index: int, value: T) -> T:
-        """Keep `value` as the most recently asked of."""
-        self._kept[index] = value
-        self._kept.move_to_end(index)
-        while len(self._kept) > self.most:
-            self._kept.popitem(last=False)
-        return value
-
-
-def together(key: int, neighbours: Array) -> list[int]:
-    """The key frame and its neighbours, each once."""
-    return list(dict.fromkeys([key, *(int(n) for n in neighbours)]))
-
-
-def pixels(views: Views, index: int, device: torch.device | str) -> Tensor:
-    """(H, W, 3) uint8 of a view, on a device."""
-    return _brought(views.images[index], device)
-
-
-def shown(values: Tensor) -> Tensor:
-    """(H, W, 3) uint8 → (1, 3, H, W) RGB in [0, 1]."""
-    return values.permute(2, 0, 1)[None] / 255
-
-
-def picture(views: Views, index: int, device: torch.device | str) -> Tensor:
-    """(1, 3, H, W) RGB in [0, 1]."""
-    return shown(pixels(views, index, device))
-
-
-def sensed(views: Views, index: int, device: torch.device | str) -> Tensor | None:
-    """(H, W) of a view's depth along z in working units, None where it has none."""
-    depth = views.depths[index] if views.depths else None
-    return None if depth is None else _brought(np.asarray(depth, np.float32), device)
-
-
-def _brought(values: Array, device: torch.device | str) -> Tensor:
-    """Values on a device."""
-    found = torch.from_numpy(np.ascontiguousarray(values))
-    if torch.device(device).type == "cuda":  # from memory that stays in place, which nobody has to wait for
-        found = found.pin_memory().to(device, non_blocking=True)
-    return found.to(device)
+        return sensor_depth(self.views, int(self.keys.indices[at]), self.device) if self.measured else None

@@ -23,7 +23,7 @@ SMALL, LARGE = 0.1, 0.8  # penalties for a step of one plane between neighbourin
 TEMPERATURE = 0.05  # of the distribution; with the penalties the best of those tried on simulated scenes (docs/measured/few_views.md)
 
 
-def describe(images: Tensor, side: int = SIDE) -> Tensor:
+def patch_descriptors(images: Tensor, side: int = SIDE) -> Tensor:
     """(V, 3, H, W) RGB in [0, 1] → (V, 21, h, w), long side at most `side`: colour, and patches of 3×3 at two spacings."""
     images = images.detach().float()
     long = max(images.shape[-2:])
@@ -95,7 +95,7 @@ def _paths(volume: Tensor) -> Tensor:
     return torch.stack(paths)
 
 
-def distribution(cost: Tensor) -> Tensor:
+def smoothed_softmax(cost: Tensor) -> Tensor:
     """(D, h, w) costs → how likely the surface lies at each plane; sums to one over D."""
     if dispatch.can_use_triton(cost):
         from fieldfuse.backends.triton import matching

@@ -19,7 +19,7 @@ from torch import Tensor
 from fieldfuse.backends import dispatch
 from fieldfuse.nerfusion import compiled
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.extras.matching import COLOUR_GAIN, LARGE, SMALL, TEMPERATURE, UNKNOWN, difference, distribution, together
+from fieldfuse.nerfusion.extras.matching import COLOUR_GAIN, LARGE, SMALL, TEMPERATURE, UNKNOWN, difference, smoothed_softmax, together
 from fieldfuse.nerfusion.extras.pixel_motion import movement
 
 SPACING = 2  # pixels of the compared pictures between those whose depth is asked for …
@@ -39,27 +39,32 @@ Empty = Callable[[Tensor], Tensor]  # (N, 3) points of the working frame → (N,
 
 
 @dataclass(frozen=True)
-class Sighted:
+class SdfEstimate:
     """What a sweep says of N voxels.
 
     Attributes:
-        signed: (N,) in [−1, 1]: expected distance from the voxel to the surface behind it in units of the truncation, cut at ±1 before the
-            mean is taken; positive in front of the surface.
-        open: (N,) in [0, 1]: likelihood that nothing more than a truncation in front of the voxel hides it.
-        sure: (N,) in [0, 1]: how much of the pixel's likelihood lies about one depth.
+        expected_sdf: (N,) in [−1, 1]: expected distance from the voxel to the surface behind it in units of the truncation, cut at
+            ±1 before the mean is taken; positive in front of the surface.
+        visibility: (N,) in [0, 1]: likelihood that nothing more than a truncation in front of the voxel hides it.
+        confidence: (N,) in [0, 1]: how much of the pixel's likelihood lies about one depth.
     """
 
-    signed: Tensor
-    open: Tensor
-    sure: Tensor
+    expected_sdf: Tensor
+    visibility: Tensor
+    confidence: Tensor
 
-    def __getitem__(self, kept: Tensor) -> Sighted:
+    @property
+    def stacked(self) -> Tensor:
+        """(N, 3) all three."""
+        return torch.stack([self.expected_sdf, self.visibility, self.confidence], 1)
+
+    def __getitem__(self, kept: Tensor) -> SdfEstimate:
         """The voxels at `kept`."""
-        return Sighted(self.signed[kept], self.open[kept], self.sure[kept])
+        return SdfEstimate(self.expected_sdf[kept], self.visibility[kept], self.confidence[kept])
 
 
 @dataclass(frozen=True)
-class Sweep:
+class DepthDistribution:
     """The likelihood of surface along the pixels of one camera.
 
     Attributes:
@@ -74,18 +79,18 @@ class Sweep:
     lowest: float
     step: float
 
-    def look(self, points: Tensor, truncation: Tensor) -> Sighted:
+    def look(self, points: Tensor, truncation: Tensor) -> SdfEstimate:
         """Read at voxels (N, 3) of the working frame, with a truncation (N,) in working units each.
 
         Voxels outside the picture read its border.
         """
         if compiled.fits(points, truncation, self.table):
             pose, lens = self.camera.world_from_camera[0], self.camera.lens(0)
-            return Sighted(*compiled.look(points, truncation, self.table, pose, lens, self.lowest, self.step).T)
+            return SdfEstimate(*compiled.look(points, truncation, self.table, pose, lens, self.lowest, self.step).T)
         if dispatch.can_use_triton(points, truncation, self.table):
             from fieldfuse.backends.triton import reading
 
-            return Sighted(*reading.look(points, truncation, self.table, self.camera, self.lowest, self.step))
+            return SdfEstimate(*reading.look(points, truncation, self.table, self.camera, self.lowest, self.step))
         local = self.camera.local(points)[0]
         depth = local[:, 2].clamp_min(1e-6)
         focal, middle = self.camera.intrinsics[0, :2], self.camera.intrinsics[0, 2:]
@@ -95,7 +100,7 @@ class Sweep:
         near, far = self._read(pixel, inverse + half), self._read(pixel, inverse - half)
         # E[clamp(x, −1, 1)] of x = (inverse − surface) / half, by parts, from the integral of the likelihood.
         signed = 1 - (near[1] - far[1]) / half
-        return Sighted(signed.clamp(-1, 1), (1 - near[0]).clamp(0, 1), near[2].clamp(0, 1))
+        return SdfEstimate(signed.clamp(-1, 1), (1 - near[0]).clamp(0, 1), near[2].clamp(0, 1))
 
     def _read(self, pixel: Tensor, inverse: Tensor) -> Tensor:
         """(3, N) entries; beyond the farthest plane everything is hidden, before the nearest nothing is."""
@@ -109,7 +114,7 @@ class Sweep:
 
 
 @dataclass(frozen=True)
-class Compared:
+class CostVolume:
     """How badly the pictures of a key view and its neighbours fit at planes, before anything is decided.
 
     Attributes:
@@ -135,11 +140,11 @@ class Compared:
 
 
 @torch.no_grad()
-def compare(described: Sequence[Tensor], cameras: Cameras, near: float, far: float, empty: Empty | None = None) -> Compared:
+def cost_volume(descriptors: Sequence[Tensor], cameras: Cameras, near: float, far: float, empty: Empty | None = None) -> CostVolume:
     """Compare the first view with all others at planes between `near` and `far` along its axis; the others may come in any order.
 
     Args:
-        described: K times (21, h, w) of `matching.describe`.
+        described: K times (21, h, w) of `matching.patch_descriptors`.
         cameras: K.
         near, far: 0 and ∞ where unknown.
         empty: where there is for sure no surface, as silhouettes tell; pixels that meet nothing else are not compared.
@@ -148,28 +153,28 @@ def compare(described: Sequence[Tensor], cameras: Cameras, near: float, far: flo
         ValueError: neither is known, or the nearest does not lie before the farthest.
     """
     with torch.autocast(cameras.intrinsics.device.type, enabled=False):  # planes lie less than a pixel apart
-        return _compared(described, cameras, *_bounded(near, far), empty)
+        return _compared(descriptors, cameras, *_bounded(near, far), empty)
 
 
-def _compared(described: Sequence[Tensor], cameras: Cameras, near: float, far: float, empty: Empty | None) -> Compared:
-    """`compare`, with both ends known."""
-    count = _planes([view.shape[2] for view in described], cameras.to("cpu"), near, far)
+def _compared(descriptors: Sequence[Tensor], cameras: Cameras, near: float, far: float, empty: Empty | None) -> CostVolume:
+    """`cost_volume`, with both ends known."""
+    count = _planes([view.shape[2] for view in descriptors], cameras.to("cpu"), near, far)
     ladder = torch.linspace(1 / far, 1 / near, count)
     first, second = ladder.numpy()[:2]  # without asking the device
     lowest, step = float(first), float(second - first)
     spacing = SPACING if empty is None else WITHIN
-    shape = _shape(described[0], spacing)
-    if dispatch.can_use_triton(cameras.intrinsics, *described):
+    shape = _shape(descriptors[0], spacing)
+    if dispatch.can_use_triton(cameras.intrinsics, *descriptors):
         from fieldfuse.backends.triton.describe import pixels
 
-        world, own, inverses = pixels(described[0], cameras, shape, count, 1 / far, 1 / near)
+        world, own, inverses = pixels(descriptors[0], cameras, shape, count, 1 / far, 1 / near)
         rays = world  # the kernel takes them in working axes
     else:
         inverses = ladder.to(cameras.intrinsics.device, non_blocking=True)
-        rays, own = _pixels(described[0], cameras, shape)
+        rays, own = _pixels(descriptors[0], cameras, shape)
         world = rays @ cameras.world_from_camera[0, :3, :3].T
     if empty is None:
-        return Compared(cameras[0], world, inverses, lowest, step, _volume(_costs(described, cameras, inverses, rays, own), shape))
+        return CostVolume(cameras[0], world, inverses, lowest, step, _volume(_costs(descriptors, cameras, inverses, rays, own), shape))
     depths, origin = (1 / inverses)[:, None], cameras.positions[0]
     few = PART if world.device.type == "cpu" else AT_ONCE
     nothing = torch.cat([empty(torch.addcmul(origin, part[:, None], depths).view(-1, 3)) for part in world.split(few)]).view(*shape, -1)
@@ -179,8 +184,8 @@ def _compared(described: Sequence[Tensor], cameras: Cameras, near: float, far: f
     )
     shape = (rows.stop - rows.start, columns.stop - columns.start)
     some = (~nothing).any(1).nonzero().view(-1)
-    cost = rays.new_full(nothing.shape, UNKNOWN).index_copy(0, some, _costs(described, cameras, inverses, rays[some], own[some]))
-    return Compared(camera, world, inverses, lowest, step, _volume(cost, shape), _volume(nothing, shape), window, spacing)
+    cost = rays.new_full(nothing.shape, UNKNOWN).index_copy(0, some, _costs(descriptors, cameras, inverses, rays[some], own[some]))
+    return CostVolume(camera, world, inverses, lowest, step, _volume(cost, shape), _volume(nothing, shape), window, spacing)
 
 
 def _cropped(camera: Cameras, wanted: Tensor) -> tuple[Cameras, tuple[float, float, float, float], slice, slice]:
@@ -201,22 +206,22 @@ def _span(wanted: Tensor) -> tuple[int, int]:
     return (0, 1) if len(found) == 0 else (max(0, int(found[0]) - 1), min(len(wanted), int(found[-1]) + 2))
 
 
-def _costs(described: Sequence[Tensor], cameras: Cameras, inverses: Tensor, rays: Tensor, own: Tensor) -> Tensor:
+def _costs(descriptors: Sequence[Tensor], cameras: Cameras, inverses: Tensor, rays: Tensor, own: Tensor) -> Tensor:
     """(P, D) of pixels of the first view, with rays (P, 3) in its axes, on CUDA in working axes, and descriptors (P, 21)."""
     if len(cameras) == 1:
         return rays.new_zeros((len(rays), len(inverses)))
-    if compiled.fits(rays, *described):
+    if compiled.fits(rays, *descriptors):
         comparison = compiled.Comparison(own, rays, inverses, COLOUR_GAIN)
         for view in range(1, len(cameras)):
-            comparison.add(described[view], *_way(cameras, view), cameras.lens(view))
+            comparison.add(descriptors[view], *_way(cameras, view), cameras.lens(view))
         return comparison.result(UNKNOWN)
-    if dispatch.can_use_triton(cameras.intrinsics, *described):
+    if dispatch.can_use_triton(cameras.intrinsics, *descriptors):
         from fieldfuse.backends.triton import matching
 
-        return matching.costs(described, cameras, inverses, rays, own, COLOUR_GAIN, UNKNOWN)
+        return matching.costs(descriptors, cameras, inverses, rays, own, COLOUR_GAIN, UNKNOWN)
     parts = []
     for ray, mine in zip(rays.split(AT_ONCE), own.split(AT_ONCE), strict=True):
-        found = [_warped(described[view], cameras, view, ray, inverses) for view in range(1, len(cameras))]
+        found = [_warped(descriptors[view], cameras, view, ray, inverses) for view in range(1, len(cameras))]
         costs = torch.stack([difference(mine[None], shown) for shown, _ in found])
         parts.append(together(costs, torch.stack([seen for _, seen in found])).T)
     return torch.cat(parts) if parts else rays.new_zeros((0, len(inverses)))
@@ -228,42 +233,42 @@ def _volume(values: Tensor, shape: tuple[int, int]) -> Tensor:
 
 
 @torch.no_grad()
-def decide(compared: Compared, depth: Tensor | None = None, said: Tensor | None = None) -> Sweep:
+def to_probability(costs: CostVolume, depth: Tensor | None = None, correction: Tensor | None = None) -> DepthDistribution:
     """Where the surface is likely to be.
 
     Args:
         depth: (H, W) of the key view along z in working units, where a sensor measured it; 0 or not finite where it did not.
-        said: (D, h, w) that makes planes likelier, in units of the cost (`witness.evidence`).
+        said: (D, h, w) that makes planes likelier, in units of the cost (`cross_view_consistency.consistency`).
     """
-    if compared.empty is None and depth is None and dispatch.can_use_triton(compared.cost):
+    if costs.empty is None and depth is None and dispatch.can_use_triton(costs.cost):
         from fieldfuse.backends.triton import matching
 
-        table = matching.decided(compared.cost, said, SMALL, LARGE, TEMPERATURE, compared.step, PEAK)
-        return Sweep(compared.camera, table, compared.lowest, compared.step)
-    likely = distribution(compared.cost if said is None else compared.cost - said)
-    if compared.empty is not None:
-        likely = carved(likely, compared.empty)
-    if depth is not None and dispatch.can_use_triton(likely, compared.inverses, depth):
+        table = matching.decided(costs.cost, correction, SMALL, LARGE, TEMPERATURE, costs.step, PEAK)
+        return DepthDistribution(costs.camera, table, costs.lowest, costs.step)
+    likely = smoothed_softmax(costs.cost if correction is None else costs.cost - correction)
+    if costs.empty is not None:
+        likely = carved(likely, costs.empty)
+    if depth is not None and dispatch.can_use_triton(likely, costs.inverses, depth):
         from fieldfuse.backends.triton.measured import measured as table_of
 
-        asked = _asked(likely, depth, compared.spacing, compared.window)
-        table = table_of(likely, compared.inverses, depth, *asked, compared.step, NOISE, TRUST, PEAK)
-        return Sweep(compared.camera, table, compared.lowest, compared.step)
+        asked = _asked(likely, depth, costs.spacing, costs.window)
+        table = table_of(likely, costs.inverses, depth, *asked, costs.step, NOISE, TRUST, PEAK)
+        return DepthDistribution(costs.camera, table, costs.lowest, costs.step)
     if depth is not None:
-        likely = measured(likely, compared.inverses, depth, compared.spacing, compared.window)
-    return Sweep(compared.camera, _table(likely, compared.step), compared.lowest, compared.step)
+        likely = measured(likely, costs.inverses, depth, costs.spacing, costs.window)
+    return DepthDistribution(costs.camera, _table(likely, costs.step), costs.lowest, costs.step)
 
 
-def sweep(
-    described: Sequence[Tensor],
+def sweep_planes(
+    descriptors: Sequence[Tensor],
     cameras: Cameras,
     near: float,
     far: float,
     depth: Tensor | None = None,
     empty: Empty | None = None,
-) -> Sweep:
-    """`compare` and `decide` for a key view alone."""
-    return decide(compare(described, cameras, near, far, empty), depth)
+) -> DepthDistribution:
+    """`cost_volume` and `to_probability` for a key view alone."""
+    return to_probability(cost_volume(descriptors, cameras, near, far, empty), depth)
 
 
 def carved(likely: Tensor, empty: Tensor) -> Tensor:
@@ -291,7 +296,7 @@ def measured(
         likely: (D, h, w) likelihoods of the planes.
         inverses: (D,) of the planes, evenly spaced, ascending.
         depth: (H, W), 0 or not finite where nothing was measured; beyond the planes it counts as the last of them.
-        spacing, window: of `Compared`; the depth is of the whole picture.
+        spacing, window: of `CostVolume`; the depth is of the whole picture.
 
     Returns:
         (D, h', w') at all pixels of the compared pictures: a depth sensor tells edges better than patches do.
@@ -321,7 +326,7 @@ def _asked(
 
 
 def _table(likely: Tensor, step: float) -> Tensor:
-    """(D, h, w) likelihoods, farthest first → what `Sweep` keeps."""
+    """(D, h, w) likelihoods, farthest first → what `DepthDistribution` keeps."""
     if compiled.fits(likely):
         return compiled.table(likely, step, PEAK)
     if dispatch.can_use_triton(likely):
@@ -348,19 +353,19 @@ def _bounded(near: float, far: float) -> tuple[float, float]:
     return near, far
 
 
-def _shape(described: Tensor, spacing: int) -> tuple[int, int]:
+def _shape(descriptors: Tensor, spacing: int) -> tuple[int, int]:
     """Rows and columns of every `spacing`-th pixel."""
-    height, width = described.shape[1:]
+    height, width = descriptors.shape[1:]
     return max(1, height // spacing), max(1, width // spacing)
 
 
-def _pixels(described: Tensor, cameras: Cameras, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def _pixels(descriptors: Tensor, cameras: Cameras, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Rays (P, 3) of unit depth through a grid of pixels of the first view, in its axes, and their descriptors (P, 21)."""
     # Cells of equal size cover the picture, so that reading the table needs its borders alone.
-    v = (torch.arange(shape[0], device=described.device) + 0.5) / shape[0] * 2 - 1
-    u = (torch.arange(shape[1], device=described.device) + 0.5) / shape[1] * 2 - 1
+    v = (torch.arange(shape[0], device=descriptors.device) + 0.5) / shape[0] * 2 - 1
+    u = (torch.arange(shape[1], device=descriptors.device) + 0.5) / shape[1] * 2 - 1
     grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)  # (h, w, 2)
-    own = F.grid_sample(described[None], grid[None], padding_mode="border", align_corners=False)[0].flatten(1).T
+    own = F.grid_sample(descriptors[None], grid[None], padding_mode="border", align_corners=False)[0].flatten(1).T
     focal, middle = cameras.intrinsics[0, :2], cameras.intrinsics[0, 2:]
     flat = ((grid.view(-1, 2) + 1) / 2 * cameras.size[0] - middle) / focal
     return torch.cat([flat, torch.ones_like(flat[:, :1])], 1), own
@@ -372,7 +377,7 @@ def _way(cameras: Cameras, view: int) -> tuple[Tensor, Tensor]:
     return cameras.world_from_camera[0, :3, :3].T @ axes, (cameras.positions[0] - cameras.positions[view]) @ axes
 
 
-def _warped(described: Tensor, cameras: Cameras, view: int, rays: Tensor, inverses: Tensor) -> tuple[Tensor, Tensor]:
+def _warped(descriptors: Tensor, cameras: Cameras, view: int, rays: Tensor, inverses: Tensor) -> tuple[Tensor, Tensor]:
     """(D, P, 21) what a view shows of each pixel of the first at each plane, and (D, P) bool whether it sees it."""
     turn, shift = _way(cameras, view)
     local = (rays @ turn)[None] + inverses[:, None, None] * shift  # of the point divided by its depth: no far plane is too far
@@ -381,7 +386,7 @@ def _warped(described: Tensor, cameras: Cameras, view: int, rays: Tensor, invers
     pixel = local[..., :2] / depth[..., None] * cameras.intrinsics[view, :2] + cameras.intrinsics[view, 2:]
     grid = pixel / cameras.size[view] * 2 - 1
     visible = deep & (grid.abs() <= 1).all(-1)
-    found = F.grid_sample(described[None], grid.clamp(-2, 2)[None], padding_mode="border", align_corners=False)[0]
+    found = F.grid_sample(descriptors[None], grid.clamp(-2, 2)[None], padding_mode="border", align_corners=False)[0]
     return found.permute(1, 2, 0), visible
 
 

@@ -1,23 +1,24 @@
-"""The loop over key frames with gradients: one volume a level, as `fusion.py` keeps them at inference, but as ordinary values.
+"""The global volumes of `fusion.fuse_key_frame` as ordinary values, so that gradients flow through the loop over key frames.
 
-Each finer lattice works only in the cells that the coarser global volume does not see through, and starts there from what the coarser
-one knows. What is taken over from a coarser level is not differentiated: each level has its own loss.
+What is taken over from a coarser level is not differentiated: each level has its own loss.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.extras.plane_sweep import Sweep
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution
+from fieldfuse.nerfusion.extras.two_lattices import allowed_cells, surface_cells
+from fieldfuse.nerfusion.fusion import fuse_key_frame
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume, cells
 from fieldfuse.nerfusion.model import NerfusionModel
-from fieldfuse.nerfusion.refine import adopt, children, solid_cells, split_volume, surface_cells
-from fieldfuse.nerfusion.unproject import EncodedView
-from fieldfuse.volume.topology import VOXELS
+from fieldfuse.nerfusion.store import ValueStore
+from fieldfuse.nerfusion.unproject import EncodedView, KeyFrame
 
 Tensor = torch.Tensor
 
@@ -49,25 +50,15 @@ class Recurrence:
         return cls(tuple(volumes), near, far, gamma, most)
 
     def add(
-        self, model: NerfusionModel, views: Sequence[EncodedView], cameras: Cameras, swept: Sweep | None = None
+        self, model: NerfusionModel, views: Sequence[EncodedView], cameras: Cameras, distribution: DepthDistribution | None = None
     ) -> tuple[Recurrence, LocalVolume]:
         """The state after one more key frame, and its local volume on the coarsest lattice. `swept`: its sweep; None: made here, alone."""
-        if swept is None:
-            swept = model.sweep(views, cameras, self.near, self.far)
-        local = model.local_volume(views, cameras, self.volumes[0].lattice, near=self.near, far=self.far, swept=swept)
-        volumes = [model.fuse(self.volumes[0], local)]
-        newest = local
-        for before in self.volumes[1:]:
-            part = _on_blocks_of(volumes[-1], newest)
-            finer = split_volume(part, self._kept(model, part, newest.known))
-            if finer.topology.blocks == 0:
-                volumes += self.volumes[len(volumes) :]
-                break
-            state = adopt(before, finer)
-            closer = model.local_volume(views, cameras, finer.lattice, finer.topology, finer.known, self.near, self.far, swept)
-            volumes.append(model.fuse(state, closer))
-            newest = closer
-        return Recurrence(tuple(volumes), self.near, self.far, self.gamma, self.most), local
+        if distribution is None:
+            distribution = model.sweep_planes(views, cameras, self.near, self.far)
+        stores = [ValueStore(volume) for volume in self.volumes]
+        frame = KeyFrame(views, cameras, self.near, self.far, distribution)
+        local = fuse_key_frame(model, frame, stores, None, partial(self._kept, model))
+        return replace(self, volumes=tuple(store.volume() for store in stores)), local
 
     @torch.no_grad()
     def _kept(self, model: NerfusionModel, part: LatentVolume, seen: Tensor) -> Tensor:
@@ -87,17 +78,9 @@ class Recurrence:
         if level == 0:
             return None
         coarse = self.volumes[level - 1]
-        kept = solid_cells(coarse, model.thickness(coarse), self.gamma)
-        return children(coarse.topology, kept, self.volumes[level].topology)
+        return allowed_cells(coarse, model.thickness(coarse), self.gamma, self.volumes[level].topology)
 
     def detached(self) -> Recurrence:
         """Cut off from the graph (truncated back-propagation)."""
-        return Recurrence(tuple(volume.detached() for volume in self.volumes), self.near, self.far, self.gamma, self.most)
+        return replace(self, volumes=tuple(volume.detached() for volume in self.volumes))
 
-
-def _on_blocks_of(volume: LatentVolume, other: LatentVolume) -> LatentVolume:
-    """The part of `volume` on the blocks of `other` (all of which it has), without gradients."""
-    slots = volume.topology.find(other.topology.keys)
-    place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
-    rows = volume.rows.detach()
-    return LatentVolume(volume.lattice, other.topology, torch.cat([rows[place], rows[-1:]]), volume.count[place])

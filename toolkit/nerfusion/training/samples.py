@@ -11,6 +11,10 @@ import torch
 
 from fieldfuse.camera import Array
 from fieldfuse.errors import InputError
+from fieldfuse.nerfusion.cameras import Cameras
+from fieldfuse.nerfusion.extras.cross_view_consistency import all_consistent
+from fieldfuse.nerfusion.extras.matching import SIDE, patch_descriptors
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, cost_volume
 from fieldfuse.volume.space import Space
 
 Tensor = torch.Tensor
@@ -165,3 +169,27 @@ def _draw(rng: np.random.Generator, among: list[int], count: int) -> list[int]:
     """`count` of `among` in random order, some twice when there are fewer."""
     order = [among[i] for i in rng.permutation(len(among))]
     return (order * -(-count // len(order)))[:count]
+
+
+def cameras_of(pictures: Pictures, indices: Tensor) -> Cameras:
+    """The networks' cameras of some pictures."""
+    height, width = pictures.images.shape[2:]
+    return Cameras.same_size(pictures.intrinsics[indices], pictures.world_from_camera[indices], width, height)
+
+
+@torch.no_grad()
+def keyframe_distributions(sample: Sample, side: int = SIDE) -> list[DepthDistribution]:
+    """The depth distribution of each key frame, checked against all others as in direct inference (not in the paper).
+
+    Nothing in it is learned, so key frames that are fused later may be asked before.
+
+    Args:
+        side: pixels of the long side at which pictures are compared.
+    """
+    descriptors = patch_descriptors(sample.pictures.images, side)
+    return all_consistent(
+        [
+            cost_volume([descriptors[index] for index in numbers], cameras_of(sample.pictures, indices), sample.near, sample.far)
+            for indices, numbers in zip(sample.references, sample.references.tolist(), strict=True)
+        ]
+    )

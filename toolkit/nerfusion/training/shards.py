@@ -15,7 +15,8 @@ import torch.nn.functional as F
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from fieldfuse.camera import Array, checked_pose
+from fieldfuse.camera import Array
+from fieldfuse.capture.poses import checked_pose
 from fieldfuse.errors import InputError, first_line
 from fieldfuse.files import atomic_path
 from fieldfuse.nerfusion.training.samples import Pictures

@@ -16,10 +16,9 @@ from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.nerfusion.training.health import feature_deviation, rendering_health
 from fieldfuse.nerfusion.training.rays import TargetRays, in_sight, random_rays
 from fieldfuse.nerfusion.training.recurrence import Recurrence
-from fieldfuse.nerfusion.training.samples import Pictures, Sample
+from fieldfuse.nerfusion.training.samples import Pictures, Sample, cameras_of, keyframe_distributions
 from fieldfuse.nerfusion.training.settings import TrainSettings
 from fieldfuse.nerfusion.training.tracing import trace
-from fieldfuse.nerfusion.training.witnessed import cameras_of, sweeps_of
 from fieldfuse.render.fused import GAMMA, make_field
 
 Tensor = torch.Tensor
@@ -152,7 +151,7 @@ class Stepper:
         stage, weights, frames = settings.stage, settings.loss, len(sample.references)
         rays = max(1, weights.rays // ((1 + stage.levels) * frames))
         state = begin(model, sample, stage.levels, stage.gamma, stage.most_split)
-        sweeps = sweeps_of(sample) if stage.witnesses else None
+        sweeps = keyframe_distributions(sample) if stage.witnesses else None
         targets = sample.targets.cpu()  # where pixels are drawn
         pending: list[Tensor] = []
         for frame in range(frames):

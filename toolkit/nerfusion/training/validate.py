@@ -21,8 +21,8 @@ from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.nerfusion.training.health import relative_depth_error
 from fieldfuse.nerfusion.training.rays import TargetRays, picture_rays
 from fieldfuse.nerfusion.training.real import Case
+from fieldfuse.nerfusion.training.samples import cameras_of, keyframe_distributions
 from fieldfuse.nerfusion.training.step import background_of, begin, render_volume
-from fieldfuse.nerfusion.training.witnessed import cameras_of, sweeps_of
 
 Tensor = torch.Tensor
 CHUNK = 4096  # rays at a time
@@ -52,10 +52,10 @@ def predict(model: NerfusionModel, case: Case, device: torch.device, prune: bool
     rays = picture_rays(sample.pictures, target)
     state = begin(model, sample, levels)
     local: LatentVolume = state.volumes[0]
-    sweeps = sweeps_of(sample) if witnesses else [None] * len(sample.references)
-    for indices, swept in zip(sample.references, sweeps, strict=True):
+    sweeps = keyframe_distributions(sample) if witnesses else [None] * len(sample.references)
+    for indices, distribution in zip(sample.references, sweeps, strict=True):
         cameras = cameras_of(sample.pictures, indices)
-        state, local = state.add(model, model.encode(sample.pictures.images[indices], cameras), cameras, swept)
+        state, local = state.add(model, model.encode(sample.pictures.images[indices], cameras), cameras, distribution)
     behind = background_of(sample.pictures, 1, None)
     truth = sample.pictures.images[target].permute(1, 2, 0)
     numbers = {"psnr_nearest": psnr((sample.pictures.images[case.nearest].permute(1, 2, 0) - truth).square().mean())}

@@ -13,9 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import Array, Intrinsics, checked_pose, invert
+from fieldfuse.camera import Array, Intrinsics, invert
 from fieldfuse.capture.calibration import from_matrix
-from fieldfuse.capture.listing import assemble, natural_key, picture_header, read_text, require_folder
+from fieldfuse.capture.listing import assemble, natural_key, read_text, require_folder
+from fieldfuse.capture.poses import checked_pose
+from fieldfuse.capture.sizes import picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError, first_line
 from fieldfuse.nerfusion.training.captured import CapturedScene

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import checked_pose
 from fieldfuse.capture.calibration import from_matrix
-from fieldfuse.capture.listing import assemble, files_in, picture_header, pictures_in, read_matrix, require_folder, same_count
+from fieldfuse.capture.listing import assemble, files_in, pictures_in, read_matrix, require_folder, same_count
+from fieldfuse.capture.poses import checked_pose
 from fieldfuse.capture.prepare import WHITE
+from fieldfuse.capture.sizes import picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 from fieldfuse.nerfusion.training.captured import CapturedScene

@@ -8,40 +8,40 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from fieldfuse.nerfusion.extras.cross_view_consistency import certain, evidence, witness
-from fieldfuse.nerfusion.extras.matching import describe
-from fieldfuse.nerfusion.extras.plane_sweep import compare, decide
+from fieldfuse.nerfusion.extras.cross_view_consistency import confident_points, consistency, cross_view
+from fieldfuse.nerfusion.extras.matching import patch_descriptors
+from fieldfuse.nerfusion.extras.plane_sweep import cost_volume, to_probability
 from fieldfuse.nerfusion.training.distributed import Crew
 from fieldfuse.nerfusion.training.mixture import Mixture
 from fieldfuse.nerfusion.training.procedural import ProceduralScene
+from fieldfuse.nerfusion.training.samples import cameras_of, keyframe_distributions
 from fieldfuse.nerfusion.training.train import Trainer
-from fieldfuse.nerfusion.training.witnessed import cameras_of, sweeps_of
 from fieldfuse.simulate.eye import take, take_all
 from tests.nerfusion.training.tiny import tiny_settings
 
 
 def test_a_samples_sweeps_are_held_against_each_other() -> None:
     sample = Mixture(tiny_settings()).sample(0, 2)
-    described = describe(sample.pictures.images)
+    descriptors = patch_descriptors(sample.pictures.images)
     first, second = (
-        compare([described[k] for k in indices], cameras_of(sample.pictures, indices), sample.near, sample.far)
+        cost_volume([descriptors[k] for k in indices], cameras_of(sample.pictures, indices), sample.near, sample.far)
         for indices in sample.references
     )
-    alone = decide(first)
-    said = evidence(first, [witness(decide(second))], certain(first, alone))
-    swept = sweeps_of(sample)
-    assert len(swept) == 2 and not torch.equal(swept[0].table, alone.table)
-    torch.testing.assert_close(swept[0].table, decide(first, said=said).table)
-    assert swept[0].lowest == alone.lowest and swept[0].step == alone.step
+    own_estimate = to_probability(first)
+    correction = consistency(first, [cross_view(to_probability(second))], confident_points(first, own_estimate))
+    distribution = keyframe_distributions(sample)
+    assert len(distribution) == 2 and not torch.equal(distribution[0].table, own_estimate.table)
+    torch.testing.assert_close(distribution[0].table, to_probability(first, correction=correction).table)
+    assert distribution[0].lowest == own_estimate.lowest and distribution[0].step == own_estimate.step
 
 
 def test_one_key_frame_has_no_witness() -> None:
     sample = Mixture(tiny_settings()).sample(0, 1)
     indices = sample.references[0]
-    described = describe(sample.pictures.images)
-    compared = compare([described[k] for k in indices], cameras_of(sample.pictures, indices), sample.near, sample.far)
-    (swept,) = sweeps_of(sample)
-    assert torch.equal(swept.table, decide(compared).table)
+    descriptors = patch_descriptors(sample.pictures.images)
+    costs = cost_volume([descriptors[k] for k in indices], cameras_of(sample.pictures, indices), sample.near, sample.far)
+    (distribution,) = keyframe_distributions(sample)
+    assert torch.equal(distribution.table, to_probability(costs).table)
 
 
 def test_a_step_with_witnesses_learns_something_else(tmp_path: Path) -> None:

@@ -1,0 +1,80 @@
+"""Two lattices and more (not in the paper, which has one): finer ones only where the coarser volume does not see through."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from fieldfuse.backends import dispatch
+from fieldfuse.nerfusion.lattice import LatentVolume, cells, corner_mask, with_blocks
+from fieldfuse.nerfusion.prune import solid_cells
+from fieldfuse.volume.edit import corner_nodes, doubled, split
+from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
+
+INHERITED = 0.25  # weight of a latent taken over from the coarse volume
+
+
+def surface_cells(volume: LatentVolume, seen: Tensor, thickness: Tensor, gamma: float) -> Tensor:
+    """(M · 512,) bool: solid cells that a key frame sees, so those about surfaces and not what lies hidden behind them.
+
+    Args:
+        seen: (M · 512,) bool, corners that its local volume knows, on the same blocks.
+    """
+    return solid_cells(volume, thickness, gamma) & cells(volume.topology, seen, every=False)
+
+
+def split_volume(volume: LatentVolume, kept: Tensor) -> LatentVolume:
+    """The cells `kept` (M · 512,) on the lattice of half the voxel size, latents interpolated; not differentiable.
+
+    Known are exactly the corners of the kept cells' children. They count little, so that what is seen finer prevails.
+    """
+    if volume.topology.bounds is not None and dispatch.can_use_triton(volume.rows):
+        from fieldfuse.backends.triton import split as split_gpu
+
+        given = volume.topology, kept, volume.rows.detach(), doubled(*volume.topology.bounds), INHERITED
+        return LatentVolume(volume.lattice.finer(), *split_gpu.split(*given))
+    topology, occupied, (rows,) = split(volume.topology, kept, [volume.rows.detach()])
+    return LatentVolume(volume.lattice.finer(), topology, rows, corner_nodes(topology, occupied).float() * INHERITED)
+
+
+def adopt(state: LatentVolume, inherited: LatentVolume) -> LatentVolume:
+    """A volume that also knows what it inherits; what it knows already stays as it is, bit for bit."""
+    if inherited.topology is state.topology:
+        new = inherited.known & (state.count == 0)
+        rows = torch.where(corner_mask(new), inherited.rows.to(state.rows.dtype), state.rows)
+        return replace(state, rows=rows, count=torch.where(new, inherited.count, state.count))
+    state, slots = with_blocks(state, inherited.topology.keys)
+    place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
+    new = (inherited.known & (state.count[place] == 0)).nonzero().view(-1)
+    return replace(
+        state,
+        rows=state.rows.index_copy(0, place[new], inherited.rows[new].to(state.rows.dtype)),
+        count=state.count.index_copy(0, place[new], inherited.count[new]),
+    )
+
+
+def children(coarse: Topology, kept: Tensor, fine: Topology) -> Tensor:
+    """Cells of a lattice of half the voxel size whose parents are `kept`.
+
+    Args:
+        kept: (M · 512,) bool, cells of `coarse`.
+
+    Returns:
+        (M' · 512,) bool, cells of `fine`.
+    """
+    keys = fine.keys.long()
+    parent = coarse.find(keys >> 1)
+    octant = keys & 1
+    half = BLOCK // 2
+    cubes = torch.cat([kept, kept.new_zeros(VOXELS)]).view(-1, 2, half, 2, half, 2, half)  # the last block stands for absent parents
+    cube = cubes[parent, octant[:, 2], :, octant[:, 1], :, octant[:, 0]]  # (M', 4, 4, 4) z, y, x
+    for axis in (1, 2, 3):
+        cube = cube.repeat_interleave(2, axis)
+    return cube.reshape(-1)
+
+
+def allowed_cells(coarse: LatentVolume, thickness: Tensor, gamma: float, fine: Topology) -> Tensor:
+    """(M' · 512,) bool, cells of `fine` whose parents are not see-through; `thickness` (M · 512 + 1,) is the coarse volume's."""
+    return children(coarse.topology, solid_cells(coarse, thickness, gamma), fine)
