@@ -98,7 +98,7 @@ def write_surface(folder: Path, scene: Scene, mesh: Mesh, points: Points, exposu
 
 def put_points(path: Path, points: Points, input_from_working: Similarity, exposure: float) -> Path:
     """Points of the working frame as a file in the input's, brighter by `exposure`."""
-    from fieldfuse.export.points import write_points
+    from fieldfuse.export.ply import write_points
 
     colours = exposed(points.colours, exposure)
     write_points(path, input_from_working.points(points.points), colours, input_from_working.directions(points.normals))

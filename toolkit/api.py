@@ -191,7 +191,7 @@ class Points:
             InputError: another suffix.
             OutputError: the file cannot be written.
         """
-        from fieldfuse.export.points import write_points
+        from fieldfuse.export.ply import write_points
 
         write_points(path, self.points, self.colours, self.normals)
 

@@ -8,7 +8,10 @@ from typing import Any
 import pytest
 
 from benchmarks.run_tables import budget_table, is_report, run_table
+from benchmarks.table import sections
+from fieldfuse.evaluation.tradeoff_page import tradeoff_data
 from fieldfuse.files import write_json
+from tests.evaluation.test_tradeoff import ladder
 from tests.pipelines.made import bench
 
 
@@ -85,6 +88,18 @@ def test_runs_of_a_budget_become_one_table() -> None:
     assert rows[2].startswith("| fox | 30 s | 30.0 s | 36.0 s | +20% | not looked for |") and rows[3].startswith("| lego | 60 s |")
     assert "240 pixels, 256³, no video, no texture | 27.2 |" in rows[2] and "256³, no video | 27.2 |" in rows[3]
     assert "1 of 2 runs took what was predicted, within 15%" in text and "    fieldfuse run b" in text
+
+
+def test_the_table_tells_what_is_missing(tmp_path: Path) -> None:
+    missing = {"left_out": ["field-900s-seed0", "tsdf-voxel2.0-seed0"], "refused": ["No surface was made: nothing to match."]}
+    data = tradeoff_data({"command": "fieldfuse tradeoff room", "unit": "m", "rows": ladder(), "machine": {"cores": 2}, **missing})
+    write_json(tmp_path / "room" / "tradeoff.json", data)
+    ((name, text),) = sections([tmp_path / "room" / "tradeoff.json"], None, None)
+    lines = text.splitlines()
+    assert name == "room" and lines[0] == "### room" and "load 1.5" in lines[2] and "    fieldfuse tradeoff room" in lines
+    points = [line for line in lines if line.startswith(("| Field", "| TSDF"))]
+    assert len(points) == 5 and any("| 1 cm |" in line for line in points)
+    assert lines[-2:] == ["- Not measured for want of time: field-900s, tsdf-voxel2.0.", "- No surface was made: nothing to match."]
 
 
 def test_results_of_benchmarks_go_into_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

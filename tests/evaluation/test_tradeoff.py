@@ -17,7 +17,6 @@ from fieldfuse.errors import InputError
 from fieldfuse.evaluation.tradeoff import NUMBERS, Point, checked_row, pareto, points_of, series
 from fieldfuse.evaluation.tradeoff_page import csv_text, tradeoff_data, write_tradeoff
 from fieldfuse.evaluation.tradeoff_plots import quality_plot
-from fieldfuse.evaluation.tradeoff_table import tradeoff_table
 from fieldfuse.evaluation.tradeoff_text import front_sentence, length, sentence, steps, times_text
 from fieldfuse.files import read_json
 from tests.evaluation.browser import embedded_pictures, open_page
@@ -154,16 +153,6 @@ def test_the_page_stands_alone(tmp_path: Path) -> None:
         assert words in html, words
     seen = open_page(tmp_path / "tradeoff.html", tmp_path)
     assert seen.pictures == 8 and not seen.broken and not seen.errors
-
-
-def test_the_table_tells_what_is_missing() -> None:
-    missing = {"left_out": ["field-900s-seed0", "tsdf-voxel2.0-seed0"], "refused": ["No surface was made: nothing to match."]}
-    data = tradeoff_data({"command": "fieldfuse tradeoff room", "unit": "m", "rows": ladder(), "machine": {"cores": 2}, **missing})
-    lines = tradeoff_table(data, "room").splitlines()
-    assert lines[0] == "### room" and "    fieldfuse tradeoff room" in lines
-    points = [line for line in lines if line.startswith(("| Field", "| TSDF"))]
-    assert len(points) == 5 and any("| 1 cm |" in line for line in points)
-    assert lines[-2:] == ["- Not measured for want of time: field-900s, tsdf-voxel2.0.", "- No surface was made: nothing to match."]
 
 
 def test_a_row_that_is_none_is_refused() -> None:

@@ -14,8 +14,7 @@ import trimesh
 from fieldfuse.camera import Array, Similarity
 from fieldfuse.errors import InputError, OutputError
 from fieldfuse.export.mesh import FORMATS, mesh_facts, write_mesh
-from fieldfuse.export.ply import single_precision
-from fieldfuse.export.points import write_points
+from fieldfuse.export.ply import single_precision, write_points
 from fieldfuse.tone import encode, shares
 from fieldfuse.tsdf.mesh import Mesh
 from tests.export.samples import coloured_ball, turned

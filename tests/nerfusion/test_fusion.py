@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from fieldfuse.backends.constants import INSIDE
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError, Interrupted
 from fieldfuse.nerfusion.block_conv import BlockConv3d
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.extras.known_terms import INSIDE
 from fieldfuse.nerfusion.fusion import KEPT_PICTURES, Fused, Fusion, FusionOptions, fuse_views, fusion_lattice
 from fieldfuse.nerfusion.head import SCALE, START
 from fieldfuse.nerfusion.keyframes import KeyFrames

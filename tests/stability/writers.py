@@ -28,7 +28,7 @@ from fieldfuse.evaluation.selftest.edit import small_field
 from fieldfuse.evaluation.selftest.place_files import ball
 from fieldfuse.export.cameras import write_cameras
 from fieldfuse.export.mesh import write_mesh
-from fieldfuse.export.points import write_points
+from fieldfuse.export.ply import write_points
 from fieldfuse.export.video import write_video
 from fieldfuse.files import write_json
 from fieldfuse.pipelines.rendered import Picture, Pictures, save_pictures, write_png, write_pngs

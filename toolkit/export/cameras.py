@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import FISHEYE, Array, Intrinsics, Similarity, invert, opengl_from_world
 from fieldfuse.errors import InputError
-from fieldfuse.export.points import write_points
+from fieldfuse.export.ply import write_points
 from fieldfuse.files import atomic_path, write_json
 from fieldfuse.tsdf.mesh import as_bytes
 

@@ -18,10 +18,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from fieldfuse.backends.constants import CHANGE, INSIDE
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d
 from fieldfuse.nerfusion.compiled_gru import Step
-from fieldfuse.nerfusion.extras.bounded_outputs import CHANGE, bounded
-from fieldfuse.nerfusion.extras.known_terms import INSIDE
+from fieldfuse.nerfusion.extras.bounded_outputs import bounded
 from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
 from fieldfuse.volume.topology import Topology
 

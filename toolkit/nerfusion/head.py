@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from fieldfuse.backends.constants import INSIDE
 from fieldfuse.nerfusion.extras.bounded_outputs import soft_bound
-from fieldfuse.nerfusion.extras.known_terms import COLOUR_SCALE, INSIDE
+from fieldfuse.nerfusion.extras.known_terms import COLOUR_SCALE
 
 START = -0.5  # log optical thickness of a voxel on the surface at the start
 SCALE = 3.0  # the density output's gain

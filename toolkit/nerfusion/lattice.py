@@ -176,7 +176,7 @@ def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
     """A copy of some blocks of a volume; where it has no such block, nothing is known."""
     slots = volume.topology.slots_of(topology)
     if volume.topology.blocks and dispatch.can_use_triton(volume.rows):
-        from fieldfuse.backends.triton import blocks as blocks
+        from fieldfuse.backends.triton import blocks
 
         return LatentVolume(volume.lattice, topology, *blocks.take(volume.rows, volume.count, slots.int(), topology))
     place = (slots.clamp_min(0)[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)

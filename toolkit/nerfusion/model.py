@@ -23,6 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from fieldfuse.backends import dispatch
+from fieldfuse.backends.constants import INSIDE
 from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.nerfusion.aggregate import CUES, FLAGS, aggregate, agreement, evidence
 from fieldfuse.nerfusion.cameras import Cameras
@@ -206,7 +207,7 @@ class NerfusionModel(nn.Module):
 
     def _on_device(self, frame: KeyFrame) -> bool:
         """Whether kernels on CUDA make local volumes."""
-        wide = self.config.hidden in (16, 32) and self.config.channels > known_terms.INSIDE
+        wide = self.config.hidden in (16, 32) and self.config.channels > INSIDE
         tables = [frame.distribution.table, *(view.features.rows for view in frame.views)]
         return not torch.is_grad_enabled() and wide and dispatch.can_use_triton(*tables)
 
@@ -259,7 +260,7 @@ class NerfusionModel(nn.Module):
 
     def surface_cells(self, volume: LatentVolume, seen: Tensor, gamma: float) -> Tensor:
         """`two_lattices.surface_cells` of the head's thickness."""
-        if not torch.is_grad_enabled() and self.config.channels > known_terms.INSIDE and dispatch.can_use_triton(volume.rows):
+        if not torch.is_grad_enabled() and self.config.channels > INSIDE and dispatch.can_use_triton(volume.rows):
             from fieldfuse.backends.triton import volumes
 
             return volumes.surface_cells(volume.topology, volume.rows, volume.count, seen, self.to_field, least_thickness(gamma))

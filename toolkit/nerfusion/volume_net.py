@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from fieldfuse.backends import dispatch
+from fieldfuse.backends.constants import INSIDE
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared
 from fieldfuse.nerfusion.extras.bounded_outputs import bounded
-from fieldfuse.nerfusion.extras.known_terms import INSIDE
 from fieldfuse.volume.topology import Topology
 
 

@@ -4,7 +4,7 @@ The kernels themselves, one ray through a sparse field in float32 scalars and sh
 `march.py` (samples along a ray), `decode.py` (features to colour).
 
 Everything here has a twin in torch (`render/march.py`, `volume/lookup.py`, `nerfusion/decoder.py`): the reference, which tests compare
-with. Compiled functions are cached on disk. Numba turns an `int * float32` and every Python literal into float64, hence the F(...).
+with. Compiled functions are cached on disk. Numba turns an `int * float32` and every Python literal into float64, hence explicit F(...).
 """
 
 from __future__ import annotations

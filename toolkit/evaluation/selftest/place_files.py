@@ -12,7 +12,7 @@ from fieldfuse.evaluation.selftest.case import Measure, absolute, case
 from fieldfuse.evaluation.selftest.place import EARTH, SCALES, similarity
 from fieldfuse.export.cameras import quaternion, write_cameras
 from fieldfuse.export.mesh import write_mesh
-from fieldfuse.export.points import write_points
+from fieldfuse.export.ply import write_points
 from fieldfuse.files import read_json
 from fieldfuse.render.paths import look_at
 from fieldfuse.tsdf.mesh import Mesh

@@ -8,8 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fieldfuse.backends.constants import CHANGE as CHANGE
-from fieldfuse.nerfusion.extras.known_terms import INSIDE
+from fieldfuse.backends.constants import CHANGE, INSIDE
 
 
 def soft_bound(learned: Tensor, most: float) -> Tensor:

@@ -10,7 +10,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from fieldfuse.backends.constants import INSIDE as INSIDE
+from fieldfuse.backends.constants import INSIDE
 from fieldfuse.nerfusion.extras.plane_sweep import SdfEstimate
 from fieldfuse.volume.topology import VOXELS, Topology
 
