@@ -47,7 +47,7 @@ class CrossView:
     _numbers: list[Tensor] = field(default_factory=list, init=False, compare=False, repr=False)
 
     def numbers(self) -> Tensor:
-        """(23,) that kernels for CUDA ask it by (`gpu/reading.py`), put together once."""
+        """(23,) that kernels for CUDA ask it by (`backends/triton/reading.py`), put together once."""
         if not self._numbers:
             from fieldfuse.backends.triton import reading
 
