@@ -12,6 +12,7 @@ EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.ipy
 SMALLER = {
     "frames=24, size=(480, 360)": "frames=14, size=(320, 240)",
     "image_size=320": "image_size=96",
+    '"keyframes.most": 8': '"keyframes.most": 3',
     "budget=10": "budget=2",
     "mesh_views=20": "mesh_views=6",
 }
