@@ -148,7 +148,7 @@ def decide(
     if worked.borrowed and decisions[EXPOSURE].on:
         which = ", ".join(worked.borrowed[:3]) + (", …" if len(worked.borrowed) > 3 else "")
         note = f"held-out frames whose points disagree about their exposure have that of their neighbours: {which}"
-        decisions[EXPOSURE] = replace(decisions[EXPOSURE], note=note)
+        decisions[EXPOSURE] = replace(decisions[EXPOSURE], note="; ".join(filter(None, [decisions[EXPOSURE].note, note])))
     if worked.agreed is not None and decisions[POSES].on:
         decisions[POSES] = replace(decisions[POSES], note=worked.agreed.note)
     if capture.has_depth:
