@@ -103,8 +103,7 @@ def test_ctrl_c_while_code_is_made_from_text(tmp_path: Path) -> None:
         "import atexit, signal, fieldfuse.pipelines.cli\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # tests that run in the background inherit that it is ignored
         "atexit.register(print, 'tidied')\n"
-        "fieldfuse.pipelines.cli.app = lambda: exec('import signal; signal.raise_signal(signal.SIGINT)')\n"
-        "fieldfuse.pipelines.cli.program()\n"
+        "fieldfuse.pipelines.cli.program(lambda: exec('import signal; signal.raise_signal(signal.SIGINT)'))\n"
     )
     there = environment(PYTHONPATH=os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])]))
     answer = subprocess.run([sys.executable, "-m", "interrupted"], env=there, capture_output=True, text=True, timeout=HUNG)

@@ -16,7 +16,7 @@ MARGIN = {EXPOSURE: 0.24, VIGNETTING: 0.1}  # least relative fall of the held-ou
 BOTH = 0.25  # … by both: each hides some of the other, so that alone neither may come as far as it does beside the other
 MIN_FALL = 0.0015  # stops by which it has to fall at least
 FEWEST_POINTS = 10  # that a held-out frame's gain is measured by
-TORN = 1.5  # times the usual disagreement of points about a frame's gain, from which it is doubtful …
+TORN, TORN_BY = 1.5, 0.1  # times the usual disagreement of points about a frame's gain, and stops, from which it is doubtful …
 APART = 0.2  # … if it lies so many stops outside of its neighbours' gains as well
 
 
@@ -133,7 +133,7 @@ def frame_gains(tracks: Tracks, frames: int, train: Array) -> tuple[Array, list[
         found = np.median(off[rows], axis=0) if rows.sum() >= FEWEST_POINTS else None
         if found is not None and len(near):
             beyond = np.maximum(found - theirs.max(0), theirs.min(0) - found).max()
-            if beyond > APART and disagreement(int(frame)) > TORN * usual:
+            if beyond > APART and disagreement(int(frame)) > max(TORN * usual, TORN_BY):
                 borrowed.append(int(frame))
                 found = None
         if found is not None or len(near):
