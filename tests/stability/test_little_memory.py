@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fieldfuse import memory
+from fieldfuse import memory, memory_limits
 from fieldfuse.camera import Similarity
 from fieldfuse.config import PosesSettings, TsdfSettings
 from fieldfuse.errors import InputError
-from fieldfuse import memory_limits
 from fieldfuse.poses import sfm
 from fieldfuse.stereo.match import stereo_depths
 from fieldfuse.tsdf.fuse import fuse_capture
