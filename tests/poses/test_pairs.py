@@ -42,6 +42,7 @@ def test_sequential_pairs_reach_far_with_few():
     assert max(j - i for i, j in pairs) == 160
     assert len(pairs) < 200 * 10
     assert {(i, i + 2) for i in range(198)} <= set(pairs), "a frame too blurred to match does not part the way"
+    assert {(i, i + step) for i in range(20) for step in range(1, 11)} <= set(sequential_pairs(30)), "of few frames each match counts"
 
 
 def test_common_counts_shared_descriptors_and_nothing_else():

@@ -15,7 +15,10 @@ RATIO = 0.85  # of the angle to the best and to the second best match
 MIN_COMMON = 4  # coarse matches that hint at overlap
 # Frames of a video from one to the other of a pair. Tracks go on from pair to pair: with all of 1 to 10, poses are as good, and matching
 # takes half as long again (docs/measured/performance.md).
-STEPS = (1, 2, 3, 5, 7, 10, 20, 40, 80, 160)
+FAR_STEPS = (20, 40, 80, 160)
+STEPS = (1, 2, 3, 5, 7, 10, *FAR_STEPS)
+EVERY_STEP = (*range(1, 11), *FAR_STEPS)
+FEW_FRAMES = 60  # up to which every step of the next ten is taken: frames lie far apart there, and each match counts
 LOOPS = 3  # such pairs of a frame at most
 LOOP_GAP = 20  # frames apart before a pair counts as a loop
 
@@ -30,8 +33,9 @@ def pairs_with(some: list[int], count: int) -> list[tuple[int, int]]:
     return sorted({(min(i, j), max(i, j)) for i in some for j in range(count) if i != j})
 
 
-def sequential_pairs(count: int, steps: tuple[int, ...] = STEPS) -> list[tuple[int, int]]:
-    """Each frame with those `steps` later."""
+def sequential_pairs(count: int, steps: tuple[int, ...] | None = None) -> list[tuple[int, int]]:
+    """Each frame with those `steps` later; None: `EVERY_STEP` of few frames, `STEPS` of many."""
+    steps = steps or (EVERY_STEP if count <= FEW_FRAMES else STEPS)
     return [(i, i + step) for i in range(count) for step in steps if i + step < count]
 
 
