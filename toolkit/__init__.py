@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
-    from fieldfuse.api import Camera, Field, Mesh, Points, Render, Scene, Scores, Surface, evaluate, fit, fuse_tsdf, infer, load
+    from fieldfuse.api import evaluate, fit, fuse_tsdf, infer, load
     from fieldfuse.errors import FieldfuseError, InputError, Interrupted, OutputError, PoseError
+    from fieldfuse.results import Camera, Field, Mesh, Points, Render, Scene, Scores, Surface
 
+_FUNCTIONS = ("evaluate", "fit", "fuse_tsdf", "infer", "load")
 _ERRORS = ("FieldfuseError", "InputError", "Interrupted", "OutputError", "PoseError")
 __all__ = [
     "Camera",
@@ -34,11 +36,12 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """What is asked for is imported then: `import fieldfuse` alone is quick."""
+    """Names are imported at their first use, so that `import fieldfuse` alone is quick."""
     from importlib import import_module
 
     if name in __all__:
-        return getattr(import_module("fieldfuse.errors" if name in _ERRORS else "fieldfuse.api"), name)
+        module = "api" if name in _FUNCTIONS else "errors" if name in _ERRORS else "results"
+        return getattr(import_module(f"fieldfuse.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -105,6 +106,8 @@ def _sentence(data: Any, error: ValidationError) -> str:
     said = first["msg"][:1].lower() + first["msg"][1:]
     for theirs, ours in WORDING.items():
         said = said.replace(theirs, ours)
+    if not name:
+        return f"a value cannot be written as UTF-8 ({said})"
     if first["type"] == "name":
         return f"{name}: {said}"
     return f"{name} is {brief(repr(value))}; {said}"
@@ -132,11 +135,12 @@ class _Loader(yaml.SafeLoader):
     """`1e-3` is a number, as in YAML 1.2, and a key stands once."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        twice = [key for key in keys if keys.count(key) > 1]
-        if twice:
-            raise yaml.YAMLError(f"the key {brief(repr(twice[0]))} stands there twice")
-        return super().construct_mapping(node, deep)
+        made = super().construct_mapping(node, deep)
+        if len(made) < len(node.value):
+            keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+            twice = next(key for key, count in Counter(keys).items() if count > 1)
+            raise yaml.YAMLError(f"the key {brief(repr(twice))} stands there twice")
+        return made
 
 
 _Loader.add_implicit_resolver(

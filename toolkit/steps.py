@@ -77,7 +77,7 @@ def choose_device(wanted: str, engine: str = "auto") -> str:
     """`auto` → `cuda` when there is one, else `cpu`.
 
     Raises:
-        InputError: `cuda` is asked for and there is none, or an engine that cannot run on the device.
+        InputError: `cuda` is wanted and there is none, or an engine that cannot run on the device.
     """
     device = _device(wanted)
     check_engine(engine, device)

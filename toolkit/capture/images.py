@@ -96,7 +96,7 @@ def see_through(path: Path) -> bool:
 
 def cut_out(frames: Sequence[Frame]) -> bool:
     """Whether alpha cuts an object out of a capture's images: some pixel of those looked at is not opaque. Screenshots and many programs'
-    PNGs have an alpha that is full everywhere. What cannot be read is left to whoever reads it all."""
+    PNGs have an alpha that is full everywhere. Files that cannot be read are reported when all pixels are read."""
     paths = [frame.image for frame in frames if frame.video_index is None]
     with_alpha = [path for path in _spread(paths, HEADERS) if _tells(_has_alpha, path)]
     return any(_tells(see_through, path) for path in _spread(with_alpha, PICTURES))

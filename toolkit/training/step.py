@@ -149,7 +149,7 @@ class Optimiser:
         shares = torch.full_like(each, 1 / count) if batch.weight is None else batch.weight / count
         (shares * each).sum().backward()
         self._move(rows, corner_weights, raw, features, rates, residual.detach())
-        self.errors = residual.detach().square().mean(1)  # for whoever draws the next batch
+        self.errors = residual.detach().square().mean(1)  # decides which pixels the next batch draws
         return float((self.errors * shares).sum())
 
     def _move(self, rows: Tensor, corner_weights: Tensor, raw: Tensor, features: Tensor, rates: Rates, residual: Tensor) -> None:

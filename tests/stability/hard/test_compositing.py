@@ -170,7 +170,7 @@ def test_neighbours_in_a_list(within: Within) -> None:
     within("values that are not finite", not_finite(weight, light, gradient), 0.0)
 
 
-# What comes to less, of weights and places of about 1, is told by the double sums to some 1e-16, not to a share of itself.
+# Losses below this are differences of sums of about 1, so in double they are right to about 1e-16, not to a share of their size.
 LEAST = 1e-9
 
 
@@ -286,7 +286,7 @@ def test_distortion(data: st.DataObject, count: int) -> None:
 
 
 def test_a_loss_too_small_for_float32_is_compared_as_it_is() -> None:
-    """A weight of 1e-38 costs 1e-77, which is 0 there; a loss that is wrong is told all the same."""
+    """A weight of 1e-38 costs 1e-77, which is 0 there; a wrong loss is noticed all the same."""
     errors = distortion_errors([([1.1754943508222875e-38], [0.0], [1.0])])
     assert errors["loss"] < 1e-30 and by_size(torch.tensor([0.5]), [1e-77]) == 0.5
 

@@ -66,7 +66,7 @@ def test_decoders(within: Within) -> None:
             got, exact = (got, exact) if kind == "deferred" else (got[1], exact[1])
             got.sum().backward()
             assert features.grad is not None
-            # Features of 1e4 turn by thousands of periods in the paper's encoding: only finiteness can be asked for there.
+            # Features of 1e4 turn by thousands of periods in the paper's encoding: only finiteness is checked there.
             worst = max(worst, absolute(got, exact) if size <= 1 else 0.0)
             wrong += not_finite(got, features.grad) + float(((got < 0) | (got > 1)).sum())
             for reduced in (torch.bfloat16, torch.float16):
@@ -182,7 +182,7 @@ TURNS = 8  # times that, behind the sines and cosines of the paper's decoder
 
 
 def awkward_views() -> dict[str, Tensor]:
-    """(4, 4) poses, each looking along +z at the origin unless it is told otherwise."""
+    """(4, 4) poses, each looking along +z at the origin unless given otherwise."""
     ahead = torch.eye(4)
     ahead[2, 3] = -3
     behind = torch.eye(4)

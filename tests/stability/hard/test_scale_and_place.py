@@ -44,7 +44,7 @@ PSNR = 0.05  # dB
 def similarity_errors(input_from_working: Similarity, points: Array) -> dict[str, float]:
     """Errors of a similarity against sums written out with `math.fsum`, and of going there and back, by the model's size.
 
-    Far from the origin a place is known to its last float64 digit, which sets what can be asked for.
+    Far from the origin a place is known to its last float64 digit, which limits the precision.
     """
     digit = float(np.spacing(np.abs(input_from_working.translation).max())) / (input_from_working.scale * float(np.ptp(points)))
     there = input_from_working.points(points)

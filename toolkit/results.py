@@ -1,0 +1,328 @@
+"""What the API's functions give: a scene, and what is made from it. Everything is in the source's frame unless it says otherwise."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, overload
+
+import numpy as np
+
+from fieldfuse import steps
+from fieldfuse.camera import Array, Intrinsics, Similarity
+from fieldfuse.config import Settings
+from fieldfuse.errors import InputError
+from fieldfuse.options import OF_SURFACE, Listener, changed_settings, listening
+from fieldfuse.tone import exposed
+
+if TYPE_CHECKING:
+    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.effects.correct import Corrections
+    from fieldfuse.poses.result import PoseResult
+    from fieldfuse.poses.scene import Scene as Geometry
+    from fieldfuse.render.field import Field as SparseField
+    from fieldfuse.tsdf.volume import TsdfVolume
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera in the source's frame.
+
+    Attributes:
+        world_from_camera: (4, 4) float64, OpenCV's axes.
+    """
+
+    intrinsics: Intrinsics
+    world_from_camera: Array
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera for images of another size."""
+        return replace(self, intrinsics=self.intrinsics.scaled(width, height))
+
+
+@dataclass(frozen=True)
+class Render:
+    """What a camera sees of a field or surface.
+
+    Attributes:
+        rgb: (H, W, 3) uint8, as bright as the training images were taken.
+        depth: (H, W) float32 along z, the source's unit of length; 0: none.
+        opacity: (H, W) float32, share of the light that is stopped.
+    """
+
+    rgb: Array
+    depth: Array
+    opacity: Array
+
+
+@dataclass(frozen=True)
+class Split:
+    """The training or the test views of a scene.
+
+    Attributes:
+        images: (H, W, 3) uint8 each, undistorted and resized: those of test views in the colours in which they were taken, those of
+            training views with what was corrected taken out.
+    """
+
+    names: list[str]
+    cameras: list[Camera]
+    images: list[Array]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass
+class Scene:
+    """A source made ready: its images with poses and corrections, in memory.
+
+    Attributes:
+        capture: the source's frames that take part, with poses and lenses as they are used.
+        poses: where these came from, and how sure they are.
+        views: what fits and measures: images, pinhole cameras and masks in the working frame.
+        geometry: the working frame, and the region of interest in it.
+        corrections: of camera and light.
+        effects: evidence and decision for each effect; empty where none was looked for.
+        settings: everything that was chosen.
+    """
+
+    capture: Capture
+    poses: PoseResult
+    views: Views
+    geometry: Geometry
+    corrections: Corrections
+    effects: list[dict[str, Any]]
+    settings: Settings
+    _files: tempfile.TemporaryDirectory[str] | None = field(default=None, repr=False)  # images of a video, as long as the scene lives
+
+    @property
+    def train(self) -> Split:
+        return self._split(False)
+
+    @property
+    def test(self) -> Split:
+        """Held-out views: no fit looks at them."""
+        return self._split(True)
+
+    @property
+    def working_from_input(self) -> Similarity:
+        return self.geometry.working_from_input
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a user has to be aware of, a sentence each."""
+        return list(dict.fromkeys([*self.capture.warnings, *self.poses.warnings, *self.geometry.warnings]))
+
+    def _split(self, test: bool) -> Split:
+        views, back = self.views, self.working_from_input.inverse()
+        indices = [int(index) for index in np.flatnonzero(np.asarray(views.test) == test)]
+        cameras = [Camera(views.intrinsics[index], back.poses(views.world_from_camera[index])) for index in indices]
+        return Split([views.names[index] for index in indices], cameras, [views.photo(index) for index in indices])
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh in the source's frame.
+
+    Attributes:
+        vertices: (V, 3) float64.
+        triangles: (T, 3) int32.
+        colours: (V, 3) uint8 sRGB.
+        normals: (V, 3) float64, or None.
+    """
+
+    vertices: Array
+    triangles: Array
+    colours: Array
+    normals: Array | None = None
+
+    def save(self, path: Path | str) -> None:
+        """Write .ply, .obj or .glb, as the suffix says.
+
+        Raises:
+            InputError: another suffix.
+            OutputError: the file cannot be written.
+        """
+        from fieldfuse.export.mesh import write_mesh
+        from fieldfuse.tsdf.mesh import Mesh as Triangles
+
+        write_mesh(path, Triangles(self.vertices, self.triangles, self.colours, self.normals))
+
+
+@dataclass(frozen=True)
+class Points:
+    """Coloured surface points (P, 3) in the source's frame, with colours (P, 3) uint8 and unit normals (P, 3)."""
+
+    points: Array
+    colours: Array
+    normals: Array
+
+    def save(self, path: Path | str) -> None:
+        """Write .ply.
+
+        Raises:
+            InputError: another suffix.
+            OutputError: the file cannot be written.
+        """
+        from fieldfuse.export.ply import write_points
+
+        write_points(path, self.points, self.colours, self.normals)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A fused surface (a truncated signed distance field in Open3D's hash map), with the way back to the source's frame."""
+
+    volume: TsdfVolume
+    working_from_input: Similarity
+    exposure: float = 1.0  # how much brighter than the volume's colours the images were taken
+    smooth: int = 2  # rounds in which the mesh's vertices go to the mean of their neighbours
+
+    @property
+    def mesh(self) -> Mesh:
+        from fieldfuse.export.field_surface import whole_mesh
+
+        made = whole_mesh(self.volume, self.smooth).transformed(self.working_from_input.inverse())
+        return Mesh(made.vertices, made.triangles, exposed(made.colours, self.exposure), made.normals)
+
+    @property
+    def points(self) -> Points:
+        back, found = self.working_from_input.inverse(), self.volume.points()
+        return Points(back.points(found.points), exposed(found.colours, self.exposure), back.directions(found.normals))
+
+    @overload
+    def render(self, camera: Camera) -> Render: ...
+    @overload
+    def render(self, camera: Iterable[Camera]) -> list[Render]: ...
+    def render(self, camera: Camera | Iterable[Camera]) -> Render | list[Render]:
+        """What one or several cameras see."""
+        return _render(self, camera)
+
+    def working(self, intrinsics: Intrinsics, world_from_camera: Array) -> Any:
+        """The same in the working frame: `rgb`, `depth`, `opacity`, and `mask` (H, W) where there is surface."""
+        return self.volume.render(intrinsics, world_from_camera)
+
+
+@dataclass(frozen=True)
+class Field:
+    """A radiance field on sparse voxel blocks, with the way back to the source's frame.
+
+    Attributes:
+        sparse: blocks, features and decoder, in the working frame.
+        exposure: how much brighter than the field's colours the training images were taken.
+        scene: what it was made from; None for a field that was opened from a file without its scene.
+        timeline: seconds and validation PSNR while it was fitted.
+        notes: what a reader of its scores has to be aware of.
+    """
+
+    sparse: SparseField
+    working_from_input: Similarity
+    exposure: float = 1.0
+    scene: Scene | None = None
+    timeline: Sequence[Mapping[str, Any]] = ()
+    notes: Sequence[str] = ()
+
+    @overload
+    def render(self, camera: Camera) -> Render: ...
+    @overload
+    def render(self, camera: Iterable[Camera]) -> list[Render]: ...
+    def render(self, camera: Camera | Iterable[Camera]) -> Render | list[Render]:
+        """What one or several cameras see."""
+        return _render(self, camera)
+
+    def working(self, intrinsics: Intrinsics, world_from_camera: Array) -> Any:
+        """The same in the working frame: `rgb` (H, W, 3) float32 in [0, 1], `depth`, `opacity`."""
+        from fieldfuse.render.image import render_view
+
+        return render_view(self.sparse, intrinsics, world_from_camera, self._renderer)
+
+    @cached_property
+    def _renderer(self) -> Any:
+        from fieldfuse.render.image import make_renderer
+
+        return make_renderer(self.sparse, "auto" if self.scene is None else self.scene.settings.engine)
+
+    def to_surface(self, progress: Listener = None, **options: Any) -> Surface:
+        """The field's depth at the training cameras, polished by their images and fused; options are those of `export` (`mesh_views`,
+        `mesh_size`, `smooth`).
+
+        Raises:
+            InputError: it was opened without its scene, or has no surface.
+        """
+        from fieldfuse.export.field_surface import Originals, surface_of_field
+
+        if self.scene is None:
+            raise InputError("a surface is made at the training cameras, and this field has no scene; use Field.open(path, scene)")
+        scene = self.scene
+        settings = changed_settings(scene.settings, {f"export.{name}": value for name, value in options.items()}, OF_SURFACE)
+        originals = Originals(scene.capture, scene.corrections)
+        volume = surface_of_field(self.sparse, scene.views, scene.geometry, settings, originals, listening(progress, "surface"))
+        return Surface(volume, self.working_from_input, self.exposure, settings.export.smooth)
+
+    def to_mesh(self, progress: Listener = None, **options: Any) -> Mesh:
+        """The mesh of `to_surface`."""
+        return self.to_surface(progress, **options).mesh
+
+    def save(self, path: Path | str) -> None:
+        """Write the field (`.safetensors`).
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        self.sparse.save(path, self.working_from_input, {"exposure": self.exposure})
+
+    @classmethod
+    def open(cls, path: Path | str, scene: Scene | None = None, device: str = "auto") -> Field:
+        """A field from its file; with its scene it can be meshed.
+
+        Raises:
+            InputError: the file is not a field, or damaged.
+        """
+        from fieldfuse.render.field import Field as SparseField
+        from fieldfuse.volume.store import read_field
+
+        data = read_field(path)
+        exposure = data.meta.get("exposure", 1.0 if scene is None else scene.views.exposure)
+        if not isinstance(exposure, int | float) or not 0 < exposure < np.inf:
+            raise InputError(f"{path} is damaged (its exposure is {exposure!s:.40}); fit it again")
+        sparse = SparseField.from_file(data, str(path)).to(steps.choose_device(device))
+        return cls(sparse, data.working_from_input, float(exposure), scene)
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Means over the test views; None where there is nothing to measure.
+
+    Attributes:
+        psnr: decibels, in the colours in which images were taken. ssim, lpips: as published.
+        depth: measures of depth against a sensor's, working units.
+        nearest_image: PSNR of the nearest training image shown unchanged: the floor under `psnr`.
+        per_view: the same for each view, with its name.
+    """
+
+    psnr: float | None
+    ssim: float | None
+    lpips: float | None
+    depth: dict[str, float] | None
+    nearest_image: float | None
+    per_view: list[dict[str, Any]]
+
+
+def _render(result: Field | Surface, camera: Camera | Iterable[Camera]) -> Render | list[Render]:
+    if not isinstance(camera, Camera):
+        return [_seen(result, one) for one in camera]
+    return _seen(result, camera)
+
+
+def _seen(result: Field | Surface, camera: Camera) -> Render:
+    way = result.working_from_input
+    if camera.intrinsics.distorted:
+        raise InputError("a render is a pinhole camera's; use camera.intrinsics.pinhole()")
+    made = result.working(camera.intrinsics, way.poses(camera.world_from_camera))
+    rgb = np.asarray(made.rgb)
+    rgb = rgb if rgb.dtype == np.uint8 else np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
+    depth = (np.asarray(made.depth) / way.scale).astype(np.float32)
+    return Render(exposed(rgb, result.exposure), depth, np.asarray(made.opacity, dtype=np.float32))
