@@ -30,20 +30,20 @@ if TYPE_CHECKING:
     from fieldfuse.stereo.left_out import LeftOut
 
 SEEN_BY_SFM = (
-    "poses were computed from all pictures, the held-out ones included, so scores are a little kinder than with poses known beforehand"
+    "poses were estimated from all images, the held-out ones included, so scores are slightly optimistic"
 )
 MATCHED = (
-    "The fit began by matching {views} training pictures of {pixels} pixels with each other ({seconds:.1f} s of its budget), so that it"
-    " knew a depth for {percent:.0f}% of their pixels{bare}."
+    "Matching {views} training images of {pixels} pixels with each other ({seconds:.1f} s of the fit's budget) gave depth for"
+    " {percent:.0f}% of their pixels{bare}."
 )
-BARE = " ({percent:.0f}% are bare and lie on planes that go on from beside them)"
+BARE = " ({percent:.0f}% without texture, on planes continued from beside them)"
 LEFT_OUT = (
-    "{percent:.1f}% of the training pictures' pixels were left out of the fit, in {pictures} of {looked_at} pictures, since they show"
-    " something else than several other pictures agree on ({seconds:.1f} s of its budget). Test views are scored on all of theirs."
+    "{percent:.1f}% of the training images' pixels were masked out, in {pictures} of {looked_at} images, since they show something else"
+    " than several other images agree on ({seconds:.1f} s of the fit's budget). Test views are scored on all their pixels."
 )
-NOTHING_LEFT_OUT = "Nothing that moves was found in the {looked_at} training pictures ({seconds:.1f} s of the fit's budget)."
+NOTHING_LEFT_OUT = "Nothing that moves was found in the {looked_at} training images ({seconds:.1f} s of the fit's budget)."
 OPENED = {".html", ".ply", ".obj", ".glb", ".mp4", ".txt", ".json"}
-NO_TEST_VIEWS = "no picture was held out, so there are no scores; give --holdout 8 to keep every 8th picture for testing"
+NO_TEST_VIEWS = "no image was held out, so there are no scores; give --holdout 8 to keep every 8th image for testing"
 
 
 def picture_size(capture: Capture) -> tuple[int | None, int | None]:

@@ -75,7 +75,7 @@ def test_without_being_asked_pictures_are_matched_for_the_fit_alone(
         data = read_json(out / "report.json")
         assert not (out / "stereo").exists() and data["evaluation"]["tsdf"] is None
         assert data["field"]["matched"]["views"] == 4 and 0 < data["field"]["matched"]["share"] < 1
-        assert any("matching 4 training pictures" in note for note in data["notes"])
+        assert any("Matching 4 training images" in note for note in data["notes"])
     # A fit that goes on does not match them again: what was found before is told.
     before = data["field"]["matched"]
     monkeypatch.setattr("fieldfuse.stereo.quick.guided", refuse)
@@ -86,7 +86,7 @@ def test_without_being_asked_pictures_are_matched_for_the_fit_alone(
     monkeypatch.undo()
     assert call(capsys, "run", tmp_path / "corner", "--out", out, *options, "--set", "fit.depth_from=sensor").code == 0
     data = read_json(out / "report.json")
-    assert "matched" not in data["field"] and not any("matching" in note for note in data["notes"])
+    assert "matched" not in data["field"] and not any("atching" in note for note in data["notes"])
     assert not (out / "fit_matched.json").exists()
 
 
@@ -107,7 +107,7 @@ def test_what_moves_is_left_out_and_told(tmp_path: Path, capsys: Capsys, monkeyp
         data = read_json(out / "report.json")
         told = data["field"]["left_out"]
         assert told["looked_at"] == 6 and told["pictures"] == 2 and 0.02 < told["share"] < 0.12
-        assert any("in 2 of 6 pictures" in note for note in data["notes"])
+        assert any("in 2 of 6 images" in note for note in data["notes"])
         page = (out / "report.html").read_text(encoding="utf-8")
         assert "Left out of the fit" in page and page.count("what is left out tinted") == 2
         assert load_left_out(out / "left_out.safetensors").to_dict() == told
@@ -123,14 +123,14 @@ def test_what_moves_is_left_out_and_told(tmp_path: Path, capsys: Capsys, monkeyp
 
 def test_the_report_tells_that_nothing_moves() -> None:
     nothing = describe_left_out(LeftOut.of(["a"] * 7, [np.zeros((3, 4), bool)] * 7))
-    assert "Nothing that moves was found in the 7 training pictures" in nothing
+    assert "Nothing that moves was found in the 7 training images" in nothing
     some = describe_left_out(LeftOut.of(["a", "b"], [np.eye(4, dtype=bool), np.zeros((4, 4), bool)], 0.5))
-    assert "12.5% of" in some and "in 1 of 2 pictures" in some and "0.5 s" in some
+    assert "12.5% of" in some and "in 1 of 2 images" in some and "0.5 s" in some
 
 
 def test_the_report_tells_of_bare_surfaces() -> None:
     """Folders of earlier versions know nothing of them."""
     found = {"views": 4, "pixels": 128, "share": 0.6, "seconds": 1.0}
     words = describe_matching({**found, "bare": 0.25})
-    assert "60% of their pixels" in words and "25% are bare" in words
-    assert "bare" not in describe_matching(found) and describe_matching(found) == describe_matching({**found, "bare": 0.0})
+    assert "60% of their pixels" in words and "25% without texture" in words
+    assert "texture" not in describe_matching(found) and describe_matching(found) == describe_matching({**found, "bare": 0.0})

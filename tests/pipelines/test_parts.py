@@ -158,7 +158,7 @@ def test_without_held_out_pictures_there_are_no_scores(tmp_path: Path, capsys: C
     assert answer.code == 0, answer.err
     data = json.loads(answer.out)
     assert data["evaluation"]["field"]["psnr"] is None and data["timeline"] == []
-    assert any("no picture was held out" in warning for warning in data["warnings"])
+    assert any("no image was held out" in warning for warning in data["warnings"])
     assert "no held-out views" in call(capsys, "render", tmp_path / "out", "--views", "test", "--quiet").sentence()
 
 

@@ -113,7 +113,7 @@ def headline(data: dict[str, Any]) -> list[tuple[str, str, str]]:
     if data["seconds_total"] is not None:
         out.append((words.duration(data["seconds_total"]), "", "from capture to report"))
     if poses["registered"] is not None and poses["total"] is not None:
-        out.append((f"{poses['registered']} / {poses['total']}", "", "pictures with a pose"))
+        out.append((f"{poses['registered']} / {poses['total']}", "", "images with a pose"))
     if field["bytes"] is not None:
         note = f"field: {words.whole(field['voxels'])} voxels" if field["voxels"] is not None else "size of the field"
         out.append((words.size(field["bytes"]), "", note))

@@ -24,7 +24,7 @@ STAGE = ("name", "seconds", "peak_memory_mb", "cached")
 FIELD = ("voxel_size", "blocks", "voxels", "bytes")
 POINT = ("seconds", "psnr")
 SFM_NOTE = (
-    "Camera poses were computed from all pictures, test views included; "
+    "Camera poses were estimated from all images, test views included; "
     "the colours of test views were never shown to anything that fits appearance."
 )
 
