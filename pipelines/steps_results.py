@@ -92,9 +92,10 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     from fieldfuse.pipelines.steps_stereo import views_for_fit
     from fieldfuse.render.field import Field
     from fieldfuse.stereo.left_out import load_left_out, save_left_out
+    from fieldfuse.training.fit import Begin
     from fieldfuse.training.guided import fit_guided
     from fieldfuse.training.network_start import network_start
-    from fieldfuse.volume.grid_host import host_for
+    from fieldfuse.volume.grid import host_for
 
     settings = job.settings
     path, times = job.folder / "field.safetensors", job.folder / "timeline.json"
@@ -119,7 +120,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
         if start is None:
             first = None if made is None else network_start(made.field, views, scene, settings)
             coarse = first is not None
-            result = fit_guided(views, scene, settings, job.progress, host=host_for(settings.device), start=first, coarse=coarse)
+            result = fit_guided(views, scene, settings, job.progress, Begin(host_for(settings.device), first, coarse))
             tell(result)
             return result.field, result.timeline
         field, timeline = load()
@@ -127,7 +128,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
         masks = load_left_out(job.folder / LEFT_OUT) if LEFT_OUT in start.outputs else None
         alone = replace(settings, fit=going_on(settings.fit))
         shown = views if masks is None else masks.without(views)
-        result = fit_guided(shown, scene, alone, job.progress, host=host_for(settings.device), start=field)
+        result = fit_guided(shown, scene, alone, job.progress, Begin(host_for(settings.device), field))
         matched = read_kept(job.folder / FIT_MATCHED, MATCHED) if FIT_MATCHED in start.outputs else None
         tell(replace(result, matched=matched, left_out=masks))
         spent = timeline[-1]["seconds"] if timeline else 0.0

@@ -33,7 +33,7 @@ def test_settling_changes_nothing_that_is_seen() -> None:
     field = random_field(keep=0.02)
     origins, directions = random_rays(100)
     assert torch.allclose(
-        render_rays(field, origins, directions).colour, render_rays(field.settled(), origins, directions).colour, atol=1e-6
+        render_rays(field, origins, directions).colour, render_rays(field.packed()(), origins, directions).colour, atol=1e-6
     )
 
 

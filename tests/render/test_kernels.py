@@ -10,7 +10,7 @@ from numba import njit
 from scipy.ndimage import distance_transform_cdt
 
 from fieldfuse.backends.numba import common as K
-from fieldfuse.backends.numba.render_rays import chessboard_distance
+from fieldfuse.backends.numba.volume import chessboard_distance
 from fieldfuse.render.numba_renderer import FARTHEST
 
 

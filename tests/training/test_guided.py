@@ -20,7 +20,7 @@ from fieldfuse.render.field import Field
 from fieldfuse.render.image import make_renderer, render_view
 from fieldfuse.stereo import moving, quick
 from fieldfuse.training import depth_start
-from fieldfuse.training.fit import LEAST_VIEWS
+from fieldfuse.training.fit import LEAST_VIEWS, Begin
 from fieldfuse.training.guided import find_moving, fit_guided, looks_for_moving, wants_matching
 from tests.stereo.made import FAR, MEDIAN, NEAR, corner
 from tests.stereo.test_moving import PASSED, with_passer
@@ -196,7 +196,7 @@ def test_a_fit_begins_with_what_is_known_of_depth_within_its_budget(monkeypatch:
     result = fit_guided(measured, SCENE, wanted("fit.moving=off"), ticks=now)
     assert len(begun) == 1 and 3.9 < result.seconds < 4.2 and result.timeline[0]["seconds"] > 1
     assert depth_error(result.field) < 0.02
-    fit_guided(measured, SCENE, wanted("budget=1"), start=result.field, ticks=now)
+    fit_guided(measured, SCENE, wanted("budget=1"), begin=Begin(start=result.field), ticks=now)
     fit_guided(measured, SCENE, wanted("budget=1", "fit.depth=0"), ticks=now)
     fit_guided(views(), SCENE, wanted("budget=1"), ticks=now)  # six pictures were matched: too few
     assert len(begun) == 1
@@ -233,10 +233,10 @@ def test_a_guess_leaves_the_coarsest_lattice_sooner_where_validation_views_tell_
     many = few.subset(np.tile(np.arange(len(few)), -(-LEAST_VIEWS // np.count_nonzero(~few.test))))
     for shown, factor, tick in ((many, 0.7, 0.002), (few, 1.0, 0.005)):
         shares = []
-        for begin in ({}, {"start": rough, "coarse": True}):
+        for begin in (Begin(), Begin(start=rough, coarse=True)):
             told = Levels()
             settings = wanted("fit.depth_from=sensor", "fit.moving=off")
-            fit_guided(shown, SCENE, settings, told, ticks=steady(tick), **begin)  # type: ignore[arg-type]
+            fit_guided(shown, SCENE, settings, told, begin, steady(tick))
             assert set(told.seen) == {"32³", "64³"}
             shares.append(told.seen.count("32³") / len(told.seen))
         assert shares[1] <= factor * shares[0]

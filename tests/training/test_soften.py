@@ -11,7 +11,7 @@ import torch
 from fieldfuse.config import FitSettings
 from fieldfuse.training import fit
 from fieldfuse.training.fit import fit_field
-from fieldfuse.training.rays import PixelPool, softened
+from fieldfuse.training.pixels import PixelPool, softened
 from fieldfuse.training.schedule import LAST_SOFT, MOST_SOFT, Schedule
 from tests.training.test_fit import scene, sphere_views, ticking, wanted
 

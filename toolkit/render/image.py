@@ -42,18 +42,16 @@ def make_renderer(field: Field, engine: str = "auto") -> View:
     Args:
         engine: auto | numba | triton | torch. Numba runs on the CPU alone, Triton on CUDA alone.
     """
-    deferred = isinstance(field.decoder, Deferred)
-    chosen = choose_engine(engine, "deferred" if deferred else "per_sample", field.device)
+    chosen = choose_engine(engine, "deferred" if isinstance(field.decoder, Deferred) else "per_sample", field.device)
     if chosen == "triton":
         from fieldfuse.render.triton_renderer import TritonRenderer
 
         return TritonRenderer(field)
     if chosen == "torch":
         return partial(_in_chunks, field)
-    from fieldfuse.render.numba_per_sample import PerSampleRenderer
     from fieldfuse.render.numba_renderer import NumbaRenderer
 
-    compiled = NumbaRenderer(field) if deferred else PerSampleRenderer(field)
+    compiled = NumbaRenderer(field)
 
     def render(origins: torch.Tensor, directions: torch.Tensor) -> RayValues:
         values = compiled.render(origins, directions)

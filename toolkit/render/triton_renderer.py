@@ -25,7 +25,6 @@ class Tables:
 
     def __init__(self, field: Field) -> None:
         space, topology = field.space, field.topology
-        assert topology.table is not None
         self.table, self.lookup = topology.table.view(-1), topology.lookup_rows.reshape(-1)
         self.occupied, self.skip = field.occupied.to(torch.uint8), bricks_to_skip(field.grid.bricks)
         self.shell, self.fine = space.shell > 0, field.fine

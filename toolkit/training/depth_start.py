@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import torch
 
+from fieldfuse.backends.numba.volume import add_points, vote
 from fieldfuse.camera import Array, invert, unproject
 from fieldfuse.capture.types import Views
 from fieldfuse.config import Settings
-from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.field import Field
 from fieldfuse.training.levels import FEATURE_NOISE, all_places, occupancy
@@ -30,11 +29,11 @@ from fieldfuse.training.start import (
     colour_behind,
     finest_resolution,
     levels,
+    new_decoder,
     possible,
     radii,
     space_of,
 )
-from fieldfuse.training.view import limit
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import BLOCK, Topology
 
@@ -103,8 +102,7 @@ def depth_start(views: Views, scene: Scene, settings: Settings, device: torch.de
     feature[known, :3] = torch.logit((colour[known] / count[known, None]).clamp(0.02, 0.98))
     density = torch.where(known, THICK, THIN)
     density[-1], feature[-1] = 0, 0
-    decoder = make_decoder(settings.field.decoder, channels, settings.field.width)
-    limit(decoder, settings.field.view)
+    decoder = new_decoder(settings.field)
     return Field(space, resolution, topology, occupied, density, feature, decoder, colour_behind(views), NEAR * scene.near).to(device)
 
 
@@ -118,7 +116,7 @@ def votes(space: Space, resolution: int, places: Tensor, views: Views) -> Votes:
     for index, depth in enumerate(views.depths):
         camera = views.intrinsics[index]
         known = np.zeros((camera.height, camera.width), np.float32) if depth is None else np.ascontiguousarray(depth, dtype=np.float32)
-        _vote(centres, radius, cameras[index], worlds[index], known, out)
+        vote(centres, radius, cameras[index], worlds[index], known, out)
     return Votes(*out)
 
 
@@ -133,7 +131,7 @@ def measured(space: Space, resolution: int, topology: Topology, views: Views) ->
     for index in asked:
         points, colours = _points(views, index, step)
         at = (space.contract(space.normalise(torch.from_numpy(points))) + space.extent) * (resolution / (2 * space.extent))
-        _add(at.clamp(-1, side).numpy().astype(np.float32), colours, whole)
+        add_points(at.clamp(-1, side).numpy().astype(np.float32), colours, whole)
     blocks = whole.reshape(side // BLOCK, BLOCK, side // BLOCK, BLOCK, side // BLOCK, BLOCK, 4).transpose(0, 2, 4, 1, 3, 5, 6)
     x, y, z = topology.keys.long().unbind(1)
     rows = torch.from_numpy(blocks)[z, y, x].reshape(-1, 4)
@@ -144,8 +142,8 @@ def measured(space: Space, resolution: int, topology: Topology, views: Views) ->
 def warm_up() -> None:
     """Have the kernels compiled, or loaded."""
     out = np.zeros((3, 1), np.int32)
-    _vote(np.zeros((1, 3)), np.ones(1), np.ones(4), np.eye(4), np.zeros((1, 1), np.float32), out)
-    _add(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), np.zeros((2, 2, 2, 4), np.float32))
+    vote(np.zeros((1, 3)), np.ones(1), np.ones(4), np.eye(4), np.zeros((1, 1), np.float32), out)
+    add_points(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), np.zeros((2, 2, 2, 4), np.float32))
 
 
 def _resolution(space: Space, train: Views, scene: Scene, settings: Settings) -> int:
@@ -180,45 +178,3 @@ def _points(views: Views, index: int, step: int) -> tuple[Array, Array]:
     pixels = np.stack([column, row], 1) + 0.5
     points = unproject(views.intrinsics[index], views.world_from_camera[index], pixels, depth[row, column].astype(np.float64))
     return points, views.images[index][row, column]
-
-
-@numba.njit(cache=True, nogil=True)
-def _vote(centres: Array, radius: Array, camera: Array, world: Array, depth: Array, out: Array) -> None:
-    """Add what one picture says of voxels to out (3, N): unknown, past, here."""
-    fx, fy, cx, cy = camera
-    height, width = depth.shape
-    for i in range(len(centres)):
-        x, y, z = centres[i]
-        far = world[2, 0] * x + world[2, 1] * y + world[2, 2] * z + world[2, 3]
-        reach = 2 * radius[i]
-        if far <= reach:
-            continue
-        u = (world[0, 0] * x + world[0, 1] * y + world[0, 2] * z + world[0, 3]) / far * fx + cx
-        v = (world[1, 0] * x + world[1, 1] * y + world[1, 2] * z + world[1, 3]) / far * fy + cy
-        if not (0 <= u < width and 0 <= v < height):
-            continue
-        there = depth[int(v), int(u)]
-        if not there > 0:
-            out[0, i] += 1
-        elif far < there - reach:
-            out[1, i] += 1
-        elif far <= there + reach:
-            out[2, i] += 1
-
-
-@numba.njit(cache=True, nogil=True)
-def _add(places: Array, colours: Array, out: Array) -> None:
-    """Add points (P, 3), in voxels, to the corners about them, out (z, y, x, 4): weight, and colours by it."""
-    high, long, wide = out.shape[0] - 1, out.shape[1] - 1, out.shape[2] - 1
-    for i in range(len(places)):
-        x, y, z = places[i]
-        if not (0 <= x < wide and 0 <= y < long and 0 <= z < high):
-            continue
-        left, top, front = int(x), int(y), int(z)
-        for corner in range(8):
-            dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
-            weight = abs(1 - dx - (x - left)) * abs(1 - dy - (y - top)) * abs(1 - dz - (z - front))
-            node = out[front + dz, top + dy, left + dx]
-            node[0] += weight
-            for channel in range(3):
-                node[channel + 1] += weight * colours[i, channel]

@@ -30,7 +30,7 @@ from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.field import Field
 from fieldfuse.render.fused import make_field, without_empty_blocks
-from fieldfuse.training.behind import sky_behind
+from fieldfuse.training.background_sh import sky_behind
 from fieldfuse.training.finer_colours import finer_colours
 from fieldfuse.training.silhouettes import inside_silhouettes, visual_hull
 from fieldfuse.training.start import colour_behind, space_of

@@ -10,7 +10,6 @@ import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypedDict, Unpack
 
 import numpy as np
 
@@ -20,23 +19,12 @@ from fieldfuse.errors import InputError, Interrupted
 from fieldfuse.memory import give_back
 from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
-from fieldfuse.render.field import Field
 from fieldfuse.stereo import moving, quick
 from fieldfuse.stereo.left_out import LeftOut
 from fieldfuse.training import depth_start
 from fieldfuse.training.engine import fit_device, warm_up
-from fieldfuse.training.fit import DEFAULT_BUDGET, Clock, FitResult, fit_field
+from fieldfuse.training.fit import DEFAULT_BUDGET, Begin, Clock, FitResult, fit_field
 from fieldfuse.training.schedule import GUESSED, PARTLY, RUNGS
-from fieldfuse.volume.host import Host
-
-
-class Begin(TypedDict, total=False):
-    """What a fit begins with besides its views; see `fit_field`."""
-
-    host: Host | None
-    start: Field | Callable[[], Field] | None
-    coarse: bool
-    rungs: tuple[float, ...]
 
 
 class Part(Progress):
@@ -71,8 +59,8 @@ def fit_guided(
     scene: Scene,
     settings: Settings,
     progress: Progress = SILENT,
+    begin: Begin = Begin(),  # noqa: B008 (frozen)
     ticks: Callable[[], float] = time.perf_counter,
-    **begin: Unpack[Begin],
 ) -> FitResult:
     """`fit_field`, with quick matching before it where that is wanted, without what moves, and, unless `begin` has a start, from what is
     known of depth. The seconds of all three are a part of the budget, and of the timeline. A start that is a guess (`coarse`) is gone on
@@ -84,11 +72,11 @@ def fit_guided(
         Interrupted: the user asked to stop while pictures were matched.
         InputError: as `fit_field`.
     """
-    if begin.get("coarse"):
-        begin.setdefault("rungs", GUESSED)
+    if begin.coarse and begin.rungs is None:
+        begin = replace(begin, rungs=GUESSED)
     matching = wants_matching(views, settings)
     if not (matching or looks_for_moving(views, settings) or depth_start.starts_by_depth(views, settings)):
-        return fit_field(views, scene, settings, progress, ticks=ticks, **begin)
+        return fit_field(views, scene, settings, progress, begin, ticks)
     warm_up(settings, progress)
     quick.warm_up()
     depth_start.warm_up()
@@ -108,15 +96,15 @@ def fit_guided(
             left_out = find_moving(known, matched, scene, budget, progress)
     left_out = None if left_out is None else replace(left_out, seconds=clock.seconds() - matched_for)
     shown = known if left_out is None else left_out.without(known)
-    if begin.get("start") is None and depth_start.starts_by_depth(shown, settings):
+    if begin.start is None and depth_start.starts_by_depth(shown, settings):
         first = depth_start.depth_start(shown, scene, settings, fit_device(settings))
-        begin["rungs"] = RUNGS if first.resolution == depth_start.RESOLUTION_KNOWN else PARTLY
-        begin["start"], begin["coarse"] = [first].pop, True  # once it is taken nobody here holds it
+        rungs = RUNGS if first.resolution == depth_start.RESOLUTION_KNOWN else PARTLY
+        begin = replace(begin, start=[first].pop, coarse=True, rungs=rungs)  # once it is taken nobody here holds it
         del first
     give_back()  # what pictures, costs and votes took
     spent = clock.seconds()
     rest = replace(settings, fit=replace(settings.fit, budget=max(budget - spent, 0.5 * budget)))
-    result = fit_field(shown, scene, rest, Part(progress, spent, budget, budget), ticks=ticks, **begin)
+    result = fit_field(shown, scene, rest, Part(progress, spent, budget, budget), begin, ticks)
     result.timeline = result.after(spent)
     result.seconds += spent
     result.notes = notes + result.notes

@@ -13,11 +13,11 @@ import torch
 
 from fieldfuse.capture.types import Views
 from fieldfuse.config import Settings
-from fieldfuse.nerfusion.decoder import Deferred, PerSample, make_decoder
+from fieldfuse.nerfusion.decoder import Deferred, PerSample
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.field import Field
 from fieldfuse.training.levels import FEATURE_NOISE, all_places, occupancy
-from fieldfuse.training.start import NEAR, THIN, finest_resolution, levels, possible
+from fieldfuse.training.start import NEAR, THIN, finest_resolution, levels, new_decoder, possible
 from fieldfuse.volume.edit import resample
 
 Tensor = torch.Tensor
@@ -72,7 +72,7 @@ def network_start(made: Field, views: Views, scene: Scene, settings: Settings) -
         decoder = widened(made.decoder, hidden, generator)
         rows = torch.where((mark > 0)[:, None], feature, noise)
     else:
-        decoder = make_decoder(settings.field.decoder, channels, hidden)
+        decoder = new_decoder(settings.field)
         rows = noise
     rows[-1] = 0
     return replace(

@@ -13,9 +13,8 @@ from dataclasses import field as default
 import numpy as np
 
 from fieldfuse.config import FitSettings
-from fieldfuse.training.depth import FINE, Trust
+from fieldfuse.training.losses import FINE, Rates, Trust
 from fieldfuse.training.start import COARSEST, FINER
-from fieldfuse.training.step import Rates
 
 RUNGS = (0.1, 0.3, 0.6, 0.8, 0.9)  # share of the budget at which each level ends at the latest, from the first one on …
 PARTLY = (0.2, 0.45, 0.7, 0.85, 0.9)  # … of a fit that begins with what is known of depth, and knows a part: what is not takes longer

@@ -10,8 +10,11 @@ import cv2
 import numpy as np
 import torch
 
+from fieldfuse.backends.constants import DIRECTION
 from fieldfuse.camera import Array, invert
 from fieldfuse.capture.types import Views
+from fieldfuse.config import FieldSettings
+from fieldfuse.nerfusion.decoder import Deferred, PerSample, make_decoder
 from fieldfuse.poses.scene import Scene
 from fieldfuse.volume.space import Space
 
@@ -24,7 +27,8 @@ ROOM_MARGIN = 1.4  # the same where nothing exists outside and no alpha says whe
 LEAST_REACH = 0.9
 NEAR = 0.8  # of the scene's nearest depth: where a fit's rays begin
 COARSEST = 32
-THIN = -4.5  # raw density of what nobody knows: thin enough that every voxel along a ray is tried, thick enough that none is ignored
+HARMONICS = {"none": 0, "low": 4, "full": DIRECTION, "auto": DIRECTION}  # of the viewing direction, lowest first, that a decoder sees
+THIN = -4.5  # raw density of what is unknown: thin enough that every voxel along a ray is tried, thick enough that none is ignored
 FINEST = 1024
 USUAL, FINER = 512, 768  # finer than usual is worth a level of its own from `FINER` on; `schedule.py` decides whether it is made
 PIXELS = 2.0  # of the training views, a voxel in the middle of the scene
@@ -36,6 +40,26 @@ SEEN_BY = 3  # training views that must see a voxel: fewer cannot tell its depth
 FEW_VIEWS = 24
 EMPTIED = 0.02  # share of the views that may err when they say that a voxel is empty
 WHOLE = 0.87  # voxels from the middle of one to its corners: half the diagonal
+
+
+def new_decoder(settings: FieldSettings) -> Deferred | PerSample:
+    """A decoder of these settings, blind for the harmonics that `settings.view` does not have: their weights are zero and stay zero, so
+    that field files, kernels and renderers are the same for all."""
+    decoder = make_decoder(settings.decoder, settings.channels, settings.width)
+    direction_weights(decoder)[:, HARMONICS[settings.view] :] = 0.0
+    return decoder
+
+
+def direction_weights(decoder: Deferred | PerSample) -> Tensor:
+    """(hidden, 16) the weights that take the direction; a view of the parameter."""
+    first = decoder.layers[0] if isinstance(decoder, Deferred) else decoder.colour[0]
+    assert isinstance(first, torch.nn.Linear)
+    return first.weight.detach()[:, -DIRECTION:]
+
+
+def unseen_harmonics(decoder: Deferred | PerSample) -> Tensor:
+    """(16,) bool: harmonics that the decoder does not see and must not learn to."""
+    return (direction_weights(decoder) == 0).all(0)
 
 
 def make_space(scene: Scene, background: bool, margin: float = MARGIN) -> Space:

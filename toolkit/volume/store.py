@@ -23,7 +23,7 @@ from fieldfuse import memory
 from fieldfuse.camera import Similarity
 from fieldfuse.errors import FieldfuseError, InputError, OutputError, all_lines, first_line
 from fieldfuse.files import atomic_path
-from fieldfuse.volume.rows import zero_rows
+from fieldfuse.volume.host import zero_rows
 from fieldfuse.volume.topology import MAX_TABLE_CELLS, VOXELS
 
 VERSION = 1

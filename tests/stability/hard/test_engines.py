@@ -67,7 +67,7 @@ def test_nothing(within: Within) -> None:
     """Nothing to see: no rays, rays that miss, a field without voxels."""
     field = small_field(1)
     origins, directions = aimed_rays(20, 5)
-    empty = replace(field, occupied=torch.zeros_like(field.occupied)).settled()
+    empty = replace(field, occupied=torch.zeros_like(field.occupied)).packed()()
     for what, seen, ways in (("missing", field, -directions), ("no voxels", empty, directions)):
         for name, values in both(seen, origins, ways, 1e-3).items():
             apart = float((values[:, :3] - field.background).abs().max())
