@@ -36,12 +36,6 @@ def test_distances_along_rays_are_those_of_the_pools_directions() -> None:
         np.testing.assert_allclose(along.numpy(), depth.reshape(-1), atol=1e-5)
 
 
-def test_without_depth_nothing_is_kept() -> None:
-    views = made_views()
-    assert PixelPool(views).take(torch.arange(3)).distance is None
-    assert PixelPool(replace(views, depths=[]), depth=True).take(torch.arange(3)).distance is None
-
-
 def test_what_is_no_depth_stays_unknown() -> None:
     depth = np.array([[np.nan, -1.0, 0.0, np.inf, 2.0]], np.float32)
     found = ray_distances(depth, Intrinsics(5, 1, 5, 5, 2.5, 0.5))

@@ -116,19 +116,6 @@ def test_a_stop_while_looking_for_what_moves_ends_the_fit() -> None:
     assert result.interrupted and result.left_out is None and result.steps == 0
 
 
-def test_looking_for_what_moves_is_a_part_of_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
-    now, whole = steady(), moving.moving
-
-    def slow(*given: object, **options: object) -> object:
-        assert [now() for _ in range(100)]  # a second
-        return whole(*given, **options)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(moving, "moving", slow)
-    result = fit_guided(replace(views(), depths=corner()[1]), SCENE, wanted(), ticks=now)
-    assert result.matched is None and result.left_out is not None and 1 <= result.left_out.seconds < 1.1
-    assert 3.9 < result.seconds < 4.2
-
-
 def test_what_moves_is_looked_for_where_depth_is_known_and_nothing_is_cut_out() -> None:
     known = replace(views(), depths=corner()[1])
     assert looks_for_moving(known, wanted()) and not looks_for_moving(known, wanted("fit.moving=off"))

@@ -87,12 +87,6 @@ def test_densities_agree_and_are_bounded(error: list[float]) -> None:
     assert out.min() >= 1 - SHARE - 1e-6 and out.max() <= TOP + 1e-5 and np.all(out[given_errors == 0] == 1)
 
 
-def test_nothing_known_draws_evenly() -> None:
-    pool = masked_pool()
-    picks, weights = TileErrors(pool).draw(500, torch.Generator().manual_seed(0))
-    assert len(picks) == 500 and bool((weights == 1).all())
-
-
 @pytest.mark.parametrize("engine", ["torch", "numba"])
 def test_pictures_that_are_masked_away_are_refused(engine: str) -> None:
     """By one sentence from a fit, and before compiled code looks at pixels that are not there."""

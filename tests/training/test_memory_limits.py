@@ -18,23 +18,13 @@ from fieldfuse.training.levels import finer
 from fieldfuse.training.losses import Rates
 from fieldfuse.training.pixels import PixelPool
 from fieldfuse.training.schedule import Schedule
-from fieldfuse.volume.compiled import finer_blocks
 from fieldfuse.volume.grid import GridHost
-from fieldfuse.volume.host import TorchHost
 from tests.pages import in_memory
 from tests.training.test_fit import scene, sphere_views, ticking, wanted
 
 
 def allow(monkeypatch: pytest.MonkeyPatch, free: int | None) -> None:
     monkeypatch.setattr(memory, "available", lambda: free)
-
-
-def test_blocks_of_a_finer_level_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    ticking(monkeypatch, 0.2)
-    field = fit_field(sphere_views(), scene(), wanted("engine=numba", "budget=2", "field.resolution=32")).field
-    for ratio in (1.0, 1.5, 2.0, 3.75):
-        keep = field.occupied & (torch.rand(len(field.occupied), generator=torch.Generator().manual_seed(1)) < 0.3)
-        assert len(finer_blocks(field.topology, keep, ratio)) == finer(field, keep, int(ratio * field.resolution), TorchHost()).blocks
 
 
 @pytest.fixture(scope="module")

@@ -30,15 +30,6 @@ def test_a_mean_is_that_of_a_gaussian(radius: float) -> None:
     assert softened(image, None, 0.0) is image
 
 
-def test_what_is_masked_away_goes_into_no_mean() -> None:
-    image, valid = np.full((40, 60, 3), 100, np.uint8), np.ones((40, 60), bool)
-    image[:, 30:], valid[:, 30:] = 0, False
-    soft = softened(image, valid, 3.0)
-    assert (soft[valid] == 100).all() and (soft[~valid] == 0).all()
-    assert image[0, 59, 0] == 0  # what was given stays
-    assert softened(image, np.ones_like(valid), 3.0)[20, 29, 0] < 90
-
-
 @pytest.mark.parametrize("radius", [0.5, 1.0, 4.0])
 def test_with_holes_it_is_nearly_the_mean_of_what_is_known(radius: float) -> None:
     """Against the same weights over valid pixels alone, on a picture with scattered holes of another colour and a large one."""

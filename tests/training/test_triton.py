@@ -25,7 +25,7 @@ from tests.training.gradients import exact_gradients, made_views, weighed
 triton = pytest.importorskip("triton", reason="triton is not installed: it comes with torch for CUDA, and with `make test` on Linux")
 
 from fieldfuse.config import load_settings  # noqa: E402
-from fieldfuse.render.triton_renderer import Tables, TritonRenderer, bricks_to_skip  # noqa: E402
+from fieldfuse.render.triton_renderer import TritonRenderer, bricks_to_skip  # noqa: E402
 from fieldfuse.training.engine import use_every_kernel  # noqa: E402
 from fieldfuse.training.triton_engine import TritonEngine  # noqa: E402
 
@@ -166,14 +166,6 @@ def test_what_is_not_finite_moves_nothing() -> None:
     assert not torch.equal(before[1], engine.field.feature_rows)
 
 
-def test_a_fit_that_cannot_begin_is_told_at_its_first_step() -> None:
-    """Later ones are looked at now and then; whether there was a good one at all decides what is said."""
-    engine = engine_of(field_of(0.0, raw=1.0))
-    engine.field.feature_rows[:-1] = float("nan")
-    with pytest.raises(NotFiniteError):
-        engine.step(RAYS, RATES)
-
-
 def test_the_skipped_distance_is_that_to_the_nearest_brick() -> None:
     bricks = torch.zeros(9, 9, 9, dtype=torch.bool)
     bricks[2, 3, 4] = bricks[7, 7, 1] = True
@@ -183,15 +175,6 @@ def test_the_skipped_distance_is_that_to_the_nearest_brick() -> None:
         torch.stack([(z - 7).abs(), (y - 7).abs(), (x - 1).abs()]).amax(0),
     )
     assert torch.equal(bricks_to_skip(bricks).view(9, 9, 9), wanted.to(torch.uint8))
-
-
-def test_tables_follow_pruning() -> None:
-    field = field_of(0.0, keep=0.5)
-    tables, kept = Tables(field), field.occupied.clone()
-    kept[::2] = False
-    less = replace(field, occupied=kept)
-    tables.renew(less)
-    assert torch.equal(tables.occupied.bool(), kept) and torch.equal(tables.skip, bricks_to_skip(less.grid.bricks))
 
 
 def test_every_kernel_is_warmed_up(monkeypatch: pytest.MonkeyPatch) -> None:

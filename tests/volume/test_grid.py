@@ -93,15 +93,6 @@ def test_trap_3_growth_moves_rows_and_old_views_lose_writes() -> None:
     assert grid.rows("value").view(-1, VOXELS)[moved[:4]].mean(1).tolist() == [0, 1, 2, 3]
 
 
-def test_trap_3_reserving_first_keeps_views() -> None:
-    grid = small_grid(4)
-    grid.reserve(100)
-    generation, rows = grid.generation, grid.rows("value")
-    grid.activate(line(0, 100))
-    grid.reserve(50)
-    assert grid.generation == generation and grid.rows("value") is rows and len(rows) == grid.capacity * VOXELS
-
-
 def test_trap_4_erased_slots_come_back_dirty() -> None:
     host = raw_grid(4)
     host.hashmap().activate(raw_keys(line(0, 4)))
@@ -169,22 +160,6 @@ def test_trap_5_no_leak_noise_at_exit() -> None:
     assert "Memory Statistics" in noisy.stdout + noisy.stderr and "Error" not in noisy.stderr
     quiet = run_python(LEAKY)
     assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")
-
-
-def test_gradient_and_optimiser_through_a_leaf_view() -> None:
-    grid = small_grid(8)
-    slots = grid.activate(line(0, 3))
-    leaf = grid.rows("value").requires_grad_()
-    optimiser = torch.optim.SGD([leaf], lr=0.5)
-    wanted = torch.arange(float(VOXELS))
-    rows = (slots[1] * VOXELS + torch.arange(VOXELS)).long()
-    (0.5 * (leaf[rows, 0] - wanted) ** 2).sum().backward()
-    assert leaf.grad is not None and torch.equal(leaf.grad[rows, 0], -wanted) and float(leaf.grad.sum()) == float(-wanted.sum())
-    optimiser.step()
-    seen = torch.from_dlpack(grid._host.attribute("value").to_dlpack()).view(-1, VOXELS)[slots[1]]
-    assert torch.equal(seen, 0.5 * wanted), "the step must be in Open3D's own buffer"
-    grid.activate(line(0, 8))  # room is there: nothing moves
-    assert leaf is grid.rows("value") and torch.equal(grid.rows("value").detach()[rows, 0], 0.5 * wanted)
 
 
 def test_ordered_is_sorted_and_does_not_depend_on_history() -> None:

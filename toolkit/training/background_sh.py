@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import torch
 
@@ -31,7 +33,7 @@ def sky_behind(views: Views) -> Tensor | None:
         return None
     # Neighbours stay together: the next image of a video tells nothing of places that nobody looked at.
     ends = np.linspace(0, len(products), min(PARTS, len(products)) + 1).round().astype(int)
-    parts = [torch.stack(products[start:end]).sum(0) for start, end in zip(ends[:-1], ends[1:], strict=True)]
+    parts = [torch.stack(products[start:end]).sum(0) for start, end in pairwise(ends)]
     choice = CHOICES[0]
     if len(parts) > 1:
         # The rest is summed up again and not taken as a difference, which would leave few digits where one part holds nearly everything.
