@@ -91,7 +91,7 @@ def test_densities_agree_and_are_bounded(error: list[float]) -> None:
 def test_pictures_that_are_masked_away_are_refused(engine: str) -> None:
     """By one sentence from a fit, and before compiled code looks at pixels that are not there."""
     views = replace(made_views(5, 24), valid=[np.zeros((24, 24), bool)] * 5)
-    with pytest.raises(InputError, match="every pixel of the training pictures is masked"):
+    with pytest.raises(InputError, match="every pixel of the training images is masked"):
         fit_field(views, scene(), wanted("budget=1", f"engine={engine}"))
     pool = masked_pool()
     pool.limit = 0

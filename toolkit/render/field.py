@@ -43,8 +43,8 @@ class Field:
         decoder: deferred or per sample.
         background: (3,) colour behind everything.
         near: distance before which nothing is sampled.
-        sky: (9, 3) harmonics of the colour behind everything, which whole pictures show instead of `background`; None: there is none. It
-            stays on the CPU, where pictures are put together.
+        sky: (9, 3) harmonics of the colour behind everything, which whole renders show instead of `background`; None: there is none. It
+            stays on the CPU, where renders are put together.
     """
 
     space: Space
@@ -103,7 +103,7 @@ class Field:
 
     def packed(self) -> Callable[[], Field]:
         """What makes the copy that `settled` is; it holds the corners that voxels use and nothing else, so that the memory of this field's
-        rows can be let go of before the copy's is taken: the end of a fit is when most is needed."""
+        rows can be freed before the copy's is taken: the end of a fit is when most is needed."""
         corners = corner_nodes(self.topology, self.occupied).view(-1, VOXELS)
         kept = corners.any(1).nonzero().view(-1)
         source = corners.view(-1).nonzero().view(-1)

@@ -1,4 +1,4 @@
-"""Whole pictures of a field: colour, depth along z and opacity at a camera."""
+"""Whole renders of a field: colour, depth along z and opacity at a camera."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SOLID = 0.5  # depth is given where at least this much of the light is stopped
 
 @dataclass(frozen=True)
 class Rendered:
-    """A picture: `rgb` (H, W, 3) float32 in [0, 1], `depth` (H, W) float32 along z in working units (0 = none), `opacity` (H, W)
+    """A render: `rgb` (H, W, 3) float32 in [0, 1], `depth` (H, W) float32 along z in working units (0 = none), `opacity` (H, W)
     float32."""
 
     rgb: Array
@@ -37,7 +37,7 @@ class View(Protocol):
 
 
 def make_renderer(field: Field, engine: str = "auto") -> View:
-    """What renders rays of `field`, for many pictures: compiled on the CPU and, where a ray is decoded once, on CUDA; torch elsewhere.
+    """What renders rays of `field`, for many renders: compiled on the CPU and, where a ray is decoded once, on CUDA; torch elsewhere.
 
     Args:
         engine: auto | numba | triton | torch. Numba runs on the CPU alone, Triton on CUDA alone.
@@ -61,7 +61,7 @@ def make_renderer(field: Field, engine: str = "auto") -> View:
 
 
 def _in_chunks(field: Field, origins: torch.Tensor, directions: torch.Tensor) -> RayValues:
-    """Torch keeps every sample of a batch in memory, so a picture is taken piece by piece."""
+    """Torch keeps every sample of a batch in memory, so a render is made piece by piece."""
     parts = [
         render_rays(field, o.to(field.device), d.to(field.device))
         for o, d in zip(origins.split(CHUNK), directions.split(CHUNK), strict=True)

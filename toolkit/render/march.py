@@ -55,7 +55,7 @@ def first_of_ray(ray: Tensor) -> Tensor:
 
 
 class MarchGrid:
-    """What a ray needs to know of a volume: its space, its lattice, which blocks and which voxels hold something.
+    """What a ray needs of a volume: its space, its lattice, which blocks and which voxels hold something.
 
     Args:
         space: region of interest and contraction.

@@ -1,7 +1,7 @@
-"""The start of a fit whose pictures' depth is known, measured or matched: which voxels can hold something, how thick, in which colour.
+"""The start of a fit whose images' depth is known, measured or matched: which voxels can hold something, how thick, in which colour.
 
-The classical start (`start.py`) goes by depth only where next to no picture contradicts it, on the coarsest lattice. Here pictures vote,
-voxel by voxel: what more than a few of them saw past is empty, what they measured is thick and has its colour, and what nobody knows stays
+The classical start (`start.py`) goes by depth only where next to no image contradicts it, on the coarsest lattice. Here images vote,
+voxel by voxel: what more than a few of them saw past is empty, what they measured is thick and has its colour, and what is unknown stays
 as thin and grey as in the classical start. So a fit begins on a finer lattice, and has more of its rays left for the finest.
 Not in the paper.
 """
@@ -38,45 +38,45 @@ from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import BLOCK, Topology
 
 Tensor = torch.Tensor
-RESOLUTION = 64  # voxels a side, where a part of the pictures' depth is known …
-KNOWN, RESOLUTION_KNOWN = 0.9, 128  # … and where that much of it is: what nobody knows is found on coarse lattices
+RESOLUTION = 64  # voxels a side, where a part of the images' depth is known …
+KNOWN, RESOLUTION_KNOWN = 0.9, 128  # … and where that much of it is: what is unknown is found on coarse lattices
 THICK = 1.5  # raw density of what was measured
-MOST_VIEWS = 80  # pictures with depth that are asked, and as many without, evenly spread: more say the same
-PIECE = 4096  # voxels of the coarsest lattice whose parts are asked for at a time: memory is bounded
+MOST_VIEWS = 80  # images with depth that vote, and as many without, evenly spread: more agree with these
+PIECE = 4096  # voxels of the coarsest lattice whose parts are voted on at a time: memory is bounded
 MOST_POINTS = 1_000_000  # that are put onto the lattice
 ENOUGH = 1.0  # points that a corner needs about it to count as measured
-PAST, PAST_SHARE = 1, 0.05  # pictures, and share of those that know, that may see past what is not empty
-SURFACE = 0.2  # pictures that measured a surface, for each one that saw past it, where it stays all the same
+PAST, PAST_SHARE = 1, 0.05  # images, and share of those with depth, that may see past what is not empty
+SURFACE = 0.2  # images that measured a surface, for each one that saw past it, where it stays all the same
 
 
 @dataclass(frozen=True)
 class Votes:
-    """What pictures say of voxels; those that have a surface before a voxel say nothing of it."""
+    """Votes of images on voxels; those that have a surface before a voxel have none on it."""
 
-    unknown: Array  # (N,) int32 pictures that look there, and know no depth
+    unknown: Array  # (N,) int32 images that look there, without depth
     past: Array  # (N,) … that measured something farther away
     here: Array  # (N,) … that measured a surface there
 
     def stays(self, views: int) -> Array:
-        """(N,) bool: the voxels that can hold something, by the votes of so many pictures."""
+        """(N,) bool: the voxels that can hold something, by the votes of so many images."""
         least = 2 if views >= FEW_VIEWS else 1
         surface = (self.here >= least) & (self.here > SURFACE * self.past)
-        told = self.unknown + self.past + self.here
-        empty = self.past > np.maximum(PAST, PAST_SHARE * told)
+        votes = self.unknown + self.past + self.here
+        empty = self.past > np.maximum(PAST, PAST_SHARE * votes)
         seen = self.unknown + self.here > 0
         return np.asarray(surface | (seen & ~empty))
 
 
 def starts_by_depth(views: Views, settings: Settings) -> bool:
     """Whether a fit of these views begins so: depth is known and believed, and alpha cuts nothing out. Depth that was matched has to be
-    that of `FEW_VIEWS` training pictures: what few agree on is too often wrong (gum with 12 pictures lost 1.1 dB by it)."""
-    told = sum(depth is not None and not test for depth, test in zip(views.depths, views.test, strict=False))
-    return told >= (FEW_VIEWS if views.matched else 1) and settings.fit.depth > 0 and views.background is None
+    that of `FEW_VIEWS` training images: what few agree on is too often wrong (gum with 12 images lost 1.1 dB by it)."""
+    known = sum(depth is not None and not test for depth, test in zip(views.depths, views.test, strict=False))
+    return known >= (FEW_VIEWS if views.matched else 1) and settings.fit.depth > 0 and views.background is None
 
 
 def depth_start(views: Views, scene: Scene, settings: Settings, device: torch.device | str = "cpu") -> Field:
     """The first field of a fit, at `RESOLUTION` voxels a side, or at `RESOLUTION_KNOWN` where nearly all depth is known (at the fit's
-    finest, when that is less), from the training pictures and their depth. About a second.
+    finest, when that is less), from the training images and their depth. About a second.
 
     Args:
         views: all views, at least one training view with depth; held-out ones are not looked at.
@@ -85,7 +85,7 @@ def depth_start(views: Views, scene: Scene, settings: Settings, device: torch.de
     train = views.subset(np.flatnonzero(~np.asarray(views.test)))
     space = space_of(views, scene, settings.field.background)
     resolution = _resolution(space, train, scene, settings)
-    some = train.subset(_asked(train))
+    some = train.subset(_voters(train))
     coarse, ratio = possible(space, COARSEST, all_places(space, COARSEST), train), resolution // COARSEST
     kept = []
     for part in coarse.split(PIECE):
@@ -107,7 +107,7 @@ def depth_start(views: Views, scene: Scene, settings: Settings, device: torch.de
 
 
 def votes(space: Space, resolution: int, places: Tensor, views: Views) -> Votes:
-    """What the depth of `views` says of the voxels `places` (N, 3)."""
+    """Votes of the depth of `views` on the voxels `places` (N, 3)."""
     # Also writeable: numba compiles kernels anew for arrays that are not.
     centres, radius = (np.require(one, requirements=("C", "W")) for one in radii(space, resolution, places, WHOLE))
     worlds = np.stack([invert(pose) for pose in views.world_from_camera])
@@ -125,10 +125,10 @@ def measured(space: Space, resolution: int, topology: Topology, views: Views) ->
     colours, each channel 0 … 1: (M · 512 + 1,) and (M · 512 + 1, 3) float32, nothing in the zero row."""
     side = BLOCK * (resolution // BLOCK + 1)
     whole = np.zeros((side, side, side, 4), np.float32)
-    asked = [index for index, depth in enumerate(views.depths) if depth is not None]
-    pixels = sum(views.images[index][..., 0].size for index in asked)
+    deep = [index for index, depth in enumerate(views.depths) if depth is not None]
+    pixels = sum(views.images[index][..., 0].size for index in deep)
     step = max(1, int(np.ceil(np.sqrt(pixels / MOST_POINTS))))
-    for index in asked:
+    for index in deep:
         points, colours = _points(views, index, step)
         at = (space.contract(space.normalise(torch.from_numpy(points))) + space.extent) * (resolution / (2 * space.extent))
         add_points(at.clamp(-1, side).numpy().astype(np.float32), colours, whole)
@@ -154,10 +154,10 @@ def _resolution(space: Space, train: Views, scene: Scene, settings: Settings) ->
     return max((rung for rung in rungs if rung <= wanted and rung & (rung - 1) == 0), default=COARSEST)
 
 
-def _asked(train: Views) -> Array:
-    """Indices of the pictures that vote."""
-    told = np.array([depth is not None for depth in train.depths])
-    return np.concatenate([some[:: max(1, -(-len(some) // MOST_VIEWS))] for some in (np.flatnonzero(told), np.flatnonzero(~told))])
+def _voters(train: Views) -> Array:
+    """Indices of the images that vote."""
+    deep = np.array([depth is not None for depth in train.depths])
+    return np.concatenate([some[:: max(1, -(-len(some) // MOST_VIEWS))] for some in (np.flatnonzero(deep), np.flatnonzero(~deep))])
 
 
 def _split(places: Tensor, ratio: int) -> Tensor:

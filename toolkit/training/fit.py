@@ -57,7 +57,7 @@ class FitResult:
     rays: int = 0
     interrupted: bool = False
     notes: list[str] = default(default_factory=list)  # a sentence on each step that was not finite, and on what it had to do without
-    matched: dict[str, float] | None = None  # what was matched before the fit: pictures, pixels, share with depth, seconds (`guided.py`)
+    matched: dict[str, float] | None = None  # what was matched before the fit: images, pixels, share with depth, seconds (`guided.py`)
     left_out: LeftOut | None = None  # what the fit did without, since it moves (`guided.py`)
     held_out: list[float] = default(default_factory=list)  # the timeline's last PSNR by held-out view
 
@@ -89,7 +89,7 @@ class Begin:
 
     Attributes:
         host: where rows live while they change (`GridHost` puts them into Open3D's hash map); None: plain tensors.
-        start: a field to go on from, at its finest level, or what gives it; then nobody need hold it while its levels are climbed.
+        start: a field to go on from, at its finest level, or what gives it; then no reference to it is held while its levels are climbed.
         coarse: `start` is a first guess and no fitted field: climb from its level to the finest, as from the classical start.
         rungs: share of the budget at which each level ends at the latest, from the first one on; with too few views to keep some aside for
             validation it ends by `UNTOLD`, if that is sooner. None: as fits the start.
@@ -129,14 +129,14 @@ class Sample:
         return np.asarray((-10 * of_views.clamp_min(1e-10).log10()).cpu().numpy())
 
     def _as_taken(self, shown: torch.Tensor) -> torch.Tensor:
-        """(P, 3) colours of the sample's pixels with what was taken out of their pictures put back."""
+        """(P, 3) colours of the sample's pixels with what was taken out of their images put back."""
         if self.factor is None:
             return shown
         return torch.from_numpy(encode(decode(shown.detach().cpu().numpy().astype(np.float64)) * self.factor)).to(shown)
 
 
 def _factors(views: Views, view: Array, row: Array, column: Array) -> Array | None:
-    """(P, 3) what was taken out of the light of pixels, so that their pictures are not as they were taken; None: nothing."""
+    """(P, 3) what was taken out of the light of pixels, so that their images are not as they were taken; None: nothing."""
     if all(photo is None for photo in views.photos):
         return None
     out = np.ones((len(view), 3))
@@ -171,7 +171,7 @@ def fit_field(
     device = fit_device(settings)
     train = views.subset(np.flatnonzero(~views.test))
     if len(train) == 0:
-        raise InputError("no training view is left; lower --holdout or give more pictures")
+        raise InputError("no training view is left; lower --holdout or give more images")
     host = begin.host or TorchHost(device)
     start = begin.start() if callable(begin.start) else begin.start
     torch.manual_seed(settings.seed)
@@ -184,7 +184,7 @@ def fit_field(
     pool = PixelPool(ordered, device, depth=settings.fit.depth > 0)
     pool.limit = int(pool.starts[np.count_nonzero(~aside)])
     if pool.limit == 0:
-        raise InputError("every pixel of the training pictures is masked away; look at the capture's masks (black is left out)")
+        raise InputError("every pixel of the training images is masked away; look at the capture's masks (black is left out)")
     budget = settings.fit.budget or DEFAULT_BUDGET
     warm_up(settings, progress)
     clock = Clock(ticks)

@@ -1,7 +1,7 @@
-"""A fit that knows depth, and what moves: both are found in the first share of its budget.
+"""A fit with known depth and without what moves: both are found in the first share of its budget.
 
-Depth is the capture's own, or what quick matching of the pictures finds. With it, pictures can be held against each other, and the fit
-begins with what it tells.
+Depth is the capture's own, or what quick matching of the images finds. With it, images can be held against each other, and the fit
+begins with it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Part(Progress):
 def wants_matching(views: Views, settings: Settings) -> bool:
     """Whether a fit of these views begins with matching: no depth is known, and the settings leave it to us (`fit.depth_from=auto`).
 
-    Not where alpha cuts an object out: silhouettes tell enough there (lego 28.6 dB after 30 s without, 28.4 with matching).
+    Not where alpha cuts an object out: silhouettes are enough there (lego 28.6 dB after 30 s without, 28.4 with matching).
     """
     known = any(depth is not None for depth in views.depths) or views.background is not None
     return settings.fit.depth_from == "auto" and settings.fit.depth > 0 and not known
@@ -66,10 +66,10 @@ def fit_guided(
     known of depth. The seconds of all three are a part of the budget, and of the timeline. A start that is a guess (`coarse`) is gone on
     from in steps of its own, unless `begin` has others.
 
-    What cannot be matched is fitted to colours alone, and `notes` says why.
+    What cannot be matched is fitted to colours alone, with the reason in `notes`.
 
     Raises:
-        Interrupted: the user asked to stop while pictures were matched.
+        Interrupted: the user asked to stop while images were matched.
         InputError: as `fit_field`.
     """
     if begin.coarse and begin.rungs is None:
@@ -99,9 +99,9 @@ def fit_guided(
     if begin.start is None and depth_start.starts_by_depth(shown, settings):
         first = depth_start.depth_start(shown, scene, settings, fit_device(settings))
         rungs = RUNGS if first.resolution == depth_start.RESOLUTION_KNOWN else PARTLY
-        begin = replace(begin, start=[first].pop, coarse=True, rungs=rungs)  # once it is taken nobody here holds it
+        begin = replace(begin, start=[first].pop, coarse=True, rungs=rungs)  # once it is taken no reference is left here
         del first
-    give_back()  # what pictures, costs and votes took
+    give_back()  # what images, costs and votes took
     spent = clock.seconds()
     rest = replace(settings, fit=replace(settings.fit, budget=max(budget - spent, 0.5 * budget)))
     result = fit_field(shown, scene, rest, Part(progress, spent, budget, budget), begin, ticks)
@@ -116,8 +116,8 @@ def fit_guided(
 def find_moving(
     views: Views, matched: quick.Matched | None, scene: Scene, budget: float, progress: Progress = SILENT
 ) -> LeftOut | None:
-    """What moves in the training pictures of `views`, by the depth that was `matched`, or by their own; None: no depth is known, by
-    matching of too few pictures, or they are too many for a fit of `budget` seconds.
+    """What moves in the training images of `views`, by the depth that was `matched`, or by their own; None: no depth is known, by
+    matching of too few images, or they are too many for a fit of `budget` seconds.
 
     Raises:
         Interrupted: the user asked to stop.

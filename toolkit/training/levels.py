@@ -87,7 +87,7 @@ def visible(field: Field, seen: Tensor, visits: Tensor, threshold: float) -> Ten
     """(M · 512,) bool: the occupied voxels that stay.
 
     A voxel stays within one voxel of one that training rays saw with a weight T·α above `threshold`, and as long as too few samples fell
-    into it to tell: in captures with many pixels a few hundred steps do not look everywhere. When nothing was seen that strongly (a very
+    into it to judge: in captures with many pixels a few hundred steps do not look everywhere. When nothing was seen that strongly (a very
     thin start), everything stays.
 
     Args:

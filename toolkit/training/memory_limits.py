@@ -27,7 +27,7 @@ def require_start(views: Views, start: Field | None, settings: Settings, device:
         InputError: with what is needed and what is free.
     """
     pixels = sum(image.shape[0] * image.shape[1] for image in views.images)
-    memory.require(POOL_BYTES * pixels, f"a fit to {pixels / 1e6:.0f} million pixels", "lower --image-size, or give fewer pictures")
+    memory.require(POOL_BYTES * pixels, f"a fit to {pixels / 1e6:.0f} million pixels", "lower --image-size, or give fewer images")
     if start is None:
         return
     needed = level_bytes(start, torch.ones_like(start.occupied), start.resolution, settings, replaced=False)

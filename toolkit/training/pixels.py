@@ -136,7 +136,7 @@ def softened(image: Array, valid: Array | None, radius: float) -> Array:
 
 def _filled(image: Array, valid: Array, reach: int) -> Array:
     """A copy with the pixels that are not `valid` as the mean of those that are, over a square up to `reach` pixels to either side: a
-    Gaussian over it takes a quarter of the time of one over a picture with holes. As they were, where nothing valid is as near."""
+    Gaussian over it takes a quarter of the time of one over a image with holes. As they were, where nothing valid is as near."""
     side, holes = (2 * reach + 1, 2 * reach + 1), np.flatnonzero(~valid)
     known = valid.view(np.uint8)
     count = cv2.boxFilter(known, cv2.CV_32F, side, normalize=False, borderType=cv2.BORDER_CONSTANT).reshape(-1)[holes]

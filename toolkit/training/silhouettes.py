@@ -68,7 +68,7 @@ def visual_hull(space: Space, views: Views, device: torch.device | str = "cpu") 
 
 
 def inside_silhouettes(field: Field, views: Views, reach: float = WHOLE) -> Field:
-    """The field without the voxels that the alpha of the training views says are empty.
+    """The field without the voxels that the alpha of the training views shows empty.
 
     Args:
         reach: voxels about the middle of each that have to be empty: `WHOLE` keeps all that a silhouette touches.

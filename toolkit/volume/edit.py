@@ -76,7 +76,7 @@ def _with_reached_blocks(topology: Topology, occupied: Tensor, lowest: int) -> T
 
 
 def _with_marked_blocks(topology: Topology, occupied: Tensor, lowest: int) -> Topology:
-    """The same by marks in the table, which asks the device once; new blocks in the table's order."""
+    """The same by marks in the table, which reads from the device once; new blocks in the table's order."""
     table = topology.table
     sx, sy, sz = topology.table_size
     # (M, 3, 3, 3) steps: whether a row of a block lies at its low end, anywhere, or at its high end along each axis.

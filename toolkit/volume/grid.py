@@ -22,7 +22,7 @@ from fieldfuse.memory import keep_only
 from fieldfuse.volume.host import Host, Hosted, TorchHost, plain_rows
 from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
 
-LOOKED_AT = 64  # blocks at once, when memory is asked whether it is clean: each value is a byte for a moment
+LOOKED_AT = 64  # blocks at once, when memory is checked for being clean: each value is a byte for a moment
 LINE = 64  # bytes of a cache line
 GROWTH = 1.5  # a table that must grow gets at least this much more room
 
@@ -58,7 +58,7 @@ class BlockGrid:
         self._views: dict[str, Tensor] = {}
         self._lent: list[weakref.ref[Tensor]] = []
         try:
-            host: Any = o3d.t.geometry.VoxelBlockGrid  # its stubs know neither tuples nor plain integers
+            host: Any = o3d.t.geometry.VoxelBlockGrid  # its stubs have neither tuples nor plain integers
             self._host = host(
                 attr_names=tuple(self.attributes),
                 attr_dtypes=(o3d.core.float32,) * len(self.attributes),
@@ -95,7 +95,7 @@ class BlockGrid:
         """
         if blocks <= self.capacity:
             return
-        self._let_go()
+        self._void_views()
         try:
             self._map.reserve(int(blocks))
         except (RuntimeError, MemoryError) as error:
@@ -180,9 +180,9 @@ class BlockGrid:
         return self._views[name]
 
     def close(self) -> None:
-        """Let go of all memory, views included. Called at exit for grids still open: Open3D complains about longer held buffers and
+        """Free all memory, views included. Called at exit for grids still open: Open3D complains about longer held buffers and
         fails the exit status."""
-        self._let_go()
+        self._void_views()
         self._map = self._host = None
         _OPEN.discard(self)
 
@@ -191,7 +191,7 @@ class BlockGrid:
             raise RuntimeError("this grid is closed")
         return self._map
 
-    def _let_go(self) -> None:
+    def _void_views(self) -> None:
         """Void every view lent so far, so that its old memory is freed and its use fails."""
         self._views.clear()
         for reference in self._lent:
@@ -262,7 +262,7 @@ class GridHost:
             return
         for name in self.grid.attributes if self.device.type == "cpu" else ():
             rows = self.grid.rows(name).numpy()
-            keep_only(rows, np.zeros(len(rows), np.bool_))  # at once, though somebody may still hold the void rows: they read as zero
+            keep_only(rows, np.zeros(len(rows), np.bool_))  # at once, though the void rows may still be referenced: they read as zero
         self.grid.close()
         self.grid = None
 

@@ -18,7 +18,7 @@ Tensor = torch.Tensor
 
 
 def zero_rows(shape: tuple[int, ...], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Tensor:
-    """Zeros; on the CPU those that nobody writes take no memory (`memory.pages`)."""
+    """Zeros; on the CPU those that are never written take no memory (`memory.pages`)."""
     device, count = torch.device(device), math.prod(shape)
     if device.type != "cpu" or count == 0:
         return torch.zeros(shape, dtype=dtype, device=device)
@@ -62,4 +62,4 @@ class TorchHost:
         return plain_rows(Topology(keys.to(self.device)), channels)
 
     def close(self) -> None:
-        """Nothing to do: torch frees what nobody holds."""
+        """Nothing to do: torch frees what is not referenced."""

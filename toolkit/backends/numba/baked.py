@@ -1,7 +1,7 @@
-"""Rays through a baked field and pictures of it, compiled: straight over the quantised arrays as they lie in the file.
+"""Rays through a baked field and renders of it, compiled: straight over the quantised arrays as they lie in the file.
 
 The march is that of `march.march_ray` (the same places, the same opacities); what differs is what it costs: a voxel's eight densities are
-one read of eight bytes, and nothing is unpacked before. A picture's rays are made where they are used, tile by tile.
+one read of eight bytes, and nothing is unpacked before. A render's rays are made where they are used, tile by tile.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from fieldfuse.backends.numba.rows import add_mixed_bytes
 F, ZERO, HALF, ONE = K.F, K.ZERO, K.HALF, K.ONE
 LEVELS = 255  # steps of a quantised value
 FINER = 16  # entries of the table of optical thickness per step: interpolated densities lie between steps
-CORNERS = 9  # corners along a block's side: those on its far faces are stored with it, so that no voxel asks a second block
+CORNERS = 9  # corners along a block's side: those on its far faces are stored with it, so that no voxel reads a second block
 VX, VY, VZ, VW = range(4)  # columns of a kept sample: place in its voxel, weight
 MOST_KEPT = 512  # samples of one ray that are coloured
 TILE = 16  # pixels a side: rays of a tile share what they read while it is still in the cache
@@ -172,7 +172,7 @@ def _put(layers: Any, tape: Any, background: Any, pixels: Any, count: Any, out: 
 def render_tiles(
     space: Any, baked: Any, layers: Any, background: Any, camera: Any, pose: Any, size: Any, tape: Any, tiles: Any, limits: Any, out: Any
 ) -> Any:
-    """Pixels of some tiles of a pinhole picture.
+    """Pixels of some tiles of a pinhole render.
 
     Args:
         camera: (4,) float32 fx, fy, cx, cy; pose: (3, 4) float32 world_from_camera; size: (width, height), ints.

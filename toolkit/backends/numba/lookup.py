@@ -35,7 +35,7 @@ def raw_density(density: Any, upper: Any, cell: Any, x: Any, y: Any, z: Any) -> 
     slot, local = cell >> 9, cell & 511
     u, v, w = local & 7, (local >> 3) & 7, local >> 6
     if u < 7 and v < 7 and w < 7:
-        at = np.uintp(cell)  # what cannot be negative need not be asked whether it is
+        at = np.uintp(cell)  # unsigned, so that no check for negative indices is compiled
         p0, p1, p2, p3 = density[at], density[at + Y_ROW], density[at + Z_ROW], density[at + Y_ROW + Z_ROW]
         at += X_ROW
         q0, q1, q2, q3 = density[at], density[at + Y_ROW], density[at + Z_ROW], density[at + Y_ROW + Z_ROW]

@@ -1,4 +1,4 @@
-"""Rays through a field whose rays are decoded once, compiled: renders, and what images ask of its colours.
+"""Rays through a field whose rays are decoded once, compiled: renders, and images projected back to its colours.
 
 `render/recolour.py` is the reference of `project_back_pass`.
 """
@@ -90,7 +90,7 @@ def project_back_pass(
     samples = Samples(np.empty(ROOM, np.int32), np.empty((ROOM, 8), np.int32), np.empty((ROOM, K.VALUES), np.float32))
     rows, values, weights = samples.rows, samples.values, np.empty((ROOM, 8), np.float32)
     features, mean = np.empty((ROOM, channels), np.float32), np.empty(channels, np.float32)
-    result, asked, starts = np.empty(4, np.float32), np.empty(3, np.float32), np.zeros(RAYS + 1, np.int64)
+    result, wanted, starts = np.empty(4, np.float32), np.empty(3, np.float32), np.zeros(RAYS + 1, np.int64)
     of_block = np.empty(RAYS, np.int64)
     given, colour, ray = tape.given, tape.colour, 0
     while ray < len(origins):
@@ -118,12 +118,12 @@ def project_back_pass(
             for k in range(3):
                 own = colour[one, k]
                 slope = max(own * (K.ONE - own), steepest)
-                asked[k] = min(max((colours[of_block[one], k] - own) / slope, -most), most)
+                wanted[k] = min(max((colours[of_block[one], k] - own) / slope, -most), most)
             for i in range(starts[one], starts[one + 1]):
                 for corner in range(8):
                     row = rows[i, corner]
                     part = values[i, K.WEIGHT] * weights[i, corner]
-                    sums[row, 0] += part * asked[0]
-                    sums[row, 1] += part * asked[1]
-                    sums[row, 2] += part * asked[2]
+                    sums[row, 0] += part * wanted[0]
+                    sums[row, 1] += part * wanted[1]
+                    sums[row, 2] += part * wanted[2]
                     sums[row, 3] += part

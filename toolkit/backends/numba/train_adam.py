@@ -12,7 +12,7 @@ from fieldfuse.backends.numba import common as K
 ZERO, ONE = K.ZERO, K.ONE
 COUNT, DENSITY, FEATURE = 0, 1, 2  # columns of a row's record: steps, and from where on the second moments are
 MOST_STEPS = 65535  # that are counted
-AHEAD = 8  # rows for which memory is asked before they are needed
+AHEAD = 8  # rows that are prefetched before they are needed
 
 
 class Rows(NamedTuple):

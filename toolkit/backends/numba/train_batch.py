@@ -33,7 +33,7 @@ class Pixels(NamedTuple):
     """The training pixels: see `pixels.PixelPool`."""
 
     colour: Any  # (N, 3) uint8
-    places: Any  # (N,) int32 in their pictures; of length 0 where all pixels of all views are there
+    places: Any  # (N,) int32 in their images; of length 0 where all pixels of all views are there
     starts: Any  # (V + 1,) int64 first pixel of each view
     first_view: Any  # (N >> GUESS,) int32 view of every 2^GUESS-th pixel
     camera: Any  # (V, 5) float32 fx, fy, cx, cy, width
@@ -282,10 +282,10 @@ def split_work(tiles: Any, memory: Any, cuts: Any) -> None:
 
 
 class Tiles:
-    """What rays from each tile of a training picture met last, and pixels drawn by it.
+    """What rays from each tile of a training image met last, and pixels drawn by it.
 
     Attributes:
-        grid: rows and columns of tiles of the largest picture.
+        grid: rows and columns of tiles of the largest image.
         met: (V · rows · columns, 2) float32 distance where half of the light was stopped (0: unknown), and work.
         error: (V · rows · columns,) float32 squared error of late (0: no ray yet).
         density: how often pixels are drawn, see `training.pixels`.

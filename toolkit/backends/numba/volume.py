@@ -185,7 +185,7 @@ def resample(
 
 @njit(**OPTIONS)
 def vote(centres: Any, radius: Any, camera: Any, world: Any, depth: Any, out: Any) -> None:
-    """Add what one picture says of voxels to out (3, N): unknown, past, here."""
+    """Add the votes of one image on voxels to out (3, N): unknown, past, here."""
     fx, fy, cx, cy = camera
     height, width = depth.shape
     for i in range(len(centres)):
