@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -59,8 +61,11 @@ class NumbaRenderer:
 
     def __init__(self, field: Field, threads: int | None = None, weights: decode.Layers | per_sample.Net | None = None) -> None:
         self.space, self.volume, self.background = make_space(field), make_volume(field), field.background.numpy().astype(np.float32)
-        self.threads, deferred = threads or torch.get_num_threads(), isinstance(field.decoder, Deferred)
-        if deferred:
+        self.threads = threads or torch.get_num_threads()
+        self.weights: Any
+        self._pass: Any
+        self._room: Any
+        if isinstance(field.decoder, Deferred):
             self.weights = weights or decode.layers_of(decoder_arrays(field.decoder))
             self._pass, self._room, self.threshold = render.render_pass, decode.rays_of, THRESHOLD
         else:

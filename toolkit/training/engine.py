@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -78,6 +79,9 @@ class Engine(Protocol):
         ...
 
 
+Make = Callable[[Field, PixelPool, int], Engine]
+
+
 def chosen_engine(settings: Settings, device: torch.device) -> str:
     """numba, triton or torch: the backend of a fit with these settings on `device`."""
     return choose_engine(settings.engine, settings.field.decoder, device)
@@ -88,7 +92,7 @@ def make_engine(settings: Settings, field: Field, pool: PixelPool) -> Engine:
     return _kind(chosen_engine(settings, field.device))(field, pool, settings.seed)
 
 
-def _kind(chosen: str) -> type[Engine]:
+def _kind(chosen: str) -> Make:
     """The class of an engine; its kernels are imported with it."""
     if chosen == "numba":
         from fieldfuse.training.numba_engine import NumbaEngine
@@ -122,7 +126,7 @@ def warm_up(settings: Settings, progress: Progress) -> None:
         _ready.add(kind)
 
 
-def use_every_kernel(kind: type[Engine], settings: Settings, device: torch.device, rays: int) -> None:
+def use_every_kernel(kind: Make, settings: Settings, device: torch.device, rays: int) -> None:
     """Everything that a fit and its renders call, on a field of a few voxels: with and without a background beyond the region of interest,
     known depth and masks, where kernels differ by these."""
     rates, host = Rates(0.01, 0.01, 0.001, 0.01, 0.01), TorchHost(device)
@@ -136,7 +140,7 @@ def use_every_kernel(kind: type[Engine], settings: Settings, device: torch.devic
             valid[0, 0] = not masked
             one = Views(["one"], [np.zeros((4, 4, 3), np.uint8)], [Intrinsics(4, 4, 4, 4, 2, 2)], pose[None], np.zeros(1, bool), [valid])
             one.depths = [np.ones((4, 4), np.float32) if known else None]
-            engine = kind(field, PixelPool(one, device, depth=known), 0)  # type: ignore[call-arg]
+            engine = kind(field, PixelPool(one, device, depth=known), 0)
             for _ in range(getattr(kind, "EAGER", 0) + 2 if known and masked else 1):  # the last two are recorded and replayed
                 engine.step(rays, rates)
         finer_blocks(field.topology, field.occupied, 2.0)

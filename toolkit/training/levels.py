@@ -57,8 +57,10 @@ def _housed(field: Field, occupied: Tensor, resolution: int, host: Host) -> Fiel
 
 def in_rows(field: Field, hosted: Hosted, occupied: Tensor, resolution: int) -> Field:
     """The field with other rows."""
-    rows = {"density_rows": hosted.density, "feature_rows": hosted.feature}
-    return replace(field, resolution=resolution, topology=hosted.topology, occupied=occupied, **rows)
+    density, feature = hosted.density, hosted.feature
+    return replace(
+        field, resolution=resolution, topology=hosted.topology, occupied=occupied, density_rows=density, feature_rows=feature
+    )
 
 
 @dataclass(frozen=True)

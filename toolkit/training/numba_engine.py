@@ -47,7 +47,7 @@ class DeferredDecoder:
     def gradient_pass(self, thread: int, around: NumbaRenderer, *rest: Any) -> tuple[int, float, int]:
         """See `train_rays.gradient_pass`; `rest` from the pixels to the sums."""
         fixed = (around.space, around.volume, self.weights, self.turned, around.background)
-        return train_rays.gradient_pass(*fixed, *rest, self.blocks[thread])  # type: ignore[no-any-return]
+        return train_rays.gradient_pass(*fixed, *rest, self.blocks[thread])
 
     def turn(self) -> None:
         """Renew the transposed copies of the weights."""
@@ -72,7 +72,7 @@ class PerSampleDecoder:
 
     def gradient_pass(self, thread: int, around: NumbaRenderer, *rest: Any) -> tuple[int, float, int]:
         fixed = (around.space, around.volume, self.weights, around.background)
-        return train_per_sample.gradient_pass(*fixed, *rest, self.scratch[thread])  # type: ignore[no-any-return]
+        return train_per_sample.gradient_pass(*fixed, *rest, self.scratch[thread])
 
     def turn(self) -> None:
         per_sample.turn(self.weights)

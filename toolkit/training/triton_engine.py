@@ -12,6 +12,7 @@ import math
 import torch
 import triton
 
+from fieldfuse.backends.constants import RENEW
 from fieldfuse.backends.dispatch import OTHERS_GO_ON
 from fieldfuse.backends.triton.march import BEHIND, COUNTS, JITTER, NOTES, RED, TARGET
 from fieldfuse.backends.triton.train_adam import count_step, learn, move
@@ -25,7 +26,7 @@ from fieldfuse.render.march import BRICK
 from fieldfuse.render.triton_renderer import Tables, TritonRenderer, buffers_for, launch_composite, launch_walk
 from fieldfuse.training.losses import Rates
 from fieldfuse.training.nonfinite_policy import NotFiniteError
-from fieldfuse.training.pixels import RENEW, Batch, PixelPool, densities, tile_grid
+from fieldfuse.training.pixels import Batch, PixelPool, densities, tile_grid
 from fieldfuse.training.start import unseen_harmonics
 
 Tensor = torch.Tensor

@@ -220,7 +220,7 @@ def march_ray(
     transmittance = ONE
     lx, ly, lz = -1, -1, -1
     slot = np.int64(-1)
-    strongest, strongest_cell = ZERO, 0
+    strongest, strongest_cell = ZERO, K.START
     ray, step = start_ray(space, line, jitter)
     while transmittance >= stop:
         more, step = next_step(space, volume.bricks, ray, step)

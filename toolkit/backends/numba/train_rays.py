@@ -44,7 +44,7 @@ def make_block(tape: Tape, channels: int) -> Block:
     samples = Samples(np.zeros(ROOM, np.int32), np.zeros((ROOM, 8), np.int32), np.zeros((ROOM, K.VALUES), np.float32))
     of_rays = (np.zeros(shape, np.float32) for shape in ((RAYS, 3), RAYS, RAYS))
     of_samples = (np.zeros(shape, np.float32) for shape in ((ROOM, 8), (ROOM, channels), ROOM, channels, 4))
-    return Block(np.zeros(RAYS + 1, np.int64), *of_rays, samples, *of_samples, tape)
+    return Block._make([np.zeros(RAYS + 1, np.int64), *of_rays, samples, *of_samples, tape])
 
 
 @njit(**K.OPTIONS)
