@@ -170,7 +170,7 @@ BAD_INFORMATION: dict[str, tuple[dict[str, Any] | str, str]] = {
     "version text": ({"version": "1"}, "no version"),
     "version true": ({"version": True}, "no version"),
     "not JSON": ("{", "not valid JSON"),
-    "NaN in JSON": ('{"version": NaN}', "no version"),
+    "NaN in JSON": ('{"version": NaN}', "not valid JSON"),
     "a list": ("[]", "no version"),
     "nested": ("[" * 200_000, "not valid JSON"),
     "huge number": ('{"version": ' + "9" * 10_000 + "}", "cannot be used"),

@@ -23,7 +23,9 @@ OPACITY = 1e-6
 def both(field: Field, origins: Tensor, directions: Tensor, threshold: float) -> dict[str, Tensor]:
     """(B, 5) colour, distance and opacity by each engine."""
     slow = render_rays(field, origins, directions, threshold)
-    fast = NumbaRenderer(field, 1).render(origins, directions, threshold)
+    renderer = NumbaRenderer(field, 1)
+    renderer.threshold = threshold
+    fast = renderer.render(origins, directions)
     return {"torch": torch.cat([slow.colour, slow.distance[:, None], slow.opacity[:, None]], 1), "compiled": fast}
 
 

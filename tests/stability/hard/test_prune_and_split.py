@@ -66,7 +66,7 @@ def split_errors(seed: int) -> dict[str, float]:
 
 def test_trilinear_split(within: Within) -> None:
     """A trilinear split leaves the field as it was."""
-    errors = split_errors(3, "trilinear")
+    errors = split_errors(3)
     for name, error in errors.items():
         within(name, error, 1e-6 if name.startswith("value in") else 0.0)
 
