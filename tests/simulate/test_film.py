@@ -17,7 +17,7 @@ from fieldfuse.camera import Intrinsics, project, unproject
 from fieldfuse.effects import exposure, motion_blur, rolling_shutter, sensor_noise, transfer, vignetting
 from fieldfuse.effects.listed import MODULES, Effects, parse
 from fieldfuse.simulate.eye import eye_of, take
-from fieldfuse.simulate.film import Film, Shot
+from fieldfuse.simulate.film import Film, FilmCamera, Shot
 from fieldfuse.simulate.materials import TextureBank, texture_bank
 from fieldfuse.simulate.paths import PathSettings, plan
 from fieldfuse.simulate.procedural import random_scene
@@ -35,7 +35,7 @@ def bank() -> TextureBank:
 def filmed(bank: TextureBank, *listing: Any, kind: str = "room", depth: bool = False, seed: int = 4) -> Film:
     scene = random_scene(kind, np.random.default_rng(seed), bank)
     motion = plan(scene, PATH, np.random.default_rng(seed))
-    return Film(scene, CAMERA, motion, PATH.times(), parse(list(listing), "test"), seed, depth)
+    return Film(scene, FilmCamera(CAMERA, depth=depth), motion, PATH.times(), parse(list(listing), "test"), seed)
 
 
 def digest(shot: Shot) -> str:
@@ -228,7 +228,7 @@ def test_exact_geometry_with_a_lens_and_rows(bank: TextureBank) -> None:
     shot = film.shot(0)
     assert isinstance(film.scene, Scene)
     eye = eye_of(film.intrinsics, 2, torch.device("cpu"))
-    rays = (eye.directions / eye.cosine[:, None])[eye.back].numpy() * shot.depth.reshape(-1, 1)
+    rays = (eye.directions / eye.cosine[:, None]).numpy() * shot.depth.reshape(-1, 1)
     points = rays @ shot.world_from_camera[:3, :3].T + shot.world_from_camera[:3, 3]
     assert np.quantile(film.scene.clearance(torch.from_numpy(points)).abs().numpy(), 0.98) < 2e-3
 

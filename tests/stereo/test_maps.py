@@ -24,10 +24,6 @@ def two_surfaces() -> Array:
     return depth
 
 
-def test_at_the_same_size_all_depth_stays() -> None:
-    np.testing.assert_array_equal(depth_at(found(two_surfaces()), WIDTH, HEIGHT), two_surfaces().astype(np.float32))
-
-
 @pytest.mark.parametrize("gap", [0, 1, 3])
 def test_on_more_pixels_no_depth_is_told_beside_an_edge_or_a_gap(gap: int) -> None:
     depth = two_surfaces()

@@ -1,32 +1,39 @@
-"""Semi-global matching (Hirschmüller 2008) over a volume of matching costs: smooth depth with steps only where they pay."""
+"""Semi-global matching (Hirschmüller 2008): costs of planes summed along paths through the image, and the lowest of them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
-import numba
 import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
 
 from fieldfuse.camera import Array
-from fieldfuse.vectors import lesser
 
-SMALL_STEP = 0.03  # penalty of a change by one plane between neighbouring pixels, in units of the cost (0 to 1)
-LARGE_STEP = 1.0  # penalty of any larger change on even ground
-SOFT_EDGE = 8.0  # grey levels between two pixels that halve the large penalty: depth steps where colour does
-# Directions that a path moves on by are taken together in two passes over the picture, downwards and to the right, and back: along the row,
-# and from the row before straight on and askew.
-DOWN, UP = 1, -1
-STRAIGHT = (0,)  # columns that a path moves by from row to row
-ALL = (0, 1, -1)
-PATHS = tuple(path for way in (DOWN, UP) for path in ((0, way), *((way, way * slant) for slant in ALL)))  # (rows, columns)
 F = np.float32
 HIGH = F(1e9)
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 ONE, TWO = np.uintp(1), np.uintp(2)  # places that cannot be negative need not be asked whether they are
 
 
-@numba.njit(**OPTIONS)
+@cast(Any, intrinsic)
+def lesser(context: Any, one: Any, other: Any) -> Any:
+    """The smaller of two float32 that are numbers.
+
+    `min` means a branch to the compiler, as soon as its result goes into the next turn of a loop, and such loops stay scalar; this is one
+    instruction. What it gives where one of them is NaN is not defined.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        number = ir.FloatType()
+        function = builder.module.declare_intrinsic("llvm.minnum", [number], ir.FunctionType(number, [number, number]))
+        return builder.call(function, arguments, fastmath=("nnan", "nsz"))
+
+    return types.float32(types.float32, types.float32), generate
+
+
+@njit(**OPTIONS)
 def _begin(cost: Array, total: Array, at: Any, line: Array, own: Any, planes: int) -> Any:
     """The first pixel of a path; arguments and answer as in `_go_on`."""
     lowest = HIGH
@@ -39,7 +46,7 @@ def _begin(cost: Array, total: Array, at: Any, line: Array, own: Any, planes: in
     return lowest
 
 
-@numba.njit(**OPTIONS)
+@njit(**OPTIONS)
 def _go_on(cost: Array, total: Array, at: Any, line: Array, past: Any, own: Any, planes: int, base: Any, most: Any, small: Any) -> Any:
     """One pixel further along a path; equation 13 of the paper.
 
@@ -62,8 +69,8 @@ def _go_on(cost: Array, total: Array, at: Any, line: Array, past: Any, own: Any,
     return lowest
 
 
-@numba.njit(**OPTIONS)
-def _add_paths(cost: Array, grey: Array, way: int, slants: tuple[int, ...], small: float, large: float, soft: float, total: Array) -> None:
+@njit(**OPTIONS)
+def add_paths(cost: Array, grey: Array, way: int, slants: tuple[int, ...], small: float, large: float, soft: float, total: Array) -> None:
     """Add the costs aggregated along some directions to `total` (H · W · D,): along the rows, and from row to row with each of `slants`;
     downwards and to the right, or the other `way`."""
     height, width = grey.shape
@@ -98,9 +105,9 @@ def _add_paths(cost: Array, grey: Array, way: int, slants: tuple[int, ...], smal
                 least[now, k, x] = _go_on(cost, total, at, lines, past, own, planes, base, base + jump, step)
 
 
-@numba.njit(**OPTIONS)
-def _lowest(total: Array, plane: Array, margin: Array) -> None:
-    """The best plane of each pixel between planes (parabola through three), and how much worse the best one elsewhere is."""
+@njit(**OPTIONS)
+def lowest_plane(total: Array, plane: Array) -> None:
+    """The best plane of each pixel between planes: a parabola through three costs."""
     height, width, planes = total.shape
     for y in range(height):
         for x in range(width):
@@ -111,11 +118,6 @@ def _lowest(total: Array, plane: Array, margin: Array) -> None:
             best = 0
             while best < planes - 1 and values[best] > least:
                 best += 1
-            second = HIGH
-            for d in range(best - 1):
-                second = lesser(second, values[d])
-            for d in range(best + 2, planes):
-                second = lesser(second, values[d])
             offset = F(0)
             if 0 < best < planes - 1:
                 low, mid, high = values[best - 1], values[best], values[best + 1]
@@ -123,31 +125,3 @@ def _lowest(total: Array, plane: Array, margin: Array) -> None:
                 if bend > F(1e-9):
                     offset = min(max(F(0.5) * (low - high) / bend, F(-0.5)), F(0.5))
             plane[y, x] = F(best) + offset
-            margin[y, x] = (second - values[best]) / max(second, F(1e-6))
-
-
-def summed_paths(cost: Array, grey: Array, small: float, large: float, slants: tuple[int, ...], ways: Sequence[int] = (DOWN, UP)) -> Array:
-    """(H, W, D) float32: costs aggregated along the rows and, from row to row, along each of `slants` (`STRAIGHT` or `ALL`), there and
-    back, summed; `ways` may name one of both. Other arguments as in `smoothed_planes`."""
-    total = np.zeros(cost.size, np.float32)
-    for way in ways:
-        _add_paths(cost.reshape(-1), grey, way, slants, small, large, SOFT_EDGE, total)
-    return total.reshape(cost.shape)
-
-
-def smoothed_planes(cost: Array, grey: Array, small: float = SMALL_STEP, large: float = LARGE_STEP) -> tuple[Array, Array]:
-    """The plane of each pixel that fits best together with its neighbours.
-
-    Args:
-        cost: (H, W, D) float32 matching costs, 0 to 1, at least three planes.
-        grey: (H, W) picture, 0 to 255.
-
-    Returns:
-        (H, W) float32 plane number with its fraction, and (H, W) float32 relative margin to the best plane that is not its neighbour.
-    """
-    cost = np.ascontiguousarray(cost, dtype=np.float32)
-    grey = np.ascontiguousarray(grey, dtype=np.float32)
-    total = summed_paths(cost, grey, small, large, ALL)
-    plane, margin = np.empty(grey.shape, np.float32), np.empty(grey.shape, np.float32)
-    _lowest(total, plane, margin)
-    return plane, margin
