@@ -13,9 +13,8 @@ import numpy as np
 import torch
 
 from fieldfuse.camera import Array, Intrinsics, pixel_grid
-from fieldfuse.effects import distortion
-from fieldfuse.effects.background import Background
-from fieldfuse.effects.highlights import Highlights
+from fieldfuse.effects.models import Distortion
+from fieldfuse.effects.scenery import Background, Highlights
 from fieldfuse.simulate.cast import FAR
 from fieldfuse.simulate.solids import Mesh
 
@@ -112,7 +111,7 @@ def eye_of(intrinsics: Intrinsics, side: int, device: torch.device) -> Eye:
 def _directions(intrinsics: Intrinsics, pixels: Array) -> tuple[Tensor, Tensor]:
     """Unit directions (N, 3) in camera axes through (N, 2) pixels, and their cosines with the optical axis (N,)."""
     place = torch.from_numpy((pixels - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy])
-    ideal = distortion.invert(distortion.of(intrinsics), place) if intrinsics.distorted else place
+    ideal = Distortion.of(intrinsics).invert(place) if intrinsics.distorted else place
     cosine = (1 + ideal.square().sum(1)).rsqrt()
     return torch.cat([ideal * cosine[:, None], cosine[:, None]], dim=1).float(), cosine.float()
 

@@ -8,9 +8,7 @@ import numpy as np
 import torch
 
 from fieldfuse.camera import Array
-from fieldfuse.effects.background import Background
-from fieldfuse.effects.highlights import Highlights
-from fieldfuse.effects.passers import STEPS, Walk
+from fieldfuse.effects.scenery import STEPS, Background, Highlights, Walk
 from fieldfuse.simulate.eye import Rays, Scenery, Seen
 from fieldfuse.simulate.furniture import Builder, turned
 from fieldfuse.simulate.materials import Material, Materials, TextureBank, texture_bank

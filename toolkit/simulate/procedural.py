@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from fieldfuse.camera import Array
 from fieldfuse.checked import nearest
-from fieldfuse.effects.background import Background
-from fieldfuse.effects.highlights import Highlights
+from fieldfuse.effects.scenery import Background, Highlights
 from fieldfuse.errors import InputError
 from fieldfuse.simulate import furniture
 from fieldfuse.simulate.furniture import FLOORS, WALLS, Builder

@@ -12,7 +12,7 @@ import numpy as np
 from safetensors.numpy import save
 
 from fieldfuse.camera import Array, Intrinsics, opengl_from_world
-from fieldfuse.effects.listed import Effects, parse
+from fieldfuse.effects.effect_specs import Effects, parse
 from fieldfuse.errors import InputError, OutputError
 from fieldfuse.files import atomic_path, write_json
 from fieldfuse.progress import SILENT, Progress
