@@ -7,20 +7,10 @@ import pytest
 
 from fieldfuse.backends.numba.stereo_cost import NOISE, UNKNOWN, best_half
 from fieldfuse.camera import Array, Intrinsics, pixel_grid, project, unproject
-from fieldfuse.stereo.cost_volume import SOFT_EDGE, GreyView, Matcher, grey_view, plane_homography, smoothed_planes
+from fieldfuse.stereo.cost_volume import SOFT_EDGE, GreyView, Matcher, grey_view, smoothed_planes
 from tests.stereo.made import CAMERA, corner
 
 PATHS = [(way * down, way * right) for way in (1, -1) for down, right in ((0, 1), (1, 0), (1, 1), (1, -1))]  # (rows, columns)
-
-
-def test_a_plane_maps_pixels_as_projection_does() -> None:
-    views, _ = corner()
-    first, second = (grey_view(views.images[i], CAMERA, views.world_from_camera[i]) for i in (0, 3))
-    pixels = pixel_grid(160, 120)[::97]
-    points = unproject(CAMERA, views.world_from_camera[0], pixels, np.full(len(pixels), 2.5))
-    expected, _ = project(CAMERA, views.world_from_camera[3], points)
-    mapped = np.c_[pixels - 0.5, np.ones(len(pixels))] @ plane_homography(first, second, 1 / 2.5).T
-    assert np.allclose(mapped[:, :2] / mapped[:, 2:] + 0.5, expected, atol=1e-8)
 
 
 def slow_cost(view: GreyView, other: GreyView, inverse_depth: Array, half: int = 3) -> Array:

@@ -9,8 +9,6 @@ import pytest
 
 from fieldfuse.camera import Array
 from fieldfuse.capture.types import Views
-from fieldfuse.errors import Interrupted
-from fieldfuse.progress import Progress
 from fieldfuse.stereo.depth_refinement import FieldDepths, Polisher, settled
 from fieldfuse.stereo.plane_completion import Unsure
 from tests.stereo import made as exact
@@ -164,17 +162,6 @@ def test_a_floater_is_dropped_and_what_one_view_alone_sees_stays(corner: tuple[V
 def test_a_view_alone_is_left_as_it_was(corner: tuple[Views, list[Array]]) -> None:
     views, truth = corner
     assert np.array_equal(made(views.subset(np.array([0])), truth[:1])[0], truth[0])
-
-
-def test_stops_when_asked(corner: tuple[Views, list[Array]]) -> None:
-    views, truth = corner
-
-    class Stop(Progress):
-        def check(self) -> None:
-            raise Interrupted("stop")
-
-    with pytest.raises(Interrupted):
-        settled(FieldDepths(truth, truth, [depth > 0 for depth in truth]), views, [CAMERA] * len(views), MEDIAN, progress=Stop())
 
 
 def test_depth_that_is_nearly_right_is_polished() -> None:

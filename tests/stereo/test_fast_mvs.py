@@ -87,7 +87,3 @@ def test_a_small_picture_takes_about_what_is_reckoned_with() -> None:
     each = (between - start) / 6
     assert matched is not None and matched.pixels == fast_mvs.LEAST_SIDE
     assert each < 8 * slower * fast_mvs.view_seconds(fast_mvs.LEAST_SIDE, 0.75)
-
-
-def test_warming_up_finds_something_to_match() -> None:
-    fast_mvs.warm_up()

@@ -54,13 +54,11 @@ def test_what_was_matched_stays_and_the_rest_is_confident_as_far_as_others_agree
         assert (now.confidence[~matched & (now.depth > 0)] >= 0.5).all() and now.depth.dtype == now.confidence.dtype == np.float32
 
 
-def test_masks_are_kept() -> None:
+def test_masked_pixels_stay_without_depth() -> None:
     views, _, found = room()
-    valid = [np.ones((120, 160), bool) for _ in range(len(views))]
-    for mask in valid:
-        mask[:40] = False
-    masked = [replace(one, depth=np.where(mask, one.depth, 0)) for one, mask in zip(found, valid, strict=True)]
-    more = continued(masked, replace(views, valid=valid), MEDIAN)
+    mask = np.arange(120)[:, None] * np.ones((1, 160)) >= 40
+    masked = [replace(one, depth=np.where(mask, one.depth, 0)) for one in found]
+    more = continued(masked, replace(views, valid=[mask] * len(views)), MEDIAN)
     assert all((one.depth[:40] == 0).all() for one in more)
     assert any((one.depth[40:] > 0).sum() > (was.depth[40:] > 0).sum() for one, was in zip(more, masked, strict=True))
 

@@ -152,7 +152,7 @@ class Film:
         return total / len(offsets)
 
     def _developed(self, linear: Tensor, index: int, facts: dict[str, Any]) -> tuple[Array, bytes | None]:
-        """Linear light on the lens → the stored picture."""
+        """Linear light on the lens → the stored image."""
         effects = self.effects
         if self._falloff is not None:
             linear = linear * self._falloff

@@ -1,6 +1,4 @@
-"""What builders of procedural scenes share: materials by kind of surface, solids without overlap on a floor, and furniture of them:
-
-tables, chairs, shelves, cupboards, lamps, plants, boxes, and what lies on them."""
+"""What builders of procedural scenes share: materials by kind of surface, solids without overlap on a floor, and furniture of them."""
 
 from __future__ import annotations
 
@@ -8,27 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fieldfuse.camera import Array
-from fieldfuse.simulate.materials import PLAIN, Material, TextureBank
+from fieldfuse.simulate.materials import PLAIN, WIDTHS, Material, TextureBank
 from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solid, upright
 
 WALLS = ("plaster", "paper", "posters", "bricks", "posters")
+Parts = list[tuple[ArrayLike, ArrayLike, int]]  # centre, half size and material of boxes
 FLOORS = ("planks", "terrazzo", "tiles", "cloth", "planks")
-WIDTHS = {  # metres that one copy of a texture covers, from and to
-    "planks": (0.9, 1.6),
-    "bricks": (1.2, 2.2),
-    "tiles": (0.8, 1.8),
-    "cloth": (0.5, 1.2),
-    "books": (0.8, 1.2),
-    "ground": (1.0, 2.5),
-    "plaster": (1.5, 3.0),
-    "paper": (0.8, 1.6),
-    "posters": (1.6, 2.6),
-    "terrazzo": (1.2, 2.4),
-    "carton": (0.35, 0.7),
-    "marble": (0.5, 1.2),
-    "picture": (0.6, 1.2),
-    PLAIN: (1.0, 1.0),
-}
 
 
 class Builder:
@@ -40,8 +23,6 @@ class Builder:
         self.materials: list[Material] = []
         self.taken: list[tuple[float, float, float]] = []  # x, y, radius on the floor
 
-    # ---- materials
-
     def material(
         self, *kinds: str, tint: ArrayLike | None = None, gloss: float = 0.0, sharpness: float = 30.0, width: float | None = None
     ) -> int:
@@ -49,16 +30,11 @@ class Builder:
         kind = kinds[self.rng.integers(len(kinds))]
         choices = self.bank.kinds[kind]
         colour = self.tint() if tint is None else np.asarray(tint)
-        self.materials.append(
-            Material(
-                texture=int(choices[self.rng.integers(len(choices))]),
-                width=float(self.rng.uniform(*WIDTHS[kind])) if width is None else width,
-                offset=(float(self.rng.uniform(0, 2)), float(self.rng.uniform(0, 2))),
-                tint=(float(colour[0]), float(colour[1]), float(colour[2])),
-                gloss=gloss,
-                sharpness=sharpness,
-            )
-        )
+        texture = int(choices[self.rng.integers(len(choices))])
+        width = float(self.rng.uniform(*WIDTHS[kind])) if width is None else width
+        offset = (float(self.rng.uniform(0, 2)), float(self.rng.uniform(0, 2)))
+        red, green, blue = (float(value) for value in colour)
+        self.materials.append(Material(texture, width, offset, (red, green, blue), gloss, sharpness))
         return len(self.materials) - 1
 
     def tint(self, spread: float = 0.14) -> Array:
@@ -75,8 +51,6 @@ class Builder:
     def faces(self, *kinds: str, count: int = 6) -> tuple[int, ...]:
         """Another picture on every face."""
         return tuple(self.material(*kinds) for _ in range(count))
-
-    # ---- solids
 
     def add(self, *solids: Solid) -> None:
         self.solids.extend(solids)
@@ -107,7 +81,7 @@ def turned(offsets: ArrayLike, degrees: float) -> Array:
     return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
 
 
-def _parts(b: Builder, at: Array, degrees: float, parts: list[tuple[ArrayLike, ArrayLike, int]]) -> None:
+def _parts(b: Builder, at: Array, degrees: float, parts: Parts) -> None:
     """Boxes given by (centre, half, material) in the furniture's own axes, its floor point at the origin."""
     centres = turned(np.array([part[0] for part in parts]), degrees) + np.array([at[0], at[1], 0.0])
     for centre, (_, half, material) in zip(centres, parts, strict=True):
@@ -119,7 +93,7 @@ def table(b: Builder, at: Array, degrees: float, half: Array, height: float) -> 
     wood = b.material("planks", "marble", "cloth")
     leg = b.material("planks", "plain")
     x, y = half[0] - 0.05, half[1] - 0.05
-    parts: list[tuple[ArrayLike, ArrayLike, int]] = [([0, 0, height - 0.02], [half[0], half[1], 0.02], wood)]
+    parts: Parts = [([0, 0, height - 0.02], [half[0], half[1], 0.02], wood)]
     parts += [([i * x, j * y, height / 2 - 0.02], [0.03, 0.03, height / 2 - 0.02], leg) for i in (-1, 1) for j in (-1, 1)]
     _parts(b, at, degrees, parts)
     things(b, at, degrees, half * 0.75, height, int(b.rng.integers(2, 6)))
@@ -127,7 +101,7 @@ def table(b: Builder, at: Array, degrees: float, half: Array, height: float) -> 
 
 def chair(b: Builder, at: Array, degrees: float) -> None:
     seat, frame = b.material("cloth", "planks"), b.material("planks", "plain")
-    parts: list[tuple[ArrayLike, ArrayLike, int]] = [([0, 0, 0.45], [0.22, 0.22, 0.025], seat)]
+    parts: Parts = [([0, 0, 0.45], [0.22, 0.22, 0.025], seat)]
     parts += [([i * 0.19, -0.19, 0.21], [0.02, 0.02, 0.215], frame) for i in (-1, 1)]
     parts += [([i * 0.19, 0.19, 0.45], [0.02, 0.02, 0.45], frame) for i in (-1, 1)]
     parts += [([0, 0.19, 0.78], [0.18, 0.015, 0.1], seat)]
@@ -139,9 +113,7 @@ def shelf(b: Builder, at: Array, degrees: float, half: Array, height: float) -> 
     wood, books, depth = b.material("planks"), b.material("books"), half[1]
     boards = int(b.rng.integers(3, 6))
     step = (height - 0.06) / boards
-    parts: list[tuple[ArrayLike, ArrayLike, int]] = [
-        ([i * (half[0] - 0.012), 0, height / 2], [0.012, depth, height / 2], wood) for i in (-1, 1)
-    ]
+    parts: Parts = [([i * (half[0] - 0.012), 0, height / 2], [0.012, depth, height / 2], wood) for i in (-1, 1)]
     parts.append(([0, depth - 0.01, height / 2], [half[0], 0.01, height / 2], wood))
     for level in range(boards + 1):
         z = 0.05 + level * step
@@ -166,10 +138,7 @@ def cupboard(b: Builder, at: Array, degrees: float, half: Array, height: float) 
 
 def sofa(b: Builder, at: Array, degrees: float) -> None:
     stuff, wide = b.material("cloth", "paper"), b.rng.uniform(0.6, 1.0)
-    parts: list[tuple[ArrayLike, ArrayLike, int]] = [
-        ([0, 0, 0.21], [wide, 0.42, 0.21], stuff),
-        ([0, 0.34, 0.6], [wide, 0.09, 0.2], stuff),
-    ]
+    parts: Parts = [([0, 0, 0.21], [wide, 0.42, 0.21], stuff), ([0, 0.34, 0.6], [wide, 0.09, 0.2], stuff)]
     parts += [([i * (wide - 0.09), 0, 0.52], [0.09, 0.42, 0.1], stuff) for i in (-1, 1)]
     _parts(b, at, degrees, parts)
     for side in (-0.5, 0.4):

@@ -18,29 +18,31 @@ Tensor = torch.Tensor
 
 LEVELS = 8  # of a texture's mip levels
 SIZE = 512  # texels of a texture's side
-GAMMA = 2.2  # what the procedural pictures are stored in
+GAMMA = 2.2  # of the procedural textures
 PLAIN = "plain"  # the texture that is white all over
 
-MAKERS: dict[str, tuple[Callable[[np.random.Generator, int], Array], int]] = {  # and how many of each a bank holds
-    "planks": (textures.planks, 5),
-    "bricks": (textures.bricks, 4),
-    "tiles": (textures.tiles, 5),
-    "cloth": (textures.cloth, 6),
-    "books": (textures.books, 3),
-    "ground": (textures.ground, 4),
-    "plaster": (textures.plaster, 4),
-    "paper": (textures.paper, 4),
-    "posters": (textures.posters, 4),
-    "terrazzo": (lambda rng, size: textures.terrazzo(rng, size, size), 3),
-    "carton": (lambda rng, size: textures.carton(rng, size, size), 8),
-    "marble": (lambda rng, size: textures.marble(rng, size, size), 4),
-    "picture": (lambda rng, size: textures.picture(rng, size, size), 8),
+# How many of each a bank holds, and metres that one copy of a texture covers, from and to
+MAKERS: dict[str, tuple[Callable[[np.random.Generator, int], Array], int, tuple[float, float]]] = {
+    "planks": (textures.planks, 5, (0.9, 1.6)),
+    "bricks": (textures.bricks, 4, (1.2, 2.2)),
+    "tiles": (textures.tiles, 5, (0.8, 1.8)),
+    "cloth": (textures.cloth, 6, (0.5, 1.2)),
+    "books": (textures.books, 3, (0.8, 1.2)),
+    "ground": (textures.ground, 4, (1.0, 2.5)),
+    "plaster": (textures.plaster, 4, (1.5, 3.0)),
+    "paper": (textures.paper, 4, (0.8, 1.6)),
+    "posters": (textures.posters, 4, (1.6, 2.6)),
+    "terrazzo": (lambda rng, size: textures.terrazzo(rng, size, size), 3, (1.2, 2.4)),
+    "carton": (lambda rng, size: textures.carton(rng, size, size), 8, (0.35, 0.7)),
+    "marble": (lambda rng, size: textures.marble(rng, size, size), 4, (0.5, 1.2)),
+    "picture": (lambda rng, size: textures.picture(rng, size, size), 8, (0.6, 1.2)),
 }
+WIDTHS = {PLAIN: (1.0, 1.0)} | {kind: widths for kind, (_, _, widths) in MAKERS.items()}
 
 
 class Atlas:
     """Args:
-    linear: (h, w, 3) float32 linear pictures in [0, 1], each of any size.
+    linear: (h, w, 3) float32 linear images in [0, 1], each of any size.
     mirrored: beyond [0, 1] a texture is mirrored; else it is repeated.
 
     Attributes:
@@ -103,7 +105,7 @@ class Atlas:
 
 
 class TextureBank(Atlas):
-    """Square procedural pictures, sorted by what they can be on.
+    """Square procedural textures, sorted by what they can be on.
 
     Attributes:
         kinds: texture numbers by kind of surface.
@@ -124,9 +126,9 @@ class TextureBank(Atlas):
 
 @lru_cache(maxsize=2)
 def texture_bank(seed: int = 0, size: int = SIZE) -> TextureBank:
-    """The bank that procedural scenes share (about a second to make, once a process). Another seed gives other pictures."""
+    """The bank that procedural scenes share (about a second to make, once a process). Another seed gives others."""
     pictures, kinds = [np.ones((size, size, 3), dtype=np.float32)], {PLAIN: [0]}
-    for number, (kind, (maker, count)) in enumerate(MAKERS.items()):
+    for number, (kind, (maker, count, _)) in enumerate(MAKERS.items()):
         rng = np.random.default_rng([seed, 77, number])
         kinds[kind] = list(range(len(pictures), len(pictures) + count))
         pictures += [maker(rng, size).astype(np.float32) for _ in range(count)]

@@ -46,6 +46,12 @@ def _lamps(b: Builder, half: Array, count: int) -> list[Lamp]:
     return lamps
 
 
+def _within(half: Array, margin: float, low: float, high: float) -> Array:
+    """(2, 3) the box of a room between two heights, `margin` away from its walls."""
+    inner = half[:2] - margin
+    return np.array([[*-inner, low], [*inner, high]])
+
+
 def _scene(b: Builder, kind: str, half: Array, free: ArrayLike, focus: Array, lamps: int = 2) -> Scene:
     solids, lit = Solids(b.solids), _lamps(b, half, lamps)
     return Scene(kind, solids, Materials(b.materials), b.bank, lit, AMBIENT, np.asarray(free, float), focus)
@@ -101,9 +107,7 @@ def room(b: Builder) -> Scene:
         spot = b.place(0.3, -half[:2] * 0.55, half[:2] * 0.55)
         if spot is not None:
             (furniture.chair if rng.random() < 0.5 else lambda b, at, _: furniture.stack(b, at))(b, spot, rng.uniform(0, 360))
-    inner = half[:2] - 0.45
-    free = [[-inner[0], -inner[1], 0.9], [inner[0], inner[1], min(1.8, 2 * half[2] - 0.4)]]
-    return _scene(b, "room", half, free, np.array([middle[0], middle[1], 0.5]))
+    return _scene(b, "room", half, _within(half, 0.45, 0.9, min(1.8, 2 * half[2] - 0.4)), np.array([middle[0], middle[1], 0.5]))
 
 
 def object_on_table(b: Builder) -> Scene:
@@ -119,8 +123,7 @@ def object_on_table(b: Builder) -> Scene:
         at = b.place(0.3, -half[:2] + 0.35, half[:2] - 0.35)
         if at is not None and np.hypot(*at) > 1.6:
             furniture.stack(b, at)
-    inner = half[:2] - 0.25
-    return _scene(b, "table", half, [[-inner[0], -inner[1], 0.7], [inner[0], inner[1], 1.7]], np.array([0, 0, height + 0.12]))
+    return _scene(b, "table", half, _within(half, 0.25, 0.7, 1.7), np.array([0, 0, height + 0.12]))
 
 
 def corridor(b: Builder) -> Scene:
@@ -181,8 +184,7 @@ def thin_structures(b: Builder) -> Scene:
         b.add(rod(np.array([0, -0.4, 0.6]) - arm, np.array([0, -0.4, 0.6]) + arm, 0.005, b.paint()))
     b.add(upright(CYLINDER, [0.0, -0.4, 0.6], [0.04, 0.05, 0.04], b.material("carton", width=0.2)))
     furniture.chair(b, np.array([rng.uniform(-0.6, 0.6), 1.1]), rng.uniform(0, 360))
-    inner = half[:2] - 0.3
-    return _scene(b, "thin", half, [[-inner[0], -inner[1], 0.8], [inner[0], inner[1], 1.6]], np.array([0, 0, 0.6]))
+    return _scene(b, "thin", half, _within(half, 0.3, 0.8, 1.6), np.array([0, 0, 0.6]))
 
 
 def glossy_sphere(b: Builder) -> Scene:
@@ -201,9 +203,7 @@ def glossy_sphere(b: Builder) -> Scene:
         cover = b.paint(gloss=0.8, dark=rng.random() < 0.3)
         kind = (BALL, CYLINDER, BOX)[rng.integers(3)]
         b.add(upright(kind, [off[0], off[1], height + size], [size] * 3, cover))
-    inner = half[:2] - 0.25
-    free = [[-inner[0], -inner[1], 0.7], [inner[0], inner[1], 1.7]]
-    scene = _scene(b, "sphere", half, free, np.array([0, 0, height + radius]))
+    scene = _scene(b, "sphere", half, _within(half, 0.25, 0.7, 1.7), np.array([0, 0, height + radius]))
     scene.highlights = Highlights()
     return scene
 

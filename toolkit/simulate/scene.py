@@ -1,4 +1,4 @@
-"""A procedural scene: solids, materials, lamps; pictures, depth and normals of it along any rays, on any torch device."""
+"""A procedural scene: solids, materials, lamps; images, depth and normals of it along any rays, on any torch device."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Rendered:
-    """One picture with its truth."""
+    """One image with its truth."""
 
     rgb: Tensor  # (H, W, 3) float32 sRGB in [0, 1]
     depth: Tensor  # (H, W) float32 metres along z at pixel centres, 0 where nothing is hit
@@ -79,7 +79,7 @@ class Scene:
         return tessellate(self.solids.items)
 
     def render(self, intrinsics: Intrinsics, world_from_camera: Array, side: int = EDGE_SIDE) -> Rendered:
-        """A camera's picture, depth and normals, through its lens.
+        """A camera's image, depth and normals, through its lens.
 
         Args:
             world_from_camera: (4, 4).

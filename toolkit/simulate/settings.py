@@ -49,7 +49,7 @@ class SceneFile:
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     camera: CameraSettings = default(default_factory=CameraSettings)
     path: PathSettings = default(default_factory=PathSettings)
-    output: Annotated[str, one_of(*OUTPUTS)] = "frames"  # frames (with transforms.json), photos (pictures alone) or video
+    output: Annotated[str, one_of(*OUTPUTS)] = "frames"  # frames (with transforms.json), photos (images alone) or video
     depth: bool = False  # a depth camera beside the colour camera
     side: Annotated[int, Field(ge=1, le=8)] = 2  # pixels that hold an edge are the mean of side × side rays
     mesh: MeshSettings = default(default_factory=MeshSettings)

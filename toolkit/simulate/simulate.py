@@ -50,7 +50,7 @@ def prepare(settings: SceneFile, beside: Path, effects: Effects) -> Film:
     """All that is needed to film: scene, path, camera and effects.
 
     Raises:
-        InputError: as for `open_scene`, or the path does not fit into the scene, or the lens not over the picture.
+        InputError: as for `open_scene`, or the path does not fit into the scene, or the lens not over the image.
     """
     for name in ("depth_noise", "depth_offset"):
         if getattr(effects, name) is not None and not settings.depth:
@@ -111,7 +111,7 @@ class CaptureWriter:
 
     Args:
         output: "frames", "photos" or "video".
-        suffix: ".jpg" when pictures are compressed, else ".png".
+        suffix: ".jpg" when images are compressed, else ".png".
     """
 
     def __init__(self, folder: Path, intrinsics: Intrinsics, fps: float, output: str, suffix: str) -> None:

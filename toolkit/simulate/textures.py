@@ -1,4 +1,4 @@
-"""Procedural pictures for surfaces: rich, never repeating, so that features can be matched on them. sRGB float32 in [0, 1]."""
+"""Procedural textures for surfaces: rich, never repeating, so that features can be matched on them. sRGB float32 in [0, 1]."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def noise(rng: Generator, height: int, width: int, coarsest: int, octaves: int) 
 
 
 def _ink(colour: Array | tuple[float, float, float]) -> list[int]:
-    """A colour in [0, 1] for OpenCV's drawing functions, which smooth edges on 8-bit pictures only."""
+    """A colour in [0, 1] for OpenCV's drawing functions, which smooth edges on 8-bit images only."""
     return [int(value) for value in np.round(np.clip(np.asarray(colour), 0, 1) * 255)]
 
 
@@ -49,7 +49,7 @@ def _canvas(height: int, width: int, colour: Array | tuple[float, float, float])
 
 
 def _grained(image: Array, grain: Array, strength: float) -> Array:
-    """uint8 picture → float32 in [0, 1], its brightness varied by (H, W) `grain`."""
+    """uint8 image → float32 in [0, 1], its brightness varied by (H, W) `grain`."""
     return np.clip(image.astype(np.float32) / 255 * (1 + strength * grain[..., None]), 0, 1)
 
 

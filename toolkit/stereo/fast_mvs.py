@@ -83,7 +83,7 @@ def guided(
     side, every = chosen
     matched = training[::every]
     some = views.subset(matched)
-    found = stereo_depths(some, near, far, median_depth, long_side=side, asked=LENIENT, progress=progress)
+    found = stereo_depths(some, near, far, median_depth, long_side=side, required=LENIENT, progress=progress)
     whole = continued(found, some, median_depth, progress, LENIENT)
     out = replace(with_depths(views, matched, whole), rough=True)
     share = float(np.mean([np.mean(out.depths[index] > 0) for index in matched]))

@@ -76,7 +76,7 @@ def stereo_depths(
     median_depth: float,
     *,
     long_side: int = LONG_SIDE,
-    asked: Demands | None = None,
+    required: Demands | None = None,
     progress: Progress = SILENT,
 ) -> list[StereoDepth]:
     """One depth map for each of `views`, all of which are matched with each other (leave held-out views out before).
@@ -85,7 +85,7 @@ def stereo_depths(
         near, far: nearest and farthest depth that is looked for, working units.
         median_depth: depth at which parallax and overlap of images are judged.
         long_side: size of the depth maps; larger images are shrunk for matching.
-        asked: of neighbours; None: as `demands` has it.
+        required: of neighbours; None: as `demands` has it.
 
     Raises:
         InputError: fewer than two views, no two of them that see the same from different places, a range that is none, or too little
@@ -99,8 +99,8 @@ def stereo_depths(
     cameras = [shrunk_camera(camera, long_side) for camera in views.intrinsics]
     poses = np.asarray(views.world_from_camera, dtype=np.float64)
     grey = [grey_view(*each) for each in zip(views.images, cameras, poses, strict=True)]
-    asked = asked or demands(len(views))
-    neighbours = usable_neighbours(poses, cameras, median_depth, max(MATCHED, CHECKED), asked)
+    required = required or demands(len(views))
+    neighbours = usable_neighbours(poses, cameras, median_depth, max(MATCHED, CHECKED), required)
     if not any(neighbours):
         raise InputError(
             "no two images see the same things from places far enough apart to match them for depth; the camera has to move sideways"
@@ -116,7 +116,7 @@ def stereo_depths(
     def checked(index: int) -> StereoDepth:
         progress.check()
         known = [other for other in neighbours[index] if neighbours[other]]
-        needed = min(asked.confirm, max(1, len(known)))
+        needed = min(required.confirm, max(1, len(known)))
         depth, confidence = confirmed(index, known, DepthMaps(maps, cameras, poses), needed, noises[index])
         return StereoDepth(depth, confidence, cameras[index], noises[index])
 
@@ -140,14 +140,14 @@ def demands(images: int) -> Demands:
 
 
 def usable_neighbours(
-    world_from_camera: Array, cameras: Sequence[Intrinsics], median_depth: float, count: int, asked: Demands | None = None
+    world_from_camera: Array, cameras: Sequence[Intrinsics], median_depth: float, count: int, required: Demands | None = None
 ) -> list[list[int]]:
     """For each view the neighbours that suit matching, best first, without views that see too little in common or from one place."""
     shares = overlap(world_from_camera, cameras, median_depth)
     angles = np.maximum(parallax(world_from_camera, median_depth), spread_parallax(world_from_camera, cameras, median_depth))
     best = best_neighbours(world_from_camera, shares, angles, count, SWEET)
-    asked = asked or demands(len(cameras))
-    fits = (np.minimum(shares, shares.T) >= asked.overlap) & (angles >= asked.parallax[0]) & (angles <= asked.parallax[1])
+    required = required or demands(len(cameras))
+    fits = (np.minimum(shares, shares.T) >= required.overlap) & (angles >= required.parallax[0]) & (angles <= required.parallax[1])
     return [[int(other) for other in row if fits[index, other]] for index, row in enumerate(best)]
 
 

@@ -55,14 +55,14 @@ ENOUGH = 3.0  # so many neighbours that measure all they can are enough for a pi
 
 
 def continued(
-    found: Sequence[StereoDepth], views: Views, median_depth: float, progress: Progress = SILENT, asked: Demands | None = None
+    found: Sequence[StereoDepth], views: Views, median_depth: float, progress: Progress = SILENT, required: Demands | None = None
 ) -> list[StereoDepth]:
     """What matching `found` of `views`, and depth beside it where a plane goes on.
 
     Args:
         found: `match.stereo_depths` of the views, in their order.
         median_depth: depth at which parallax and overlap of images are judged.
-        asked: of the neighbours that confirm a plane; None: as `match.demands` has it.
+        required: of the neighbours that confirm a plane; None: as `match.demands` has it.
 
     Returns:
         depths as matched where there were any; others confident as what `consistency.confirmed` keeps.
@@ -73,7 +73,7 @@ def continued(
     poses, count = np.asarray(views.world_from_camera, dtype=np.float64), len(found)
     cameras, matched = [one.intrinsics for one in found], [one.depth for one in found]
     planes = find_planes(points_of(DepthMaps(matched, cameras, poses)))
-    neighbours = usable_neighbours(poses, cameras, median_depth, CHECKED, asked) if count > 1 else [[]]
+    neighbours = usable_neighbours(poses, cameras, median_depth, CHECKED, required) if count > 1 else [[]]
     if not len(planes) or not any(neighbours):
         return list(found)
     others = [[other for other in row if neighbours[other]] for row in neighbours]

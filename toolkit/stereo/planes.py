@@ -20,19 +20,19 @@ MIN_SHARE = 0.006  # share of all points that a plane must have
 MAX_PLANES = 24  # planes
 TRIPLES = 400  # planes that are tried in each round …
 SCORED = 6000  # … on so many of the points
-APART = (0.02, 0.3)  # of the picture's long side: a triple's points lie in one picture, no nearer and no farther from each other
+APART = (0.02, 0.3)  # of the image's long side: a triple's points lie in one image, no nearer and no farther from each other
 BEST = 3  # of the planes that were tried are fitted to their points
 REFITS = 4
 
 
 @dataclass(frozen=True)
 class Points:
-    """Points of several pictures, those of one picture beside each other."""
+    """Points of several images, those of one image beside each other."""
 
     place: Array  # (N, 3) float64, world
-    depth: Array  # (N,) float64 along z of the picture's camera
+    depth: Array  # (N,) float64 along z of the image's camera
     view: Array  # (N,) int64, rising
-    pixel: Array  # (N, 2) float64 x, y in shares of the picture's long side
+    pixel: Array  # (N, 2) float64 x, y in shares of the image's long side
 
 
 def points_of(maps: DepthMaps) -> Points:
@@ -54,7 +54,7 @@ def points_of(maps: DepthMaps) -> Points:
 def find_planes(points: Points, seed: int = 0, on: float = ON, least: float = MIN_SHARE, most: int = MAX_PLANES) -> Array:
     """(K, 4) float64 planes, those with most points first: n · p = d with a unit normal n in the first three columns, d in the last.
 
-    What lies on a plane, within twice `on` (a share of its depth), is no longer asked for the next one. Each has `least` of the points.
+    What lies on a plane, within twice `on` (a share of its depth), is not used for the next one. Each has `least` of the points.
     """
     generator = np.random.default_rng(seed)
     left = np.arange(len(points.depth))
@@ -83,7 +83,7 @@ def shares(points: Points, planes: Array, on: float = ON) -> Array:
 
 
 def _triples(points: Points, left: Array, generator: np.random.Generator) -> Array:
-    """(T, 3) points of `left`, each three in one picture and `APART`."""
+    """(T, 3) points of `left`, each three in one image and `APART`."""
     first = generator.choice(left, TRIPLES)
     views = points.view[left]
     start, stop = np.searchsorted(views, points.view[first]), np.searchsorted(views, points.view[first], side="right")

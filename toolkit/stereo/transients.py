@@ -37,7 +37,7 @@ FEWEST = 24  # images with depth by matching: with fewer, what has none before w
 COMPARED = 12  # images that show what stands at a place, at most
 LEAST_OFF = 20.0  # levels by which a colour must be off, besides what the others' colours scatter by …
 USUAL = 0.9  # … and what this share of the confirmed pixels of the capture is off by
-CONFIRMED_OFF = 0.5  # of that, below which a colour confirms what the others say
+CONFIRMED_OFF = 0.5  # of that, below which a colour confirms the others
 BEFORE, BEFORE_OFF = 0.1, 0.25  # share of depth by which measured depth lies before the consensus where so little of that is enough
 BLUR = 0.7  # pixels, before colours are compared
 AWAY, EDGE = 0.1, 30.0  # of the long side, levels: how far votes go in an image; see `plane_completion.spread_along`
@@ -250,16 +250,16 @@ def _disc(radius: float) -> Array:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What of some images is left out, since it moves; see `moving`."""
+    """What of some images is excluded, since it moves; see `moving`."""
 
     looked_at: int  # images
-    share: float  # of their pixels that are left out
-    masks: dict[str, Array]  # (h, w) bool, of the images where something is, by name; True: left out
+    share: float  # of their pixels that are excluded
+    masks: dict[str, Array]  # (h, w) bool, of the images where something is, by name; True: excluded
     seconds: float = 0.0  # that looking took
 
     @staticmethod
     def of(names: Sequence[str], masks: Sequence[Array], seconds: float = 0.0) -> LeftOut:
-        """What the `masks` of the images `names` leave out."""
+        """What the `masks` of the images `names` exclude."""
         share = float(np.mean([mask.mean() for mask in masks])) if masks else 0.0
         return LeftOut(len(names), share, {name: mask for name, mask in zip(names, masks, strict=True) if mask.any()}, seconds)
 
@@ -267,13 +267,13 @@ class LeftOut:
         return {"looked_at": self.looked_at, "pictures": len(self.masks), "share": round(self.share, 5), "seconds": round(self.seconds, 2)}
 
     def mask(self, name: str, width: int, height: int) -> Array:
-        """(height, width) bool pixels of the image `name`, at this size, that are left out."""
+        """(height, width) bool pixels of the image `name`, at this size, that are excluded."""
         if name not in self.masks:
             return np.zeros((height, width), bool)
         return np.asarray(cv2.resize(self.masks[name].astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0)
 
     def without(self, views: Views) -> Views:
-        """`views` in which the pixels that are left out are not valid, and have no depth."""
+        """`views` in which the excluded pixels are not valid, and have no depth."""
         valid: list[Array | None] = list(views.valid) if views.valid else [None] * len(views)
         depths = list(views.depths)
         for index, name in enumerate(views.names):

@@ -206,7 +206,7 @@ def fuse_frames(
     volume.require_frames()
     if volume.empty_frames:
         seen = volume.frames + volume.empty_frames
-        log.warning("%d of %d frames hold no depth within %g and were left out of the TSDF", volume.empty_frames, seen, depth_max)
+        log.warning("%d of %d frames hold no depth within %g and were not fused into the TSDF", volume.empty_frames, seen, depth_max)
     return volume
 
 

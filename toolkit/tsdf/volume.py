@@ -4,7 +4,7 @@ What Open3D 0.20 does and this file takes care of:
 - `integrate` reads the depth pixel by cutting the decimals off, so it needs the matrix with pixel centres at +0.5, while
   `compute_unique_block_coordinates` unprojects whole pixel numbers and needs centres at whole numbers; with one matrix for
   both the surface moves by half a pixel.
-- 16-bit depth with 8-bit colour is its fastest pair of types (others convert each picture); depth is stored in 1/60000 of the range.
+- 16-bit depth with 8-bit colour is its fastest pair of types (others convert each image); depth is stored in 1/60000 of the range.
 - A frame without valid depth raises; the weight threshold is exclusive, so 3 needs four observations.
 - `VoxelBlockGrid.ray_cast` can hang on the CPU, leaves tiles empty, and its depth is off by up to a voxel: views are rendered by ray
   casting the extracted mesh.
@@ -210,7 +210,7 @@ class TsdfVolume:
         matrix = o3c.Tensor(intrinsics.matrix_integer_centres())
         try:
             return self.grid.compute_unique_block_coordinates(depth, matrix, extrinsic, self._scale, self.depth_max, TRUNCATION)
-        except RuntimeError as error:  # Open3D's way to say that no pixel it looked at has depth
+        except RuntimeError as error:  # Open3D's error where no pixel that it looked at has depth
             if "No block is touched" not in str(error):
                 raise
             return None

@@ -34,8 +34,8 @@ def compare(
             where nothing stands before the point, whether the other's depth is known or not.
         there: (4, 4) from the view's frame to the other's.
     """
-    depth, camera, picture = here
-    other, other_camera, other_picture = away
+    depth, camera, image = here
+    other, other_camera, other_image = away
     height, width = depth.shape
     rows, columns = other.shape
     fx, fy, cx, cy = camera
@@ -53,10 +53,10 @@ def compare(
                 continue
             column, row = int(u), int(v)
             seen = other[row, column]
-            if len(picture) > 0 and not 0 < seen < (1 - HIDDEN) * qz:
+            if len(image) > 0 and not 0 < seen < (1 - HIDDEN) * qz:
                 difference = 0.0
                 for channel in range(3):
-                    difference += abs(float(picture[y, x, channel]) - float(other_picture[row, column, channel]))
+                    difference += abs(float(image[y, x, channel]) - float(other_image[row, column, channel]))
                 colours[y, x] = difference / 3
             if seen <= 0:
                 continue
@@ -74,7 +74,7 @@ def compare(
 
 
 @njit(**OPTIONS)
-def warp(depth: Array, picture: Array, camera: Array, target: Array, there: Array, out: Array, colours: Array) -> None:
+def warp(depth: Array, image: Array, camera: Array, target: Array, there: Array, out: Array, colours: Array) -> None:
     """Put each point of a depth map on the four pixels around it in another camera; the nearest one stays."""
     fx, fy, cx, cy = camera
     gx, gy, ox, oy = target
@@ -96,7 +96,7 @@ def warp(depth: Array, picture: Array, camera: Array, target: Array, there: Arra
                     if out[row, column] == 0 or qz < out[row, column]:
                         out[row, column] = qz
                         for channel in range(3):
-                            colours[row, column, channel] = picture[y, x, channel]
+                            colours[row, column, channel] = image[y, x, channel]
 
 
 @njit(**OPTIONS)

@@ -14,7 +14,7 @@ from fieldfuse.camera import Array
 F = np.float32
 HIGH = F(1e9)
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
-ONE, TWO = np.uintp(1), np.uintp(2)  # places that cannot be negative need not be asked whether they are
+ONE, TWO = np.uintp(1), np.uintp(2)  # places that cannot be negative need no check
 
 
 @cast(Any, intrinsic)
@@ -31,19 +31,6 @@ def lesser(context: Any, one: Any, other: Any) -> Any:
         return builder.call(function, arguments, fastmath=("nnan", "nsz"))
 
     return types.float32(types.float32, types.float32), generate
-
-
-@njit(**OPTIONS)
-def _begin(cost: Array, total: Array, at: Any, line: Array, own: Any, planes: int) -> Any:
-    """The first pixel of a path; arguments and answer as in `_go_on`."""
-    lowest = HIGH
-    for number in range(planes):
-        d = np.uintp(number)
-        value = cost[at + d]
-        line[own + d + ONE] = value
-        total[at + d] += value
-        lowest = lesser(lowest, value)
-    return lowest
 
 
 @njit(**OPTIONS)
@@ -76,32 +63,29 @@ def add_paths(cost: Array, grey: Array, way: int, slants: tuple[int, ...], small
     height, width = grey.shape
     planes = len(cost) // max(height * width, 1)
     room = planes + 2
-    # Of each direction two rows, this one and the one before; and two pixels of the row's own path.
-    lines = np.full((2 * len(slants) * width + 2) * room, HIGH, np.float32)
-    least = np.zeros((2, len(slants), width), np.float32)
+    # Of each direction two rows, this one and the one before; two pixels of the row's own path; and nothing, from which paths begin.
     single = 2 * len(slants) * width
-    step, lowest = F(small), F(0)
+    lines = np.full((single + 3) * room, HIGH, np.float32)
+    lines[(single + 2) * room :] = F(0)
+    least = np.zeros((2, len(slants), width), np.float32)
+    step, lowest, nothing = F(small), F(0), np.uintp((single + 2) * room)
     for number in range(height):
         y = number if way > 0 else height - 1 - number
         now = number & 1
         for i in range(width):
             x = i if way > 0 else width - 1 - i
             at = np.uintp((y * width + x) * planes)
-            own, past = np.uintp((single + (i & 1)) * room), np.uintp((single + (1 - (i & 1))) * room)
-            if i == 0:
-                lowest = _begin(cost, total, at, lines, own, planes)
-            else:
+            own, past, base, jump = np.uintp((single + (i & 1)) * room), nothing, F(0), F(0)
+            if i > 0:
+                past, base = np.uintp((single + (1 - (i & 1))) * room), lowest
                 jump = max(F(large) / (F(1) + abs(grey[y, x] - grey[y, x - way]) / F(soft)), F(1.5) * step)
-                lowest = _go_on(cost, total, at, lines, past, own, planes, lowest, lowest + jump, step)
+            lowest = _go_on(cost, total, at, lines, past, own, planes, base, base + jump, step)
             for k in range(len(slants)):
                 before = x - way * slants[k]
-                own = np.uintp(((2 * k + now) * width + x) * room)
-                if number == 0 or before < 0 or before >= width:
-                    least[now, k, x] = _begin(cost, total, at, lines, own, planes)
-                    continue
-                past = np.uintp(((2 * k + 1 - now) * width + before) * room)
-                jump = max(F(large) / (F(1) + abs(grey[y, x] - grey[y - way, before]) / F(soft)), F(1.5) * step)
-                base = least[1 - now, k, before]
+                own, past, base, jump = np.uintp(((2 * k + now) * width + x) * room), nothing, F(0), F(0)
+                if number > 0 and 0 <= before < width:
+                    past, base = np.uintp(((2 * k + 1 - now) * width + before) * room), least[1 - now, k, before]
+                    jump = max(F(large) / (F(1) + abs(grey[y, x] - grey[y - way, before]) / F(soft)), F(1.5) * step)
                 least[now, k, x] = _go_on(cost, total, at, lines, past, own, planes, base, base + jump, step)
 
 

@@ -1,6 +1,5 @@
 """Matching costs: how unlike one image is to another where that shows its points, by normalised correlation of windows, a row at a time."""
 
-
 from __future__ import annotations
 
 from typing import Any
@@ -30,8 +29,8 @@ OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 def _places(
     height: int, width: int, far: Array, move: Array, inverse: Array, columns: Array, v: int, place: Array, share: Array, inside: Array
 ) -> None:
-    """Where a picture of this size shows the points of row `v` at `columns` with the inverse depths `inverse`: upper left pixel, shares of
-    its right and lower neighbours, and 1 where it is in the picture, 0 elsewhere. A loop of its own, because it becomes vectors, and what
+    """Where a image of this size shows the points of row `v` at `columns` with the inverse depths `inverse`: upper left pixel, shares of
+    its right and lower neighbours, and 1 where it is in the image, 0 elsewhere. A loop of its own, because it becomes vectors, and what
     is read by it not."""
     zero, one, least = F(0), F(1), F(1e-6)
     bottom, right = F(height - 1), F(width - 1)
@@ -102,15 +101,15 @@ def _correlated(sums: Array, mean: Array, steep: Array, seen: Array, out: Array)
 def correlate(
     own: Array, mean: Array, steep: Array, columns: Array, quads: Array, far: Array, move: Array, inverse: Array, out: Array
 ) -> None:
-    """Costs of one other picture, a row at a time: what was warped stays in the cache until all windows that hold it are done.
+    """Costs of one other image, a row at a time: what was warped stays in the cache until all windows that hold it are done.
 
     Args:
         own, mean, steep: (H, wide) grey levels less `MIDDLE`; mean and 1 / deviation of windows, which begin `HALF` before their middles.
-        columns: (wide,) float32 of the picture.
-        quads: (h, w) of the other picture, both at least 2 (`cost_volume.GreyView.quads`).
+        columns: (wide,) float32 of the image.
+        quads: (h, w) of the other image, both at least 2 (`cost_volume.GreyView.quads`).
         far, move: (3, 3) and (3,) of `cost_volume.between`.
         inverse: (H, wide) inverse depths, whose first `HALF` stand before the first column.
-        out: (H, wide), −1 where the other picture does not show a point; nothing of meaning beyond the picture's width.
+        out: (H, wide), −1 where the other image does not show a point; nothing of meaning beyond the image's width.
     """
     height, wide = own.shape
     pixels = quads.reshape(-1)
