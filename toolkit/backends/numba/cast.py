@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from fieldfuse.camera import Array
-
 F = np.float32
 FAR, NEAREST, PARALLEL, SMALLEST = F(1e9), F(1e-5), F(1e-8), F(1e-12)  # metres but for the last two: nothing is hit nearer than `NEAREST`
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
@@ -23,7 +21,7 @@ def _slab(start: Any, slope: Any, half: Any) -> Any:
 
 
 @njit(**OPTIONS)
-def _own(turn: Array, x: Any, y: Any, z: Any) -> Any:
+def _own(turn: Any, x: Any, y: Any, z: Any) -> Any:
     """A vector in a solid's own axes, the columns of `turn`."""
     return (
         x * turn[0, 0] + y * turn[1, 0] + z * turn[2, 0],
@@ -33,7 +31,7 @@ def _own(turn: Array, x: Any, y: Any, z: Any) -> Any:
 
 
 @njit(**OPTIONS)
-def _interval(axes: int, sx: Any, sy: Any, sz: Any, rx: Any, ry: Any, rz: Any, half: Array) -> Any:
+def _interval(axes: int, sx: Any, sy: Any, sz: Any, rx: Any, ry: Any, rz: Any, half: Any) -> Any:
     """Entry and exit of a solid that is round in its first `axes` axes (0, 2 or 3) and flat in the others; entry after exit: missed."""
     enter, leave = F(-FAR), FAR
     if axes == 0:
@@ -60,8 +58,8 @@ def _interval(axes: int, sx: Any, sy: Any, sz: Any, rx: Any, ry: Any, rz: Any, h
 
 @njit(**OPTIONS)
 def cast(
-    origins: Array, directions: Array, centres: Array, halves: Array, turns: Array, radii: Array, ends: Array, distance: Array, number:
-    Array
+    origins: Any, directions: Any, centres: Any, halves: Any, turns: Any, radii: Any, ends: Any, distance: Any, number:
+    Any
 ) -> None:
     """The nearest solid of each ray, −1 and a distance of `FAR` where there is none. A solid that a ray starts in is not seen, but rooms
     are.

@@ -7,14 +7,12 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from fieldfuse.camera import Array
-
 HIDDEN = 0.03  # share of a point's depth by which another view's surface before it hides its colour
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True}
 
 
 @njit(**OPTIONS)
-def _moved(move: Array, x: float, y: float, z: float) -> Any:
+def _moved(move: Any, x: float, y: float, z: float) -> Any:
     """A point in the frame that `move` (4, 4) leads to."""
     return (
         move[0, 0] * x + move[0, 1] * y + move[0, 2] * z + move[0, 3],
@@ -25,7 +23,7 @@ def _moved(move: Array, x: float, y: float, z: float) -> Any:
 
 @njit(**OPTIONS)
 def compare(
-    here: Any, away: Any, there: Array, tolerance: float, noise: float, agree: Array, through: Array, total: Array, colours: Array
+    here: Any, away: Any, there: Any, tolerance: float, noise: float, agree: Any, through: Any, total: Any, colours: Any
 ) -> None:
     """Count for each pixel whether one other view confirms its depth or sees through it, and sum up the inverse depths that confirm it.
 
@@ -74,7 +72,7 @@ def compare(
 
 
 @njit(**OPTIONS)
-def warp(depth: Array, image: Array, camera: Array, target: Array, there: Array, out: Array, colours: Array) -> None:
+def warp(depth: Any, image: Any, camera: Any, target: Any, there: Any, out: Any, colours: Any) -> None:
     """Put each point of a depth map on the four pixels around it in another camera; the nearest one stays."""
     fx, fy, cx, cy = camera
     gx, gy, ox, oy = target
@@ -101,7 +99,7 @@ def warp(depth: Array, image: Array, camera: Array, target: Array, there: Array,
 
 @njit(**OPTIONS)
 def nearest_agreed(
-    depths: Array, colours: Array, least: int, same: float, count: Array, depth: Array, colour: Array, scatter: Array
+    depths: Any, colours: Any, least: int, same: float, count: Any, depth: Any, colour: Any, scatter: Any
 ) -> None:
     """The nearest surface that at least `least` of the maps agree on, pixel by pixel."""
     number, height, width = depths.shape
@@ -146,7 +144,7 @@ def nearest_agreed(
 
 
 @njit(**OPTIONS)
-def _inverse_on(planes: Array, which: Any, x: float, y: float, slant: float) -> float:
+def _inverse_on(planes: Any, which: Any, x: float, y: float, slant: float) -> float:
     """Inverse depth of the plane `which` on the ray (x, y, 1), 0: behind the camera, or too much aslant."""
     along = planes[which, 0] * x + planes[which, 1] * y + planes[which, 2]
     offset = planes[which, 3]
@@ -156,7 +154,7 @@ def _inverse_on(planes: Array, which: Any, x: float, y: float, slant: float) -> 
 
 
 @njit(**OPTIONS)
-def plane_numbers(depth: Array, camera: Array, planes: Array, on: float, slant: float, out: Array) -> None:
+def plane_numbers(depth: Any, camera: Any, planes: Any, on: float, slant: float, out: Any) -> None:
     fx, fy, cx, cy = camera
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -173,7 +171,7 @@ def plane_numbers(depth: Array, camera: Array, planes: Array, on: float, slant: 
 
 
 @njit(**OPTIONS)
-def plane_depths(which: Array, camera: Array, planes: Array, slant: float, out: Array) -> None:
+def plane_depths(which: Any, camera: Any, planes: Any, slant: float, out: Any) -> None:
     fx, fy, cx, cy = camera
     for v in range(which.shape[0]):
         for u in range(which.shape[1]):
@@ -184,7 +182,7 @@ def plane_depths(which: Array, camera: Array, planes: Array, slant: float, out: 
 
 
 @njit(**OPTIONS)
-def pass_on(values: Array, keep: Array) -> None:
+def pass_on(values: Any, keep: Any) -> None:
     """Along the second axis of values (A, B, C, K), there and back, every value becomes (1 − keep) of itself and keep[·, b, ·] of the one
     before it; keep (A, B − 1, C)."""
     lines, length, beside, channels = values.shape

@@ -9,8 +9,6 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
-from fieldfuse.camera import Array
-
 F = np.float32
 HIGH = F(1e9)
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
@@ -34,7 +32,7 @@ def lesser(context: Any, one: Any, other: Any) -> Any:
 
 
 @njit(**OPTIONS)
-def _go_on(cost: Array, total: Array, at: Any, line: Array, past: Any, own: Any, planes: int, base: Any, most: Any, small: Any) -> Any:
+def _go_on(cost: Any, total: Any, at: Any, line: Any, past: Any, own: Any, planes: int, base: Any, most: Any, small: Any) -> Any:
     """One pixel further along a path; equation 13 of the paper.
 
     Args:
@@ -57,7 +55,7 @@ def _go_on(cost: Array, total: Array, at: Any, line: Array, past: Any, own: Any,
 
 
 @njit(**OPTIONS)
-def add_paths(cost: Array, grey: Array, way: int, slants: tuple[int, ...], small: float, large: float, soft: float, total: Array) -> None:
+def add_paths(cost: Any, grey: Any, way: int, slants: tuple[int, ...], small: float, large: float, soft: float, total: Any) -> None:
     """Add the costs aggregated along some directions to `total` (H · W · D,): along the rows, and from row to row with each of `slants`;
     downwards and to the right, or the other `way`."""
     height, width = grey.shape
@@ -90,7 +88,7 @@ def add_paths(cost: Array, grey: Array, way: int, slants: tuple[int, ...], small
 
 
 @njit(**OPTIONS)
-def lowest_plane(total: Array, plane: Array) -> None:
+def lowest_plane(total: Any, plane: Any) -> None:
     """The best plane of each pixel between planes: a parabola through three costs."""
     height, width, planes = total.shape
     for y in range(height):

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from fieldfuse.camera import Array
-
 WINDOW = 7  # pixels a side that are compared
 HALF = WINDOW // 2
 RING = 8  # rows that are kept, a power of two: those of a window and the one that leaves it
@@ -27,7 +25,7 @@ OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 @njit(**OPTIONS)
 def _places(
-    height: int, width: int, far: Array, move: Array, inverse: Array, columns: Array, v: int, place: Array, share: Array, inside: Array
+    height: int, width: int, far: Any, move: Any, inverse: Any, columns: Any, v: int, place: Any, share: Any, inside: Any
 ) -> None:
     """Where a image of this size shows the points of row `v` at `columns` with the inverse depths `inverse`: upper left pixel, shares of
     its right and lower neighbours, and 1 where it is in the image, 0 elsewhere. A loop of its own, because it becomes vectors, and what
@@ -52,7 +50,7 @@ def _places(
 
 
 @njit(**OPTIONS)
-def _take(quads: Array, place: Array, share: Array, inside: Array, found: Array, out: Array) -> None:
+def _take(quads: Any, place: Any, share: Any, inside: Any, found: Any, out: Any) -> None:
     """Grey levels less `MIDDLE` between the pixels of `quads` (h · w,) at `_places`, in quarters; 0 outside."""
     low, rounder = np.uint32(255), F(ROUNDER)
     for u in range(len(place)):
@@ -69,7 +67,7 @@ def _take(quads: Array, place: Array, share: Array, inside: Array, found: Array,
 
 
 @njit(**OPTIONS)
-def _move_on(new: Array, new_own: Array, old: Array, old_own: Array, sums: Array) -> None:
+def _move_on(new: Any, new_own: Any, old: Any, old_own: Any, sums: Any) -> None:
     """Sums over the rows of a window, (3, wide) of values, squares and products: one row more and one less."""
     values, squares, products = sums[0], sums[1], sums[2]
     for x in range(len(new)):
@@ -80,7 +78,7 @@ def _move_on(new: Array, new_own: Array, old: Array, old_own: Array, sums: Array
 
 
 @njit(**OPTIONS)
-def _correlated(sums: Array, mean: Array, steep: Array, seen: Array, out: Array) -> None:
+def _correlated(sums: Any, mean: Any, steep: Any, seen: Any, out: Any) -> None:
     """Costs of a row from the sums over the rows of its windows, which begin `HALF` before their middles, as does what is `seen`; `mean`
     and `steep` (1 / deviation) are those of the windows that they are compared with."""
     zero, half, part_of = F(0), F(0.5), F(1 / (WINDOW * WINDOW))
@@ -99,7 +97,7 @@ def _correlated(sums: Array, mean: Array, steep: Array, seen: Array, out: Array)
 
 @njit(**OPTIONS)
 def correlate(
-    own: Array, mean: Array, steep: Array, columns: Array, quads: Array, far: Array, move: Array, inverse: Array, out: Array
+    own: Any, mean: Any, steep: Any, columns: Any, quads: Any, far: Any, move: Any, inverse: Any, out: Any
 ) -> None:
     """Costs of one other image, a row at a time: what was warped stays in the cache until all windows that hold it are done.
 
@@ -134,7 +132,7 @@ def correlate(
 
 
 @njit(**OPTIONS)
-def _best_of_four(costs: Array, out: Array) -> None:
+def _best_of_four(costs: Any, out: Any) -> None:
     """`best_half` of four; comparisons without a branch become vectors."""
     zero, never, half = F(0), F(1e3), F(0.5)
     for y in range(costs.shape[1]):
@@ -150,7 +148,7 @@ def _best_of_four(costs: Array, out: Array) -> None:
 
 
 @njit(**OPTIONS)
-def _into_order(low: Array, high: Array) -> None:
+def _into_order(low: Any, high: Any) -> None:
     """The smaller of each two values into `low`, the larger into `high`."""
     for x in range(len(low)):
         one, other = low[x], high[x]
@@ -158,7 +156,7 @@ def _into_order(low: Array, high: Array) -> None:
 
 
 @njit(**OPTIONS)
-def best_half(costs: Array, out: Array) -> None:
+def best_half(costs: Any, out: Any) -> None:
     """(K, H, W) costs, −1 unknown → (H, W) the mean of the better half of the known ones: the worse half may be hidden behind something.
 
     Rows are sorted against each other, all their pixels at once: sorting pixel by pixel takes ten times as long.
