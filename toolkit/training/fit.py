@@ -22,7 +22,7 @@ from fieldfuse.memory import give_back
 from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.field import Field
-from fieldfuse.stereo.left_out import LeftOut
+from fieldfuse.stereo.transients import LeftOut
 from fieldfuse.tone import decode, encode
 from fieldfuse.training import memory_limits
 from fieldfuse.training.background_sh import sky_behind
