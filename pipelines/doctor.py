@@ -1,8 +1,9 @@
-"""What this machine has, what is missing, and what to do about it: a list of checks as plain data, and a table of them."""
+"""`fieldfuse doctor`: what this machine has, what is missing, and what to do about it; a list of checks as plain data, and a table."""
 
 from __future__ import annotations
 
 import importlib.metadata as metadata
+import json
 import os
 import re
 import shutil
@@ -10,28 +11,14 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import typer
+
+from fieldfuse.pipelines.options import Options, takes
+
 OK, WARN, FAIL = "ok", "warn", "fail"
-PACKAGES = (
-    "numba",
-    "numpy",
-    "torch",
-    "opencv-contrib-python-headless",
-    "trimesh",
-    "fast-simplification",
-    "typer",
-    "rich",
-    "pydantic",
-    "matplotlib",
-    "safetensors",
-    "pillow",
-    "jinja2",
-    "pyyaml",
-    "scipy",
-    "psutil",
-)
 # Shared libraries that Open3D loads, and the Debian packages that hold them.
 LIBRARIES = {
     "libusb-1.0": "libusb-1.0-0",
@@ -57,6 +44,12 @@ KERNELS = """
 from fieldfuse.pipelines.kernel_check import report
 print(report())
 """
+EXTRAS = (
+    ("viewer", "viser", "`fieldfuse view` is not there", "viser>=1"),
+    ("heic", "pillow-heif", "photos of phones in HEIC (.heic) are not read", "pillow-heif>=1"),
+    ("record3d", "imagecodecs", "recordings of Record3D with depth are not read", "imagecodecs>=2024.1"),
+    ("h264", "av", "videos are written as VP9, slowly, which not all players know", "av>=14"),
+)
 GIB = 2**30
 OLDEST_PYTHON = (3, 11)
 
@@ -71,11 +64,29 @@ class Check:
     advice: str = ""  # what to do; empty when the status is "ok"
 
 
+@takes("json")
+def doctor(options: Options) -> None:
+    """Look at this machine: libraries, versions, devices, and what to do about what is missing."""
+    checks = collect()
+    if options.json:
+        typer.echo(json.dumps([asdict(check) for check in checks], indent=1))
+    else:
+        show(checks)
+    if any(check.status == FAIL for check in checks):
+        raise typer.Exit(1)
+
+
 def collect() -> list[Check]:
     """Look at everything (a few seconds). Never raises: what goes wrong in a check is its finding."""
     checks = [_python(), *_packages()]
-    extras: tuple[Callable[[], Check], ...] = (_xfeat, _lpips, _viewer, _heic, _record3d, _h264)
-    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _kernels, _video, *extras, _cores, _memory, _disk)
+    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _kernels, _video, _xfeat, _lpips)
+    checks += _run(looks)
+    checks += [_extra(*extra) for extra in EXTRAS]
+    return [*checks, *_run((_cores, _memory, _disk))]
+
+
+def _run(looks: tuple[Callable[[], Check], ...]) -> list[Check]:
+    checks = []
     for look in looks:
         try:
             checks.append(look())
@@ -115,8 +126,12 @@ def _python() -> Check:
 
 
 def _packages() -> list[Check]:
+    """Those that Fieldfuse requires; Open3D and pycolmap are tried in processes of their own."""
+    required = [re.split(r"[<>=; ]", line)[0] for line in metadata.requires("fieldfuse") or () if "extra ==" not in line]
     checks = []
-    for name in PACKAGES:
+    for name in required:
+        if name in ("open3d", "open3d-cpu", "pycolmap"):
+            continue
         try:
             checks.append(Check(name, OK, metadata.version(name)))
         except metadata.PackageNotFoundError:
@@ -209,30 +224,12 @@ def _video() -> Check:
     return Check("video", OK, "mp4 written and read")
 
 
-def _viewer() -> Check:
-    return _package("viewer", "viser", "`fieldfuse view` is not there", "pip install 'viser>=1'")
-
-
-def _heic() -> Check:
-    return _package("heic", "pillow-heif", "photos of phones in HEIC (.heic) are not read", "pip install 'pillow-heif>=1'")
-
-
-def _record3d() -> Check:
-    return _package("record3d", "imagecodecs", "recordings of Record3D with depth are not read", "pip install 'imagecodecs>=2024.1'")
-
-
-def _h264() -> Check:
-    return _package("h264", "av", "videos are written as VP9, slowly, which not all players know", "pip install 'av>=14'")
-
-
-def _package(name: str, package: str, without: str, ask: str) -> Check:
+def _extra(name: str, package: str, without: str, ask: str) -> Check:
     """A package that one thing needs and all else does without."""
-    from importlib.metadata import PackageNotFoundError, version
-
     try:
-        return Check(name, OK, f"{package} {version(package)}")
-    except PackageNotFoundError:
-        return Check(name, WARN, f"no {package}: {without}", ask)
+        return Check(name, OK, f"{package} {metadata.version(package)}")
+    except metadata.PackageNotFoundError:
+        return Check(name, WARN, f"no {package}: {without}", f"pip install '{ask}'")
 
 
 def _xfeat() -> Check:

@@ -21,12 +21,12 @@ def effects_facts(target: Path, quiet: bool) -> dict[str, Any]:
     from fieldfuse.errors import InputError
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.folder import is_run_folder
-    from fieldfuse.pipelines.kept import EFFECTS, read_kept
+    from fieldfuse.pipelines.schemas import Effects, read_checked
 
     if is_run_folder(target):
         if not (target / "effects.json").is_file():
             raise InputError(f"{target} holds no effects.json; run the job again without effects=off")
-        return {key: value for key, value in read_kept(target / "effects.json", EFFECTS).items() if key != "corrections"}
+        return {key: value for key, value in read_checked(target / "effects.json", Effects).items() if key != "corrections"}
     capture = open_capture(target)
     posed = [frame for frame in capture.frames if frame.world_from_camera is not None and frame.intrinsics is not None]
     if len(posed) < 3:

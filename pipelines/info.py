@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json as writer
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fieldfuse.pipelines.options import Json, Quiet
+from fieldfuse.pipelines.options import Options, takes
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Capture
@@ -23,33 +24,30 @@ OUTDATED = (
 SHOWN = {"views": "views {}", "psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.3f}", "lpips": "LPIPS {:.3f}"}
 
 
+@takes("quiet json")
 def info(
     target: Annotated[Path, typer.Argument(metavar="SOURCE", help="A source, or the folder of an earlier run.", show_default=False)],
     fast: Annotated[bool, typer.Option("--fast", help="Read headers only; pictures are not looked at for damage.")] = False,
     effects: Annotated[bool, typer.Option("--effects", help="Look for effects of camera and light, with the evidence of each.")] = False,
-    quiet: Quiet = False,
-    json: Json = False,
+    *,
+    options: Options,
 ) -> None:
     """Tell what was detected: kind, counts, sizes, lenses, depth, warnings."""
+    from fieldfuse.pipelines.effects_table import effects_facts, show
     from fieldfuse.pipelines.folder import is_run_folder
 
-    data = run_facts(target) if is_run_folder(target) else source_facts(target, fast, quiet or json)
+    quiet = options.quiet or options.json
+    data = run_facts(target) if is_run_folder(target) else source_facts(target, fast, quiet)
     if effects:
-        from fieldfuse.pipelines.effects_table import effects_facts
-
-        data["effects"] = effects_facts(target, quiet or json)
-    if json:
-        import json as writer
-
+        data["effects"] = effects_facts(target, quiet)
+    if options.json:
         typer.echo(writer.dumps(data, indent=1))
-    else:
-        if effects:
-            from fieldfuse.pipelines.effects_table import show
-
-            show(data.pop("effects"))
-        for key, value in for_people(data).items():
-            for line in lines(key, value):
-                typer.echo(line)
+        return
+    if effects:
+        show(data.pop("effects"))
+    for key, value in for_people(data).items():
+        for line in lines(key, value):
+            typer.echo(line)
 
 
 def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
@@ -142,10 +140,10 @@ def run_facts(folder: Path) -> dict[str, Any]:
 def scores_of(path: Path) -> dict[str, dict[str, float]]:
     """What was scored, and how well; empty when nothing was, or the file cannot be read: the run's other facts are told all the same."""
     from fieldfuse.errors import InputError
-    from fieldfuse.pipelines.kept import EVALUATION, read_kept
+    from fieldfuse.pipelines.schemas import EVALUATION, read_checked
 
     try:
-        scores = read_kept(path, EVALUATION)
+        scores = read_checked(path, EVALUATION)
     except InputError:
         return {}
     return {

@@ -1,11 +1,24 @@
-"""Arguments and flags that commands share, and how they become settings."""
+"""Arguments and options that commands share, each declared once, and what all commands do with them.
+
+Nothing here imports NumPy before `bound_threads` has set the number of threads.
+"""
 
 from __future__ import annotations
 
+import inspect
+import json as writer
+import os
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import typer
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+SHORT_SPIN = "1000"  # turns, microseconds
+FIELD_PAGE = "exports/field.html"
 
 Source = Annotated[
     Path, typer.Argument(help="A video, a folder of photos, or a posed capture; its kind is found by looking.", show_default=False)
@@ -17,6 +30,14 @@ OptionalOut = Annotated[
 ]
 Preset = Annotated[str | None, typer.Option(help="fast, balanced (default), quality, or paper (as NeRFusion does it).", show_default=False)]
 Budget = Annotated[float | None, typer.Option(help="Seconds of optimisation.", show_default=False)]
+TotalBudget = Annotated[
+    float | None,
+    typer.Option(
+        min=10,
+        help="Seconds for the whole run: picture size, voxels, a video's frames, fitting time and exports are chosen for it.",
+        show_default=False,
+    ),
+]
 ImageSize = Annotated[int | None, typer.Option(help="Long side of the pictures in pixels.", show_default=False)]
 Holdout = Annotated[
     int | None, typer.Option(help="Every n-th picture by name is kept for testing; 0: none. Default 8.", show_default=False)
@@ -51,6 +72,129 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but erro
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")]
 
 
+@dataclass(frozen=True)
+class Place:
+    """The run that a command works on."""
+
+    target: Target
+    out: OptionalOut = None
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder."""
+        return self.out or self.target
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a command may be given besides; each has those that it names (`takes`)."""
+
+    preset: Preset = None
+    budget: Budget = None
+    total_budget: TotalBudget = None
+    image_size: ImageSize = None
+    holdout: Holdout = None
+    baked: Baked = False
+    device: Device = None
+    threads: Threads = None
+    seed: Seed = None
+    engine: Engine = None
+    decoder: Decoder = None
+    init: Init = None
+    finetune: Finetune = None
+    poses: PosesFrom = None
+    config: Config = None
+    pairs: Pairs = None
+    quiet: Quiet = False
+    json: Json = False
+
+    def settings(self, *pairs: str, **flags: Any) -> dict[str, Any]:
+        """The options that `fieldfuse.pipelines.job.read_settings` takes: `pairs` come before those of `--set`, `flags` are added."""
+        given = {name: getattr(self, name) for name in FLAGS}
+        return gather(self.preset, self.config, [*pairs, *(self.pairs or [])], **given, **flags)
+
+
+FLAGS = ("budget", "image_size", "holdout", "device", "threads", "seed", "engine", "decoder", "init", "finetune", "poses")
+
+
 def gather(preset: str | None = None, config: Path | None = None, pairs: list[str] | None = None, **flags: Any) -> dict[str, Any]:
-    """Flags of a command → the options that `fieldfuse.pipelines.job.read_settings` takes."""
+    """Options by name → what `fieldfuse.pipelines.job.read_settings` takes."""
     return {"preset": preset, "config": config, "pairs": list(pairs or []), "flags": flags}
+
+
+def takes(names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A command of a function whose arguments may be groups (dataclasses): typer reads a signature with their fields one by one.
+
+    Args:
+        names: those of `Options` that the command has, in the order of its help.
+    """
+
+    def spread(command: Callable[..., None]) -> Callable[..., None]:
+        groups: dict[str, tuple[Any, list[str]]] = {}
+        parameters: list[inspect.Parameter] = []
+        hints = get_type_hints(command, include_extras=True)
+        for name, parameter in inspect.signature(command).parameters.items():
+            kind = hints[name]
+            if not is_dataclass(kind):
+                parameters.append(parameter.replace(annotation=kind, kind=inspect.Parameter.KEYWORD_ONLY))
+                continue
+            inner, defaults = get_type_hints(kind, include_extras=True), {entry.name: entry.default for entry in fields(kind)}
+            groups[name] = kind, names.split() if kind is Options else list(defaults)
+            for one in groups[name][1]:
+                default = inspect.Parameter.empty if defaults[one] is MISSING else defaults[one]
+                parameters.append(inspect.Parameter(one, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=inner[one]))
+
+        def run(**given: Any) -> None:
+            made = {name: kind(**{one: given.pop(one) for one in members}) for name, (kind, members) in groups.items()}
+            command(**given, **made)
+
+        run.__name__, run.__doc__ = command.__name__, command.__doc__
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        return run
+
+    return spread
+
+
+def bound_threads(options: dict[str, Any]) -> None:
+    """Give numeric libraries the thread count of the command line, and have all threads allocate from one heap.
+
+    Call it before anything imports NumPy: its BLAS reads the count when it is loaded, and no more.
+    """
+    # Threads that spin while they wait take the cores from whatever else runs: on a busy machine with two cores a fit made 83 steps
+    # in 15 s with spinning threads and 306 with sleeping ones. So they sleep, but not at once (GNU's library counts the turns): to wake
+    # one for each of the networks' many short operations would cost a quarter of their time (docs/measured/performance.md).
+    if os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE").upper() == "PASSIVE":
+        os.environ.setdefault("GOMP_SPINCOUNT", SHORT_SPIN)
+    pairs = [pair.removeprefix("threads=") for pair in options.get("pairs") or [] if pair.startswith("threads=")]
+    wanted = options.get("flags", {}).get("threads") or next(iter(pairs), None)
+    if wanted is not None and str(wanted).isdigit() and int(wanted) > 0:
+        os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(wanted)))
+    from fieldfuse import memory
+
+    memory.one_heap()
+
+
+def show(data: Any, options: Options, lines: Callable[[], Iterable[str]]) -> None:
+    """The result on standard output: JSON, `lines` for people, or nothing with `--quiet`."""
+    if options.json:
+        sys.stdout.write(writer.dumps(data, indent=1) + "\n")
+    elif not options.quiet:
+        sys.stdout.writelines(f"{line}\n" for line in lines())
+
+
+def work(place: Place, options: Options, goals: Iterable[str], settings: dict[str, Any], **how: Any) -> None:
+    """Make `goals` in the run's folder and show the report's numbers; `how`: as `fieldfuse.pipelines.reconstruct.run_job` takes it."""
+    bound_threads(settings)
+    from fieldfuse.pipelines.console import make_progress, table_lines
+    from fieldfuse.pipelines.reconstruct import run_job
+
+    data = run_job(place, settings, goals, make_progress(options.quiet), **how)
+
+    def lines() -> Iterable[str]:
+        yield from table_lines(data)
+        yield from (f"note: {warning}" for warning in data.get("warnings", []))
+        yield from (str(place.folder / FIELD_PAGE) for export in data.get("exports", []) if export["path"] == FIELD_PAGE)
+        yield str(place.folder / ("report.html" if data.get("evaluation") else "exports/cameras"))
+
+    show(data, options, lines)

@@ -17,15 +17,16 @@ from fieldfuse.config import EXPORTS, settings_dict
 from fieldfuse.errors import FieldfuseError
 from fieldfuse.evaluation import budget as model
 from fieldfuse.files import fingerprint, read_json, write_json
+from fieldfuse.pipelines.exports import TEXTURE
 from fieldfuse.pipelines.page import PAGE
-from fieldfuse.pipelines.taken import TEXTURE
+from fieldfuse.pipelines.source import picture_size
 from fieldfuse.pipelines.textured import TSDF_TEXTURE
 
 if TYPE_CHECKING:
-    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.capture.types import Capture
     from fieldfuse.config import Settings
     from fieldfuse.pipelines.job import Job
-    from fieldfuse.poses.scene import Scene
+    from fieldfuse.pipelines.prepare import Prepared
 
 FILE = "plan.json"
 LONGEST_START = 60.0  # seconds; a process that is older was not started for this command
@@ -65,11 +66,10 @@ class TotalBudget:
         self.name = model.signature(threads, settings.device)
         self.speed = model.remembered(self.name)
         if self.speed is None:
-            job.progress.begin("self-test")
             start = time.monotonic()
-            self.speed = self_test(settings)
+            with job.progress.stage("self-test"):
+                self.speed = self_test(settings)
             self.self_test = time.monotonic() - start
-            job.progress.finish("self-test", self.self_test, False)
             self._began += self.self_test
             model.remember(self.name, self.speed)
         self.work = work_of(capture, settings)
@@ -133,7 +133,7 @@ class TotalBudget:
         left = self.asked - self.elapsed() - after
         return left - self._for_exports(job, left) - self.speed.seconds("beside", 1.0)
 
-    def choose_fit(self, job: Job, views: Views, scene: Scene) -> None:
+    def choose_fit(self, job: Job, ready: Prepared) -> None:
         """Decide the fit's seconds and its finest lattice from what is left, and whether meshes get textures and the field its page."""
         from fieldfuse.training.start import worth_a_level
 
@@ -145,7 +145,7 @@ class TotalBudget:
             self.choice.texture, self.choice.page = self.work.texture, self.work.page
             self.choice.fit_seconds = round(max(model.LEAST_FIT, self._left(job)), 2)
             pace = self.speed.units["fit"] * self._pace(job)
-            possible = model.resolution_for(self.choice.fit_seconds, pace, finest(job, views, scene))
+            possible = model.resolution_for(self.choice.fit_seconds, pace, finest(job, ready))
             self.choice.resolution = possible if job.settings.field.resolution is not None else worth_a_level(possible)
         job.settings.fit.budget = self.choice.fit_seconds
         job.settings.fit.passes = None  # so many seconds were asked for
@@ -180,7 +180,7 @@ class TotalBudget:
         else:
             export.formats = [name for name in export.formats if name != "video"]
 
-    def told(self, job: Job) -> dict[str, Any]:
+    def report(self, job: Job) -> dict[str, Any]:
         """The report's part `budget`: seconds asked for, predicted and real, in all and by stage, and what was chosen."""
         assert self.choice is not None
         real = {record.name: record.seconds for record in job.stages.records.values()}
@@ -220,7 +220,7 @@ class TotalBudget:
 
     def finish(self, job: Job, report_seconds: float) -> dict[str, Any]:
         """After the report: correct its total, and learn from stages that took other than predicted."""
-        told = self.told(job)
+        told = self.report(job)
         told["stages"]["report"] = {"predicted": _round(self.predicted.get("report")), "real": _round(report_seconds)}
         if self.speed is not None and not told["reused"]:
             for name in NOT_FITTED:
@@ -303,7 +303,6 @@ def work_of(capture: Capture, settings: Any) -> model.Work:
     """What the capture asks for, from what its headers say."""
     from fieldfuse.capture.convert import to_convert
     from fieldfuse.capture.prepare import held_out
-    from fieldfuse.pipelines.summary import picture_size
 
     width, height = picture_size(capture)
     video = capture.filmed
@@ -336,15 +335,13 @@ def work_of(capture: Capture, settings: Any) -> model.Work:
     )
 
 
-def finest(job: Job, views: Views, scene: Scene) -> int:
+def finest(job: Job, ready: Prepared) -> int:
     """The lattice that a fit would end at without a budget."""
-    import numpy as np
-
     from fieldfuse.training.start import MARGIN, ROOM_MARGIN, finest_resolution, make_space
 
-    settings = job.settings.field
+    settings, scene, views = job.settings.field, ready.scene, ready.views
     if settings.resolution is not None:
         return settings.resolution
     background = scene.has_background if settings.background == "auto" else settings.background == "on"
     space = make_space(scene, background and views.background is None, MARGIN if views.background is not None else ROOM_MARGIN)
-    return finest_resolution(space, views.subset(np.flatnonzero(~views.test)), scene)
+    return finest_resolution(space, ready.training, scene)

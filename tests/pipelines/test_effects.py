@@ -20,7 +20,7 @@ from fieldfuse.config import load_settings
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.effects.decide import Decided, asleep, decide, wish
 from fieldfuse.errors import InputError
-from fieldfuse.pipelines.kept import EFFECTS, fitting
+from fieldfuse.pipelines.schemas import Effects, checked
 from fieldfuse.pipelines.steps_effects import moved_cameras
 from fieldfuse.simulate.settings import scene_file
 from fieldfuse.simulate.simulate import simulate
@@ -86,7 +86,7 @@ def test_seconds_stand_beside_each_effect(captures: dict[str, Path], monkeypatch
     points = data["looked_at"]["points_seconds"]
     assert points > 0.02 and paid["exposure"] > paid["vignetting"] > 0 and paid["poses"] == pytest.approx(paid["distortion"], abs=0.002)
     assert 0.7 * data["seconds"] < points + sum(paid.values()) < 1.02 * data["seconds"] + 0.01
-    fitting(data, EFFECTS, Path("effects.json"))
+    checked(data, Effects, Path("effects.json"))
 
 
 def test_blurred_pictures_weigh_less(captures: dict[str, Path], tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import pytest
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.folder import FILES, SUBFOLDERS
-from fieldfuse.pipelines.thread_limits import THREAD_VARIABLES, bound_threads
+from fieldfuse.pipelines.options import THREAD_VARIABLES, bound_threads
 from tests.pipelines.made import bench, call, make_room
 from tests.pipelines.short import FAST, finished, report, stages
 
@@ -193,5 +193,5 @@ def test_waiting_threads_sleep_soon_unless_told_otherwise(
 
 def test_threads_are_bounded_before_numpy_is_loaded() -> None:
     """NumPy's BLAS reads the count when it is loaded; later it is too late."""
-    code = "import sys; from fieldfuse.pipelines import cli, run, work, thread_limits; sys.exit('numpy' in sys.modules)"
+    code = "import sys; from fieldfuse.pipelines import cli, options, run; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from fieldfuse.memory import give_back
-from fieldfuse.pipelines.memory import PeakMemory, own_bytes
+from fieldfuse.pipelines.stages import PeakMemory, own_bytes
 
 SIZE = 2**27  # 128 MiB
 

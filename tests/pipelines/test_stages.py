@@ -17,7 +17,7 @@ from fieldfuse.errors import InputError, Interrupted, OutputError
 from fieldfuse.files import read_json, write_json
 from fieldfuse.pipelines.console import ConsoleProgress
 from fieldfuse.pipelines.folder import RunFolder
-from fieldfuse.pipelines.stages import Stages, finished_stages
+from fieldfuse.pipelines.stages import CollectingStage, EndlessStage, Stage, Stages, finished_stages
 
 
 class Chain:
@@ -65,7 +65,7 @@ class Chain:
                 raise InputError(f"{path} is damaged")
             return int(text)
 
-        return stages.run(name, make, save, load, uses=uses, after=after, keeps=keeps)
+        return stages.run((EndlessStage if keeps else Stage)(name, make, save, load, after, uses))
 
 
 def test_finished_stages_are_reused(tmp_path: Path) -> None:
@@ -154,7 +154,8 @@ def test_outputs_that_are_no_longer_made_are_removed(tmp_path: Path, adds: bool,
                     path.write_text("here")
                 return paths
 
-            stages.run("only", lambda: count, save, lambda: 0, uses=count, adds=adds)  # noqa: B023
+            kind = CollectingStage if adds else Stage
+            stages.run(kind("only", lambda: count, save, lambda: 0, settings=count))  # noqa: B023
         assert sorted(path.name for path in folder.path.glob("*.txt")) == left == sorted(stages.records["only"].outputs)
 
 
@@ -162,8 +163,8 @@ def test_memory_of_children_counts(tmp_path: Path) -> None:
     program = "import time; block = bytearray(300 * 2**20); time.sleep(1.5)"
     with RunFolder(tmp_path / "run") as folder:
         stages = Stages(folder, ConsoleProgress())
-        stages.run("idle", lambda: 0, lambda value: [], lambda: 0)
-        stages.run("child", lambda: subprocess.run([sys.executable, "-c", program], check=True).returncode, lambda value: [], lambda: 0)
+        stages.run(Stage("idle", lambda: 0, lambda value: [], lambda: 0))
+        stages.run(Stage("child", lambda: subprocess.run([sys.executable, "-c", program], check=True).returncode, lambda value: [], lambda: 0))
         idle, child = (stages.records[name].peak_memory_mb for name in ("idle", "child"))
     assert child > idle + 250
     assert stages.records["child"].seconds >= 1.5
@@ -174,7 +175,7 @@ import os, signal, sys
 from pathlib import Path
 from fieldfuse.pipelines.console import ConsoleProgress
 from fieldfuse.pipelines.folder import RunFolder
-from fieldfuse.pipelines.stages import Stages
+from fieldfuse.pipelines.stages import Stage, Stages
 from fieldfuse.config import Settings
 from fieldfuse.files import atomic_path
 
@@ -200,7 +201,7 @@ with RunFolder(Path(sys.argv[1])) as folder:
         die("saved")
         return [path]
 
-    print(stages.run("only", make, save, path.read_text))
+    print(stages.run(Stage("only", make, save, path.read_text)))
     die("after")
 """
 

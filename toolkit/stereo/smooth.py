@@ -8,8 +8,8 @@ from typing import Any
 import numba
 import numpy as np
 
+from fieldfuse.backends.numba.vectors import lesser
 from fieldfuse.camera import Array
-from fieldfuse.vectors import lesser
 
 SMALL_STEP = 0.03  # penalty of a change by one plane between neighbouring pixels, in units of the cost (0 to 1)
 LARGE_STEP = 1.0  # penalty of any larger change on even ground

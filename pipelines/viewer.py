@@ -9,6 +9,7 @@ import io
 import signal
 import socket
 import threading
+import time
 import warnings
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -23,7 +24,7 @@ from fieldfuse.errors import FieldfuseError, InputError
 from fieldfuse.export.cameras import transforms
 from fieldfuse.files import write_json
 from fieldfuse.pipelines.render_path import read_cameras
-from fieldfuse.pipelines.visitor import COLOURS, DEPTH, OPACITY, SMALLEST, Visitor, lens_of, pose_of
+from fieldfuse.pipelines.rendered import to_picture
 
 if TYPE_CHECKING:
     import viser
@@ -34,6 +35,12 @@ MOST_CAMERAS = 150  # that are drawn
 FRUSTUM = 0.06  # of the median depth
 LINE = 0.03  # thickness of a camera's lines, in its own size
 TRAINING, HELD_OUT = (40, 110, 200), (230, 120, 30)
+MOVING_SECONDS = 0.08  # that a picture may take while the camera moves
+REST = 0.15  # seconds without a movement after which a camera rests
+GOODBYE = 0.5  # seconds after which it is known whether what failed was the connection
+NOTHING = 160.0  # depth where nothing is; viser's pictures know 167 at most
+COLOURS, DEPTH, OPACITY = "colours", "depth", "opacity"
+SMALLEST = 64  # pixels of a long side
 
 
 @dataclass(frozen=True)
@@ -95,7 +102,7 @@ class Live:
         self.rendering = threading.Lock()  # the kernels' threads are shared
         self._keeping = threading.Lock()
         self.failed: BaseException | None = None
-        self._ends = threading.Event()
+        self.ends = threading.Event()
         self._visitors: dict[int, Visitor] = {}
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # a visitor left while a picture was made
         with redirect_stdout(io.StringIO()):  # viser's own box with its addresses
@@ -127,18 +134,13 @@ class Live:
         asked: list[int] = []
         before = {number: signal.signal(number, lambda number, _: asked.append(number)) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
-            while not asked and not self._ends.wait(0.2):
+            while not asked and not self.ends.wait(0.2):
                 pass
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
         if self.failed is not None:
             raise self.failed
-
-    def fail(self, error: BaseException) -> None:
-        """End because of `error`."""
-        self.failed = error
-        self._ends.set()
 
     def _furnish(self) -> None:
         """Controls, the capture's cameras, and where a visitor begins: at the first of them."""
@@ -153,10 +155,10 @@ class Live:
             "Cameras", initial_value=False, hint="Blue: training views; orange: held out. A click looks through one."
         )
         for control in (self.what, self.side):
-            control.on_update(lambda _: self.renew())
+            control.on_update(self._renew)
         keep = gui.add_button("Keep this camera", hint="For `fieldfuse render --cameras`.")
         keep.on_click(self._keep)
-        self.told = gui.add_markdown("")
+        self.status = gui.add_markdown("")
         frustums = [self._frustum(index) for index in spread(len(views), MOST_CAMERAS)]
 
         @cameras.on_update
@@ -171,6 +173,8 @@ class Live:
         start.fov = _fov(views.intrinsics[0])
 
     def _frustum(self, index: int) -> viser.CameraFrustumHandle:
+        from viser.transforms import SO3
+
         views = self.shown.views
         lens, pose = views.intrinsics[index], np.asarray(views.world_from_camera[index], dtype=np.float64)
         frustum = self.server.scene.add_camera_frustum(
@@ -180,7 +184,7 @@ class Live:
             scale=FRUSTUM * self.shown.median_depth,
             thickness=LINE * FRUSTUM * self.shown.median_depth,
             color=HELD_OUT if views.test[index] else TRAINING,
-            wxyz=_quaternion(pose),
+            wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
             position=pose[:3, 3],
             visible=False,
         )
@@ -199,11 +203,11 @@ class Live:
         lens, pose = lens_of(camera.fov, camera.aspect, int(self.side.value)), pose_of(camera.wxyz, camera.position)
         try:
             with self._keeping:
-                self.told.content = f"{self.shown.keep(lens, pose)} in `{self.shown.kept}`"
+                self.status.content = f"{self.shown.keep(lens, pose)} in `{self.shown.kept}`"
         except FieldfuseError as error:
-            self.told.content = str(error)
+            self.status.content = str(error)
 
-    def renew(self) -> None:
+    def _renew(self, _: Any) -> None:
         """Everybody's picture is rendered again."""
         for visitor in list(self._visitors.values()):
             visitor.moved.set()
@@ -218,12 +222,78 @@ class Live:
             visitor.leave()
 
 
-def _quaternion(pose: Array) -> Array:
-    from viser.transforms import SO3
-
-    return np.asarray(SO3.from_matrix(pose[:3, :3]).wxyz)
-
-
 def _fov(lens: Intrinsics) -> float:
     """Vertical opening angle in radians."""
     return float(2 * np.arctan(lens.height / 2 / lens.fy))
+
+
+class Visitor:
+    """One browser, and the thread that renders for it."""
+
+    def __init__(self, live: Live, client: viser.ClientHandle) -> None:
+        self.live, self.client = live, client
+        self.moved = threading.Event()
+        self.moved.set()
+        self._left = False
+        self._per_pixel = 1e-6  # seconds, learnt as it goes
+        threading.Thread(target=self._run, name=f"visitor-{client.client_id}", daemon=True).start()
+
+    def leave(self) -> None:
+        """Nothing is rendered for it any more."""
+        self._left = True
+        self.moved.set()
+
+    def _run(self) -> None:
+        try:
+            while not self._left:
+                self.moved.wait()
+                self.moved.clear()
+                whole = int(self.live.side.value)
+                small = int(np.clip((MOVING_SECONDS / self._per_pixel) ** 0.5, SMALLEST, whole))
+                self._show(small)
+                if small < whole and not self.moved.wait(REST) and not self._left:
+                    self._show(whole)
+        except BaseException as error:  # a thread's own would be lost
+            time.sleep(GOODBYE)
+            if not self._left:
+                self.live.failed = error
+                self.live.ends.set()
+
+    def _show(self, long_side: int) -> None:
+        """Render what the camera sees, and send it."""
+        if self._left:
+            return
+        camera = self.client.camera
+        lens = lens_of(camera.fov, camera.aspect, long_side)
+        with self.live.rendering:
+            begin = time.perf_counter()
+            rendered = self.live.shown.render(lens, pose_of(camera.wxyz, camera.position))
+            self._per_pixel = (time.perf_counter() - begin) / (lens.width * lens.height)
+        depth = np.where(rendered.depth > 0, rendered.depth, NOTHING)
+        self.client.scene.set_background_image(picture(rendered, self.live.what.value), format="jpeg", jpeg_quality=85, depth=depth)
+
+
+def lens_of(fov: float, aspect: float, long_side: int) -> Intrinsics:
+    """A pinhole camera by its vertical opening angle (radians) and width over height."""
+    height, width = (long_side / aspect, long_side) if aspect >= 1 else (long_side, long_side * aspect)
+    height, width = max(1, round(height)), max(1, round(width))
+    focal = height / 2 / np.tan(fov / 2)
+    return Intrinsics(width, height, focal, focal, width / 2, height / 2)
+
+
+def picture(rendered: Any, what: str) -> Array:
+    """(H, W, 3) uint8 of what was asked for."""
+    from fieldfuse.evaluation.pictures import depth_picture, depth_range
+
+    if what == DEPTH:
+        return depth_picture(rendered.depth, depth_range([rendered.depth]))
+    if what == OPACITY:
+        return np.repeat((np.clip(rendered.opacity, 0, 1) * 255 + 0.5).astype(np.uint8)[..., None], 3, axis=2)
+    return to_picture(rendered).rgb
+
+
+def pose_of(wxyz: Any, position: Any) -> Array:
+    """(4, 4) world_from_camera of a viewer's camera, whose axes are ours."""
+    from fieldfuse.capture.poses import rigid
+
+    return rigid(np.asarray(wxyz, dtype=np.float64), np.asarray(position, dtype=np.float64), "the viewer's camera")
