@@ -273,7 +273,7 @@ def depth_offset(ready: Prepared) -> list[str]:
 
 def _apart(capture: Capture, some: Array, others: Array) -> tuple[str, str]:
     """How far poses (N, 4, 4) lie from others in the median, and how far they are turned, in words."""
-    from fieldfuse.effects.bounds import apart
+    from fieldfuse.effects.correct import apart
 
     way, turn = apart(some, others)
     length = f"{100 * np.median(way):.1f} cm" if capture.metric else f"{np.median(way):.3g} of the capture's units"

@@ -84,7 +84,8 @@ def test_large_pictures_are_corrected_as_those_of_the_fit(run: Path) -> None:
 
 
 def test_a_mesh_is_made_of_pictures_as_they_were_taken_where_there_is_room(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with open_job(Place(run / "room", run / "other"), gather(None, None, ["export.mesh_size=128"], image_size=48), make_progress(True)) as job:
+    options = gather(None, None, ["export.mesh_size=128"], image_size=48)
+    with open_job(Place(run / "room", run / "other"), options, make_progress(True)) as job:
         ready = prepare(job)
         posed, views = ready.posed, ready.views
         train = np.flatnonzero(~views.test)
