@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from fieldfuse.pipelines.options import Options, Place, takes, work
+from fieldfuse.pipelines.options import Options, Place, takes
+from fieldfuse.pipelines.work import work
 
 
 @takes("threads config pairs quiet json")

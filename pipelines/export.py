@@ -8,7 +8,8 @@ import typer
 
 from fieldfuse.config import EXPORTS, require_formats
 from fieldfuse.errors import InputError
-from fieldfuse.pipelines.options import Options, Place, takes, work
+from fieldfuse.pipelines.options import Options, Place, takes
+from fieldfuse.pipelines.work import work
 
 
 @takes("threads config pairs quiet json")

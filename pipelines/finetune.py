@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from fieldfuse.pipelines.options import Options, Place, takes, work
+from fieldfuse.pipelines.options import Options, Place, takes
+from fieldfuse.pipelines.work import work
 
 
 @takes("budget device threads seed engine decoder config pairs quiet json")

@@ -18,7 +18,6 @@ import typer
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 SHORT_SPIN = "1000"  # turns, microseconds
-FIELD_PAGE = "exports/field.html"
 
 Source = Annotated[
     Path, typer.Argument(help="A video, a folder of photos, or a posed capture; its kind is found by looking.", show_default=False)
@@ -181,20 +180,3 @@ def show(data: Any, options: Options, lines: Callable[[], Iterable[str]]) -> Non
         sys.stdout.write(writer.dumps(data, indent=1) + "\n")
     elif not options.quiet:
         sys.stdout.writelines(f"{line}\n" for line in lines())
-
-
-def work(place: Place, options: Options, goals: Iterable[str], settings: dict[str, Any], **how: Any) -> None:
-    """Make `goals` in the run's folder and show the report's numbers; `how`: as `fieldfuse.pipelines.reconstruct.run_job` takes it."""
-    bound_threads(settings)
-    from fieldfuse.pipelines.console import make_progress, table_lines
-    from fieldfuse.pipelines.reconstruct import run_job
-
-    data = run_job(place, settings, goals, make_progress(options.quiet), **how)
-
-    def lines() -> Iterable[str]:
-        yield from table_lines(data)
-        yield from (f"note: {warning}" for warning in data.get("warnings", []))
-        yield from (str(place.folder / FIELD_PAGE) for export in data.get("exports", []) if export["path"] == FIELD_PAGE)
-        yield str(place.folder / ("report.html" if data.get("evaluation") else "exports/cameras"))
-
-    show(data, options, lines)

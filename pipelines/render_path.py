@@ -20,14 +20,14 @@ from fieldfuse.memory import require_pictures
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.fields import finished_field
 from fieldfuse.pipelines.job import Job, open_job
-from fieldfuse.pipelines.options import Place
 from fieldfuse.pipelines.pictures import Camera, camera_of, orbit_cameras, pictures
 from fieldfuse.pipelines.prepare import BEFORE, prepare
-from fieldfuse.pipelines.render import CameraPath
 from fieldfuse.pipelines.rendered import file_name, write_png
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Views
+    from fieldfuse.pipelines.options import Place
+    from fieldfuse.pipelines.render import CameraPath
 
 VIDEO = (".mp4",)
 NUMBERED = re.compile(r"\d{4,}_.*\.png")

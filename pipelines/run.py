@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from fieldfuse.errors import InputError
-from fieldfuse.pipelines.options import Options, Out, Place, Source, takes, work
+from fieldfuse.pipelines.options import Options, Out, Place, Source, takes
+from fieldfuse.pipelines.work import work
 
 MOST_SECONDS = 1e7  # a third of a year
 

@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from fieldfuse.pipelines.options import Options, Place, takes, work
+from fieldfuse.pipelines.options import Options, Place, takes
+from fieldfuse.pipelines.work import work
 
 
 @takes("image_size holdout poses threads config pairs quiet json")

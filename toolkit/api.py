@@ -92,7 +92,7 @@ def load(
 
 
 def fit(scene: Scene, budget: float | None = None, *, progress: Listener = None, start: Field | None = None, **options: Any) -> Field:
-    """Fit a field to the training views.
+    """Fit a field to the training views. With `finetune=False` nothing is fitted: the result is what `infer` gives.
 
     Args:
         budget: seconds; None: as the preset has it.
@@ -108,6 +108,10 @@ def fit(scene: Scene, budget: float | None = None, *, progress: Listener = None,
     from fieldfuse.volume.grid_host import host_for
 
     settings = changed_settings(scene.settings, {**options, **({} if budget is None else {"budget": budget})}, OF_FIT)
+    if not settings.fit.finetune:
+        if start is not None or settings.field.init == "classical":
+            raise InputError("without fine-tuning the networks' field is the result, so it has no start; leave out start or finetune=False")
+        return infer(scene, progress=progress, **options)
     with steps.seeded(settings.seed):
         first = None if start is None else start.sparse
         if first is None and steps.starts_from_networks(scene.views, settings):

@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 from fieldfuse.capture.types import Capture, Frame
-from fieldfuse.pipelines.steps_capture import at_home
+from fieldfuse.pipelines.prepare import in_folder
 from tests.pipelines.made import CAMERA, call, circle, command, environment, look_at, make_photos, shoot
 from tests.pipelines.short import HUNG
 
@@ -82,7 +82,7 @@ def test_the_frames_of_a_run_folder_that_was_moved_are_its_own(tmp_path: Path) -
     kept = [tmp_path / "photos" / "a.jpg", tmp_path / "frames" / "b.jpg"]  # photos that needed no writing
     frames = [Frame(str(index), path) for index, path in enumerate([before / "a.jpg", *kept])]
     deep = [replace(frames[0], depth=before / "depth" / "a.png"), replace(frames[0], depth=tmp_path / "depth" / "a.png")]
-    got = at_home(Capture("photos", tmp_path, (*frames, *deep)), now)
+    got = in_folder(Capture("photos", tmp_path, (*frames, *deep)), now)
     assert [frame.image for frame in got.frames] == [now / "a.jpg", *kept, now / "a.jpg", now / "a.jpg"]
     assert [frame.depth for frame in got.frames[3:]] == [now / "depth" / "a.png", deep[1].depth]
 

@@ -13,7 +13,7 @@ from fieldfuse.capture import open_capture
 from fieldfuse.capture.images import load_depth
 from fieldfuse.capture.select import select_frames
 from fieldfuse.config import CaptureSettings
-from fieldfuse.pipelines.steps_capture import at_home
+from fieldfuse.pipelines.prepare import in_folder
 from tests.capture.layouts import write_record3d, zipped
 from tests.capture.made import BALL, RADIUS
 from tests.pipelines.made import call
@@ -44,6 +44,6 @@ def test_a_recording_becomes_its_surface(recording: Path, tmp_path: Path, capsys
 def test_depth_of_a_run_that_was_moved_is_found(recording: Path, tmp_path: Path) -> None:
     chosen = select_frames(open_capture(recording), tmp_path / "run", CaptureSettings())
     (tmp_path / "run").rename(tmp_path / "moved")
-    capture = at_home(chosen, tmp_path / "moved" / "frames")
+    capture = in_folder(chosen, tmp_path / "moved" / "frames")
     for frame in capture.frames:
         assert load_depth(frame, capture).any() and frame.image.parent == frame.depth.parent.parent == tmp_path / "moved" / "frames"

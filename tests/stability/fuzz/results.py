@@ -120,7 +120,7 @@ def read_results(root: Path, number: int) -> None:
     from fieldfuse.evaluation.page import render_page
     from fieldfuse.evaluation.pictures import Pictures
     from fieldfuse.evaluation.table import table
-    from fieldfuse.pipelines.effects_table import effects_facts
+    from fieldfuse.pipelines.info import effects_facts
 
     data = _report(root)
     str(table(data))
