@@ -27,31 +27,10 @@ STAGES = "stages"
 ERROR_LOG = "error.log"
 SUBFOLDERS = (STAGES, "frames", "sparse", "renders", "tsdf", "stereo", "tsdf_stereo", "compare", "tradeoff", "exports")
 FILES = (
-    "capture.json",
-    "plan.json",
-    "poses.json",
-    "effects.json",
-    "scene.json",
-    "keyframes.json",
-    "views.safetensors",
-    "network.safetensors",
-    "network.json",
-    "direct.safetensors",
-    "preview.png",
-    "field.safetensors",
-    "timeline.json",
-    "fit_notes.json",
-    "fit_matched.json",
-    "left_out.safetensors",
-    "mesh.ply",
-    "evaluation.json",
-    "report.json",
-    "report.html",
-    "compare.json",
-    "compare.html",
-    "tradeoff.csv",
-    "tradeoff.json",
-    "tradeoff.html",
+    *("capture.json", "plan.json", "poses.json", "effects.json", "scene.json", "keyframes.json", "views.safetensors"),
+    *("network.safetensors", "network.json", "direct.safetensors", "preview.png", "field.safetensors", "timeline.json"),
+    *("fit_notes.json", "fit_matched.json", "left_out.safetensors", "mesh.ply", "evaluation.json", "report.json", "report.html"),
+    *("compare.json", "compare.html", "tradeoff.csv", "tradeoff.json", "tradeoff.html"),
 )
 BUSY = "another fieldfuse command is working in {}; wait for it to end or choose another --out folder"
 FOREIGN = "{} holds {!r} but no fieldfuse run; choose a new or empty --out folder so that nothing of yours is replaced"
@@ -90,14 +69,16 @@ class RunFolder:
             self._made = [place for place in (self.path, *self.path.parents) if not place.exists()]
             self._take_lock()
             self._held_run = is_run_folder(self.path)
-            self._check_ours()
+            if not self._held_run and (foreign := self._results()):  # of the same names, but without a run: somebody's data
+                self._unlock()
+                remove(self.path / LOCK)
+                raise OutputError(FOREIGN.format(self.path, foreign[0]))
             self._remove_leftovers()
             remove(self.path / ERROR_LOG)
-        except BlockingIOError as error:
-            self._unlock()
-            raise OutputError(BUSY.format(self.path)) from error
         except OSError as error:
             self._unlock()
+            if isinstance(error, BlockingIOError):
+                raise OutputError(BUSY.format(self.path)) from error
             reason = error.strerror or error
             raise OutputError(f"cannot write to {self.path}: {reason}; make it writable, or choose another --out folder") from error
         return self
@@ -147,16 +128,6 @@ class RunFolder:
     def _results(self) -> list[str]:
         """Names of a run's files and folders that are there, `run.json` aside."""
         return [name for name in (*SUBFOLDERS, *FILES) if (self.path / name).exists()]
-
-    def _check_ours(self) -> None:
-        """A folder with files of the same names as a run's, but without a run in it, is somebody's data."""
-        if self._held_run:
-            return
-        foreign = self._results()
-        if foreign:
-            self._unlock()
-            remove(self.path / LOCK)
-            raise OutputError(FOREIGN.format(self.path, foreign[0]))
 
     def _unlock(self) -> None:
         if self._lock is not None:

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, create_model
 
 from fieldfuse.errors import InputError, brief
 from fieldfuse.files import read_json
@@ -15,156 +15,84 @@ from fieldfuse.files import read_json
 LARGEST = 1e300  # numbers beyond it cannot be computed with
 Number = Annotated[float, Field(gt=-LARGEST, lt=LARGEST)]
 Numbers = dict[str, Number | None]
-Cell = Number | bool | str | None
+NO_OTHERS = object()
 
 
-class Table(BaseModel):
-    """Keys that are named and no others."""
-
-    model_config = ConfigDict(strict=True, extra="forbid")
-
-
-class OpenTable(BaseModel):
-    """Keys that are named, and others of any finite content."""
-
-    model_config = ConfigDict(strict=True, extra="allow")
+def table(name: str, others: Any = NO_OTHERS, /, **keys: Any) -> Any:
+    """The form of a JSON object: keys → types, (type, default) for keys that may be missing; `others`: type of all other keys."""
+    extra = {"__pydantic_extra__": dict[str, others]} if others is not NO_OTHERS else {}
+    config = ConfigDict(strict=True, extra="allow" if extra else "forbid")
+    base = type(name, (BaseModel,), {"__annotations__": extra, "__module__": __name__, "model_config": config})
+    return create_model(name, __base__=base, **{key: kind if isinstance(kind, tuple) else (kind, ...) for key, kind in keys.items()})
 
 
-class Mesh(Table):
-    vertices: Number
-    triangles: Number
-    watertight: bool
-    components: Number
-    area: Number
-    bounds: list[list[Number]]
+Maybe, Text = Number | None, (str | None, None)
+Mesh = table("Mesh", vertices=Number, triangles=Number, watertight=bool, components=Number, area=Number, bounds=list[list[Number]])
+View = table("View", Number | str | None, index=Number, name=str, depth=(Numbers | None, None))
+Scores = table(
+    "Scores",
+    Number | bool | None,
+    per_view=(list[View], []),
+    depth=(Numbers | None, None),
+    mesh=(Mesh | None, None),
+    depth_from=Text,
+    on=(dict[str, Numbers], {}),
+)
+Wanted = table("Wanted", Maybe, decoder=Text, precision=Text)
+Setting = table("Setting", Maybe, decoder=Text, precision=Text, wanted=(Wanted | None, None))
+Point = table(
+    "Point",
+    Maybe,
+    method=str,
+    setting=Setting,
+    stages=(Numbers | None, None),
+    load=(list[Maybe] | None, None),
+    axes=(list[str] | None, None),
+    id=Text,
+    variant=Text,
+    error=Text,
+    measured=(Any, None),
+    wanted=(Wanted | None, None),
+    changed=(Wanted | None, None),
+)
+Finding = table(
+    "Finding",
+    Any,
+    effect=str,
+    there=bool,
+    number=Number,
+    threshold=Number,
+    reason=str,
+    held_out=(table("HeldOut", Any, before=Number, after=Number, unit=str) | None, None),
+    wish=(str, ""),
+    on=(bool, False),
+    note=(str, ""),
+    seconds=(Number, 0),
+    decided_by=(str, ""),
+    trial=(dict[str, Number], {}),
+)
+LookedAt = table("LookedAt", Any, frames=Number, points=Number, points_seconds=(Number, 0))
 
-
-class View(OpenTable):
-    index: Number
-    name: str
-    depth: Numbers | None = None
-    __pydantic_extra__: dict[str, Number | str | None]
-
-
-class Scores(OpenTable):
-    per_view: list[View] = []
-    depth: Numbers | None = None
-    mesh: Mesh | None = None
-    depth_from: str | None = None
-    on: dict[str, Numbers] = {}
-    __pydantic_extra__: dict[str, Number | bool | None]
-
-
-class CompareScores(Table):
-    scores: dict[str, Scores]
-    geometry: dict[str, Numbers] | None
-    seen_share: Number | None
-    matching: Numbers | None
-
-
-class Wanted(OpenTable):
-    decoder: str | None = None
-    precision: str | None = None
-    __pydantic_extra__: dict[str, Number | None]
-
-
-class Setting(Wanted):
-    wanted: Wanted | None = None
-
-
-class Point(OpenTable):
-    method: str
-    setting: Setting
-    stages: Numbers | None = None
-    load: list[Number | None] | None = None
-    axes: list[str] | None = None
-    id: str | None = None
-    variant: str | None = None
-    error: str | None = None
-    measured: Any = None
-    wanted: Wanted | None = None
-    changed: Wanted | None = None
-    __pydantic_extra__: dict[str, Number | None]
-
-
-class Tradeoff(OpenTable):
-    rows: list[Point]
-    command: str
-    unit: str | None
-    machine: dict[str, Number | str | None]
-
-
-class MeasuredPoint(Table):
-    key: str
-    crashed: bool
-    wall_seconds: Number
-    rows: list[Point]
-
-
-class ExportFacts(Table):
-    mesh: Mesh | None
-    notes: list[str] = []
-    note: str | None = None
-
-
-class Moment(OpenTable):
-    seconds: Number
-    psnr: Number | None
-    __pydantic_extra__: dict[str, Number | str | None]
-
-
-class Matched(Table):
-    views: Number
-    pixels: Number
-    share: Number
-    bare: Number = 0
-    seconds: Number
-
-
-class Network(Table):
-    key_frames: Number
-    seconds: Number
-    fusion_seconds: Number = 0
-    encode_seconds: Number
-    first_preview_seconds: Number
-    resolution: Number
-
-
-class HeldOut(OpenTable):
-    before: Number
-    after: Number
-    unit: str
-
-
-class Finding(OpenTable):
-    effect: str
-    there: bool
-    number: Number
-    threshold: Number
-    reason: str
-    held_out: HeldOut | None = None
-    wish: str = ""
-    on: bool = False
-    note: str = ""
-    seconds: Number = 0
-    decided_by: str = ""
-    trial: dict[str, Number] = {}
-
-
-class LookedAt(OpenTable):
-    frames: Number
-    points: Number
-    points_seconds: Number = 0
-
-
-class Effects(Table):
-    effects: list[Finding]
-    seconds: Number
-    corrections: dict[str, Any] = {}
-    looked_at: LookedAt
-
-
-EVALUATION, TIMELINE, NOTES = dict[str, Scores], list[Moment], list[str]
+NOTES = list[str]
+EVALUATION = dict[str, Scores]
+TIMELINE = list[table("Moment", Number | str | None, seconds=Number, psnr=Maybe)]  # type: ignore[misc]
+Effects = table("Effects", effects=list[Finding], seconds=Number, corrections=(dict[str, Any], {}), looked_at=LookedAt)
+Matched = table("Matched", views=Number, pixels=Number, share=Number, bare=(Number, 0), seconds=Number)
+Network = table(
+    "Network",
+    key_frames=Number,
+    seconds=Number,
+    fusion_seconds=(Number, 0),
+    encode_seconds=Number,
+    first_preview_seconds=Number,
+    resolution=Number,
+)
+ExportFacts = table("ExportFacts", mesh=Mesh | None, notes=(list[str], []), note=Text)
+CompareScores = table(
+    "CompareScores", scores=EVALUATION, geometry=dict[str, Numbers] | None, seen_share=Maybe, matching=Numbers | None
+)
+Tradeoff = table("Tradeoff", Any, rows=list[Point], command=str, unit=str | None, machine=dict[str, Number | str | None])
+MeasuredPoint = table("MeasuredPoint", key=str, crashed=bool, wall_seconds=Number, rows=list[Point])
 
 
 @cache

@@ -8,7 +8,7 @@ import typer
 
 from fieldfuse.pipelines.options import Options, Place, bound_threads, takes
 
-KEPT = "cameras_kept.json"
+CAMERAS = "cameras_kept.json"
 
 
 @takes("baked device threads config pairs quiet")
@@ -33,9 +33,8 @@ def view(
     require_server(host)
     with open_job(place, settings, make_progress(options.quiet), (*BEFORE, "field")) as job:
         ready = prepare(job)
-        views, scene = ready.views, ready.scene
-        render = camera_of(job, finished_field(job, ready).field, views, scene, options.baked)
-        shown = Shown(job.source.name, render, views, scene.median_depth, place.folder / KEPT, scene.working_from_input)
+        render = camera_of(job, finished_field(job, ready).field, ready.views, ready.scene, options.baked)
+        shown = Shown(job.source.name, render, ready, place.folder / CAMERAS)
     with Live(shown, host, port, image_size) as live:  # the run's folder is free again: others may work in it
         typer.echo(f"{live.address} shows the field; Ctrl-C ends it")
         live.wait()

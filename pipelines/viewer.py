@@ -19,26 +19,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fieldfuse.camera import Array, Intrinsics, Similarity
+from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.capture.poses import rigid
 from fieldfuse.errors import FieldfuseError, InputError
+from fieldfuse.evaluation.pictures import depth_picture, depth_range, spread
 from fieldfuse.export.cameras import transforms
 from fieldfuse.files import write_json
+from fieldfuse.pipelines.prepare import Prepared
 from fieldfuse.pipelines.render_path import read_cameras
 from fieldfuse.pipelines.rendered import to_picture
 
 if TYPE_CHECKING:
     import viser
 
-    from fieldfuse.capture.types import Views
-
 MOST_CAMERAS = 150  # that are drawn
 FRUSTUM = 0.06  # of the median depth
 LINE = 0.03  # thickness of a camera's lines, in its own size
 TRAINING, HELD_OUT = (40, 110, 200), (230, 120, 30)
-MOVING_SECONDS = 0.08  # that a picture may take while the camera moves
+MOVING_SECONDS = 0.08  # that a render may take while the camera moves
 REST = 0.15  # seconds without a movement after which a camera rests
-GOODBYE = 0.5  # seconds after which it is known whether what failed was the connection
-NOTHING = 160.0  # depth where nothing is; viser's pictures know 167 at most
+GOODBYE = 0.5  # seconds after which it shows whether what failed was the connection
+NOTHING = 160.0  # depth where nothing is; viser's images hold 167 at most
 COLOURS, DEPTH, OPACITY = "colours", "depth", "opacity"
 SMALLEST = 64  # pixels of a long side
 
@@ -49,28 +50,25 @@ class Shown:
 
     Attributes:
         render: lens and pose (4, 4, working frame) → `Rendered`.
-        median_depth: of the scene, working units.
-        kept: the file for cameras that visitors keep, in the input's frame; those that it has stay in it.
+        cameras: the file for cameras that visitors save, in the input's frame; those that it has stay in it.
     """
 
     name: str
     render: Callable[[Intrinsics, Array], Any]
-    views: Views
-    median_depth: float
-    kept: Path
-    working_from_input: Similarity
+    ready: Prepared
+    cameras: Path
 
-    def keep(self, lens: Intrinsics, pose: Array) -> int:
+    def save_camera(self, lens: Intrinsics, pose: Array) -> int:
         """Add a camera (working frame) to the file; answers how many it has.
 
         Raises:
             InputError: the file that is there holds no cameras.
             OutputError: it cannot be written.
         """
-        names, lenses, poses = read_cameras(self.kept) if self.kept.is_file() else ([], [], np.zeros((0, 4, 4)))
-        mine = self.working_from_input.inverse().poses(pose[None])
+        names, lenses, poses = read_cameras(self.cameras) if self.cameras.is_file() else ([], [], np.zeros((0, 4, 4)))
+        mine = self.ready.scene.working_from_input.inverse().poses(pose[None])
         names = [*names, f"view_{len(names):04d}"]
-        write_json(self.kept, transforms(names, [*lenses, lens], np.concatenate([poses, mine])))
+        write_json(self.cameras, transforms(names, [*lenses, lens], np.concatenate([poses, mine])))
         return len(names)
 
 
@@ -95,19 +93,19 @@ class Live:
     """The server. A context: it stops serving at the end."""
 
     def __init__(self, shown: Shown, host: str, port: int, image_size: int) -> None:
-        """`image_size`: long side in pixels of a picture at rest. `require_server` must have passed."""
+        """`image_size`: long side in pixels of a render at rest. `require_server` must have passed."""
         import viser
 
         self.shown, self.image_size = shown, image_size
         self.rendering = threading.Lock()  # the kernels' threads are shared
-        self._keeping = threading.Lock()
+        self._saving = threading.Lock()
         self.failed: BaseException | None = None
         self.ends = threading.Event()
         self._visitors: dict[int, Visitor] = {}
-        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # a visitor left while a picture was made
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # a visitor left while a render was made
         with redirect_stdout(io.StringIO()):  # viser's own box with its addresses
             self.server = viser.ViserServer(host=host, port=port, label=f"Fieldfuse: {shown.name}", verbose=False)
-        self.host = host
+        self.address = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0', '::') else host}:{self.server.get_port()}"
         self._furnish()
         self.server.on_client_connect(self._welcome)
         self.server.on_client_disconnect(self._farewell)
@@ -121,20 +119,16 @@ class Live:
         with redirect_stdout(io.StringIO()):  # "Server stopped"
             self.server.stop()
 
-    @property
-    def address(self) -> str:
-        return f"http://{'localhost' if self.host in ('127.0.0.1', '0.0.0.0', '::') else self.host}:{self.server.get_port()}"
-
     def wait(self) -> None:
         """Until Ctrl-C. Handlers of its own: what a shell starts in the background ignores Ctrl-C otherwise.
 
         Raises:
-            whatever went wrong while a picture was rendered.
+            whatever went wrong while a render was made.
         """
-        asked: list[int] = []
-        before = {number: signal.signal(number, lambda number, _: asked.append(number)) for number in (signal.SIGINT, signal.SIGTERM)}
+        signals: list[int] = []
+        before = {number: signal.signal(number, lambda number, _: signals.append(number)) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
-            while not asked and not self.ends.wait(0.2):
+            while not signals and not self.ends.wait(0.2):
                 pass
         finally:
             for number, handler in before.items():
@@ -144,20 +138,16 @@ class Live:
 
     def _furnish(self) -> None:
         """Controls, the capture's cameras, and where a visitor begins: at the first of them."""
-        from fieldfuse.evaluation.pictures import spread
-
-        gui, scene, views = self.server.gui, self.server.scene, self.shown.views
+        gui, scene, views = self.server.gui, self.server.scene, self.shown.ready.views
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         scene.set_up_direction("+z")
         self.what = gui.add_dropdown("Show", (COLOURS, DEPTH, OPACITY))
         self.side = gui.add_slider("Pixels at rest", min=SMALLEST, max=max(1600, self.image_size), step=16, initial_value=self.image_size)
-        cameras = gui.add_checkbox(
-            "Cameras", initial_value=False, hint="Blue: training views; orange: held out. A click looks through one."
-        )
+        hint = "Blue: training views; orange: held out. A click looks through one."
+        cameras = gui.add_checkbox("Cameras", initial_value=False, hint=hint)
         for control in (self.what, self.side):
             control.on_update(self._renew)
-        keep = gui.add_button("Keep this camera", hint="For `fieldfuse render --cameras`.")
-        keep.on_click(self._keep)
+        gui.add_button("Keep this camera", hint="For `fieldfuse render --cameras`.").on_click(self._save_camera)
         self.status = gui.add_markdown("")
         frustums = [self._frustum(index) for index in spread(len(views), MOST_CAMERAS)]
 
@@ -169,22 +159,22 @@ class Live:
         first = views.world_from_camera[0]
         start = self.server.initial_camera
         start.position = first[:3, 3]
-        start.look_at = first[:3, 3] + self.shown.median_depth * first[:3, 2]
+        start.look_at = first[:3, 3] + self.shown.ready.scene.median_depth * first[:3, 2]
         start.fov = _fov(views.intrinsics[0])
 
     def _frustum(self, index: int) -> viser.CameraFrustumHandle:
         from viser.transforms import SO3
 
-        views = self.shown.views
+        views, size = self.shown.ready.views, FRUSTUM * self.shown.ready.scene.median_depth
         lens, pose = views.intrinsics[index], np.asarray(views.world_from_camera[index], dtype=np.float64)
         frustum = self.server.scene.add_camera_frustum(
             f"/cameras/{index:04d}",
             _fov(lens),
             lens.width / lens.height,
-            scale=FRUSTUM * self.shown.median_depth,
-            thickness=LINE * FRUSTUM * self.shown.median_depth,
+            scale=size,
+            thickness=LINE * size,
             color=HELD_OUT if views.test[index] else TRAINING,
-            wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
+            wxyz=np.asarray(SO3.from_matrix(pose[:3, :3]).wxyz),
             position=pose[:3, 3],
             visible=False,
         )
@@ -198,17 +188,16 @@ class Live:
 
         return frustum
 
-    def _keep(self, event: Any) -> None:
+    def _save_camera(self, event: Any) -> None:
         camera = event.client.camera
         lens, pose = lens_of(camera.fov, camera.aspect, int(self.side.value)), pose_of(camera.wxyz, camera.position)
         try:
-            with self._keeping:
-                self.status.content = f"{self.shown.keep(lens, pose)} in `{self.shown.kept}`"
+            with self._saving:
+                self.status.content = f"{self.shown.save_camera(lens, pose)} in `{self.shown.cameras}`"
         except FieldfuseError as error:
             self.status.content = str(error)
 
     def _renew(self, _: Any) -> None:
-        """Everybody's picture is rendered again."""
         for visitor in list(self._visitors.values()):
             visitor.moved.set()
 
@@ -220,11 +209,6 @@ class Live:
         visitor = self._visitors.pop(client.client_id, None)
         if visitor is not None:
             visitor.leave()
-
-
-def _fov(lens: Intrinsics) -> float:
-    """Vertical opening angle in radians."""
-    return float(2 * np.arctan(lens.height / 2 / lens.fy))
 
 
 class Visitor:
@@ -270,7 +254,7 @@ class Visitor:
             rendered = self.live.shown.render(lens, pose_of(camera.wxyz, camera.position))
             self._per_pixel = (time.perf_counter() - begin) / (lens.width * lens.height)
         depth = np.where(rendered.depth > 0, rendered.depth, NOTHING)
-        self.client.scene.set_background_image(picture(rendered, self.live.what.value), format="jpeg", jpeg_quality=85, depth=depth)
+        self.client.scene.set_background_image(image_of(rendered, self.live.what.value), format="jpeg", jpeg_quality=85, depth=depth)
 
 
 def lens_of(fov: float, aspect: float, long_side: int) -> Intrinsics:
@@ -281,10 +265,8 @@ def lens_of(fov: float, aspect: float, long_side: int) -> Intrinsics:
     return Intrinsics(width, height, focal, focal, width / 2, height / 2)
 
 
-def picture(rendered: Any, what: str) -> Array:
-    """(H, W, 3) uint8 of what was asked for."""
-    from fieldfuse.evaluation.pictures import depth_picture, depth_range
-
+def image_of(rendered: Any, what: str) -> Array:
+    """(H, W, 3) uint8: colours, depth or opacity."""
     if what == DEPTH:
         return depth_picture(rendered.depth, depth_range([rendered.depth]))
     if what == OPACITY:
@@ -294,6 +276,9 @@ def picture(rendered: Any, what: str) -> Array:
 
 def pose_of(wxyz: Any, position: Any) -> Array:
     """(4, 4) world_from_camera of a viewer's camera, whose axes are ours."""
-    from fieldfuse.capture.poses import rigid
-
     return rigid(np.asarray(wxyz, dtype=np.float64), np.asarray(position, dtype=np.float64), "the viewer's camera")
+
+
+def _fov(lens: Intrinsics) -> float:
+    """Vertical opening angle in radians."""
+    return float(2 * np.arctan(lens.height / 2 / lens.fy))
