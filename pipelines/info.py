@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as writer
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,6 +22,7 @@ OUTDATED = (
     ({"render", "evaluate"}, "scores, pictures and the report are of an earlier field or surface; `fieldfuse evaluate {}` renews them"),
     ({"export"}, "the exports are of an earlier field; `fieldfuse export {}` renews them"),
 )
+STAGE = ("name", "seconds", "peak_memory_mb", "stopped")
 BESIDE = 140  # characters that a line must have for the evidence to stand in the table
 SHOWN = {"views": "views {}", "psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.3f}", "lpips": "LPIPS {:.3f}"}
 
@@ -100,10 +102,7 @@ def check_poses(capture: Capture, progress: Progress) -> tuple[str | None, list[
 
 def lenses(capture: Capture) -> list[dict[str, Any]]:
     """The different cameras that the source names, each with how many frames have it."""
-    found: dict[Any, int] = {}
-    for frame in capture.frames:
-        if frame.intrinsics is not None:
-            found[frame.intrinsics] = found.get(frame.intrinsics, 0) + 1
+    found = Counter(frame.intrinsics for frame in capture.frames if frame.intrinsics is not None)
     return [{"frames": count, **camera.to_dict()} for camera, count in found.items()]
 
 
@@ -124,21 +123,12 @@ def run_facts(folder: Path) -> dict[str, Any]:
         "report": str(page) if page.is_file() else None,
         "scores": scores_of(run / "evaluation.json"),
         "outdated": [text.format(folder) for stages, text in OUTDATED if stages & old],
-        "stages": [
-            {
-                "name": record.name,
-                "seconds": record.seconds,
-                "peak_memory_mb": record.peak_memory_mb,
-                "stopped": record.stopped,
-                "outdated": record.name in old,
-            }
-            for record in records
-        ],
+        "stages": [{**{name: getattr(record, name) for name in STAGE}, "outdated": record.name in old} for record in records],
     }
 
 
 def scores_of(path: Path) -> dict[str, dict[str, float]]:
-    """What was scored, and how well; empty when nothing was, or the file cannot be read: the run's other facts are told all the same."""
+    """What was scored, and how well; empty when nothing was, or the file cannot be read: the run's other facts are shown all the same."""
     from fieldfuse.errors import InputError
     from fieldfuse.pipelines.schemas import EVALUATION, read_checked
 
@@ -149,7 +139,7 @@ def scores_of(path: Path) -> dict[str, dict[str, float]]:
     return {
         what: {name: score[name] for name in SHOWN if score.get(name) is not None}
         for what, score in scores.items()
-        if score is not None and score.get("psnr") is not None
+        if score.get("psnr") is not None
     }
 
 
@@ -160,8 +150,9 @@ def for_people(data: dict[str, Any]) -> dict[str, Any]:
         shown["extra"] = {name: value for name, value in shown["extra"].items() if shown.get(name) != value}
     if "stages" in shown:
         words = {"stopped": " (stopped early)", "outdated": " (out of date)"}
-        told = [f"{one['name']} {one['seconds']:.1f} s" + "".join(words[name] for name in words if one[name]) for one in shown["stages"]]
-        shown["stages"] = ", ".join(told)
+        shown["stages"] = ", ".join(
+            f"{one['name']} {one['seconds']:.1f} s" + "".join(words[name] for name in words if one[name]) for one in shown["stages"]
+        )
     if "scores" in shown:
         shown["scores"] = [
             f"{what.replace('_', ' ')}: " + ", ".join(SHOWN[name].format(value) for name, value in of.items())
@@ -172,17 +163,15 @@ def for_people(data: dict[str, Any]) -> dict[str, Any]:
 
 def lines(key: str, value: Any) -> list[str]:
     """One fact as lines for people; what is empty or unknown is left out."""
-    name = key.replace("_", " ")
     if value is None or value == [] or value == {} or value is False:
         return []
     if isinstance(value, dict):
         return [line for inner, entry in value.items() for line in lines(inner, entry)]
-    if isinstance(value, list) and isinstance(value[0], dict):
-        shown = value[:4] + ([{"and": f"{len(value) - 4} more"}] if len(value) > 4 else [])
-        return [f"{name:<14} " + ", ".join(f"{inner} {number(entry)}" for inner, entry in part.items()) for part in shown]
-    if isinstance(value, list):
-        return [f"{name:<14} {entry}" for entry in value]
-    return [f"{name:<14} {'yes' if value is True else number(value)}"]
+    shown = value if isinstance(value, list) else ["yes" if value is True else value]
+    if isinstance(shown[0], dict):
+        rest = [{"and": f"{len(shown) - 4} more"}] if len(shown) > 4 else []
+        shown = [", ".join(f"{inner} {number(entry)}" for inner, entry in part.items()) for part in [*shown[:4], *rest]]
+    return [f"{key.replace('_', ' '):<14} {number(entry)}" for entry in shown]
 
 
 def number(value: Any) -> str:
