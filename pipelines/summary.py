@@ -31,9 +31,7 @@ if TYPE_CHECKING:
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.stereo.left_out import LeftOut
 
-SEEN_BY_SFM = (
-    "poses were estimated from all images, the held-out ones included, so scores are slightly optimistic"
-)
+SEEN_BY_SFM = "poses were estimated from all images, the held-out ones included, so scores are slightly optimistic"
 MATCHED = (
     "Matching {views} training images of {pixels} pixels with each other ({seconds:.1f} s of the fit's budget) gave depth for"
     " {percent:.0f}% of their pixels{bare}."
@@ -45,10 +43,11 @@ LEFT_OUT = (
 )
 NOTHING_LEFT_OUT = "Nothing that moves was found in the {looked_at} training images ({seconds:.1f} s of the fit's budget)."
 SEES = {
-    "none": "colours do not hang on the direction of view",
-    "low": "colours hang on the direction of view in first order",
-    "full": "colours hang on the direction of view",
+    "none": "colours do not depend on the direction of view",
+    "low": "colours depend on the direction of view in first order",
+    "full": "colours depend on the direction of view",
 }
+POSES = ("source", "registered", "total", "models", "missing", "seconds", "agreement")
 OPENED = {".html", ".ply", ".obj", ".glb", ".mp4", ".txt", ".json"}
 NO_TEST_VIEWS = "no image was held out, so there are no scores; give --holdout 8 to keep every 8th image for testing"
 
@@ -69,19 +68,6 @@ def describe_capture(capture: Capture) -> dict[str, Any]:
     }
 
 
-def describe_poses(poses: PoseResult) -> dict[str, Any]:
-    """The report's part `poses`."""
-    return {
-        "source": poses.source,
-        "registered": poses.registered,
-        "total": poses.total,
-        "models": poses.models,
-        "missing": poses.missing,
-        "seconds": poses.seconds,
-        "agreement": poses.agreement,
-    }
-
-
 def base_data(job: Job, capture: Capture, poses: PoseResult) -> dict[str, Any]:
     return {
         "version": __version__,
@@ -89,7 +75,7 @@ def base_data(job: Job, capture: Capture, poses: PoseResult) -> dict[str, Any]:
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "source": str(job.source),
         "capture": describe_capture(capture),
-        "poses": describe_poses(poses),
+        "poses": {name: getattr(poses, name) for name in POSES},
         "stages": job.stages.summary(),
         "settings": settings_dict(job.settings),
         "machine": {"python": platform.python_version(), "system": platform.platform(), "device": job.settings.device},
@@ -137,34 +123,25 @@ def describe_left_out(left_out: LeftOut) -> str:
     return (LEFT_OUT if left_out.masks else NOTHING_LEFT_OUT).format(**left_out.to_dict(), percent=100 * left_out.share)
 
 
-def describe_field(fitted: Fitted | None) -> dict[str, Any] | None:
+def describe_field(fitted: Fitted) -> dict[str, Any]:
     """The report's part `field`; the voxel size is in working units."""
-    if fitted is None:
-        return None
-    field, matched, left_out = fitted.field, fitted.matched, fitted.left_out
-    return {
-        "voxel_size": field.voxel_size,
-        "blocks": field.blocks,
-        "voxels": field.voxels,
-        "bytes": field.bytes,
-        "resolution": field.resolution,
-        **({"matched": matched} if matched is not None else {}),
-        **({"left_out": left_out.to_dict()} if left_out is not None else {}),
-    }
+    found = {name: getattr(fitted.field, name) for name in ("voxel_size", "blocks", "voxels", "bytes", "resolution")}
+    if fitted.matched is not None:
+        found["matched"] = fitted.matched
+    if fitted.left_out is not None:
+        found["left_out"] = fitted.left_out.to_dict()
+    return found
 
 
 def exported_files(job: Job) -> list[dict[str, Any]]:
     """Files that other programs can open, as they stand in the records of the stages."""
-    out = []
-    for name in ("tsdf", TSDF_TEXTURE, "export"):
-        record = job.stages.records.get(name)
-        out += [{"path": path, "bytes": size} for path, size in (record.outputs if record else {}).items() if is_export(path)]
-    return out
-
-
-def is_export(path: str) -> bool:
-    """True for what other programs open."""
-    return path.startswith(("exports/", "tsdf/", "mesh")) and Path(path).suffix in OPENED and not path.endswith("facts.json")
+    records = [job.stages.records[name] for name in job.stages.done("tsdf", TSDF_TEXTURE, "export")]
+    return [
+        {"path": path, "bytes": size}
+        for record in records
+        for path, size in record.outputs.items()
+        if path.startswith(("exports/", "tsdf/", "mesh")) and Path(path).suffix in OPENED and not path.endswith("facts.json")
+    ]
 
 
 @dataclass
@@ -189,7 +166,8 @@ def put_report(job: Job, ready: Prepared, results: Results, seconds: float) -> d
     fitted, exported, scores = results.fitted, results.exported, results.scores
     left_out = None if fitted is None else fitted.left_out
     notes = [] if fitted is None or fitted.matched is None else [describe_matching(fitted.matched)]
-    notes += [] if left_out is None else [describe_left_out(left_out)]
+    if left_out is not None:
+        notes.append(describe_left_out(left_out))
     data = {
         **base_data(job, ready.capture, ready.poses),
         "warnings": warnings_of(job, ready, fitted) + (exported["notes"] if exported else []),
@@ -202,7 +180,7 @@ def put_report(job: Job, ready: Prepared, results: Results, seconds: float) -> d
             "height": views.intrinsics[0].height,
             "depth_step": depth_step(scene),
         },
-        "field": describe_field(fitted),
+        "field": None if fitted is None else describe_field(fitted),
         "notes": notes,
         "evaluation": {name: scores.get(name) for name in ("field", "tsdf", *(["network"] if "network" in scores else []))},
         "baseline": scores.get("nearest_image"),

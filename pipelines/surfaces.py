@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from fieldfuse.capture.types import Views
     from fieldfuse.stereo.match import StereoDepth
     from fieldfuse.tsdf.fuse import Points
+    from fieldfuse.tsdf.mesh import Mesh
     from fieldfuse.tsdf.volume import TsdfVolume
 
 
@@ -108,6 +109,8 @@ def fuse_tsdf(job: Job, ready: Prepared, name: str = "tsdf", depth_from: str | N
         depth_from: "sensor", "matching" (images with each other) or "exact" (the truth that a simulated capture brings); None: the
             sensor's when the capture has depth, else by matching.
     """
+    from fieldfuse.export.mesh import mesh_facts
+
     depth_from = depth_from or ("sensor" if ready.posed.has_depth else "matching")
     matched = match_images(job, ready) if depth_from == "matching" else None
     folder = job.folder / name
@@ -117,7 +120,8 @@ def fuse_tsdf(job: Job, ready: Prepared, name: str = "tsdf", depth_from: str | N
         start = time.monotonic()
         volume = _fused(job, ready, depths, carve=depth_from != "exact")
         fused = time.monotonic() - start
-        facts = _write_surface(job, ready, folder, volume)
+        mesh = whole_mesh(volume, job.settings.export.smooth)
+        write_surface(ready, folder, mesh, volume.points())
         found = render_views(job, ready.views, volume.render)
         share = None if depths is None else round(float(np.mean([(one.depth > 0).mean() for one in depths])), 4)
         found.facts = {
@@ -128,7 +132,7 @@ def fuse_tsdf(job: Job, ready: Prepared, name: str = "tsdf", depth_from: str | N
             "blocks": volume.blocks,
             "bytes": volume.bytes,
             "fusion_seconds": round(fused, 3),
-            "mesh": facts,
+            "mesh": mesh_facts(mesh),
             "depth_from": depth_from,
         }
         return found
@@ -163,15 +167,13 @@ def _fused(job: Job, ready: Prepared, depths: list[StereoDepth] | None, carve: b
     return fuse_capture(posed, ready.scene.working_from_input, train, settings, job.progress, views.toned())
 
 
-def _write_surface(job: Job, ready: Prepared, folder: Path, volume: TsdfVolume) -> dict[str, Any]:
-    """Mesh and points in the input's frame, as bright as the images were taken; answers the mesh's facts."""
-    from fieldfuse.export.mesh import mesh_facts, write_mesh
+def write_surface(ready: Prepared, folder: Path, mesh: Mesh, points: Points) -> None:
+    """Mesh and points of the working frame as files in the input's, as bright as the images were taken."""
+    from fieldfuse.export.mesh import write_mesh
 
     input_from_working, exposure = ready.scene.working_from_input.inverse(), ready.views.exposure
-    mesh = whole_mesh(volume, job.settings.export.smooth)
     write_mesh(folder / "mesh.ply", replace(mesh, colours=exposed(mesh.colours, exposure)).transformed(input_from_working))
-    put_points(folder / "points.ply", volume.points(), input_from_working, exposure)
-    return mesh_facts(mesh)
+    put_points(folder / "points.ply", points, input_from_working, exposure)
 
 
 def put_points(path: Path, points: Points, input_from_working: Similarity, exposure: float) -> Path:

@@ -17,31 +17,11 @@ from fieldfuse.config import load_settings
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.fields import uses_network
 from tests.pipelines.made import CAMERA, call, make_room
-from tests.pipelines.short import start, wait_for
+from tests.pipelines.short import stages, start, wait_for
 
 Capsys = pytest.CaptureFixture[str]
-FAST = [
-    "--init",
-    "network",
-    "--budget",
-    1,
-    "--threads",
-    1,
-    "--set",
-    "field.resolution=64",
-    "--set",
-    "export.formats=[cameras]",
-    "--set",
-    "network.voxels=12",
-    "--set",
-    "tsdf.enabled=off",
-    "--set",
-    "keyframes.most=5",
-]
-
-
-def stages(data: dict[str, Any]) -> dict[str, bool]:
-    return {stage["name"]: stage["cached"] for stage in data["stages"]}
+FAST = ["--init", "network", "--budget", 1, "--threads", 1, "--set", "field.resolution=64", "--set", "export.formats=[cameras]"]
+FAST += ["--set", "network.voxels=12", "--set", "tsdf.enabled=off", "--set", "keyframes.most=5"]
 
 
 def run(capsys: Capsys, room: Path, out: Path, *more: object) -> dict[str, Any]:
