@@ -27,8 +27,7 @@ import numpy as np
 from fieldfuse import steps
 from fieldfuse.config import Settings
 from fieldfuse.errors import InputError
-from fieldfuse.options import OF_FIT, OF_SURFACE, Listener, changed_settings, chosen_settings, listening
-from fieldfuse.results import Field, Scene, Scores, Surface
+from fieldfuse.results import OF_FIT, OF_SURFACE, Field, Listener, Scene, Scores, Surface, changed_settings, chosen_settings, listening
 
 log = logging.getLogger("fieldfuse")
 
