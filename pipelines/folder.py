@@ -22,7 +22,6 @@ from fieldfuse.files import atomic_path, read_json, remove, require_utf8, write_
 
 LOCK = ".lock"
 RUN = "run.json"
-ATTEMPTS = 10  # to lock a folder that another command is removing
 STAGES = "stages"
 ERROR_LOG = "error.log"
 SUBFOLDERS = (STAGES, "frames", "sparse", "renders", "tsdf", "stereo", "tsdf_stereo", "compare", "tradeoff", "exports")
@@ -67,7 +66,9 @@ class RunFolder:
         require_utf8(self.path)
         try:
             self._made = [place for place in (self.path, *self.path.parents) if not place.exists()]
-            self._take_lock()
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = (self.path / LOCK).open("a", encoding="utf-8")
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._held_run = is_run_folder(self.path)
             if not self._held_run and (foreign := self._results()):  # of the same names, but without a run: somebody's data
                 self._unlock()
@@ -96,24 +97,6 @@ class RunFolder:
                 self._take_back()
             self._unlock()
 
-    def _take_lock(self) -> None:
-        """Make the folder and lock it.
-
-        A command that was refused may be removing both (`_take_back`): then what was locked is no longer the file in the folder.
-
-        Raises:
-            BlockingIOError: another command holds the lock.
-        """
-        for _ in range(ATTEMPTS):
-            self.path.mkdir(parents=True, exist_ok=True)
-            with suppress(FileNotFoundError):  # gone again
-                self._lock = (self.path / LOCK).open("a", encoding="utf-8")
-                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if os.path.samestat(os.fstat(self._lock.fileno()), (self.path / LOCK).stat()):
-                    return
-            self._unlock()
-        raise BlockingIOError
-
     def _take_back(self) -> None:
         """Remove what says that a run is here, and folders made for it, where the input was refused before anything else was written."""
         if self._held_run:
@@ -121,7 +104,7 @@ class RunFolder:
         with suppress(OSError):  # the refusal is what has to be told
             if not self._results():
                 remove(self.path / RUN)
-                remove(self.path / LOCK)  # still held: whoever opened it in between sees that it is gone
+                remove(self.path / LOCK)
                 for place in self._made:
                     place.rmdir()  # never one that holds something
 

@@ -59,7 +59,7 @@ def prepare(job: Job, capture: Capture | None = None) -> Prepared:
     from fieldfuse.capture.subset import limited
 
     features: dict[str, Features] = {}  # of images by name, as they are extracted on the way
-    capture = choose_frames(job, capture or find_capture(job))
+    capture = choose_frames(job, find_capture(job) if capture is None else capture)
     poses = find_camera_poses(job, capture, features)
     posed = limited(poses.apply(capture), job.settings.capture.holdout, job.settings.views.limit)
     corrections = find_effects(job, posed)

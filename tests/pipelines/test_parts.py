@@ -63,23 +63,8 @@ def test_tsdf_alone_then_the_rest_in_the_same_folder(tmp_path: Path, capsys: Cap
     assert answer.code == 0, answer.err
     data = json.loads(answer.out)
     assert data["evaluation"]["tsdf"]["psnr"] > 10 and data["evaluation"]["field"] is None
-    answer = call(
-        capsys,
-        "finetune",
-        out,
-        "--budget",
-        1,
-        "--set",
-        "init=classical",
-        "--threads",
-        1,
-        "--set",
-        "field.resolution=32",
-        "--set",
-        "export.formats=[points]",
-        "--quiet",
-        "--json",
-    )
+    options = ["--budget", 1, "--threads", 1, "--set", "init=classical", "--set", "field.resolution=32", "--set", "export.formats=[points]"]
+    answer = call(capsys, "finetune", out, *options, "--quiet", "--json")
     assert answer.code == 0, answer.err
     both = json.loads(answer.out)
     assert both["evaluation"]["tsdf"] == data["evaluation"]["tsdf"] and both["evaluation"]["field"]["psnr"] > 10
