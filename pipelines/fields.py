@@ -26,7 +26,7 @@ from fieldfuse.tone import exposed
 if TYPE_CHECKING:
     from fieldfuse.config import FitSettings
     from fieldfuse.render.field import Field
-    from fieldfuse.stereo.left_out import LeftOut
+    from fieldfuse.stereo.transients import LeftOut
     from fieldfuse.training.fit import FitResult
     from fieldfuse.training.from_network import Inference
 
@@ -190,7 +190,7 @@ def fit_radiance_field(job: Job, ready: Prepared, network: NetworkField | None, 
         go_on: the field that the folder has is the start, and the budget is for what is added.
     """
     from fieldfuse.render.field import Field
-    from fieldfuse.stereo.left_out import load_left_out, save_left_out
+    from fieldfuse.stereo.transients import load_left_out, save_left_out
     from fieldfuse.training.guided import fit_guided
     from fieldfuse.training.network_start import network_start
     from fieldfuse.volume.grid_host import host_for

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from fieldfuse.camera import Array
     from fieldfuse.capture.types import Capture
     from fieldfuse.poses.result import PoseResult
-    from fieldfuse.stereo.left_out import LeftOut
+    from fieldfuse.stereo.transients import LeftOut
 
 SEEN_BY_SFM = "poses were estimated from all images, the held-out ones included, so scores are slightly optimistic"
 MATCHED = (

@@ -25,9 +25,8 @@ if TYPE_CHECKING:
     from fieldfuse.camera import Array, Intrinsics, Similarity
     from fieldfuse.capture.types import Views
     from fieldfuse.stereo.match import StereoDepth
-    from fieldfuse.tsdf.fuse import Points
     from fieldfuse.tsdf.mesh import Mesh
-    from fieldfuse.tsdf.volume import TsdfVolume
+    from fieldfuse.tsdf.volume import Points, TsdfVolume
 
 
 def match_images(job: Job, ready: Prepared) -> list[StereoDepth]:
@@ -37,9 +36,9 @@ def match_images(job: Job, ready: Prepared) -> list[StereoDepth]:
         InputError: the images cannot be matched.
         Interrupted: the user asked to stop.
     """
-    from fieldfuse.stereo.bare import continued
     from fieldfuse.stereo.maps import load_stereo, save_stereo
     from fieldfuse.stereo.match import stereo_depths
+    from fieldfuse.stereo.plane_completion import continued
 
     path = job.folder / "stereo" / "depths.safetensors"
     scene, training = ready.scene, ready.training
@@ -68,7 +67,7 @@ def views_for_fit(job: Job, ready: Prepared) -> tuple[Views, list[str]]:
         InputError: the images are to be matched, and cannot be.
         Interrupted: the user asked to stop.
     """
-    from fieldfuse.stereo.quick import with_depths
+    from fieldfuse.stereo.fast_mvs import with_depths
 
     views = ready.views
     wanted = job.settings.fit.depth_from if job.settings.fit.depth > 0 else "off"
@@ -157,8 +156,7 @@ def fuse_tsdf(job: Job, ready: Prepared, name: str = "tsdf", depth_from: str | N
 
 def _fused(job: Job, ready: Prepared, depths: list[StereoDepth] | None, carve: bool) -> TsdfVolume:
     """The training frames in one volume; `depths`: of the training views, None: the capture's own."""
-    from fieldfuse.tsdf.fuse import fuse_capture
-    from fieldfuse.tsdf.stereo_frames import fuse_stereo
+    from fieldfuse.tsdf.fuse import fuse_capture, fuse_stereo
 
     settings, posed, views = job.settings.tsdf, ready.posed, ready.views
     if depths is not None:
