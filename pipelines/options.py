@@ -19,54 +19,38 @@ import typer
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 SHORT_SPIN = "1000"  # turns, microseconds
 
-Source = Annotated[
-    Path, typer.Argument(help="A video, a folder of photos, or a posed capture; its kind is found by looking.", show_default=False)
-]
-Target = Annotated[Path, typer.Argument(help="The folder of an earlier run; or a source, then --out is needed.", show_default=False)]
-Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for everything that the run makes.", show_default=False)]
-OptionalOut = Annotated[
-    Path | None, typer.Option("--out", "-o", help="Folder of the run, when the first argument is a source.", show_default=False)
-]
-Preset = Annotated[str | None, typer.Option(help="fast, balanced (default), quality, or paper (as NeRFusion does it).", show_default=False)]
-Budget = Annotated[float | None, typer.Option(help="Seconds of optimisation.", show_default=False)]
-TotalBudget = Annotated[
-    float | None,
-    typer.Option(
-        min=10,
-        help="Seconds for the whole run: picture size, voxels, a video's frames, fitting time and exports are chosen for it.",
-        show_default=False,
-    ),
-]
-ImageSize = Annotated[int | None, typer.Option(help="Long side of the pictures in pixels.", show_default=False)]
-Holdout = Annotated[
-    int | None, typer.Option(help="Every n-th picture by name is kept for testing; 0: none. Default 8.", show_default=False)
-]
-Device = Annotated[str | None, typer.Option(help="auto (default), cpu or cuda.", show_default=False)]
-Threads = Annotated[int | None, typer.Option(help="Threads to use; default: all cores.", show_default=False)]
-Seed = Annotated[int | None, typer.Option(help="Seed of all random numbers; default 0.", show_default=False)]
-Engine = Annotated[
-    str | None, typer.Option(help="auto (default): numba on the CPU, triton on CUDA; numba, triton or torch.", show_default=False)
-]
-Decoder = Annotated[str | None, typer.Option(help="deferred (default) or per_sample (the paper's).", show_default=False)]
-Init = Annotated[
-    str | None,
-    typer.Option(
-        help="Start of the fit: network, classical, or auto (default): the networks' with fewer than 24 training pictures.",
-        show_default=False,
-    ),
-]
-Finetune = Annotated[
-    bool | None,
-    typer.Option("--finetune/--no-finetune", help="Whether the networks' field is fitted (default), or the result.", show_default=False),
-]
-PosesFrom = Annotated[str | None, typer.Option("--poses", help="auto (default), given, or sfm: ignore given poses.", show_default=False)]
-Baked = Annotated[
-    bool, typer.Option("--baked", help="Take the baked field (about twice as fast on a CPU); it is made if need be.", show_default=False)
-]
-Config = Annotated[Path | None, typer.Option(help="YAML file with settings.", show_default=False)]
-Pairs = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting as key=value; may be repeated.", show_default=False)
-]
+
+
+def option(help: str, *names: str, **more: Any) -> Any:
+    """An option whose default the help does not show: the text has it."""
+    return typer.Option(*names, help=help, show_default=False, **more)
+
+
+_SOURCE = "A video, a folder of photos, or a posed capture; its kind is found by looking."
+_TARGET = "The folder of an earlier run; or a source, then --out is needed."
+_TOTAL = "Seconds for the whole run: picture size, voxels, a video's frames, fitting time and exports are chosen for it."
+_START = "Start of the fit: network, classical, or auto (default): the networks' with fewer than 24 training pictures."
+_FINETUNE = "Whether the networks' field is fitted (default), or the result."
+Source = Annotated[Path, typer.Argument(help=_SOURCE, show_default=False)]
+Target = Annotated[Path, typer.Argument(help=_TARGET, show_default=False)]
+Out = Annotated[Path, option("Folder for everything that the run makes.", "--out", "-o")]
+OptionalOut = Annotated[Path | None, option("Folder of the run, when the first argument is a source.", "--out", "-o")]
+Preset = Annotated[str | None, option("fast, balanced (default), quality, or paper (as NeRFusion does it).")]
+Budget = Annotated[float | None, option("Seconds of optimisation.")]
+TotalBudget = Annotated[float | None, option(_TOTAL, min=10)]
+ImageSize = Annotated[int | None, option("Long side of the pictures in pixels.")]
+Holdout = Annotated[int | None, option("Every n-th picture by name is kept for testing; 0: none. Default 8.")]
+Device = Annotated[str | None, option("auto (default), cpu or cuda.")]
+Threads = Annotated[int | None, option("Threads to use; default: all cores.")]
+Seed = Annotated[int | None, option("Seed of all random numbers; default 0.")]
+Engine = Annotated[str | None, option("auto (default): numba on the CPU, triton on CUDA; numba, triton or torch.")]
+Decoder = Annotated[str | None, option("deferred (default) or per_sample (the paper's).")]
+Init = Annotated[str | None, option(_START)]
+Finetune = Annotated[bool | None, option(_FINETUNE, "--finetune/--no-finetune")]
+PosesFrom = Annotated[str | None, option("auto (default), given, or sfm: ignore given poses.", "--poses")]
+Baked = Annotated[bool, option("Take the baked field (about twice as fast on a CPU); it is made if need be.", "--baked")]
+Config = Annotated[Path | None, option("YAML file with settings.")]
+Pairs = Annotated[list[str] | None, option("Any setting as key=value; may be repeated.", "--set", metavar="KEY=VALUE")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")]
 
