@@ -15,8 +15,8 @@ from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.config import Settings, TsdfSettings
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json
-from fieldfuse.pipelines.memory import PeakMemory, own_bytes
 from fieldfuse.pipelines.rendered import Picture, to_picture
+from fieldfuse.pipelines.stages import PeakMemory, own_bytes
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Capture, Views
