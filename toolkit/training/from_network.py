@@ -143,7 +143,7 @@ class Inference:
         if self._latest is None:
             raise InputError("no key frame has been fused yet, so there is no field; fuse one first")
         start = time.perf_counter()
-        gamma, allowed = self.settings.gamma, self._latest.allowed
+        gamma, allowed = self.settings.gamma if self.settings.gamma < 1 else None, self._latest.allowed  # 1 prunes nothing
         made = make_field(self.model, self._latest.volume, self.behind, gamma, 0.5 * self.near, allowed=allowed)
         if finished and self.hull is not None:
             made = inside_silhouettes(made, self.train)
