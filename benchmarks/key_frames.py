@@ -24,7 +24,7 @@ from fieldfuse.nerfusion.fusion import FusionOptions, fuse_views, fusion_lattice
 from fieldfuse.nerfusion.keyframes import KeyFrames, select_keyframes
 from fieldfuse.nerfusion.lattice import Lattice
 from fieldfuse.nerfusion.model import NerfusionModel
-from fieldfuse.nerfusion.training.paths import hand_held
+from fieldfuse.nerfusion.training.procedural import hand_held
 from fieldfuse.nerfusion.weights import SHIPPED, load_model
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.job import set_threads

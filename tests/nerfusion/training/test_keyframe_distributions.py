@@ -14,7 +14,7 @@ from fieldfuse.nerfusion.extras.plane_sweep import cost_volume, to_probability
 from fieldfuse.nerfusion.training.distributed import Crew
 from fieldfuse.nerfusion.training.mixture import Mixture
 from fieldfuse.nerfusion.training.procedural import ProceduralScene
-from fieldfuse.nerfusion.training.samples import cameras_of, keyframe_distributions
+from fieldfuse.nerfusion.training.samples import keyframe_distributions
 from fieldfuse.nerfusion.training.train import Trainer
 from fieldfuse.simulate.eye import take, take_all
 from tests.nerfusion.training.tiny import tiny_settings
@@ -24,7 +24,7 @@ def test_a_samples_sweeps_are_held_against_each_other() -> None:
     sample = Mixture(tiny_settings()).sample(0, 2)
     descriptors = patch_descriptors(sample.pictures.images)
     first, second = (
-        cost_volume([descriptors[k] for k in indices], cameras_of(sample.pictures, indices), sample.near, sample.far)
+        cost_volume([descriptors[k] for k in indices], sample.pictures.cameras(indices), sample.near, sample.far)
         for indices in sample.references
     )
     own_estimate = to_probability(first)
@@ -39,7 +39,7 @@ def test_one_key_frame_has_no_witness() -> None:
     sample = Mixture(tiny_settings()).sample(0, 1)
     indices = sample.references[0]
     descriptors = patch_descriptors(sample.pictures.images)
-    costs = cost_volume([descriptors[k] for k in indices], cameras_of(sample.pictures, indices), sample.near, sample.far)
+    costs = cost_volume([descriptors[k] for k in indices], sample.pictures.cameras(indices), sample.near, sample.far)
     (distribution,) = keyframe_distributions(sample)
     assert torch.equal(distribution.table, to_probability(costs).table)
 

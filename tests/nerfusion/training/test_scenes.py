@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from fieldfuse.errors import InputError
-from fieldfuse.nerfusion.training.paths import around, hand_held, look_at, wander
-from fieldfuse.nerfusion.training.procedural import ProceduralScene
-from fieldfuse.nerfusion.training.shards import ShardScene, shard_files, write_shard
+from fieldfuse.nerfusion.training.procedural import ProceduralScene, around, hand_held, look_at, wander
+from fieldfuse.nerfusion.training.scenes import ShardScene, shard_files, write_shard
 
 
 def in_open_space(points: np.ndarray) -> np.ndarray:

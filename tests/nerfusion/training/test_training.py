@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterable
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,13 +19,13 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from fieldfuse.errors import InputError
-from fieldfuse.nerfusion.training.caution import RECOVER, Caution
-from fieldfuse.nerfusion.training.checkpoint import checkpoint_settings, checkpoints
+from fieldfuse.nerfusion.training.checkpoint import TrainState, checkpoints, load_checkpoint
 from fieldfuse.nerfusion.training.curve import Curve, draw_curve
 from fieldfuse.nerfusion.training.distributed import Crew, join_crew
-from fieldfuse.nerfusion.training.health import ALIVE
+from fieldfuse.nerfusion.training.optimiser import RECOVER, NonfinitePolicy, learning_rate
+from fieldfuse.nerfusion.training.rendering import ALIVE
 from fieldfuse.nerfusion.training.step import local_of
-from fieldfuse.nerfusion.training.train import WEIGHTS, Trainer, learning_rate, make_model
+from fieldfuse.nerfusion.training.train import WEIGHTS, Trainer, make_model
 from fieldfuse.nerfusion.weights import load_model
 from fieldfuse.progress import Progress
 from tests.nerfusion.training.tiny import SMALL, merged, tiny_settings
@@ -65,7 +66,9 @@ def test_a_run_leaves_weights_curve_and_checkpoint(tmp_path: Path, monkeypatch: 
     # Every part learns: the fusion in stage 2 only, all others from the first step.
     moved = {name.split(".")[0] for name, value in state(trainer).items() if not torch.equal(value, before[name])}
     assert moved == {name.split(".")[0] for name in before}
-    assert checkpoint_settings(checkpoints(tmp_path)[-1])["loss"]["rays"] == SMALL["loss"]["rays"]
+    again = make_model(trainer.settings)
+    read = load_checkpoint(checkpoints(tmp_path)[-1], TrainState(again, torch.optim.Adam(again.parameters())))
+    assert read["loss"]["rays"] == SMALL["loss"]["rays"]
 
 
 def test_what_is_shipped_is_the_average_along_the_run(tmp_path: Path) -> None:
@@ -93,13 +96,13 @@ def test_resuming_repeats_every_bit(tmp_path: Path) -> None:
         first = Trainer(settings, tmp_path / "parts", Crew(), resume=stop > 1)
         assert first.run(until=stop) == stop
     second = Trainer(settings, tmp_path / "parts", Crew(), resume=True)
-    assert second.step == 3 and same(state(first), state(second)) and same(first.average.values, second.average.values)
+    assert second.state.step == 3 and same(state(first), state(second)) and same(first.average.values, second.average.values)
     second.run()
     assert same(state(whole), state(second)) and same(whole.average.values, second.average.values)
     assert (tmp_path / "whole" / WEIGHTS).read_bytes() == (tmp_path / "parts" / WEIGHTS).read_bytes()
     for a, b in zip(whole.model.parameters(), second.model.parameters(), strict=True):
         for name in ("step", "exp_avg", "exp_avg_sq"):
-            assert torch.equal(whole.adam.state[a][name], second.adam.state[b][name])
+            assert torch.equal(whole.state.adam.state[a][name], second.state.adam.state[b][name])
     once, twice = (
         [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in trainer.curve.rows] for trainer in (whole, second)
     )
@@ -117,7 +120,7 @@ def test_a_kill_between_two_files_of_a_save_costs_no_row_of_the_curve(tmp_path: 
         patched.setattr("fieldfuse.nerfusion.training.train.save_model", killed)  # the checkpoint is there then
         first.run(until=1)
     second = Trainer(tiny_settings(), tmp_path, Crew(), resume=True)
-    assert second.step == 1 and [row["step"] for row in second.curve.rows] == [1]
+    assert second.state.step == 1 and [row["step"] for row in second.curve.rows] == [1]
 
 
 def test_a_request_to_stop_keeps_what_there_is(tmp_path: Path) -> None:
@@ -166,7 +169,7 @@ def test_training_starts_from_given_weights(tmp_path: Path) -> None:
     first = Trainer(tiny_settings(), tmp_path / "first", Crew())
     first.run(until=2)
     second = Trainer(tiny_settings(start_from=str(tmp_path / "first" / WEIGHTS)), tmp_path / "second", Crew())
-    assert second.step == 0 and same(state(first), state(second))
+    assert second.state.step == 0 and same(state(first), state(second))
     with pytest.raises(InputError, match="model: channels is 12, and 8 in the weights"):
         make_model(tiny_settings(start_from=str(tmp_path / "first" / WEIGHTS), model={"channels": 12}))
     with pytest.raises(InputError, match="pretrained and start_from"):
@@ -220,24 +223,24 @@ def test_a_bad_step_moves_nothing_and_the_next_ones_are_smaller(loss: bool, tmp_
     before = state(trainer)
     poison(trainer, monkeypatch, {0}, loss)
     row = trainer.one_step()
-    assert same(before, state(trainer)) and not trainer.adam.state and row["skipped"] == 1
+    assert same(before, state(trainer)) and not trainer.state.adam.state and row["skipped"] == 1
     name = next(name for name, _ in trainer.model.named_parameters())
-    assert trainer.caution.last == ("step 1: the loss" if loss else f"step 1: the gradient of {name}")
-    trainer.step = 1
+    assert trainer.state.policy.last == ("step 1: the loss" if loss else f"step 1: the gradient of {name}")
+    trainer.state.step = 1
     row = trainer.one_step()
     assert row["rate"] == learning_rate(trainer.settings, 1) / 2 and row["skipped"] == 0 and not same(before, state(trainer))
     for _ in range(RECOVER - 1):
-        trainer.caution.well()
-    assert trainer.caution == Caution(met=1, last=trainer.caution.last)
+        trainer.state.policy.well()
+    assert trainer.state.policy == NonfinitePolicy(met=1, last=trainer.state.policy.last)
 
 
 def test_training_gives_up_with_the_weights_of_the_last_good_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = Trainer(tiny_settings(), tmp_path, Crew())
     poison(trainer, monkeypatch, range(4))
-    monkeypatch.setattr("fieldfuse.nerfusion.training.caution.MOST", 2)
+    monkeypatch.setattr("fieldfuse.nerfusion.training.optimiser.MOST", 2)
     with pytest.raises(InputError, match=r"the last at step 2 in the gradient of .*; the weights of the last good step"):
         trainer.run()
-    assert trainer.caution.slower == 0.25
+    assert trainer.state.policy.slower == 0.25
     loaded = load_model(tmp_path / WEIGHTS)
     assert same(loaded.state_dict(), state(trainer)) and all(bool(torch.isfinite(v).all()) for v in loaded.state_dict().values())
 
@@ -250,7 +253,7 @@ def test_resuming_after_a_bad_step_repeats_every_bit(tmp_path: Path, monkeypatch
     poison(first, monkeypatch, {0})
     first.run(1)
     second = Trainer(tiny_settings(), tmp_path / "parts", Crew(), resume=True)
-    assert second.caution == first.caution and second.caution.slower == 0.5
+    assert second.state.policy == first.state.policy and second.state.policy.slower == 0.5
     second.run(2)
     assert same(state(whole), state(second))
 
@@ -262,12 +265,12 @@ def test_a_checkpoint_with_a_damaged_record_of_bad_steps_is_refused(change: dict
     (path,) = checkpoints(tmp_path)
     with safe_open(path, "pt") as file:
         tensors, meta = {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata())  # noqa: SIM118
-    save_file(tensors, path, {**meta, "caution": json.dumps({**Caution().to_dict(), **change})})
+    save_file(tensors, path, {**meta, "caution": json.dumps({**asdict(NonfinitePolicy()), **change})})
     with pytest.raises(InputError, match="is not a training checkpoint"):
         Trainer(tiny_settings(), tmp_path, Crew(), resume=True)
     del meta["caution"]
     save_file(tensors, path, meta)
-    assert Trainer(tiny_settings(), tmp_path, Crew(), resume=True).caution == Caution()
+    assert Trainer(tiny_settings(), tmp_path, Crew(), resume=True).caution == NonfinitePolicy()
 
 
 WORKER = """
@@ -325,7 +328,7 @@ def test_processes_that_share_a_device_meet_on_the_processor(processes: int, bac
         monkeypatch.setenv(name, str(number))
     with join_crew("cuda") as crew:
         assert begun == [backend] and crew.device == torch.device("cuda", 1)
-        assert crew.meeting == (torch.device("cpu") if backend == "gloo" else crew.device)
+        assert crew.exchange_device == (torch.device("cpu") if backend == "gloo" else crew.device)
 
 
 @pytest.mark.parametrize("device", ["tpu", "cuda"])

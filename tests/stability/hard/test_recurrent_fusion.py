@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from fieldfuse.nerfusion.gru import LEAST, FusionGRU, RunningMean
-from fieldfuse.nerfusion.training.health import saturation
+from fieldfuse.nerfusion.training.curve import saturation
 from fieldfuse.volume.topology import Topology
 from tests.stability.hard.errors import absolute, by_size, not_finite
 from tests.stability.hard.within import Within

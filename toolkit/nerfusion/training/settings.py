@@ -164,8 +164,3 @@ def _check(settings: TrainSettings) -> None:
         raise InputError(f"pictures.long_side begins at {settings.pictures.long_side[0]} pixels; at least {LEAST_SIDE} are needed")
     if settings.total_steps < 1:
         raise InputError("stage.steps and stage.fused_steps are both 0; at least one step is needed")
-
-
-def train_settings_dict(settings: TrainSettings) -> dict[str, Any]:
-    """Plain data of all settings, kept in checkpoints."""
-    return asdict(settings)
