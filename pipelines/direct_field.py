@@ -48,9 +48,7 @@ def training_key_frames(views: Views, scene: Scene, settings: Settings) -> KeyFr
         views.world_from_camera[train],
         [views.intrinsics[int(index)] for index in train],
         scene.median_depth,
-        method=settings.keyframes.method,
-        every=settings.keyframes.every,
-        most=settings.keyframes.most,
+        settings.keyframes,
     )
 
 

@@ -13,11 +13,12 @@ from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError, Interrupted
 from fieldfuse.nerfusion.block_conv import BlockConv3d
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.fusion import KEPT_PICTURES, Fused, Fusion, FusionOptions, fuse_views, fusion_lattice
-from fieldfuse.nerfusion.head import SCALE, START
+from fieldfuse.nerfusion.fusion import CACHED, Fused, Fusion, FusionOptions, fuse_views, fusion_lattice
 from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.nerfusion.lattice import Lattice, part
 from fieldfuse.nerfusion.model import NerfusionModel
+from fieldfuse.nerfusion.unproject import KeyFrame
+from fieldfuse.nerfusion.volume_net import SCALE, START
 from fieldfuse.progress import Progress
 from fieldfuse.volume.space import Space
 from tests.nerfusion.made import HEIGHT, INTRINSICS, WIDTH, poses, small_model
@@ -56,11 +57,11 @@ def test_one_level_is_the_plain_recurrence() -> None:
     with torch.no_grad():
         state = model.start(lattice)
         for step in fuse_views(model, views, keys, lattice, FusionOptions(1, 0.2, FAR)):
-            group = list(dict.fromkeys([step.frame, *keys.neighbours[step.frame].tolist()]))
+            group = keys.group(step.frame)
             cameras = Cameras.of([INTRINSICS] * len(group), views.world_from_camera[group])
             images = torch.stack([torch.from_numpy(views.images[i]).permute(2, 0, 1).float() / 255 for i in group])
             encoded = [model.encode(images[k : k + 1], cameras[k])[0] for k in range(len(group))]
-            state = model.fuse(state, model.local_volume(encoded, cameras, lattice, near=0.2, far=FAR))
+            state = model.fuse(state, model.local_volume(KeyFrame(encoded, cameras, 0.2, FAR), lattice))
             found = part(step.volume, state.topology)
             assert step.volume.topology.blocks == state.topology.blocks
             assert torch.equal(found.count, state.count)
@@ -120,7 +121,7 @@ def test_encoded_pictures_are_kept_only_for_a_while(monkeypatch: pytest.MonkeyPa
         return encode(images, cameras, side)
 
     monkeypatch.setattr(model, "encode", counted)
-    views, keys = captured(KEPT_PICTURES + 4)
+    views, keys = captured(CACHED + 4)
     lattice = Lattice(SPACE, 16)
     for _ in fuse_views(model, views, keys, lattice, FusionOptions(1, 0.2, FAR)):
         pass

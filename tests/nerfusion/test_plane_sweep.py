@@ -306,7 +306,8 @@ def test_a_measured_depth_is_cut_as_the_window_is(window: tuple[float, float, fl
     depth = 1 + torch.arange(96.0)[None] / 96 + torch.arange(72.0)[:, None] / 36
     inverses, (left, upper, right, lower) = torch.linspace(0.2, 1, 200), window
     shape = round(72 * (lower - upper)), round(96 * (right - left))
-    found = measured(torch.full((200, *shape), 1 / 200), inverses, depth, 1, window)
+    spans = [(72 * upper, 72 * (lower - upper)), (96 * left, 96 * (right - left))]
+    found = measured(torch.full((200, *shape), 1 / 200), inverses, depth, shape, spans)
     told = 1 / inverses[found.argmax(0)]
     wanted = depth[round(72 * upper) : round(72 * lower), round(96 * left) : round(96 * right)]
     assert found.shape[1:] == shape and float((told / wanted - 1).abs().max()) < 0.02

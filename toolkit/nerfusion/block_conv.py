@@ -85,9 +85,8 @@ class Prepared:
         """
         from fieldfuse.backends.triton import convolution
 
-        kind = rows.device.type
-        numbers = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else rows.dtype
-        rows, around = rows if rows.dtype == numbers else rows.to(numbers), topology.around
+        numbers, around = _computed_in(rows), topology.around
+        rows = rows.to(numbers)
         for taps, bias in self._parameters(stages, numbers):
             rows = convolution.convolve(rows, around, taps, bias, occupied, relu)
             relu = True
@@ -107,6 +106,12 @@ class Prepared:
                 self._laid.append((taps.to(numbers), torch.cat(biases).to(numbers) if biases else None))
             self._key = key
         return self._laid
+
+
+def _computed_in(rows: Tensor) -> torch.dtype:
+    """The numbers that autocast computes in, else those of the rows."""
+    kind = rows.device.type
+    return torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else rows.dtype
 
 
 def block_conv3d(
@@ -139,18 +144,16 @@ def block_conv3d(
         raise ValueError(f"occupied must have {topology.zero_row} entries, not {tuple(occupied.shape)}")
     if topology.blocks == 0:
         return rows.new_zeros((len(rows), len(weight)))
-    kind = rows.device.type
-    reduced = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else None
     if not torch.is_grad_enabled() and dispatch.can_use_triton(rows, dtypes=dispatch.FLOATS):
         from fieldfuse.backends.triton import convolution
 
-        numbers = reduced or rows.dtype
+        numbers = _computed_in(rows)
         taps, added = convolution.taps_of(weight.to(numbers)), None if bias is None else bias.to(numbers)
         out = convolution.convolve(rows.to(numbers), topology.around, taps, added, occupied, relu)
         return out if len(rows) > topology.zero_row else out[:-1]
     if relu:
         rows = torch.relu(rows)
-    result: Tensor = _BlockConv.apply(rows, weight, bias, topology, occupied, chunk, reduced)
+    result: Tensor = _BlockConv.apply(rows, weight, bias, occupied, topology, chunk)
     return result
 
 
@@ -201,17 +204,10 @@ def _convolve(rows: Tensor, weight: Tensor, bias: Tensor | None, topology: Topol
 class _BlockConv(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        rows: Tensor,
-        weight: Tensor,
-        bias: Tensor | None,
-        topology: Topology,
-        occupied: Tensor | None,
-        chunk: int,
-        reduced: torch.dtype | None,
+        ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor | None, occupied: Tensor | None, topology: Topology, chunk: int
     ) -> Tensor:
         ctx.save_for_backward(rows, weight, occupied)
-        ctx.topology, ctx.chunk, ctx.kind, ctx.biased = topology, chunk, reduced or rows.dtype, bias is not None
+        ctx.topology, ctx.chunk, ctx.kind, ctx.biased = topology, chunk, _computed_in(rows), bias is not None
         with torch.autocast(rows.device.type, enabled=False):
             padded = _with_zero_row(rows, topology, ctx.kind)
             bias = bias.to(ctx.kind) if bias is not None else None
@@ -236,7 +232,7 @@ class _BlockConv(torch.autograd.Function):
                 to_weight = _weight_gradient(_with_zero_row(rows, topology, kind), padded, weight, topology, ctx.chunk)
             if ctx.biased and ctx.needs_input_grad[2]:
                 to_bias = padded.sum(0, dtype=weight.dtype)
-        return to_rows, to_weight, to_bias, None, None, None, None
+        return to_rows, to_weight, to_bias, None, None, None
 
 
 def _weight_gradient(rows: Tensor, gradient: Tensor, weight: Tensor, topology: Topology, chunk: int) -> Tensor:

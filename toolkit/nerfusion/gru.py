@@ -16,12 +16,13 @@ from __future__ import annotations
 from itertools import pairwise
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from fieldfuse.backends.constants import CHANGE, INSIDE
+from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d
-from fieldfuse.nerfusion.compiled_gru import Step
-from fieldfuse.nerfusion.extras.bounded_outputs import bounded
+from fieldfuse.nerfusion.extras.known_terms import bounded
 from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
 from fieldfuse.volume.topology import Topology
 
@@ -70,27 +71,19 @@ class FusionGRU(nn.Module):
         self.most = most
         self._gates_prepared, self._candidate_prepared = Prepared(), Prepared()
 
-    def forward(
-        self, state: Tensor, count: Tensor, local: Tensor, raw: Tensor, weight: Tensor, topology: Topology, inside: Tensor
-    ) -> Tensor:
-        """H' on the local volume's rows.
+    def forward(self, state: LatentVolume, local: LocalVolume) -> Tensor:
+        """(M · 512 + 1, C) H' on the local volume's blocks, zero where it knows nothing.
 
         Args:
-            state: (M · 512 + 1, C) H, zero outside the local volume and where nothing is known.
-            count, weight: (M · 512,) n and w.
-            local, raw: (M · 512 + 1, C) V and V_raw.
-            inside: (M · 512,) bool, the voxels of the local volume.
-
-        Returns:
-            (M · 512 + 1, C), zero outside.
+            state: H and n there, zero where the local volume knows nothing.
         """
-        both = _beside(state, local)
-        known = torch.log(count.clamp_max(self.most)) - torch.log(weight.clamp_min(LEAST))  # −∞ where nothing is known: z = 1
-        known = torch.cat([known, known.new_full((1,), -torch.inf)])[:, None]
-        update, reset = self._gates(both, topology, inside)
+        topology, inside, h, v = local.topology, local.known, state.rows, local.rows
+        known = torch.log(state.count.clamp_max(self.most)) - torch.log(local.weight.clamp_min(LEAST))
+        known = F.pad(known, (0, 1), value=-torch.inf)[:, None]  # −∞ where nothing is known: z = 1
+        update, reset = self._gates(_beside(h, v), topology, inside)
         z, r = torch.sigmoid(update - known), torch.sigmoid(reset)
-        candidate = torch.tanh(raw + bounded(self.candidate(_beside(r * state, local), topology, inside)))
-        return torch.lerp(state, candidate, z)
+        candidate = torch.tanh(local.raw + bounded(self.candidate(_beside(r * h, v), topology, inside)))
+        return torch.lerp(h, candidate, z)
 
     def compiled(self, part: LatentVolume, local: LocalVolume) -> tuple[Tensor, Tensor]:
         """The running mean on all rows of `part` (the global volume on the local one's blocks) and `forward` on blocks near surfaces,
@@ -101,9 +94,11 @@ class FusionGRU(nn.Module):
         """
         kind, near_surface = part.rows.device.type, local.near_surface
         numbers = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
-        if not on_cpu(part.rows.device):
+        if not is_cpu(part.rows.device):
             return self._on_device(part, local, numbers)
-        step = Step(local.place[:-1], part, local, LEAST, self.most)
+        from fieldfuse.backends.numba import gru
+
+        step = gru.Step(local.place[:-1], part, local, LEAST, self.most)
         rows = step.average()
         if near_surface.blocks:
             inside = local.known[local.place[:-1]]
@@ -136,10 +131,6 @@ class FusionGRU(nn.Module):
         return [gate(both, topology, inside, part) for gate, part in zip((self.update, self.reset), rows.chunk(2, 1), strict=True)]
 
 
-def on_cpu(device: torch.device) -> bool:
-    return device.type == "cpu"
-
-
 def _beside(one: Tensor, other: Tensor) -> Tensor:
     """Both rows' channels; without gradients at once in the numbers that convolutions compute in, which is half as much to write."""
     kind = one.device.type
@@ -163,9 +154,6 @@ class RunningMean(nn.Module):
         super().__init__()
         self.most = most
 
-    def forward(
-        self, state: Tensor, count: Tensor, local: Tensor, raw: Tensor, weight: Tensor, topology: Topology, inside: Tensor
-    ) -> Tensor:
+    def forward(self, state: LatentVolume, local: LocalVolume) -> Tensor:
         """See `FusionGRU.forward`."""
-        z = mean_gate(count, weight, self.most)
-        return torch.lerp(state, local, z)
+        return torch.lerp(state.rows, local.rows, mean_gate(state.count, local.weight, self.most))

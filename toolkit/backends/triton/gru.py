@@ -1,5 +1,5 @@
 # mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
-"""What the GRU does between its convolutions on CUDA, a launch each (`FusionGRU.forward` in tensors, `compiled_gru.py` on the CPU)."""
+"""What the GRU does between its convolutions on CUDA, a launch each (`FusionGRU.forward` in tensors)."""
 
 from __future__ import annotations
 
@@ -128,6 +128,6 @@ class Step:
         _beside[self._grid](*given, gates, both, inside.view(torch.uint8), self.rows, FORGET=forget, **self._sizes)
 
     def update(self, gates: Tensor, candidate: Tensor, channel: int, change: float, rows: Tensor) -> None:
-        """H' into `rows` (M · 512 + 1, C), in place; see `compiled_gru.Step.update`."""
+        """H' into `rows` (M · 512 + 1, C), in place; see `numba.gru.Step.update`."""
         given = self.among, self.state, self.count, self.raw, self.weight, self.seen
         _step[self._grid](*given, gates, candidate, rows, self.rows, self.least, self.most, channel, change, **self._sizes)

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
-"""What is done with the rows of local and global volumes between the networks on CUDA, a launch each (`local.py`, `refine.py`)."""
+"""What is done with the rows of local and global volumes between the networks on CUDA, a launch each."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _settle(
 
 
 def settle(start: Tensor, learned: Tensor, busy: Tensor) -> tuple[Tensor, Tensor]:
-    """A local volume's rows before and after tanh, (F · 512 + 1, C), from `start` and what the networks add in busy blocks (`local.held`).
+    """A local volume's rows before and after tanh, (F · 512 + 1, C), from `start` and what the networks add in busy blocks.
 
     Args:
         start: (F · 512 + 1, C).
@@ -121,7 +121,7 @@ def _surface(count, solid, seen, around, out):
 
 
 def surface_cells(topology: Topology, rows: Tensor, count: Tensor, seen: Tensor, head: Any, least: float) -> Tensor:
-    """`refine.surface_cells` of what a head says.
+    """`two_lattices.surface_cells` of a head's thickness.
 
     Args:
         rows, count: (M · 512 + 1, C) and (M · 512,) of the volume.

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.matching import SIDE
-from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, sweep_planes
 from fieldfuse.nerfusion.extras.two_lattices import allowed_cells, surface_cells
 from fieldfuse.nerfusion.fusion import fuse_key_frame
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume, cells
@@ -81,7 +81,7 @@ class Recurrence:
     def add(self, views: Sequence[EncodedView], cameras: Cameras, distribution: DepthDistribution | None = None) -> LocalVolume:
         """Fuse one more key frame; answers its local volume on the coarsest lattice. `distribution`: of its depth; None: made here."""
         if distribution is None:
-            distribution = self.model.sweep_planes(views, cameras, self.near, self.far)
+            distribution = sweep_planes([view.descriptors for view in views], cameras, self.near, self.far)
         stores = [ValueStore(volume) for volume in self.volumes]
         local = fuse_key_frame(self.model, KeyFrame(views, cameras, self.near, self.far, distribution), stores, None, self._finer_cells)
         self.volumes = [store.volume() for store in stores]
@@ -213,7 +213,7 @@ def local_of(model: NerfusionModel, sample: Sample, frame: int) -> LocalVolume:
     indices = sample.references[frame]
     cameras = sample.pictures.cameras(indices)
     views = model.encode(sample.pictures.images[indices], cameras)
-    return model.local_volume(views, cameras, Lattice(sample.space, sample.resolution), near=sample.near, far=sample.far)
+    return model.local_volume(KeyFrame(views, cameras, sample.near, sample.far), Lattice(sample.space, sample.resolution))
 
 
 def seeded(seed: int, rank: int, step: int) -> torch.Generator:

@@ -19,7 +19,7 @@ from torch import Tensor
 from fieldfuse.camera import Array
 from fieldfuse.capture.detect import read_source
 from fieldfuse.capture.prepare import prepare_views
-from fieldfuse.config import CaptureSettings
+from fieldfuse.config import CaptureSettings, KeyframesSettings
 from fieldfuse.errors import InputError, OutputError
 from fieldfuse.files import atomic_path
 from fieldfuse.nerfusion.keyframes import select_keyframes
@@ -64,7 +64,7 @@ def load_cases(folder: Path | str, settings: TrainSettings) -> list[Case]:
         raise InputError(f"{folder} has {len(train)} training and {len(held)} held-out images; too few to validate on")
     intrinsics = [views.intrinsics[i] for i in train]
     given = views.world_from_camera[train], intrinsics, scene.median_depth
-    keys = select_keyframes(*given, views=settings.pictures.views, most=MOST_KEY_FRAMES)
+    keys = select_keyframes(*given, KeyframesSettings(most=MOST_KEY_FRAMES), settings.pictures.views)
     distances = view_distance(views.world_from_camera, scene.median_depth)
     groups = np.concatenate([train[keys.indices][:, None], train[keys.neighbours]], axis=1)  # (M, K)
     space = make_space(scene, scene.has_background)

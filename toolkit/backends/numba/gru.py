@@ -1,4 +1,4 @@
-"""What the GRU does between its convolutions, compiled: a pass over the rows each time, instead of one for each operation.
+"""What the GRU does between its convolutions: a pass over the rows each time, instead of one for each operation.
 
 Rows that the key frame does not see cost a look. Latents are read where the volumes keep them, not gathered first, and convolutions'
 results in the numbers that they come in. Values equal those of `FusionGRU.forward` to rounding (tests compare them), whatever the number of
@@ -15,14 +15,12 @@ from numba import njit, types
 from numba.extending import overload
 from torch import Tensor
 
-from fieldfuse.nerfusion.compiled import OPTIONS, array, spread
-from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
+from fieldfuse.backends.numba.tensors import OPTIONS, F, array, spread
 
-F = np.float32
 LARGE = F(4.5)  # half of where tanh is 1 in float32
 
 
-def numbers(values: Tensor) -> Any:
+def _numbers(values: Tensor) -> Any:
     """What a kernel takes: float32, or the bits of bfloat16; no copy."""
     values = values.detach()
     return values.view(torch.int16).numpy().view(np.uint16) if values.dtype == torch.bfloat16 else values.numpy()
@@ -180,7 +178,7 @@ class Step:
         least, most: bounds of w and n.
     """
 
-    def __init__(self, place: Tensor, part: LatentVolume, local: LocalVolume, least: float, most: float) -> None:
+    def __init__(self, place: Tensor, part: Any, local: Any, least: float, most: float) -> None:
         self.place, self.state, self.count, self.local = array(place), array(part.rows), array(part.count), array(local.rows)
         self.raw, self.weight, self.seen = array(local.raw), array(local.weight), array(local.count)
         self.least, self.most = F(least), F(most)
@@ -197,13 +195,13 @@ class Step:
         """(M' · 512 + 1, 2C) [H, V] in the numbers that convolutions compute in."""
         both = torch.empty((len(self.place) + 1, 2 * self.state.shape[1]), dtype=kind)
         both[-1] = 0
-        out = numbers(both)
+        out = _numbers(both)
         spread(lambda i: _beside(self.place[i], self.state, self.count, self.local, self.seen, out[i]), len(self.place))
         return both
 
     def forget(self, reset: Tensor, both: Tensor) -> None:
         """[H, V] → [r ∘ H, V], in place; `reset`: M_r's."""
-        gate, out = numbers(reset), numbers(both)
+        gate, out = _numbers(reset), _numbers(both)
         spread(lambda i: _forget(self.place[i], self.state, self.count, self.seen, gate[i], out[i]), len(self.place))
 
     def update(self, update: Tensor, candidate: Tensor, channel: int, change: float, rows: Tensor) -> None:
@@ -213,6 +211,6 @@ class Step:
             update, candidate: M_z's, M_t's.
             channel, change: that of the latent to which at most so much is added.
         """
-        z, t, out = numbers(update), numbers(candidate), rows.numpy()
+        z, t, out = _numbers(update), _numbers(candidate), rows.numpy()
         known, limits = (self.state, self.count, self.raw, self.weight, self.seen), np.array([self.least, self.most, change], np.float32)
         spread(lambda i: _step(self.place[i], *known, z[i], t[i], limits, channel, out), len(self.place))
