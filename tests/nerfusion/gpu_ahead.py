@@ -24,8 +24,6 @@ from fieldfuse.backends.triton import cast as cast_gpu
 from fieldfuse.backends.triton import coarse_steps as march_gpu
 from fieldfuse.backends.triton import convolution, depth_reading, local_volume, plane_sweep
 from fieldfuse.backends.triton import feature_lookup as lookup
-from fieldfuse.backends.triton import split as split_gpu
-from fieldfuse.backends.triton import tables as tables_gpu
 from fieldfuse.backends.triton import volumes as volumes_gpu
 from fieldfuse.backends.triton.gru import Step
 from fieldfuse.nerfusion.cull import all_blocks
@@ -105,16 +103,16 @@ def volumes(blocks: int) -> None:
         convolution.weight_gradient(values, topology.around, torch.rand(topology.zero_row + 1, outside))
     side_by_side = convolution.taps_of(torch.rand(8, 8, 3, 3, 3), torch.rand(8, 8, 3, 3, 3))
     convolution.convolve(torch.rand(topology.zero_row + 1, 16), topology.around, side_by_side, torch.rand(16), mask, True)
-    table, cells = tables_gpu.table(topology.keys, topology.table_origin, topology.table_size)
-    tables_gpu.around(table, cells)
-    tables_gpu.around(table, cells, torch.arange(blocks, dtype=torch.int32), torch.arange(blocks, dtype=torch.int32))
+    table, cells = blocks_gpu.table(topology.keys, topology.table_origin, topology.table_size)
+    blocks_gpu.around(table, cells)
+    blocks_gpu.around(table, cells, torch.arange(blocks, dtype=torch.int32), torch.arange(blocks, dtype=torch.int32))
     blocks_gpu.pooled(topology, mask, 0, 2, True)
     blocks_gpu.resample(topology, mask, [rows], topology.keys.long(), 0.5)
     slots, count = torch.arange(blocks, dtype=torch.int32), torch.rand(topology.zero_row)
     taken = blocks_gpu.take(rows, count, slots, topology)
     blocks_gpu.take(rows, count, slots, topology, (rows, count, topology))
     blocks_gpu.put(rows, count, slots, *taken, mask)
-    split_gpu.split(topology, mask, rows, ((-1, -1, -1), (2 * blocks, 3, 3)), 0.25)
+    blocks_gpu.split(topology, mask, rows, ((-1, -1, -1), (2 * blocks, 3, 3)), 0.25)
     volumes_gpu.settle(rows, rows, slots)
     volumes_gpu.merge(rows, count, rows, count, mask)
     volumes_gpu.surface_cells(topology, rows, count, mask, FieldHead(16, 32, 16), -3.0)

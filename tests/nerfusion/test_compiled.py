@@ -14,7 +14,7 @@ from fieldfuse.backends.numba import plane_sweep as kernels
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.cross_view_consistency import CrossView, confident_points, consistency, cross_view
 from fieldfuse.nerfusion.extras.matching import semi_global, smoothed_softmax
-from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, _table, carved, cost_volume, sweep_planes, to_probability
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, carved, cost_volume, sweep_planes, to_probability
 from tests.nerfusion.made import off
 from tests.nerfusion.test_plane_sweep import slow_paths, wall
 
@@ -98,16 +98,6 @@ def test_semi_global_matching_against_its_recurrence(shape: tuple[int, int, int]
     given = torch.from_numpy(cost)
     assert dispatch.can_use_numba(given)
     np.testing.assert_allclose(semi_global(given).numpy(), slow_paths(cost.astype(np.float64)), atol=1e-5)
-
-
-@pytest.mark.parametrize("shape", [(32, 5, 7), (3, 2, 2), (1, 1, 1)])
-def test_tables_lie_pixel_by_pixel_in_memory(shape: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch) -> None:
-    likely = torch.softmax(3 * torch.randn(shape, generator=torch.Generator().manual_seed(0)), 0)
-    quick = _table(likely, 0.02)
-    assert quick.shape == (3, *shape) and quick.permute(2, 3, 1, 0).is_contiguous()
-    assert not dispatch.can_use_numba(likely.double()) and dispatch.can_use_numba(likely)
-    off(monkeypatch)
-    torch.testing.assert_close(quick, _table(likely, 0.02), atol=1e-6, rtol=1e-5)
 
 
 def no_number(camera: Cameras) -> Cameras:

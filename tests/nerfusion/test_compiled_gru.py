@@ -77,22 +77,6 @@ def test_a_step_in_bfloat16_equals_that_of_tensors_to_its_rounding(monkeypatch: 
     assert float((found.rows - expected.rows).abs().mean()) <= rounding
 
 
-def test_neither_global_nor_local_volume_is_written_to() -> None:
-    part, local = volumes(2)
-    before = [value.clone() for value in (part.rows, part.count, local.rows, local.raw, local.weight, local.count)]
-    with torch.no_grad():
-        trained().fuse_part(part, local)
-    for value, kept in zip((part.rows, part.count, local.rows, local.raw, local.weight, local.count), before, strict=True):
-        assert torch.equal(value, kept)
-
-
-def test_nothing_seen_gives_zeros() -> None:
-    part, local = volumes(3, seen=0.0)
-    with torch.no_grad():
-        out = trained().fuse_part(part, local)
-    assert not out.rows.any() and not out.count.any()
-
-
 def test_what_was_never_known_takes_nothing_from_the_global_volume() -> None:
     part, local = volumes(4)
     with torch.no_grad():
@@ -111,7 +95,7 @@ def test_threads_do_not_matter(reduced: bool) -> None:
     for threads in (1, 2, 3):
         with pinned(threads):
             step = kernels.Step(local.place[:-1], part, local, 1e-3, 16)
-            rows, both = step.average(), step.beside(kind)
+            rows, both = step.average(), step.beside()
             step.forget(reset, both)
             step.update(update, candidate, 3, 0.5, rows)
             out.append((rows, both))

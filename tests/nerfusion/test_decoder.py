@@ -43,11 +43,6 @@ def test_no_direction_is_preferred(vector: tuple[float, float, float]) -> None:
         assert abs(float(squares[part].sum()) - (2 * degree + 1) / (4 * math.pi)) < 1e-12
 
 
-def test_the_lower_ones_are_the_same() -> None:
-    directions = around(50)
-    assert torch.equal(spherical_harmonics(directions, BEHIND), spherical_harmonics(directions)[:, :BEHIND])
-
-
 @pytest.mark.parametrize("kind", ["deferred", "per_sample"])
 def test_a_field_stored_with_nine_harmonics_is_the_same_field(kind: str, tmp_path: Path) -> None:
     field = random_field(decoder=kind)

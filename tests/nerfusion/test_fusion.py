@@ -148,13 +148,6 @@ def test_measured_depth_is_asked_only_when_it_is_wanted() -> None:
     assert all(bool(torch.isfinite(rows).all()) for rows in with_it)
 
 
-def test_looking_away_adds_nothing_and_does_not_fail() -> None:
-    views, keys = captured(3)
-    views.world_from_camera[:, 2, 3] = 40.0
-    steps = list(fuse_views(small_model().eval(), views, keys, Lattice(SPACE, 32), FusionOptions(2, 0.2, FAR)))
-    assert len(steps) == 3 and steps[-1].volume.topology.blocks == 0
-
-
 def test_what_cannot_be_is_refused() -> None:
     views, keys = captured(2)
     model = small_model().eval()

@@ -60,15 +60,6 @@ def test_the_start_is_close_to_the_running_mean_of_what_was_seen() -> None:
     torch.testing.assert_close(gru(state, local), mean, atol=1e-6, rtol=1e-5)
 
 
-def test_unknown_voxels_take_nothing_from_before_and_outside_stays_zero() -> None:
-    topology, _ = cube(2, 1.0, 0)
-    gru = trained()
-    state, local = inputs(topology, 3)
-    out = gru(state, local).detach()
-    assert not out[:-1][~local.known].any() and not out[-1].any()
-    assert bool(torch.isfinite(out).all()) and float(out.abs().max()) <= 1
-
-
 def test_against_dense_convolutions() -> None:
     """The equations written down again on a dense grid in float64."""
     topology, low = cube(3, 0.5, 5)

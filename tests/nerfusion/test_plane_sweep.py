@@ -24,7 +24,6 @@ from fieldfuse.nerfusion.extras.plane_sweep import (
     sweep_planes,
     to_probability,
 )
-from tests.nerfusion.made import cameras
 
 WALL = 2.0
 
@@ -186,25 +185,6 @@ def test_costs_go_together_in_any_order_and_say_when_nobody_sees() -> None:
     torch.testing.assert_close(together(costs, everywhere), 0.5 * (costs.mean(0) + costs.min(0).values))
 
 
-def test_planes_follow_the_parallax() -> None:
-    few, many = (sweep_planes(wall(2)[0], _apart(by), 0.7, 8.0).table.shape[1] for by in (0.05, 0.6))
-    assert few < many <= PLANES[1]
-
-
-def _apart(by: float) -> Cameras:
-    seen_by = wall(2)[1]
-    poses = seen_by.world_from_camera.clone()
-    poses[1, :2, 3] = torch.tensor([by, 0.0])
-    return replace(seen_by, world_from_camera=poses)
-
-
-def test_it_runs_on_cameras_of_the_other_tests() -> None:
-    seen_by = cameras(3)
-    descriptors = list(patch_descriptors(torch.rand(3, 3, int(seen_by.size[0, 1]), int(seen_by.size[0, 0]))))
-    made = sweep_planes(descriptors, seen_by, 0.3, 3.0)
-    assert bool((torch.diff(made.table[0], dim=0) <= 1e-6).all()), "what lies nearer is hidden less"
-
-
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_a_measured_depth_is_where_the_surface_is(scale: float) -> None:
     """One view alone: pictures say nothing, the sensor tells two surfaces on the left, and on the right nothing."""
@@ -311,14 +291,6 @@ def test_a_measured_depth_is_cut_as_the_window_is(window: tuple[float, float, fl
     told = 1 / inverses[found.argmax(0)]
     wanted = depth[round(72 * upper) : round(72 * lower), round(96 * left) : round(96 * right)]
     assert found.shape[1:] == shape and float((told / wanted - 1).abs().max()) < 0.02
-
-
-def test_where_silhouettes_leave_nothing_all_is_free() -> None:
-    descriptors, seen_by = wall(3)
-    made = sweep_planes(descriptors, seen_by, 0.8, 4.0, empty=slab(2.0, 1.0))
-    assert made.table.shape[2:] == (1, 1)
-    seen = made.look(on_axis(torch.linspace(0.9, 3.0, 9)), torch.full((9,), 0.1))
-    assert float(seen.visibility.min()) > 0.99 and float(seen.expected_sdf.min()) > 0.99
 
 
 def test_likelihoods_within_silhouettes_against_a_loop() -> None:

@@ -15,42 +15,24 @@ from fieldfuse.camera import Array, Intrinsics
 
 @dataclass(frozen=True)
 class Cameras:
-    """K cameras with OpenCV axes and pixel centres at +0.5.
+    """K cameras with OpenCV axes and pixel centres at +0.5."""
 
-    Attributes:
-        intrinsics: (K, 4) fx, fy, cx, cy in pixels.
-        size: (K, 2) width and height in pixels.
-        world_from_camera: (K, 4, 4).
-        host: the same cameras in the processor's memory, where they came from there, so that asking for them does not wait for the device.
-    """
-
-    intrinsics: Tensor
-    size: Tensor
-    world_from_camera: Tensor
+    intrinsics: Tensor  # (K, 4) fx, fy, cx, cy in pixels
+    size: Tensor  # (K, 2) width and height in pixels
+    world_from_camera: Tensor  # (K, 4, 4)
+    # The same cameras in the processor's memory, where they came from there, so that reading them does not wait for the device.
     host: Cameras | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def of(cls, intrinsics: Sequence[Intrinsics], world_from_camera: Array, device: torch.device | str = "cpu") -> Cameras:
-        """From the toolkit's cameras; lenses are not looked at (pictures are undistorted before)."""
-        inner = [(c.fx, c.fy, c.cx, c.cy) for c in intrinsics]
-        parts = inner, [(c.width, c.height) for c in intrinsics], world_from_camera
-        return cls._laid(np.concatenate([np.asarray(part, dtype=np.float32).reshape(-1) for part in parts]), torch.device(device))
-
-    @classmethod
-    def _laid(cls, whole: Array, device: torch.device) -> Cameras:
-        """Cameras of (22 · K,) float32: all intrinsics, then all sizes, then all poses; sent to the device in one piece."""
-        count = len(whole) // 22
-
-        def split(values: Tensor, host: Cameras | None) -> Cameras:
-            inner, size, poses = values.split([4 * count, 2 * count, 16 * count])
-            return cls(inner.view(-1, 4), size.view(-1, 2), poses.view(-1, 4, 4), host)
-
-        host = split(torch.from_numpy(whole), None)
-        return host if device.type == "cpu" else split(to_device_async(whole, device), host)
+        """From the toolkit's cameras; lenses are not looked at (images are undistorted before)."""
+        lenses = np.array([(c.fx, c.fy, c.cx, c.cy) for c in intrinsics], np.float32)
+        sizes = np.array([(c.width, c.height) for c in intrinsics], np.float32)
+        return cls(*map(torch.from_numpy, (lenses, sizes, np.asarray(world_from_camera).astype(np.float32)))).to(device)
 
     @classmethod
     def same_size(cls, intrinsics: Tensor, world_from_camera: Tensor, width: int, height: int) -> Cameras:
-        """(K, 4) and (K, 4, 4) of pictures of one size."""
+        """(K, 4) and (K, 4, 4) of images of one size."""
         return cls(intrinsics, intrinsics.new_tensor([width, height]).expand(len(intrinsics), 2), world_from_camera)
 
     def __len__(self) -> int:
@@ -68,28 +50,20 @@ class Cameras:
         """All of them in one bundle."""
         hosts = [part.host for part in parts if part.host is not None]
         if hosts and len(hosts) == len(parts):
-            groups = zip(*((one.intrinsics, one.size, one.world_from_camera) for one in hosts), strict=True)
-            whole = np.concatenate([one.numpy().reshape(-1) for group in groups for one in group])
-            return cls._laid(whole, parts[0].intrinsics.device)
-        return cls(
-            torch.cat([part.intrinsics for part in parts]),
-            torch.cat([part.size for part in parts]),
-            torch.cat([part.world_from_camera for part in parts]),
-        )
+            return cls.together(hosts).to(parts[0].intrinsics.device)
+        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in ("intrinsics", "size", "world_from_camera")))
 
     def to(self, device: torch.device | str) -> Cameras:
         """The same cameras on another device, in one piece."""
-        device = torch.device(device)
+        device, on_cpu = torch.device(device), self.intrinsics.device.type == "cpu"
         if device.type == self.intrinsics.device.type:
             return self
         if device.type == "cpu" and self.host is not None:
             return self.host
         parts = self.intrinsics, self.size, self.world_from_camera
-        if self.intrinsics.device.type == "cpu":
-            return self._laid(np.concatenate([part.numpy().reshape(-1) for part in parts]), device)
-        # What comes back is waited for.
-        moved = torch.cat([part.reshape(-1) for part in parts]).to(device).split([part.numel() for part in parts])
-        return Cameras(*(new.view(old.shape) for new, old in zip(moved, parts, strict=True)))
+        flat = torch.cat([part.reshape(-1) for part in parts])
+        moved = (to_device_async(flat.numpy(), device) if on_cpu else flat.to(device)).split([part.numel() for part in parts])
+        return Cameras(*(new.view(old.shape) for new, old in zip(moved, parts, strict=True)), self if on_cpu else None)
 
     @property
     def positions(self) -> Tensor:

@@ -129,12 +129,12 @@ def test_recurrence_edges(within: Within) -> None:
     nothing = torch.zeros(SIZE + 1, 4)
     empty = fuse(gru, held, once, nothing, nothing, none, topology, torch.zeros(SIZE, dtype=torch.bool))
     value = torch.tanh(raw.detach()) * mask
-    first = fuse(mean, torch.zeros(SIZE + 1, 4), none, value, value, once, topology, inside)
-    twice = fuse(mean, first, once, value, value, once, topology, inside)
+    one = fuse(mean, torch.zeros(SIZE + 1, 4), none, value, value, once, topology, inside)
+    twice = fuse(mean, one, once, value, value, once, topology, inside)
     # A key frame that sees nothing weighs LEAST, not zero: what was known hardly changes, and where nothing was, it counts.
     unseen = fuse(mean, held, once, value, value, none, topology, inside)
     drift = LEAST / (LEAST + 1)
-    heavy = [module(held, once, value, raw.detach(), once * 1e6, topology, inside) for module in (gru, mean)]
+    heavy = [fuse(module, held, once, value, raw.detach(), once * 1e6, topology, inside) for module in (gru, mean)]
     within("values that are not finite", not_finite(first, saturated, empty, raw.grad, large.grad, unseen, *heavy), 0.0)
     within("first frame without a gradient", float(raw.grad[:-1][inside].abs().sum() == 0), 0.0)
     within("mean of the same frame twice", absolute(twice, value), 2e-7)

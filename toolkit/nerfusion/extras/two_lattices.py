@@ -53,10 +53,10 @@ def split_volume(volume: LatentVolume, kept: Tensor) -> LatentVolume:
     Known are exactly the corners of the kept cells' children. They count little, so that what is seen finer prevails.
     """
     if volume.topology.bounds is not None and dispatch.can_use_triton(volume.rows):
-        from fieldfuse.backends.triton import split as kernels
+        from fieldfuse.backends.triton import blocks
 
         given = volume.topology, kept, volume.rows.detach(), doubled(*volume.topology.bounds), INHERITED
-        return LatentVolume(volume.lattice.finer(), *kernels.split(*given))
+        return LatentVolume(volume.lattice.finer(), *blocks.split(*given))
     topology, occupied, (rows,) = split(volume.topology, kept, [volume.rows.detach()])
     return LatentVolume(volume.lattice.finer(), topology, rows, corner_nodes(topology, occupied).float() * INHERITED)
 

@@ -110,7 +110,7 @@ class Traced:
         opacity = ray_sum(self.weight.double(), self.ray, rays)
         before[1:] = opacity.cumsum(0)[:-1]
         reached = total - before[self.ray] >= 0.5 * opacity[self.ray]
-        far = torch.full((rays,), torch.inf, device=self.distance.device)
+        far = self.distance.new_full((rays,), torch.inf)
         found = far.scatter_reduce(0, self.ray, torch.where(reached, self.distance, torch.inf), "amin")
         return torch.where(torch.isfinite(found) & (self.opacity > 1e-3), found, 0.0)
 
