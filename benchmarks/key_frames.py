@@ -21,7 +21,7 @@ from fieldfuse.capture.types import Views
 from fieldfuse.config import KeyframesSettings
 from fieldfuse.errors import InputError
 from fieldfuse.nerfusion.extras.keyframe_depth import overlapping
-from fieldfuse.nerfusion.fusion import FusionOptions, fuse_views, fusion_lattice
+from fieldfuse.nerfusion.fusion import FusionOptions, fuse_views
 from fieldfuse.nerfusion.keyframes import KeyFrames, select_keyframes
 from fieldfuse.nerfusion.lattice import Lattice
 from fieldfuse.nerfusion.model import NerfusionModel
@@ -98,7 +98,7 @@ def walk(key_frames: int, width: int, voxel: float, levels: int, seed: int, devi
         voxel: side of the finest voxels, metres.
 
     Raises:
-        InputError: no clear walk was found, or the lattice cannot be made.
+        InputError: no clear walk was found.
     """
     random = np.random.default_rng(seed)
     scene = random_scene("room", random, texture_bank(0, TEXTURE))
@@ -118,7 +118,9 @@ def walk(key_frames: int, width: int, voxel: float, levels: int, seed: int, devi
     half = float((high - low).max() / 2)
     middle, box = (low + high) / 2, (high - low) / 2 / half
     space = Space((float(middle[0]), float(middle[1]), float(middle[2])), half, 0.0, (float(box[0]), float(box[1]), float(box[2])))
-    return Walk(views, keys, overlapping(keys, poses, views.intrinsics, median), fusion_lattice(space, voxel, levels))
+    unit = 8 * 2 ** (levels - 1)
+    lattice = Lattice(space, max(round(2 * space.extent * space.half / voxel / unit), 1) * unit)
+    return Walk(views, keys, overlapping(keys, poses, views.intrinsics, median), lattice)
 
 
 def _path(scene: Scene, random: np.random.Generator, count: int) -> Array:

@@ -26,7 +26,7 @@ from fieldfuse.backends.triton import convolution, depth_reading, local_volume, 
 from fieldfuse.backends.triton import feature_lookup as lookup
 from fieldfuse.backends.triton import volumes as volumes_gpu
 from fieldfuse.backends.triton.gru import Step
-from fieldfuse.nerfusion.cull import all_blocks
+from fieldfuse.nerfusion.cameras import all_blocks
 from fieldfuse.nerfusion.extras.cross_view_consistency import CrossView
 from fieldfuse.nerfusion.extras.plane_sweep import CostVolume, DepthDistribution
 from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume

@@ -25,7 +25,7 @@ from fieldfuse.backends.triton import feature_lookup as lookup
 from fieldfuse.backends.triton import gru as compiled_rows
 from fieldfuse.backends.triton import volumes as volumes_gpu
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d
-from fieldfuse.nerfusion.cull import all_blocks
+from fieldfuse.nerfusion.cameras import all_blocks
 from fieldfuse.nerfusion.extras.cross_view_consistency import consistency, cross_view, own_estimate
 from fieldfuse.nerfusion.extras.matching import patch_descriptors, semi_global, smoothed_softmax
 from fieldfuse.nerfusion.extras.plane_sweep import _table, cost_volume, sweep_planes, to_probability

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldfuse.camera import project as project_one
-from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.cull import all_blocks, frustum
+from fieldfuse.nerfusion.cameras import Cameras, all_blocks, frustum
 from fieldfuse.nerfusion.lattice import Lattice
 from fieldfuse.nerfusion.unproject import KeyFrame, look_up, project
 from fieldfuse.volume.space import Space

@@ -12,8 +12,7 @@ import pytest
 import torch
 
 from fieldfuse.camera import pixel_grid, rays
-from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.cull import all_blocks
+from fieldfuse.nerfusion.cameras import Cameras, all_blocks
 from fieldfuse.nerfusion.extras.plane_sweep import sweep_planes
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice
 from fieldfuse.nerfusion.model import NerfusionModel

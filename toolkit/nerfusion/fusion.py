@@ -19,8 +19,7 @@ from torch import Tensor
 from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError
-from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.cull import depth_range, frustum
+from fieldfuse.nerfusion.cameras import Cameras, depth_range, frustum
 from fieldfuse.nerfusion.extras.keyframe_depth import KeyframeDepth
 from fieldfuse.nerfusion.extras.matching import SIDE, SIDE_WITHIN
 from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, Empty, sweep_planes
@@ -33,7 +32,6 @@ from fieldfuse.nerfusion.precision import FLOAT32, computing
 from fieldfuse.nerfusion.store import GlobalStore, ValueStore
 from fieldfuse.nerfusion.unproject import EncodedView, KeyFrame
 from fieldfuse.progress import SILENT, Progress
-from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
 
 CACHED = 12  # encoded images for key frames to come …
@@ -73,21 +71,6 @@ class Fused:
     def allowed(self) -> Tensor:
         """(M · 512,) bool, cells whose coarser ones are not see-through; to be read before the loop goes on."""
         return self.fusion.allowed()
-
-
-def fusion_lattice(space: Space, voxel_size: float, levels: int) -> Lattice:
-    """The finest lattice with voxels of about `voxel_size` (working units) that can be made in `levels` doublings.
-
-    Raises:
-        InputError: the voxel size is not positive, or too small for the space.
-    """
-    unit = BLOCK * 2 ** (levels - 1)
-    if not (math.isfinite(voxel_size) and voxel_size > 0):
-        raise InputError(f"the voxel size must be positive, not {voxel_size:g}")
-    resolution = max(round(2 * space.extent * space.half / voxel_size / unit), 1) * unit
-    if resolution > 4096:
-        raise InputError(f"voxels of {voxel_size:.3g} are too small for a space {2 * space.half:.3g} wide; choose larger ones")
-    return Lattice(space, resolution)
 
 
 def fuse_key_frame(

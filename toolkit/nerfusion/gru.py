@@ -63,10 +63,10 @@ class FusionGRU(nn.Module):
         self._gates_prepared, self._candidate_prepared = Prepared(), Prepared()
 
     def forward(self, state: LatentVolume, local: LocalVolume) -> Tensor:
-        """(M · 512 + 1, C) H' on the local volume's blocks, zero where it knows nothing.
+        """(M · 512 + 1, C) H' on the local volume's blocks, zero where nothing is known there.
 
         Args:
-            state: H and n there, zero where the local volume knows nothing.
+            state: H and n there, zero where the local volume is unknown.
         """
         topology, inside, h, v = local.topology, local.known, state.rows, local.rows
         known = torch.log(state.count.clamp_max(MOST)) - torch.log(local.weight.clamp_min(LEAST))
@@ -78,7 +78,7 @@ class FusionGRU(nn.Module):
 
     def compiled(self, part: LatentVolume, local: LocalVolume) -> tuple[Tensor, Tensor]:
         """The running mean on all rows of `part` (the global volume on the local one's blocks) and `forward` on blocks near surfaces,
-        without gradients, by kernels (float32; convolutions in what autocast says).
+        without gradients, by kernels (float32; convolutions in the numbers of autocast).
 
         Returns:
             (M · 512 + 1, C), zero outside the local volume, and (M · 512,) weights so far, likewise.

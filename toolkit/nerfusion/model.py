@@ -26,8 +26,7 @@ from fieldfuse.backends import dispatch
 from fieldfuse.backends.constants import INSIDE
 from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.nerfusion.aggregate import CUES, FLAGS, aggregate, agreement, evidence
-from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.cull import depth_range, frustum
+from fieldfuse.nerfusion.cameras import Cameras, depth_range, frustum
 from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.nerfusion.encoder import DEEPEST, STRIDE, DirectionCode, ImageEncoder, Sampled, padded
 from fieldfuse.nerfusion.extras import known_terms

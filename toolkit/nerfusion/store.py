@@ -66,11 +66,6 @@ class GlobalStore:
         """How many there are."""
         return len(self._slots.keys)
 
-    @property
-    def bytes(self) -> int:
-        """Memory held."""
-        return self._rows.numel() * 4 + self._count.numel() * 4
-
     def volume(self) -> LatentVolume:
         """Everything, sharing memory with the store: valid until the next change."""
         zero_row = self.blocks * VOXELS

@@ -42,7 +42,7 @@ def surface_cells(volume: LatentVolume, seen: Tensor, thickness: Tensor, gamma: 
     """(M · 512,) bool: solid cells that a key frame sees, so those about surfaces and not what lies hidden behind them.
 
     Args:
-        seen: (M · 512,) bool, corners that its local volume knows, on the same blocks.
+        seen: (M · 512,) bool, corners known in its local volume, on the same blocks.
     """
     return solid_cells(volume, thickness, gamma) & cells(volume.topology, seen, every=False)
 
@@ -62,7 +62,7 @@ def split_volume(volume: LatentVolume, kept: Tensor) -> LatentVolume:
 
 
 def adopt(state: LatentVolume, inherited: LatentVolume) -> LatentVolume:
-    """A volume that also knows what it inherits; what it knows already stays as it is, bit for bit."""
+    """A volume with what it inherits where nothing was known; what was known stays as it is, bit for bit."""
     if inherited.topology is state.topology:
         new = inherited.known & (state.count == 0)
         rows = torch.where(corner_mask(new), inherited.rows.to(state.rows.dtype), state.rows)

@@ -69,7 +69,7 @@ class Crew:
 
 @contextmanager
 def join_crew(device: str = "auto") -> Iterator[Crew]:
-    """The crew that `torchrun` started (its environment variables tell), or a crew of one.
+    """The crew that `torchrun` started (by its environment variables), or a crew of one.
 
     nccl between CUDA devices; gloo between CPUs, and where a machine's processes share its devices, which nccl refuses.
 

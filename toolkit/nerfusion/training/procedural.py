@@ -21,7 +21,7 @@ OBJECTS = ("table", "table", "thin", "sphere")
 ROOMS = ("room",) * 5 + ("table",) * 4 + ("thin", "corridor", "corridor", "street", "wall")
 SHAPES = (4 / 3, 4 / 3, 3 / 4, 16 / 9, 9 / 16, 1.0)  # width by height
 BANKS = 8  # sets of textures that scenes choose from
-TEXELS = 256  # a side of a texture: training pictures are small
+TEXELS = 256  # a side of a texture: training images are small
 TRIES = 6  # scenes …
 PATHS = 24  # … and paths through one
 CLEAR = 0.12  # of the distance to the focus: cameras keep this far from surfaces
@@ -39,13 +39,13 @@ class ProceduralScene:
     """One random scene with a path through it.
 
     Objects are looked at from around; rooms are filmed by hand. Lengths are multiplied by a random factor, so that nothing in a sample
-    tells metres from centimetres.
+    distinguishes metres from centimetres.
 
     Args:
         kind: "object" or "room".
         bank: set of textures, 0 … `BANKS` − 1.
         frames: cameras on the path.
-        device: where pictures are drawn, and stay.
+        device: where images are drawn, and stay.
 
     Raises:
         InputError: no path was found after several scenes.
