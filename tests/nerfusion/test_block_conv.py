@@ -118,25 +118,6 @@ def test_only_what_needs_a_gradient_gets_one_and_inputs_stay_as_they_are() -> No
     assert float(layer.bias.grad[0]) == topology.zero_row and torch.equal(rows, before)
 
 
-def test_autocast_computes_in_the_reduced_type() -> None:
-    topology, _ = cube(2, 1.0, 0)
-    rows = torch.randn(topology.zero_row + 1, 8)
-    rows[-1] = 0
-    layer = BlockConv3d(8, 8)
-    full = layer(rows.requires_grad_(), topology)
-    full.square().sum().backward()
-    reference, kernel = rows.grad, layer.weight.grad
-    assert reference is not None and kernel is not None
-    rows.grad, layer.weight.grad = None, None
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        half = layer(rows, topology)
-    assert half.dtype == torch.bfloat16
-    half.float().square().sum().backward()
-    for one, two in ((half.float(), full), (rows.grad, reference), (layer.weight.grad, kernel)):
-        assert one is not None and one.dtype == torch.float32
-        assert float((one - two).detach().norm() / two.detach().norm()) < 0.02
-
-
 def test_shapes_that_do_not_fit() -> None:
     topology, _ = cube(2, 1.0, 0)
     layer = BlockConv3d(4, 4)

@@ -28,8 +28,8 @@ from fieldfuse.nerfusion.training.scenes import (
     synthetic_folders,
     synthetic_scene,
 )
+from fieldfuse.simulate.eye import Rays
 from fieldfuse.simulate.mesh_scene import load_mesh_scene
-from fieldfuse.simulate.seen import Rays
 from tests.capture.layouts import LAYOUTS
 from tests.nerfusion.training import layouts
 

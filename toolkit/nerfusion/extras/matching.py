@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from fieldfuse.backends import dispatch
-from fieldfuse.stereo.smooth import DOWN, STRAIGHT, UP, summed_paths
+from fieldfuse.stereo.cost_volume import DOWN, STRAIGHT, UP, summed_paths
 from fieldfuse.threads import share
 
 SIDE = 256  # pixels of the long side at which images are compared (docs/measured/few_views.md) …
