@@ -25,7 +25,6 @@ from fieldfuse.backends.triton import coarse_steps as march_gpu
 from fieldfuse.backends.triton import convolution, depth_reading, local_volume, plane_sweep
 from fieldfuse.backends.triton import feature_lookup as lookup
 from fieldfuse.backends.triton import volumes as volumes_gpu
-from fieldfuse.backends.triton.gru import Step
 from fieldfuse.nerfusion.cameras import all_blocks
 from fieldfuse.nerfusion.extras.cross_view_consistency import CrossView
 from fieldfuse.nerfusion.extras.plane_sweep import CostVolume, DepthDistribution
@@ -119,7 +118,7 @@ def volumes(blocks: int) -> None:
     part = LatentVolume(lattice(), topology, rows, count)
     local = LocalVolume(lattice(), topology, rows, torch.ones(topology.zero_row), rows, count, topology, slots)
     for kind in (torch.float32, torch.bfloat16):
-        step = Step(part, local, 0.1, 16)
+        step = volumes_gpu.Step(part, local, 0.1, 16)
         step.average()
         both, _ = step.beside(kind)
         step.forget(torch.rand(len(both), 32).to(kind), both)

@@ -22,7 +22,6 @@ from fieldfuse.backends import dispatch
 from fieldfuse.backends.triton import blocks as blocks_gpu
 from fieldfuse.backends.triton import convolution, depth_reading, local_volume, plane_sweep
 from fieldfuse.backends.triton import feature_lookup as lookup
-from fieldfuse.backends.triton import gru as compiled_rows
 from fieldfuse.backends.triton import volumes as volumes_gpu
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d
 from fieldfuse.nerfusion.cameras import all_blocks
@@ -53,7 +52,7 @@ def large_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plane_sweep, "PIXELS", 1024)
     monkeypatch.setattr(depth_reading, "TILE", (1024, 32))
     monkeypatch.setattr(plane_sweep, "BLOCK", 1024)
-    for module in (depth_reading, lookup, local_volume, compiled_rows, volumes_gpu, blocks_gpu):
+    for module in (depth_reading, lookup, local_volume, volumes_gpu, blocks_gpu):
         monkeypatch.setattr(module, "BLOCK", 2048)
     for module, names in ((convolution, ("TILE", "SLOPES")), (blocks_gpu, ("TILE",)), (local_volume, ("PART",))):
         for name in names:

@@ -95,7 +95,7 @@ class FusionGRU(nn.Module):
                 one.forget(reset, both)
                 one.update(update, self.candidate(both, near_surface, inside), INSIDE, CHANGE, rows)
             return rows, part.count * local.known + local.weight
-        from fieldfuse.backends.triton import gru as on_cuda
+        from fieldfuse.backends.triton import volumes as on_cuda
 
         # Both gates' convolutions go side by side.
         step = on_cuda.Step(part, local, LEAST, MOST)
