@@ -1,4 +1,4 @@
-"""Both optimisers of a step on CUDA: lazy Adam on the rows that it touched, Adam on the decoder. `adam.py` is the reference."""
+"""Both optimisers of a step on CUDA: lazy Adam on the rows that it touched, Adam on the decoder; `torch_engine.py` is the reference."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import triton
 import triton.language as tl
 
 if TYPE_CHECKING:
-    from fieldfuse.training.step import Rates
+    from fieldfuse.training.losses import Rates
 
 # Where kernels find the step sizes and the weights of the losses.
 R_DENSITY, R_FEATURE, R_DECODER, R_DISTORTION, R_OPACITY, R_DEPTH, R_NOISE, R_SLOW = (tl.constexpr(v) for v in range(8))

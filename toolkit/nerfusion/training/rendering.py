@@ -14,8 +14,8 @@ from torch import Tensor
 from fieldfuse.backends.dispatch import to_device_async
 from fieldfuse.nerfusion.training.samples import Pictures
 from fieldfuse.render.composite import ray_sum
-from fieldfuse.render.differentiable import render_with_gradients
 from fieldfuse.render.field import Field
+from fieldfuse.render.rays import render_with_gradients
 
 HIDDEN = 0.05  # relative: what lies this much behind what an image shows is not shown by it
 THRESHOLD = 1e-3  # samples of smaller weight are not decoded; they keep their gradient as obstacles
