@@ -95,23 +95,6 @@ def test_lonely_block(within: Within) -> None:
     within.each(lookup_errors(moved, *random_places(moved, 600, 5), values), VALUE, BOUNDS)
 
 
-def test_on_lattice(within: Within) -> None:
-    """Exactly on lattice points, from every voxel that touches them."""
-    topology = Topology(torch.stack(torch.meshgrid(*[torch.arange(-1, 1)] * 3, indexing="ij"), -1).view(-1, 3))
-    values = torch.cat([torch.randn(topology.zero_row), torch.zeros(1)])
-    places = lattice(topology)
-    inner = ((places > -8) & (places < 7)).all(1).nonzero().squeeze(1)
-    worst = 0.0
-    for index in range(8):
-        step = torch.tensor([index & 1, index >> 1 & 1, index >> 2])
-        below = places[inner] - step
-        local = below & 7
-        cell = topology.find(below >> 3) * VOXELS + (local[:, 2] * 8 + local[:, 1]) * 8 + local[:, 0]
-        got = gather(values, *corners(topology, cell, step.float().expand(len(cell), 3)))
-        worst = max(worst, absolute(got, values[inner]))
-    within("stored value, read from eight sides", worst, 0.0)
-
-
 def test_linear_fields(within: Within) -> None:
     """Linear fields across block borders."""
     topology = Topology(torch.stack(torch.meshgrid(*[torch.arange(-2, 2)] * 3, indexing="ij"), -1).view(-1, 3))
@@ -126,44 +109,6 @@ def test_linear_fields(within: Within) -> None:
         got = gather(values, *corners(topology, cell, inside))
         worst = max(worst, by_size(got, (places + inside.double()) @ direction))
     within("linear field, by its largest value", worst, VALUE)
-
-
-def test_continuity(within: Within) -> None:
-    """Continuity where two voxels meet."""
-    topology = Topology(torch.stack(torch.meshgrid(*[torch.arange(-1, 1)] * 3, indexing="ij"), -1).view(-1, 3))
-    values = torch.cat([torch.randn(topology.zero_row), torch.zeros(1)])
-    places = lattice(topology)
-    worst, slope = 0.0, 0.0
-    for axis in range(3):
-        here = (places[:, axis] < 6).nonzero().squeeze(1)
-        following = places[here].clone()
-        following[:, axis] += 1
-        local = following & 7
-        there = topology.find(following >> 3) * VOXELS + (local[:, 2] * 8 + local[:, 1]) * 8 + local[:, 0]
-        inside = torch.rand(len(here), 3)
-        for back in (0.0, 1e-4):
-            first, second = inside.clone(), inside.clone()
-            first[:, axis], second[:, axis] = 1 - back, back
-            a, b = gather(values, *corners(topology, here, first)), gather(values, *corners(topology, there, second))
-            if back == 0:
-                worst = max(worst, absolute(a, b))
-            else:
-                slope = max(slope, absolute(a, b))
-    within("jump at the border", worst, VALUE)
-    within("change over 2e-4 of a voxel", slope, 2e-3)
-
-
-def test_double_gradcheck(within: Within) -> None:
-    """Gradcheck in double."""
-    topology = scattered_blocks(2, 9, 1)
-    cell, inside = random_places(topology, 6, 2)
-    rows, weights = corners(topology, cell, inside.double())
-    used, index = torch.unique(rows, return_inverse=True)
-    small = torch.randn(len(used), 2, dtype=torch.float64, requires_grad=True)
-    flat = torch.randn(len(used), dtype=torch.float64, requires_grad=True)
-    good = torch.autograd.gradcheck(lambda v: gather(v, index.int(), weights), (small,), raise_exception=False)
-    good &= torch.autograd.gradcheck(lambda v: gather(v, index, weights), (flat,), raise_exception=False)
-    within("gradcheck failures", float(not good), 0.0)
 
 
 def test_many_into_one(within: Within) -> None:

@@ -57,20 +57,6 @@ def unclear(value: Any) -> int:
     return int(isinstance(value, float) and not math.isfinite(value))
 
 
-def test_pairs(within: Within) -> None:
-    """PSNR and SSIM of every pair of awkward pictures."""
-    shown = pictures()
-    numbers = [f(a, b) for f in (psnr, ssim) for a in shown.values() for b in shown.values()]
-    missing = float(sum(number is None for number in numbers))
-    within("NaN or infinity", float(unclear([number or 0.0 for number in numbers])), 0.0)
-    within("no number", missing, 0.0)
-    for name, picture in shown.items():
-        same, alike = psnr(picture, picture), ssim(picture, picture)
-        assert same is not None and alike is not None
-        within(f"{name} with itself: PSNR below the cap", PSNR_CAP - same, 0.0)
-        within(f"{name} with itself: SSIM below 1", abs(1 - alike), 1e-12)
-
-
 def test_written_out(within: Within) -> None:
     """PSNR and SSIM against sums written out."""
     rng = np.random.default_rng(4)
