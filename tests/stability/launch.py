@@ -10,13 +10,13 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import resource
 import signal
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
+
+from tests.stability.fuzz.watch import bound_memory
 
 CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir")
 
@@ -51,13 +51,6 @@ def at_stage(stage: str, strike: Callable[[], None]) -> None:
     ConsoleProgress.begin = begin  # type: ignore[method-assign]
 
 
-def little_memory(more: int) -> None:
-    """From now on this process may take `more` bytes beyond what it has."""
-    status = Path("/proc/self/status").read_text(encoding="ascii")
-    now = int(next(line for line in status.splitlines() if line.startswith("VmSize:")).split()[1]) * 1024
-    resource.setrlimit(resource.RLIMIT_AS, (now + more, resource.RLIM_INFINITY))
-
-
 def steady_clock(tick: float) -> None:
     """`perf_counter` advances by `tick` at each look: what is bounded by seconds is then bounded by steps."""
     looks = itertools.count()
@@ -70,7 +63,7 @@ def main() -> None:
     if "ticks" in plan:
         steady_clock(plan["ticks"])
     if "stage" in plan:
-        at_stage(plan["stage"], lambda: little_memory(plan["memory"]))
+        at_stage(plan["stage"], lambda: bound_memory(plan["memory"]))
     if "event" in plan:
         strike_at(plan["event"], getattr(signal, plan["signal"]))
     from fieldfuse.pipelines.cli import main as command

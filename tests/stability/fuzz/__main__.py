@@ -1,4 +1,4 @@
-"""`python -m tests.stability.fuzz --inputs 100000 [--seed 1] [--jobs 2] [--only field] [--state FILE] [--page docs/stability.md]`."""
+"""`python -m tests.stability.fuzz --inputs 100000 [--seed 1] [--jobs 2] [--only field] [--page docs/stability.md]`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import sys
 from pathlib import Path
 
-from tests.stability.fuzz.drive import Result, fuzz, fuzz_in_rounds
+from tests.stability.fuzz.drive import Result, fuzz
 from tests.stability.page import replace_part
 
 
@@ -17,7 +17,6 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", action="append", default=[], help="a target's name; may be repeated")
-    parser.add_argument("--state", type=Path, help="notes how far it came, so that a run that was stopped goes on; removed at the end")
     parser.add_argument("--page", type=Path, help="a page of which a part is replaced by the result")
     parser.add_argument("--part", default="fuzz", help="that part's name")
     chosen = parser.parse_args()
@@ -32,14 +31,11 @@ def main() -> int:
         sys.stdout.flush()
         shown = len(result.problems)
 
-    given = (chosen.inputs, chosen.seed, chosen.jobs, chosen.only, told)
-    result = fuzz(*given) if chosen.state is None else fuzz_in_rounds(chosen.state, *given)
+    result = fuzz(chosen.inputs, chosen.seed, chosen.jobs, chosen.only, told)
     told(result)
     if chosen.page is not None:
         replace_part(chosen.page, chosen.part, result.lines())
     sys.stderr.write("\n".join(result.lines()) + "\n")
-    if chosen.state is not None:
-        chosen.state.unlink()  # the next run begins anew
     return 1 if result.problems else 0
 
 
