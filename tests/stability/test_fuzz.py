@@ -19,6 +19,7 @@ from tests.stability.fuzz.drive import ROOT, fuzz
 INPUTS = 300
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_hundreds_of_damaged_files() -> None:
     result = fuzz(INPUTS, seed=int(os.environ.get("FIELDFUSE_SEED", "20")))

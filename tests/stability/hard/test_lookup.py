@@ -128,24 +128,6 @@ def test_many_into_one(within: Within) -> None:
     within("rows touched, beyond 8", float(len(touched) - 8), 0.0)
 
 
-def test_half_values(within: Within) -> None:
-    """Values in bfloat16 and float16, and under autocast."""
-    topology = scattered_blocks(8, 5)
-    cell, inside = random_places(topology, 2000, 8)
-    rows, weights = corners(topology, cell, inside)
-    for kind in (torch.bfloat16, torch.float16):
-        values = torch.cat([torch.randn(topology.zero_row), torch.zeros(1)]).to(kind)
-        exact = gather(values.double(), rows, weights.double())
-        name = str(kind).removeprefix("torch.")
-        with torch.autocast("cpu", dtype=kind):
-            mixed = gather(values.float(), rows, weights)
-            _, (share,) = scatter(rows, weights, (torch.ones(len(cell)),))
-        _, (plain,) = scatter(rows, weights, (torch.ones(len(cell)),))
-        within(f"values stored in {name}", by_size(gather(values, rows, weights), exact), 4 * float(torch.finfo(kind).eps))
-        within(f"values under {name} autocast", by_size(mixed, exact), VALUE)
-        within(f"gradients under {name} autocast", absolute(share, plain), 0.0)
-
-
 @QUICK
 @given(st.lists(KEYS, min_size=1, max_size=8, unique=True), st.integers(0, 1000))
 def test_lookup(keys: list[tuple[int, int, int]], seed: int) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,14 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldfuse.camera import Array, Intrinsics
-from fieldfuse.capture.types import Views
+from fieldfuse.camera import Array
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.baseline import nearest_image_scores
 from fieldfuse.evaluation.depth import KEYS, depth_metrics
 from fieldfuse.evaluation.images import PSNR_CAP, psnr, ssim
-from fieldfuse.evaluation.perceptual import lpips, lpips_available
-from fieldfuse.evaluation.score import score_views
+from fieldfuse.evaluation.perceptual import lpips
 from tests.stability.hard import reference
 from tests.stability.hard.errors import refused
 from tests.stability.hard.ranges import QUICK
@@ -122,49 +118,6 @@ def test_depths(within: Within) -> None:
     seen = depth_metrics(mixed, truth)
     within("three of fifteen rows missing: coverage", abs(seen["coverage"] - 0.8), 1e-12)
     within("three of fifteen rows missing: error of the others", seen["abs_err"], 0.0)
-
-
-def test_scores(within: Within) -> None:
-    """Scores of views without depth, mask, training picture or pixel are JSON."""
-    camera = Intrinsics(32, 24, 30.0, 30.0, 16.0, 12.0)
-    shown = list(pictures().values())
-    truth = [shown[index] for index in (0, 1, 3, 4)]
-    empty = np.zeros(SHAPE[:2], bool)
-    views = Views(
-        [str(i) for i in range(4)],
-        truth,
-        [camera] * 4,
-        np.tile(np.eye(4), (4, 1, 1)),
-        np.ones(4, bool),
-        valid=[None, empty, None, None],
-        depths=[None, np.full(SHAPE[:2], np.nan, np.float32), np.zeros(SHAPE[:2], np.float32), np.ones(SHAPE[:2], np.float32)],
-    )
-    wrong = 0
-    for picture in shown:
-        for depth in (np.zeros(SHAPE[:2]), np.full(SHAPE[:2], np.nan)):
-            for mask in (None, empty):
-                rendered = SimpleNamespace(rgb=picture, depth=depth, **({} if mask is None else {"mask": mask}))
-                result = score_views([rendered] * 4, views, range(4), [0.0] * 4)
-                json.dumps(result, allow_nan=False)
-                wrong += unclear(result)
-    nearest = nearest_image_scores(views, range(4))
-    json.dumps(nearest, allow_nan=False)
-    nothing = score_views([], views, [])
-    within("NaN or infinity", float(wrong + unclear(nearest) + unclear(nothing)), 0.0)
-    within("a nearest picture where none is for training", float(nearest["psnr"] is not None), 0.0)
-    within("a mean of nothing", float(nothing["psnr"] is not None), 0.0)
-
-
-def test_perceptual(within: Within) -> None:
-    """LPIPS of constant, identical and damaged pictures."""
-    if not lpips_available():
-        within("numbers without weights", float(lpips(pictures()["black"], pictures()["white"]) is not None), 0.0)
-    big = {name: np.tile(picture, (2, 2, 1)) for name, picture in pictures().items()}
-    numbers = [lpips(a, b) for a in list(big.values())[:6] for b in list(big.values())[5:]]
-    own = [lpips(picture, picture) or 0.0 for picture in big.values()]
-    within("NaN or infinity", float(unclear(numbers) + sum(number is None for number in numbers)), 0.0)
-    within("pictures with themselves", float(max(own)), 1e-6)
-    within("numbers of pictures too small", float(lpips(np.zeros((8, 8, 3)), np.ones((8, 8, 3))) is not None), 0.0)
 
 
 NUMBERS = st.sampled_from([0.0, -0.0, 1.0, 0.5, -1.0, 255.0, 65535.0, 1e-310, 1e-20, 1e20, 1e308, math.nan, math.inf, -math.inf])

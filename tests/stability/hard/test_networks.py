@@ -175,49 +175,6 @@ def test_aggregation(within: Within) -> None:
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 50.0
 SIDE = 0.05  # of a voxel
-LOW = 16  # roundings of the lower precision that a gradient through a few layers may carry
-TURNS = 8  # times that, behind the sines and cosines of the paper's decoder
-
-
-def test_reduced_gradients(within: Within) -> None:
-    """Gradients under bfloat16 and float16 autocast against float64."""
-    directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
-    features = torch.randn(200, 8)
-    topology = scattered_blocks(6, 1, 1)
-    rows, weight = torch.randn(topology.zero_row, 4), torch.randn(4, 4, 3, 3, 3) * 0.1
-    pull = torch.randn(topology.zero_row, 4)
-    views, visible = torch.randn(3, 100, 4), torch.rand(3, 100) < 0.7
-    visible[0] |= ~visible.any(0)
-    for kind in (torch.bfloat16, torch.float16):
-        name, bound = str(kind).removeprefix("torch."), LOW * float(torch.finfo(kind).eps)
-        for decoder in ("deferred", "per_sample"):
-            torch.manual_seed(1)
-            net = make_decoder(decoder, 8, 32)
-            double = make_decoder(decoder, 8, 32).double()
-            double.load_state_dict({key: value.double() for key, value in net.state_dict().items()})
-            low, exact = features.clone().requires_grad_(True), features.double().requires_grad_(True)
-            with torch.autocast("cpu", dtype=kind):
-                got = net(low, directions)
-            want = double(exact, directions.double())
-            (got if decoder == "deferred" else got[1]).float().sum().backward()
-            (want if decoder == "deferred" else want[1]).sum().backward()
-            assert low.grad is not None and exact.grad is not None
-            steep = 1 if decoder == "deferred" else TURNS  # the paper's encoding multiplies what is rounded by up to 16 π
-            within(f"decoder {decoder}, {name}, by the largest", by_size(low.grad, exact.grad), steep * bound)
-        low, exact = rows.clone().requires_grad_(True), rows.double().requires_grad_(True)
-        with torch.autocast("cpu", dtype=kind):
-            block_conv3d(low, topology, weight).float().mul(pull).sum().backward()
-        block_conv3d(exact, topology, weight.double()).mul(pull.double()).sum().backward()
-        assert low.grad is not None and exact.grad is not None
-        within(f"block convolution, {name}, by the largest", by_size(low.grad, exact.grad), bound)
-        low, exact = views.clone().requires_grad_(True), views.double().requires_grad_(True)
-        with torch.autocast("cpu", dtype=kind):
-            mean, variance, _ = aggregate(low, visible)
-        (mean.float().sum() + variance.float().sum()).backward()
-        sums = aggregate(exact, visible)
-        (sums[0].sum() + sums[1].sum()).backward()
-        assert low.grad is not None and exact.grad is not None
-        within(f"aggregation, {name}, by the largest", by_size(low.grad, exact.grad), bound)
 
 
 @FEW

@@ -16,13 +16,10 @@ from fieldfuse.camera import (
     Array,
     Intrinsics,
     Similarity,
-    invert,
     world_from_opengl,
 )
-from fieldfuse.capture.poses import checked_pose
 from fieldfuse.export.cameras import write_cameras
 from fieldfuse.export.mesh import write_mesh
-from fieldfuse.export.ply import write_points
 from fieldfuse.files import read_json
 from fieldfuse.render.image import render_view
 from fieldfuse.render.paths import look_at
@@ -80,19 +77,6 @@ def test_similarities(within: Within) -> None:
         within(f"{name}, in what float64 can hold", error, 0.0 if name == "stored and read" else 4.0)
 
 
-def test_inverted(within: Within) -> None:
-    """Inverting poses 6,000 km away."""
-    for away in (1.0, EARTH):
-        poses = similarity(1.0, away, 2).poses(
-            look_at(np.random.default_rng(0).normal(size=(20, 3)) * 3, np.zeros(3), np.array([0.0, 0, 1]))
-        )
-        product = invert(poses) @ poses
-        within(f"pose times its inverse, {away:g} m away", absolute(product, np.tile(np.eye(4), (20, 1, 1))), 1e-14 + 4e-16 * away)
-        checked = np.array([checked_pose(pose, "here") for pose in poses])
-        within(f"places changed by the check, {away:g} m away", absolute(checked[:, :3, 3], poses[:, :3, 3]), 0.0)
-        within(f"turned by the check, {away:g} m away", absolute(checked[:, :3, :3], poses[:, :3, :3]), 1e-12)
-
-
 def test_working_unit(within: Within) -> None:
     """A field's picture does not depend on the unit of its working frame."""
     from dataclasses import replace
@@ -148,19 +132,6 @@ def test_meshes(within: Within, tmp_path: Path) -> None:
         for suffix in ("ply", "obj", "glb"):
             error = mesh_error(tmp_path / f"mesh.{suffix}", mesh, placed)
             within(f"{suffix}, {_label(scale, away)}, by the model's size", error, RELATIVE)
-
-
-def test_points(within: Within, tmp_path: Path) -> None:
-    """Points in the input's coordinates."""
-    mesh = ball()
-    for scale, away in PLACES:
-        placed = similarity(scale, away, 4)
-        path = tmp_path / "points.ply"
-        write_points(path, mesh.vertices, mesh.colours, mesh.normals, placed.inverse())
-        read = _vertices(trimesh.load(path, process=False))
-        size = scale * float(np.ptp(mesh.vertices, axis=0).max())
-        error = absolute(read, placed.points(mesh.vertices)) / size
-        within(f"{_label(scale, away)}, by the model's size", error, RELATIVE)
 
 
 def test_cameras(within: Within, tmp_path: Path) -> None:
