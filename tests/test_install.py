@@ -50,10 +50,6 @@ def test_pins_satisfy_the_ranges() -> None:
             assert requirement.specifier.contains(pins()[requirement.name.lower()]), line
 
 
-def test_torch_is_open_for_other_builds() -> None:
-    assert re.search(r"^torch>=[\d.]+$", setup()["options"]["install_requires"], re.MULTILINE)
-
-
 def test_pyproject_holds_only_the_build_system() -> None:
     assert list(tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))) == ["build-system"]
 
@@ -104,11 +100,6 @@ def test_the_command_is_declared_and_the_version_is_one() -> None:
     except metadata.PackageNotFoundError:
         pytest.skip("fieldfuse runs from its folder here, it is not installed")
     assert installed == fieldfuse.__version__
-
-
-def test_licence_is_whole() -> None:
-    text = (ROOT / "LICENSE").read_text(encoding="utf-8")
-    assert "Version 2.0, January 2004" in text and "END OF TERMS AND CONDITIONS" in text and len(text) > 10_000
 
 
 def test_ci_runs_make_test() -> None:
