@@ -1,8 +1,7 @@
 """`fieldfuse …` with something going wrong at a chosen moment: `python -m tests.stability.launch JSON run SOURCE --out DIR …`.
 
 JSON: `event` n and `signal` s: send s to this process at its n-th change of a file (open for writing, rename, remove, make a folder).
-`stage` and `memory`: from when that stage begins the process may take so many bytes more. `ticks`: the clock of the fit advances by so
-many seconds a look, so that a fit of a given budget makes the same steps on every machine.
+`ticks`: the clock of the fit advances by so many seconds a look, so that a fit of a given budget makes the same steps on every machine.
 """
 
 from __future__ import annotations
@@ -13,10 +12,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
 from typing import Any
-
-from tests.stability.fuzz.watch import bound_memory
 
 CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir")
 
@@ -37,20 +33,6 @@ def strike_at(count: int, number: int) -> None:
     sys.addaudithook(hear)
 
 
-def at_stage(stage: str, strike: Callable[[], None]) -> None:
-    """Do something as soon as a stage begins."""
-    from fieldfuse.pipelines.console import ConsoleProgress
-
-    plain = ConsoleProgress.begin
-
-    def begin(self: ConsoleProgress, name: str) -> None:
-        plain(self, name)
-        if name == stage:
-            strike()
-
-    ConsoleProgress.begin = begin  # type: ignore[method-assign]
-
-
 def steady_clock(tick: float) -> None:
     """`perf_counter` advances by `tick` at each look: what is bounded by seconds is then bounded by steps."""
     looks = itertools.count()
@@ -62,8 +44,6 @@ def main() -> None:
     sys.argv = ["fieldfuse", *sys.argv[2:]]
     if "ticks" in plan:
         steady_clock(plan["ticks"])
-    if "stage" in plan:
-        at_stage(plan["stage"], lambda: bound_memory(plan["memory"]))
     if "event" in plan:
         strike_at(plan["event"], getattr(signal, plan["signal"]))
     from fieldfuse.pipelines.cli import main as command

@@ -15,9 +15,9 @@ import pytest
 
 from fieldfuse.config import Settings
 from fieldfuse.pipelines.folder import RunFolder
-from tests.pipelines.made import Answer, environment
+from tests.pipelines.made import environment
 from tests.stability.kills import kill_runs
-from tests.stability.runs import OPTIONS, PATIENCE, ROOT, corrupt, differences, launch, leftovers, make_source
+from tests.stability.runs import OPTIONS, PATIENCE, ROOT, corrupt, differences, leftovers, make_source
 from tests.stability.stops import KINDS, fieldfuse, stop_everywhere
 from tests.stability.writers import ELSEWHERE
 
@@ -147,16 +147,6 @@ def test_a_wall_clock_that_jumps_by_a_year_changes_nothing(tmp_path: Path, monke
     assert 0 < report["seconds_total"] < time.monotonic() - began
     again = fieldfuse("run", source, "--out", tmp_path / "out", *OPTIONS, "--json")
     assert again.code == 0 and all(stage["cached"] for stage in json.loads(again.out)["stages"])
-
-
-@pytest.mark.slow
-@LONG
-def test_a_stage_that_does_not_fit_into_memory_is_refused_with_numbers(tmp_path: Path) -> None:
-    done = launch({"stage": "views", "memory": 100 * 2**20}, make_source(tmp_path / "room"), tmp_path / "out")
-    assert done.returncode == 2, done.stderr
-    sentence = Answer(done.returncode, done.stdout, done.stderr).sentence()
-    assert "GB of memory" in sentence and "is free" in sentence and "--image-size" in sentence
-    assert corrupt(tmp_path / "out") == []
 
 
 RACE = """

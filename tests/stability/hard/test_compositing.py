@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fieldfuse.render.composite import distortion, exclusive_sum, ray_sum, weights
+from fieldfuse.render.composite import distortion, ray_sum, weights
 from fieldfuse.render.field import density
 from fieldfuse.render.march import first_of_ray
 from tests.stability.hard import reference
@@ -254,16 +253,3 @@ def test_distortion(data: st.DataObject, count: int) -> None:
     errors = distortion_errors([([weight / total for weight in weights], places, lengths)])
     assert errors["values that are not finite"] == 0 and errors["negative losses"] == 0
     assert errors["gradient"] < 1e-6 and errors["loss"] < 1e-6
-
-
-def test_weights_from_one_minus_exp_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def careless(thickness: torch.Tensor, first: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        light = torch.exp(-exclusive_sum(thickness, first)).to(thickness.dtype)
-        return light * (1 - torch.exp(-thickness)), light
-
-    monkeypatch.setitem(globals(), "weights", careless)
-    within = Within()
-    test_haze(within)
-    assert "weight, relative" in within.missed
-    test_neighbours_in_a_list(within := Within())
-    assert within.missed

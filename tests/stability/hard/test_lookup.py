@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -136,10 +135,3 @@ def test_lookup(keys: list[tuple[int, int, int]], seed: int) -> None:
     errors = lookup_errors(topology, *random_places(topology, 60, seed), values)
     for name, error in errors.items():
         assert error <= (0 if "finite" in name else ABSENT if "absent" in name else VALUE), (name, error)
-
-
-def test_a_wrong_corner_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = corners
-    monkeypatch.setitem(globals(), "corners", lambda *given: (plain(*given)[0].roll(1, 1), plain(*given)[1]))
-    test_linear_fields(within := Within())
-    assert within.missed

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import fields
 from itertools import pairwise
 
 import pytest
@@ -13,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fieldfuse.render.march import MarchGrid, Samples, march
+from fieldfuse.render.march import MarchGrid, march
 from fieldfuse.volume.topology import BLOCK, VOXELS
 from tests.stability.hard import reference
 from tests.stability.hard.errors import largest, not_finite
@@ -221,20 +220,3 @@ def test_marching(resolution: int, share: float, seed: int, away: float, power: 
     errors = march_errors(lattice_grid(resolution, share, seed, half), origins * half, directions, fine=fine)
     for name, bound in BOUNDS.items():
         assert errors[name] <= bound, (name, errors[name])
-
-
-@pytest.mark.parametrize("fault", ["lost", "doubled"])
-def test_lost_and_doubled_samples_are_noticed(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = march
-
-    def faulty(*arguments: object, **options: object) -> Samples:
-        samples = plain(*arguments, **options)  # type: ignore[arg-type]
-        number = torch.arange(len(samples))
-        if fault == "lost":
-            return samples.keep(number % 97 != 0)
-        twice = number.repeat_interleave(1 + (number % 97 == 0).long())
-        return Samples(*(getattr(samples, field.name)[twice] for field in fields(samples)))
-
-    monkeypatch.setitem(globals(), "march", faulty)
-    errors = march_errors(lattice_grid(64, 1.0), *random_rays(60, 3))
-    assert errors["gap or overlap between samples, in steps"] > SPLIT
