@@ -1,4 +1,4 @@
-"""kill -9 at random moments of a small real run, again and again: `python -m tests.stability.kills --kills 50`.
+"""kill -9 at random moments of a small real run, again and again: `python -m tests.stability kills`.
 
 Half of the moments are drawn in time, half among the changes that the run makes to files, where a kill can do the most harm. After each
 kill no file may be damaged; a run that is let go on must end with the same files as one that was never killed. The last third of the kills
@@ -7,18 +7,15 @@ meets runs that start from the networks.
 
 from __future__ import annotations
 
-import argparse
 import random
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.pipelines.made import environment
-from tests.stability.page import replace_part
 from tests.stability.runs import NETWORK, ROOT, command, corrupt, differences, launch, leftovers, make_source
 
 EACH = 5  # kills before a run is left alone
@@ -110,21 +107,8 @@ def killed_after(seconds: float, source: Path, out: Path, *more: str) -> int:
         return process.wait()
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(prog="kills")
-    parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--page", type=Path)
-    chosen = parser.parse_args()
+def survey(kills: int, seed: int) -> tuple[list[str], list[str]]:
+    """What was wrong, and lines for the page."""
     with tempfile.TemporaryDirectory(prefix="fieldfuse-kills-") as folder:
-        survey = kill_runs(Path(folder), chosen.kills, chosen.seed)
-    for text in survey.wrong:
-        sys.stdout.write(text + "\n")
-    sys.stdout.write("\n".join(survey.lines()) + f"\n{survey.late} moments came too late\n")
-    if chosen.page is not None:
-        replace_part(chosen.page, "kills", survey.lines())
-    return 1 if survey.wrong else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        found = kill_runs(Path(folder), kills, seed)
+    return found.wrong, found.lines()

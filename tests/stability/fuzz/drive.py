@@ -67,6 +67,16 @@ def fuzz(inputs: int, seed: int, jobs: int = 1, only: list[str] | None = None, t
     return result
 
 
+def survey(inputs: int, seed: int, jobs: int, only: list[str]) -> tuple[list[str], list[str]]:
+    """What was wrong as lines of JSON, and lines for the page."""
+
+    def told(result: Result) -> None:
+        sys.stderr.write(f"{result.inputs} inputs, {len(result.problems)} problems\n")
+
+    result = fuzz(inputs, seed, jobs, only, told)
+    return [json.dumps(problem) for problem in result.problems], result.lines()
+
+
 def _one_range(folder: Path, seed: int, first: int, count: int, only: list[str], result: Result, told: Told | None) -> None:
     stop = first + count
     while first < stop:

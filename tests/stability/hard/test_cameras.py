@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +24,6 @@ from fieldfuse.camera import (
     undistort_maps,
     unproject,
 )
-from fieldfuse.capture.poses import checked_pose
 from fieldfuse.capture.types import Capture, Frame, Views
 from fieldfuse.errors import InputError, PoseError
 from fieldfuse.evaluation.baseline import nearest_training
@@ -254,26 +252,6 @@ def test_intersections(within: Within) -> None:
     within("rays that meet", absolute(points, np.array([[0.1, 0.2, 0.3]])), 1e-9)
     nothing = intersect(meeting, np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0))
     within("points of no rays", float(sum(len(values) for values in nothing)), 0.0)
-
-
-def test_not_rigid(within: Within) -> None:
-    """Poses that are not rigid."""
-    good = look_at(np.array([[1.0, 2, 3]]), np.zeros(3), UP)[0]
-    bad = {"zeros": np.zeros((4, 4)), "mirrored": good @ np.diag([1.0, 1, -1, 1]), "NaN": good * np.nan, "3×3": np.eye(3), "words": [["a"]]}
-    bad["infinite place"] = good + np.pad([[np.inf]], ((0, 3), (3, 0)))
-    bad["sheared by 2%"] = good @ np.diag([1.0, 1.02, 1, 1])
-    bad["scaled ×1e-200"] = good * 1e-200
-    for name, pose in bad.items():
-        within(f"taken: {name}", refused(partial(checked_pose, pose, "here"), InputError), 0.0)
-    noisy = good.copy()
-    noisy[:3, :3] += 1e-4 * np.random.default_rng(0).normal(size=(3, 3))
-    fixed = checked_pose(noisy, "here")
-    within("slightly off: made rigid", absolute(fixed[:3, :3] @ fixed[:3, :3].T, np.eye(3)), 1e-14)
-    within(
-        "cameras with a focal length of 0, NaN or -1 taken",
-        sum(refused(partial(replace(CAMERA, fx=f).checked, "here"), InputError) for f in (0.0, np.nan, -1.0, np.inf)),
-        0.0,
-    )
 
 
 @QUICK

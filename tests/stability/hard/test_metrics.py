@@ -12,12 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldfuse.camera import Array
-from fieldfuse.errors import InputError
 from fieldfuse.evaluation.depth import KEYS, depth_metrics
 from fieldfuse.evaluation.images import PSNR_CAP, psnr, ssim
-from fieldfuse.evaluation.perceptual import lpips
 from tests.stability.hard import reference
-from tests.stability.hard.errors import refused
 from tests.stability.hard.ranges import QUICK
 from tests.stability.hard.within import Within
 
@@ -71,25 +68,6 @@ def test_written_out(within: Within) -> None:
         assert got is not None and alike is not None
         within(f"{name}: PSNR, dB", abs(got - wanted), 1e-9)
         within(f"{name}: SSIM", abs(alike - reference.ssim(first.tolist(), second.tolist())), 1e-10)
-
-
-def test_nothing_to_compare(within: Within) -> None:
-    """Empty masks, single rows and columns, one pixel, nothing at all."""
-    a, b = pictures()["noise"], pictures()["grey"]
-    empty, full = np.zeros(SHAPE[:2], bool), np.ones(SHAPE[:2], bool)
-    one = empty.copy()
-    one[5, 7] = True
-    within("numbers for an empty mask", float(sum(f(a, b, empty) is not None for f in (psnr, ssim, lpips))), 0.0)
-    within("SSIM of one pixel", float(ssim(a, b, one) is not None), 0.0)
-    within("no PSNR of one pixel", float(psnr(a, b, one) is None), 0.0)
-    within("a full mask changes PSNR", abs((psnr(a, b, full) or 0) - (psnr(a, b) or 1)), 0.0)
-    within("a mask of another size taken", refused(lambda: psnr(a, b, full[:-1]), InputError), 0.0)
-    within("pictures of two sizes taken", refused(lambda: ssim(a, b[:-1]), InputError), 0.0)
-    for shape in ((1, 32, 3), (24, 1, 3), (1, 1, 3), (10, 40, 3)):
-        first, second = np.zeros(shape), np.full(shape, 0.25)
-        within(f"{shape[1]}×{shape[0]}: PSNR, dB", abs((psnr(first, second) or 0) - 12.041199826559248), 1e-9)
-        within(f"{shape[1]}×{shape[0]}: SSIM given", float(ssim(first, second) is not None), 0.0)
-    within("numbers for pictures without pixels", float(psnr(np.zeros((0, 5, 3)), np.zeros((0, 5, 3))) is not None), 0.0)
 
 
 def test_depths(within: Within) -> None:
