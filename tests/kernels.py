@@ -5,23 +5,18 @@ from __future__ import annotations
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
+from fieldfuse.stereo import fast_mvs
+from fieldfuse.training import numba_warm
+
 
 def fits() -> None:
-    from fieldfuse.training import numba_warm
-
     for decoder in ("deferred", "per_sample"):
         numba_warm.run(decoder, 16, 16)
 
 
-def matching() -> None:
-    from fieldfuse.stereo import quick
-
-    quick.warm_up()
-
-
 def main() -> None:
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        for done in [pool.submit(fits), pool.submit(matching)]:
+        for done in [pool.submit(fits), pool.submit(fast_mvs.warm_up)]:
             done.result()
 
 
