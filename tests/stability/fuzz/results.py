@@ -27,6 +27,7 @@ MEASURED = (
     "report.json",
     "few_views.json",
 )
+KEPT = (("scores", "score"), ("geometry", "geometry"))  # a part of what a comparison has, and its name in each method
 PAGE_EVERY = 25  # the whole page takes a hundred times as long as its numbers
 
 
@@ -124,7 +125,7 @@ def make_measured(root: Path) -> None:
     rows = ladder()
     tradeoff = tradeoff_data({**measured, "rows": rows, "unit": "m"})
     whole = {**made(), **measured, "matching": None}
-    scored = {key: {part["key"]: part.get(of) for part in whole["methods"]} for key, of in (("scores", "score"), ("geometry", "geometry"))}
+    scored = {name: {part["key"]: part[of] for part in whole["methods"] if of in part} for name, of in KEPT}
     choice = {"image_size": 240, "fit_seconds": 12.5, "resolution": 256, "video_frames": 9, "effects": True}
     told = {"asked_seconds": 60, "predicted_seconds": 58.0, "real_seconds": 63.0, "stages": {"effects": {"real": 5.0}}, "choice": choice}
     suite = next(iter(SUITES.values()))
