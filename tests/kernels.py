@@ -5,13 +5,15 @@ from __future__ import annotations
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
+from fieldfuse.config import load_settings
+from fieldfuse.progress import SILENT
 from fieldfuse.stereo import fast_mvs
-from fieldfuse.training import numba_warm
+from fieldfuse.training.engine import warm_up
 
 
 def fits() -> None:
     for decoder in ("deferred", "per_sample"):
-        numba_warm.run(decoder, 16, 16)
+        warm_up(load_settings(pairs=["device=cpu", f"field.decoder={decoder}"]), SILENT)
 
 
 def main() -> None:

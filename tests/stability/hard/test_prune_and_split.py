@@ -10,7 +10,8 @@ import torch
 from fieldfuse.errors import InputError
 from fieldfuse.render.field import Field, density
 from fieldfuse.render.rays import render_rays
-from fieldfuse.training.step import Optimiser, Rates
+from fieldfuse.training.losses import Rates
+from fieldfuse.training.torch_engine import TorchEngine
 from fieldfuse.volume.edit import erase_empty_blocks, split
 from tests.stability.hard.errors import absolute, not_finite, refused
 from tests.stability.hard.fields import aimed_rays, small_field
@@ -27,7 +28,7 @@ def test_pictures_agree(within: Within) -> None:
     field = replace(small_field(2), fine=16)
     origins, directions = aimed_rays(300, 3)
     before = render_rays(field, origins, directions)
-    settled = render_rays(field.settled(), origins, directions)
+    settled = render_rays(field.packed()(), origins, directions)
     topology, occupied, (raw, features) = split(field.topology, field.occupied, [field.density_rows, field.feature_rows])
     finer = Field(field.space, 64, topology, occupied, raw, features, field.decoder, field.background, field.near, field.fine // 2)
     after = render_rays(finer, origins, directions)
@@ -79,26 +80,28 @@ def test_extreme_file(within: Within, tmp_path: Path) -> None:
 def test_optimiser_state(within: Within) -> None:
     """The optimiser's state survives pruning, and starts afresh at a split."""
     from fieldfuse.training.levels import finer, pruned
-    from fieldfuse.training.rays import Batch
+    from fieldfuse.training.pixels import Batch, PixelPool
     from fieldfuse.volume.host import TorchHost
+    from tests.training.gradients import made_views
 
     field = small_field(3, 0.4)
     origins, directions = aimed_rays(200, 2)
     batch = Batch(origins, directions, torch.rand(200, 3), torch.zeros(200, dtype=torch.int64))
     rates, generator = Rates(0.05, 0.02, 1e-3, 0.01), torch.Generator().manual_seed(0)
-    optimiser = Optimiser(replace(field, density_rows=field.density_rows.clone(), feature_rows=field.feature_rows.clone()))
+    copied = replace(field, density_rows=field.density_rows.clone(), feature_rows=field.feature_rows.clone())
+    optimiser = TorchEngine(copied, PixelPool(made_views()))
     for _ in range(3):
-        optimiser.step(batch, rates, generator)
+        optimiser.step_on(batch, rates, torch.rand(200, generator=generator))
     before = [optimiser.density.state.clone(), optimiser.feature.state.clone(), optimiser.field.density_rows.clone()]
     keep = torch.rand(len(field.occupied), generator=generator) < 0.5
     optimiser.go_on_with(pruned(optimiser.field, keep))
     after = [optimiser.density.state, optimiser.feature.state, optimiser.field.density_rows]
     lost = sum(absolute(new, old) for new, old in zip(after, before, strict=True))
-    optimiser.step(batch, rates, generator)
+    optimiser.step_on(batch, rates, torch.rand(200, generator=generator))
     grown = finer(optimiser.field, optimiser.field.occupied, 2 * field.resolution, TorchHost())
     optimiser.renew_rows(grown)
     fresh = float(optimiser.density.state.abs().sum() + optimiser.feature.state.abs().sum())
-    optimiser.step(batch, rates, generator)
+    optimiser.step_on(batch, rates, torch.rand(200, generator=generator))
     states = optimiser.decoder.state.values()
     decoder = [state[name] for state in states for name in ("exp_avg", "exp_avg_sq")]
     forgotten = min(int(state["step"]) for state in states) < 5 or not all(bool(value.any()) for value in decoder)
