@@ -306,11 +306,13 @@ FAULTS = (
         "steps not made again for other settings",
         "dropped guard",
         ("(trusted or (record.key == key and not record.stopped))", "(trusted or not record.stopped)"),
+        ("return trusted or (record.key == key and not record.stopped)", "return trusted or not record.stopped"),
     ),
     fault(
         "damaged results of a step reused",
         "dropped guard",
         ("if not path.is_file() or path.stat().st_size != size:", "if not path.is_file():"),
+        ("all(path.is_file() and path.stat().st_size == size for", "all(path.is_file() for"),
     ),
     fault("a run written over its own source", "dropped guard", ("if source.resolve() == out.resolve():", "if False:")),
     fault(
@@ -318,7 +320,12 @@ FAULTS = (
         "wrong comparison",
         ("if before.resolve() == source.resolve():", "if before.resolve() != source.resolve():"),
     ),
-    fault("somebody's files in the run's folder", "dropped guard", ("foreign = self._results()", "foreign: list[str] = []")),
+    fault(
+        "somebody's files in the run's folder",
+        "dropped guard",
+        ("foreign = self._results()", "foreign: list[str] = []"),
+        ("if not self._held_run and (foreign := self._results()):", "if (foreign := self._results()) == [None]:"),
+    ),
     fault(
         "renders of the wrong size",
         "wrong comparison",
