@@ -117,12 +117,12 @@ class Inference:
         Raises:
             Interrupted: the user asked to stop.
         """
-        measured, precision = self.measured, self.settings.precision
-        options = FusionOptions(self.settings.levels, self.near, self.far, measured=measured, precision=precision)
+        own = self.settings
+        options = FusionOptions(own.levels, self.near, self.far, measured=self.measured, precision=own.precision, empty=self.hull)
         # Things without texture that stand before nothing lead all sweeps astray in the same way; the hull is the better guide.
-        agree = self.settings.agreement and self.hull is None and (self.near > 0 or math.isfinite(self.far))
-        witnesses = overlapping(self.keys, self.train.world_from_camera, self.train.intrinsics, self.median_depth) if agree else None
-        for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress, self.hull, witnesses):
+        agree = own.agreement and self.hull is None and (self.near > 0 or math.isfinite(self.far))
+        others = overlapping(self.keys, self.train.world_from_camera, self.train.intrinsics, self.median_depth) if agree else None
+        for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress, others):
             self._latest = fused
             self.seconds += fused.seconds
             self.fusion_seconds += fused.seconds
