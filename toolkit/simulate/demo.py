@@ -258,15 +258,15 @@ def write_demo_video(
     width, height = size
     intrinsics = Intrinsics(width, height, 0.85 * width, 0.85 * width, width / 2, height / 2)
     poses = hand_held(frames, seed)
-    with drawing() as side_by_side, atomic_path(path) as temporary:
-        scene = demo_scene(seed)
+    scene = demo_scene(seed)
+    with atomic_path(path) as temporary, drawing(lambda pose: scene.picture(intrinsics, pose), poses) as images:
         writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_A_SECOND, (width, height))
         if not writer.isOpened():
             raise OutputError(f"cannot write {path}: OpenCV has no mp4 encoder or the folder is not writable; see `fieldfuse doctor`")
         try:
-            for number, picture in enumerate(side_by_side(lambda pose: scene.picture(intrinsics, pose), poses)):
+            for number, image in enumerate(images):
                 progress.check()
-                writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+                writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
                 progress.update(number + 1, frames)
         finally:
             writer.release()

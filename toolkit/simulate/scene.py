@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import torch
 
 from fieldfuse.camera import Array, Intrinsics
-from fieldfuse.effects.models import encode_srgb
 from fieldfuse.effects.scenery import Background, Highlights
 from fieldfuse.simulate.cast import cast
-from fieldfuse.simulate.eye import Rays, Seen, eye_of, take
+from fieldfuse.simulate.eye import Picture, Rays, Seen, eye_of, take
 from fieldfuse.simulate.materials import Materials, TextureBank
 from fieldfuse.simulate.solids import ROOM, Mesh, Solids, tessellate
 
@@ -27,15 +26,6 @@ class Lamp:
     position: tuple[float, float, float]
     colour: tuple[float, float, float]  # linear irradiance on a surface that faces it, at `reach`
     reach: float | None = 2.0  # metres; None: as strong everywhere (the sun; put it far away)
-
-
-@dataclass(frozen=True)
-class Rendered:
-    """One image with its truth."""
-
-    rgb: Tensor  # (H, W, 3) float32 sRGB in [0, 1]
-    depth: Tensor  # (H, W) float32 metres along z at pixel centres, 0 where nothing is hit
-    normals: Tensor  # (H, W, 3) float32 unit, world axes, towards the camera; 0 where nothing is hit
 
 
 @dataclass
@@ -78,15 +68,14 @@ class Scene:
         """All solids as triangles, also the parts that lie hidden inside or below others."""
         return tessellate(self.solids.items)
 
-    def render(self, intrinsics: Intrinsics, world_from_camera: Array, side: int = EDGE_SIDE) -> Rendered:
+    def render(self, intrinsics: Intrinsics, world_from_camera: Array, side: int = EDGE_SIDE) -> Picture:
         """A camera's image, depth and normals, through its lens.
 
         Args:
             world_from_camera: (4, 4).
             side: pixels that hold an edge are the mean of side × side rays; 1: one ray a pixel everywhere.
         """
-        picture = take(self, eye_of(intrinsics, side, self.device), world_from_camera[None])
-        return Rendered(encode_srgb(picture.linear), picture.depth, picture.normals)
+        return take(self, eye_of(intrinsics, side, self.device), world_from_camera[None])
 
     def see(self, beam: Rays) -> Seen:
         """What rays see: light, distance, normals and material, one row a ray."""
