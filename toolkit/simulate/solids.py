@@ -76,10 +76,11 @@ class Solids:
         ends = np.cumsum([sum(solid.kind == kind for solid in self.items) for kind in KINDS]).tolist()
         self.ranges = dict(zip(KINDS, pairwise([0, *ends]), strict=True))  # kind → first and past-the-last number
         half = np.array([np.maximum(solid.half, THINNEST) for solid in self.items]).reshape(-1, 3)
-        # Of a sphere around each: a ball's is its largest half size, and a room is met by every ray.
+        # Of a sphere around each, a little more: a ball's is its largest half size, and a room is met by every ray.
         balls, rooms = slice(*self.ranges[BALL]), slice(*self.ranges[ROOM])
-        radius = 1.001 * np.linalg.norm(half, axis=1)
-        radius[balls], radius[rooms] = 1.001 * half[balls].max(axis=1, initial=0), np.inf
+        radius = np.linalg.norm(half, axis=1)
+        radius[balls], radius[rooms] = half[balls].max(axis=1, initial=0), np.inf
+        radius = 1.001 * radius + 1e-4
 
         def stack(rows: object, *shape: int) -> Tensor:
             return torch.tensor(np.array(rows, dtype=np.float32).reshape(-1, *shape), device=device)
