@@ -15,8 +15,7 @@ import torch
 from fieldfuse.camera import Array, Intrinsics, pixel_grid
 from fieldfuse.effects.models import Distortion, encode_srgb
 from fieldfuse.effects.scenery import Background, Highlights
-from fieldfuse.simulate.cast import FAR
-from fieldfuse.simulate.solids import Mesh
+from fieldfuse.simulate.solids import FAR, Mesh
 
 Tensor = torch.Tensor
 

@@ -8,7 +8,6 @@ import torch
 
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.effects.scenery import Background, Highlights
-from fieldfuse.simulate.cast import cast
 from fieldfuse.simulate.eye import Picture, Rays, Seen, eye_of, take
 from fieldfuse.simulate.materials import Materials, TextureBank
 from fieldfuse.simulate.solids import ROOM, Mesh, Solids, tessellate
@@ -80,7 +79,7 @@ class Scene:
     def see(self, beam: Rays) -> Seen:
         """What rays see: light, distance, normals and material, one row a ray."""
         origins, directions = beam.origins, beam.directions
-        distance, solid = cast(self.solids, origins, directions)
+        distance, solid = self.solids.cast(origins, directions)
         hit = (solid >= 0).nonzero()[:, 0]
         every = len(hit) == len(solid)
 
@@ -140,7 +139,7 @@ class Scene:
             light = light * (2 * lamp.reach**2 / (lamp.reach**2 + distance.square()))
         lit = (facing > 0).nonzero()[:, 0]
         # From the lamp to the points: all rays start at one place, and neighbours stay neighbours.
-        reached, _ = cast(self.solids, position, -to_lamp[lit])
+        reached, _ = self.solids.cast(position, -to_lamp[lit])
         blocked = reached < distance[lit] * (1 - 1e-3) - 2e-3
         shadow = torch.zeros(len(points), dtype=torch.int64, device=self.device)
         shadow[lit] = blocked.long()
