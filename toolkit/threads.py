@@ -8,7 +8,7 @@ done with one.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import count, pairwise
 from typing import TypeVar
@@ -53,7 +53,7 @@ def share(work: Callable[[T], R], pieces: Sequence[T], threads: int) -> list[R]:
     return [results[turn] for turn in range(len(pieces))]
 
 
-def in_order(work: Callable[[T], R], pieces: Iterable[T], threads: int) -> Iterator[R]:
+def in_order(work: Callable[[T], R], pieces: Iterable[T], threads: int) -> Generator[R, None, None]:
     """`work` of each piece on so many threads, in their order; no more are begun than the threads need. What is left ends with the
     iterator: close it."""
     with ThreadPoolExecutor(threads) as pool:
