@@ -60,8 +60,8 @@ def pooled_in_torch(topology: Topology, occupied: Tensor, width: int) -> Tensor:
 
 
 def _with_reached_blocks(topology: Topology, occupied: Tensor, lowest: int) -> Topology:
-    """These blocks, then the absent ones that hold a row one step (from `lowest` to +1 along each axis) beside an occupied row, in the order
-    of the table. The device is read once."""
+    """These blocks, then the absent ones that hold a row one step (from `lowest` to +1 along each axis) beside an occupied row, in the
+    order of the table. The device is read once."""
     (sx, sy, sz), nowhere = topology.table_size, topology.table.numel()  # one more cell takes what is not reached
     # (M, 3, 3, 3) steps: whether a row of a block lies at its low end, anywhere, or at its high end along each axis.
     reaches = occupied.view(-1, BLOCK, BLOCK, BLOCK)
