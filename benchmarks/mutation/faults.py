@@ -163,6 +163,7 @@ FAULTS = (
     fault(
         "reset gate left out",
         "skipped step",
+        ("self.candidate(_beside(r * h, v)", "self.candidate(_beside(h, v)"),
         ("self.candidate(_beside(r * state, local)", "self.candidate(_beside(state, local)"),
     ),
     fault(
@@ -173,6 +174,7 @@ FAULTS = (
     fault(
         "key frames chosen when both are low",
         "wrong comparison",
+        ("(angle[i, chosen] > MIN_PARALLAX) | (common", "(angle[i, chosen] > MIN_PARALLAX) & (common"),
         ("np.all((angle > min_parallax) | (common < max_overlap))", "np.all((angle > min_parallax) & (common < max_overlap))"),
     ),
     fault(
@@ -183,9 +185,15 @@ FAULTS = (
     fault(
         "opacity loss pulls to zero",
         "wrong sign",
+        ("torch.where(rays.solid, (1 - traced.opacity).square(), 0.0)", "torch.where(rays.solid, traced.opacity.square(), 0.0)"),
         ("torch.where(solid, (1 - traced.opacity).square(), 0.0)", "torch.where(solid, traced.opacity.square(), 0.0)"),
     ),
-    fault("warm-up off by one", "off by one", ("return asked.rate * (step + 1) / asked.warmup", "return asked.rate * step / asked.warmup")),
+    fault(
+        "warm-up off by one",
+        "off by one",
+        ("return wanted.rate * (step + 1) / wanted.warmup", "return wanted.rate * step / wanted.warmup"),
+        ("return asked.rate * (step + 1) / asked.warmup", "return asked.rate * step / asked.warmup"),
+    ),
     fault("DTU's volumes in millimetres", "wrong unit", ("MILLIMETRES = 1 / 200", "MILLIMETRES = 1 / 1000")),
     fault(
         "rays through pixel corners",
