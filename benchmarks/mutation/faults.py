@@ -233,7 +233,7 @@ FAULTS = (
     fault(
         "numba: weight of thin samples",
         "wrong sign",
-        ("weight = transmittance * tau * (ONE - tau * HALF * (ONE", "weight = transmittance * tau * (ONE + tau * HALF * (ONE"),
+        ("tau * (ONE - tau * HALF * (ONE - tau * THIRD))", "tau * (ONE + tau * HALF * (ONE - tau * THIRD))"),
         ("return before * tau * (ONE - tau * HALF * (ONE", "return before * tau * (ONE + tau * HALF * (ONE"),
     ),
     fault(
