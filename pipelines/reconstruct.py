@@ -52,7 +52,7 @@ def run_job(
 
 def stand(job: Job) -> tuple[Capture, PoseResult, Capture, Scene, Views]:
     """What every result stands on: capture, poses, the posed capture (as far as it takes part), the scene, and the views made ready."""
-    from fieldfuse.capture.subset import limited
+    from fieldfuse.capture.prepare import limited
 
     capture = find_capture(job)
     if job.plan is not None:

@@ -194,7 +194,7 @@ def choose_keyframes(job: Job, scene: Scene, views: Views) -> KeyFrames:
 
 def make_views(job: Job, posed: Capture, scene: Scene, corrections: Corrections | None = None) -> Views:
     """Pictures undistorted and resized once, in the working frame, test views marked, with `corrections` of colour."""
-    from fieldfuse.capture.views_file import load_views, save_views
+    from fieldfuse.capture.storage import load_views, save_views
 
     path = job.folder / "views.safetensors"
 

@@ -53,7 +53,8 @@ def picture_size(capture: Capture) -> tuple[int | None, int | None]:
         return first.intrinsics.width, first.intrinsics.height
     if capture.kind == "video":
         return capture.extra.get("width"), capture.extra.get("height")
-    from fieldfuse.capture.headers import read_bytes, read_header
+    from fieldfuse.capture.archive import read_bytes
+    from fieldfuse.capture.headers import read_header
 
     header = read_header(read_bytes(first.image), first.image)
     turned = header.orientation >= 5  # EXIF: the stored picture lies on its side
@@ -119,9 +120,8 @@ def put_cameras(
         points, colours: (P, 3) of a surface in the input's frame, for poses that came without points: programs that start from points
             need some.
     """
-    from fieldfuse.capture.convert import all_converted
+    from fieldfuse.capture.convert import all_converted, stored_cameras
     from fieldfuse.capture.select import SELECTED
-    from fieldfuse.capture.stored import stored_cameras
     from fieldfuse.export.cameras import write_cameras
 
     made_here = SELECTED in posed.extra or all_converted(posed)  # then the pictures lie in the run's folder

@@ -12,9 +12,9 @@ from PIL import Image
 
 from fieldfuse.camera import Array
 from fieldfuse.capture import Capture, open_capture
-from fieldfuse.capture.beside import unused
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.duplicates import copies
+from fieldfuse.capture.photos import unused
 from fieldfuse.errors import InputError
 from tests.capture.films import film, quarters
 from tests.capture.layouts import write_colmap_bin, write_transforms

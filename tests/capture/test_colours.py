@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 from PIL import Image, ImageCms
 
 from fieldfuse.camera import Array
-from fieldfuse.capture.colours import MOST_BYTES, SAME, to_srgb
-from fieldfuse.capture.convert import write_picture
+from fieldfuse.capture.colours import MOST_BYTES, SAME, png_colours, profile_of, to_srgb
+from fieldfuse.capture.convert import write_image
 from fieldfuse.capture.images import load_image, load_mask
-from fieldfuse.capture.primaries import png_colours, profile_of
 from fieldfuse.capture.types import Frame
 from tests.capture.board import texture
 
@@ -157,7 +156,7 @@ def test_a_heif_photo_is_read_and_converted_as_srgb(tmp_path: Path) -> None:
     wanted = expected(picture, P3)
     inner = np.abs(wanted - picture).max(axis=2) > 0
     inner[:, 40:56] = False  # codecs blur an edge
-    written = write_picture(path, tmp_path / "written")
+    written = write_image(path, tmp_path / "written")
     with Image.open(written) as jpeg:
         assert jpeg.info.get("icc_profile") is None
     for got in (load_image(Frame("a", path)), load_image(Frame("a", written))):

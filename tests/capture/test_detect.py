@@ -11,11 +11,11 @@ import pytest
 
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture import open_capture
+from fieldfuse.capture.calibration import fitted
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.detect import READERS, detect_kind
 from fieldfuse.capture.images import load_image
 from fieldfuse.capture.listing import natural_key, unique_names
-from fieldfuse.capture.sizes import fitted
 from fieldfuse.errors import InputError
 from tests.capture.films import film
 from tests.capture.layouts import (

@@ -15,7 +15,7 @@ from PIL import Image
 from fieldfuse.camera import Array
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.checks import check_capture
-from fieldfuse.capture.convert import CONVERTED, all_converted, convert_pictures, to_convert
+from fieldfuse.capture.convert import CONVERTED, all_converted, convert_images, to_convert
 from fieldfuse.capture.headers import read_header
 from fieldfuse.capture.images import load_image
 from fieldfuse.capture.types import Frame
@@ -168,7 +168,7 @@ def test_pictures_are_written_as_jpeg_and_the_others_stay(tmp_path: Path) -> Non
     Image.fromarray(smooth(7)).save(source / "z.jpg", quality=95)
     heic(source / "with_alpha.heic", np.dstack([smooth(8), np.full((90, 120), 128, np.uint8)]))
     capture = open_capture(source)
-    got = convert_pictures(capture, tmp_path / "run", 2)
+    got = convert_images(capture, tmp_path / "run", 2)
     assert [frame.name for frame in got.frames] == [frame.name for frame in capture.frames]
     assert [frame.focal_prior for frame in got.frames] == [frame.focal_prior for frame in capture.frames]
     assert got.extra[CONVERTED] == 7 and got.extra["sizes"] == {"120x90": 8}
@@ -186,15 +186,15 @@ def test_a_stopped_conversion_goes_on_and_a_changed_photo_is_converted_again(tmp
     source, run = folder(tmp_path / "photos"), tmp_path / "run"
     capture = open_capture(source)
     with pytest.raises(Interrupted):
-        convert_pictures(capture, run, 1, StopsAt(3))
+        convert_images(capture, run, 1, StopsAt(3))
     first = {path.name: path.stat().st_mtime_ns for path in (run / "frames").glob("*.jpg")}
     assert len(first) == 3 and not list((run / "frames").glob(".*"))
     heic(source / "IMG_0001.HEIC", smooth(20))
-    got = convert_pictures(open_capture(source), run, 2)
+    got = convert_images(open_capture(source), run, 2)
     assert len(got.frames) == 6
     for name, written in first.items():
         assert (written == (run / "frames" / name).stat().st_mtime_ns) == (name != "IMG_0001.jpg")
     assert close(load_image(got.frames[1]), smooth(20))
     (run / "frames" / "converted.json").write_text("[1, 2")
-    again = convert_pictures(open_capture(source), run, 2)
+    again = convert_images(open_capture(source), run, 2)
     assert close(load_image(again.frames[1]), smooth(20))

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldfuse.camera import FISHEYE, OPENCV, Intrinsics, Similarity, undistort_maps
-from fieldfuse.capture.prepare import held_out, pictures_at, prepare_views, target_size
+from fieldfuse.capture.prepare import held_out, images_at, prepare_views, target_size
 from fieldfuse.capture.types import Frame, Views
 from fieldfuse.config import CaptureSettings
 from fieldfuse.errors import InputError, Interrupted
@@ -57,11 +57,11 @@ def test_pictures_in_another_size_are_those_that_views_of_it_have(tmp_path: Path
     frames = [posed(save(tmp_path / f"{name}.png", photograph(camera)), camera) for name, camera in (("a", PLAIN), ("b", BARREL))]
     capture = capture_of(tmp_path, frames)
     views = prepare_views(capture, SAME, CaptureSettings(image_size=size))
-    for index, (camera, picture) in zip((1, 0), pictures_at(capture, [1, 0], size), strict=True):
+    for index, (camera, picture) in zip((1, 0), images_at(capture, [1, 0], size), strict=True):
         assert camera == views.intrinsics[index]
         np.testing.assert_array_equal(picture, views.images[index])
     with pytest.raises(InputError, match="no intrinsics; find poses first"):
-        next(pictures_at(capture_of(tmp_path, [replace(frames[0], intrinsics=None)]), [0], size))
+        next(images_at(capture_of(tmp_path, [replace(frames[0], intrinsics=None)]), [0], size))
 
 
 def test_a_lens_is_removed_exactly_once(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from PIL import Image
 
 from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, invert, pixel_grid, project
 from fieldfuse.capture import Capture, open_capture
-from fieldfuse.capture.convert import CONVERTED, convert_pictures, to_convert
+from fieldfuse.capture.convert import CONVERTED, convert_images, to_convert
 from fieldfuse.capture.headers import orientation_of
 from fieldfuse.capture.images import load_image, upright
 from fieldfuse.pipelines.summary import put_cameras
@@ -106,7 +106,7 @@ def test_mirrored_photos_are_written_upright_into_the_run(tmp_path: Path) -> Non
         photo(tmp_path / "photos" / f"{number}.png", number, seed=number)
     capture = open_capture(tmp_path / "photos")
     assert to_convert(capture) == [0, 1, 2, 3]
-    turned = convert_pictures(capture, tmp_path / "run", 1)
+    turned = convert_images(capture, tmp_path / "run", 1)
     assert turned.extra[CONVERTED] == 4
     for before, after in zip(capture.frames, turned.frames, strict=True):
         assert after.image.parent == tmp_path / "run" / "frames"

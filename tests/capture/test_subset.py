@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldfuse.capture.prepare import held_out
-from fieldfuse.capture.subset import evenly, limited, sharpness
+from fieldfuse.capture.prepare import evenly, held_out, limited
+from fieldfuse.capture.select import sharpness
 from fieldfuse.capture.types import Capture, Frame
 
 

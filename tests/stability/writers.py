@@ -19,8 +19,8 @@ import numpy as np
 import torch
 
 from fieldfuse.camera import Intrinsics, Similarity
+from fieldfuse.capture.storage import save_views
 from fieldfuse.capture.types import Views
-from fieldfuse.capture.views_file import save_views
 from fieldfuse.errors import OutputError
 from fieldfuse.evaluation.report import write_report
 from fieldfuse.export.cameras import write_cameras

@@ -16,7 +16,7 @@ from PIL import Image
 
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture import open_capture
-from fieldfuse.capture.convert import convert_pictures
+from fieldfuse.capture.convert import convert_images
 from fieldfuse.capture.film import Film
 from fieldfuse.capture.photos import read_photos
 from fieldfuse.capture.select import select_frames
@@ -118,7 +118,7 @@ def more_writers(place: Path) -> dict[str, Write]:
         "select_frames, a scan": lambda folder: select_frames(scan, folder / f"scan{next(numbers)}", CaptureSettings(max_frames=4)),
         "Film.write_depth, a recording's": lambda folder: recording.write_depth(0, folder / "0.npy"),
         "Film.write_depth, a scan's": lambda folder: Film.of(scan).write_depth(0, folder / "0.png"),
-        "convert_pictures": lambda folder: convert_pictures(read_photos(photos), folder / f"photos{next(numbers)}", 2),
+        "convert_images": lambda folder: convert_images(read_photos(photos), folder / f"photos{next(numbers)}", 2),
         "RunFolder": run_folder,
     }  # fmt: skip
 

@@ -14,8 +14,8 @@ from functools import cached_property
 import numpy as np
 
 from fieldfuse.camera import Array, Intrinsics, distort
+from fieldfuse.capture.calibration import fitted
 from fieldfuse.capture.images import load_depth
-from fieldfuse.capture.sizes import fitted
 from fieldfuse.capture.types import Capture
 from fieldfuse.poses.points import undistorted
 from fieldfuse.progress import SILENT, Progress

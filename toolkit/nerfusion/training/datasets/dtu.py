@@ -15,9 +15,9 @@ import numpy as np
 
 from fieldfuse.camera import Array, Intrinsics, invert
 from fieldfuse.capture.calibration import from_matrix
+from fieldfuse.capture.headers import image_header
 from fieldfuse.capture.listing import assemble, natural_key, read_text, require_folder
 from fieldfuse.capture.poses import checked_pose
-from fieldfuse.capture.sizes import picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError, first_line
 from fieldfuse.nerfusion.training.captured import CapturedScene
@@ -91,7 +91,7 @@ def read_rectified(scene: DtuScene) -> Capture:
         if match is None or int(match[2]) != scene.light:
             continue
         view = int(match[1]) - 1
-        size = picture_header(picture).size
+        size = image_header(picture).size
         pose, matrix = read_camera(cameras / f"{view:08d}_cam.txt")
         intrinsics = _camera(matrix, size, f"{cameras / f'{view:08d}_cam.txt'}")
         depth = next((path for base in _either(scene, "Depths") if (path := base / f"depth_map_{view:04d}.pfm").is_file()), None)
@@ -102,7 +102,7 @@ def read_rectified(scene: DtuScene) -> Capture:
                 intrinsics=intrinsics,
                 world_from_camera=pose,
                 depth=depth,
-                depth_intrinsics=None if depth is None else _depth_camera(intrinsics, picture_header(depth).size, str(depth)),
+                depth_intrinsics=None if depth is None else _depth_camera(intrinsics, image_header(depth).size, str(depth)),
             )
         )
     return assemble("dtu", folder, frames, depth_scale=1.0)

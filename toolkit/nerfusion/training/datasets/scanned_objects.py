@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from fieldfuse.capture.calibration import from_matrix
-from fieldfuse.capture.listing import assemble, files_in, pictures_in, read_matrix, require_folder, same_count
+from fieldfuse.capture.headers import image_header
+from fieldfuse.capture.listing import assemble, files_in, images_in, read_matrix, require_folder, same_count
 from fieldfuse.capture.poses import checked_pose
 from fieldfuse.capture.prepare import WHITE
-from fieldfuse.capture.sizes import picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 from fieldfuse.nerfusion.training.captured import CapturedScene
@@ -41,7 +41,7 @@ def read_scanned_object(folder: Path | str) -> Capture:
         InputError: pictures, poses and cameras differ in number, or one cannot be used.
     """
     root = require_folder(folder)
-    pictures = pictures_in(root / "rgb")
+    pictures = images_in(root / "rgb")
     same_count(len(pictures), len(files_in(root / "pose", "*.txt")), root)
     frames, alpha = [], 0
     for picture in pictures:
@@ -49,7 +49,7 @@ def read_scanned_object(folder: Path | str) -> Capture:
         for file in (pose, camera):
             if not file.is_file():
                 raise InputError(f"{picture} has no {file}; add it or remove the picture")
-        header = picture_header(picture)
+        header = image_header(picture)
         alpha += header.alpha
         matrix = read_matrix(camera, (4, 4), (3, 3))[:3, :3]
         frames.append(
