@@ -76,7 +76,7 @@ def test_missing_pictures_are_counted(tmp_path: Path) -> None:
     read_blender(tmp_path).frames[0].image.unlink()
     capture = read_blender(tmp_path)
     assert capture.extra == {"listed": 5, "missing": 1}
-    assert capture.warnings == ("1 of the 5 listed pictures do not exist; the other 4 are used",)
+    assert capture.warnings == ("1 of the 5 listed images do not exist; the other 4 are used",)
     for frame in capture.frames:
         frame.image.unlink()
     with pytest.raises(InputError, match="none of the 5 images"):

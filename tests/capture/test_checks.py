@@ -48,8 +48,8 @@ def refused(capture: Capture, text: str) -> None:
 
 
 def test_no_and_one_picture(tmp_path: Path) -> None:
-    refused(capture_of(tmp_path, [], kind="photos"), "no pictures")
-    refused(photos(tmp_path, scenery(1)), "only one picture")
+    refused(capture_of(tmp_path, [], kind="photos"), "no images")
+    refused(photos(tmp_path, scenery(1)), "only one image")
 
 
 def test_ten_identical_photos(tmp_path: Path) -> None:
@@ -143,14 +143,14 @@ def test_some_bad_pictures_are_told(tmp_path: Path) -> None:
     for index in (1, 9):
         pictures[index] = cv2.GaussianBlur(pictures[index], (0, 0), 5)
     text = warnings_of(photos(tmp_path, pictures))
-    assert "1 of 11 pictures show nothing but one colour (04)" in text
-    assert "1 picture is a copy of others (07.jpg of 06.jpg) and counts once" in text
-    assert "2 of 11 pictures are much less sharp" in text
+    assert "1 of 11 images show nothing but one colour (04)" in text
+    assert "1 image is a copy of others (07.jpg of 06.jpg) and counts once" in text
+    assert "2 of 11 images are much less sharp" in text
 
 
 def test_dark_and_overexposed_pictures_are_told(tmp_path: Path) -> None:
     dark = [(picture / 8).astype(np.uint8) for picture in scenery()]
-    assert "8 of 8 pictures are very dark" in warnings_of(photos(tmp_path / "dark", dark))
+    assert "8 of 8 images are very dark" in warnings_of(photos(tmp_path / "dark", dark))
     bright = [np.clip(picture.astype(int) * 4, 0, 255).astype(np.uint8) for picture in scenery()]
     assert "white in large parts" in warnings_of(photos(tmp_path / "bright", bright))
     assert "white" not in warnings_of(replace(photos(tmp_path / "object", bright), alpha=True))

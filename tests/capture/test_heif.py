@@ -27,7 +27,7 @@ pillow_heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not inst
 
 
 def heic(path: Path, picture: Array, orientation: int = 1, **options: object) -> Path:
-    """A HEIF file with `picture`, stored so that `orientation` turns it upright; encoded in haste, which on two busy cores is a fifth."""
+    """A HEIF file with `image`, stored so that `orientation` turns it upright; encoded in haste, which on two busy cores is a fifth."""
     pillow_heif.register_heif_opener()
     path.parent.mkdir(parents=True, exist_ok=True)
     tags = Image.Exif()
@@ -39,7 +39,7 @@ def heic(path: Path, picture: Array, orientation: int = 1, **options: object) ->
 
 
 def smooth(seed: int = 0, height: int = 90, width: int = 120) -> Array:
-    """A picture that codecs keep within a few levels."""
+    """A image that codecs keep within a few levels."""
     rough = texture(height, width, seed=seed).astype(np.float32)
     return np.asarray(np.clip(cv2.GaussianBlur(rough, (0, 0), 4) * 1.2, 0, 255), dtype=np.uint8)
 
@@ -99,7 +99,7 @@ def test_what_is_there_as_jpeg_too_is_used_once(tmp_path: Path) -> None:
         Image.fromarray(smooth(index)).save(tmp_path / f"IMG_{index:04d}.jpg")
     capture = open_capture(tmp_path)
     assert [frame.image.suffix for frame in capture.frames] == [".jpg", ".HEIC", ".jpg"]
-    assert any("2 pictures are there as HEIC and in another format" in warning for warning in capture.warnings)
+    assert any("2 images are there as HEIC and in another format" in warning for warning in capture.warnings)
 
 
 def test_the_small_copy_in_the_file_is_looked_at_where_there_is_one(tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_damage_anywhere_gives_a_picture_or_a_sentence(tmp_path: Path, data: st.
 def test_without_the_package_one_sentence_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder(tmp_path)
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    with pytest.raises(InputError, match=r"IMG_0000\.HEIC is a HEIF picture .* install pillow-heif|pip install pillow-heif"):
+    with pytest.raises(InputError, match=r"IMG_0000\.HEIC is a HEIF image .* install pillow-heif|pip install pillow-heif"):
         open_capture(tmp_path)
 
 

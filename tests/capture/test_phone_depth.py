@@ -57,7 +57,7 @@ def test_polycam_without_depth_or_camera(tmp_path: Path) -> None:
     capture = open_capture(tmp_path)
     assert [frame.name for frame in capture.frames] == ["100000", "100333", "100999", "101332"]
     assert [frame.depth is None for frame in capture.frames] == [False, True, False, False]
-    assert capture.frames[1].confidence is None and "1 of the 5 pictures" in capture.warnings[0]
+    assert capture.frames[1].confidence is None and "1 of the 5 images" in capture.warnings[0]
 
 
 @pytest.mark.parametrize(("key", "value"), [("t_12", None), ("fx", "wide"), ("width", 0.2), ("t_00", 7.0)])
@@ -149,7 +149,7 @@ def test_key_frames_alone_have_pictures_and_some_no_depth(tmp_path: Path) -> Non
     assert [frame.name for frame in capture.frames] == ["frame_00000", "frame_00004", "frame_00006", "frame_00008"]
     assert [frame.depth is None for frame in capture.frames] == [False, True, False, False]
     assert [frame.confidence is None for frame in capture.frames] == [False, True, True, False]
-    assert capture.warnings == ("1 of the 5 pictures have no .json beside them and are left out",)
+    assert capture.warnings == ("1 of the 5 images have no .json beside them and are left out",)
 
 
 def test_a_pose_that_is_written_column_by_column(tmp_path: Path) -> None:

@@ -127,7 +127,7 @@ def test_folders_of_pictures(tmp_path: Path, folder: str) -> None:
     (tmp_path / "color").rename(tmp_path / folder)
     assert len(open_capture(tmp_path).frames) == 5
     (tmp_path / folder).rename(tmp_path / "elsewhere")
-    with pytest.raises(InputError, match="no pictures in image/"):
+    with pytest.raises(InputError, match="no images in image/"):
         open_capture(tmp_path)
 
 
@@ -142,10 +142,10 @@ def test_depth_at_another_size_has_a_scaled_camera(tmp_path: Path) -> None:
 def test_numbers_that_do_not_match(tmp_path: Path) -> None:
     write_redwood(tmp_path)
     (tmp_path / "depth/00004.png").unlink()
-    with pytest.raises(InputError, match="5 pictures but 4 depth pictures"):
+    with pytest.raises(InputError, match="5 images but 4 depth images"):
         open_capture(tmp_path)
     save_picture(tmp_path / "color/00009.jpg", render(eyes()[0], OFF_CENTRE)[0])
-    with pytest.raises(InputError, match="6 pictures but 5 poses"):
+    with pytest.raises(InputError, match="6 images but 5 poses"):
         open_capture(tmp_path)
 
 
@@ -195,5 +195,5 @@ def test_a_principal_point_outside_the_picture(tmp_path: Path) -> None:
     write_redwood(tmp_path)
     camera = {"width": 80, "height": 60, "fx": 71, "fy": 73, "cx": 169, "cy": 110}
     (tmp_path / "camera_intrinsics.json").write_text(json.dumps(camera))
-    with pytest.raises(InputError, match=r"camera_intrinsics\.json.*outside the 80×60 picture"):
+    with pytest.raises(InputError, match=r"camera_intrinsics\.json.*outside the 80×60 image"):
         open_capture(tmp_path)

@@ -115,7 +115,7 @@ def test_bundlefusion_tells_its_cameras_in_a_file_of_its_own(tmp_path: Path) -> 
     [
         ("583 0 320", "583 320", "must hold 16 finite numbers"),
         ("583 0 320", "-583 0 320", "must be positive"),
-        ("583 0 320", "583 0 1320", "outside the 640×480 picture"),
+        ("583 0 320", "583 0 1320", "outside the 640×480 image"),
         ("m_colorWidth = 640", "m_colorWidth = wide", "must hold 1 finite number;"),
         ("m_colorWidth = 640", "m_colorWidth = 0", "is not usable"),
         ("m_depthShift = 2000", "m_depthShift = 0", "must be positive"),
@@ -138,7 +138,7 @@ def test_frames_without_depth_are_kept(tmp_path: Path) -> None:
 def test_pictures_and_poses_must_be_as_many(tmp_path: Path) -> None:
     write_seven_scenes(tmp_path)
     (tmp_path / "frame-000002.pose.txt").unlink()
-    with pytest.raises(InputError, match="5 pictures but 4 poses"):
+    with pytest.raises(InputError, match="5 images but 4 poses"):
         open_capture(tmp_path)
     (tmp_path / "frame-000009.pose.txt").write_text(rows(np.eye(4)))
     with pytest.raises(InputError, match=r"no pose file frame-000002\.pose\.txt"):

@@ -36,7 +36,7 @@ def photo(path: Path, orientation: int, seed: int = 0) -> Path:
 
 
 def camera_for(orientation: int, lens: str = PINHOLE) -> Intrinsics:
-    """Of the upright picture, with nothing in its middle and no two numbers alike."""
+    """Of the upright image, with nothing in its middle and no two numbers alike."""
     width, height = (HEIGHT, WIDTH) if orientation >= 5 else (WIDTH, HEIGHT)
     return Intrinsics(width, height, 61.0, 67.0, width / 2 + 3.5, height / 2 - 5.25, lens, LENSES[lens])
 
@@ -59,7 +59,7 @@ def found(capture: Capture, cameras: list[Intrinsics]) -> tuple[PoseResult, Capt
 
 
 def stored_places(orientation: int, places: Array) -> Array:
-    """(N, 2) pixels of the upright picture → where the file has them, by turning a picture of the pixels' own places."""
+    """(N, 2) pixels of the upright image → where the file has them, by turning a image of the pixels' own places."""
     grid = upright(pixel_grid(WIDTH, HEIGHT).reshape(HEIGHT, WIDTH, 2), orientation)
     shown = pixel_grid(grid.shape[1], grid.shape[0])
     way = np.linalg.lstsq(np.hstack([shown, np.ones((len(shown), 1))]), grid.reshape(-1, 2), rcond=None)[0]

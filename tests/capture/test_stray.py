@@ -34,7 +34,7 @@ def rewritten(root: Path, change) -> Path:
 
 
 def shown(capture: Capture) -> list[int]:
-    """Which of the true pictures each frame's is, by the difference."""
+    """Which of the true images each frame's is, by the difference."""
     true = [render(eye, PHONE)[0].astype(int) for eye in eyes()]
     return [int(np.argmin([np.abs(load_image(frame).astype(int) - picture).mean() for picture in true])) for frame in capture.frames]
 

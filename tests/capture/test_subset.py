@@ -1,4 +1,4 @@
-"""Fewer training pictures: evenly spread, and the held-out ones stay the same."""
+"""Fewer training images: evenly spread, and the held-out ones stay the same."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def test_without_depth(tmp_path: Path) -> None:
         ("rgb.txt", "soon rgb/a.png\n", "line 1"),
         ("rgb.txt", "1000.0\n", "line 1"),
         ("rgb.txt", "1000.0 ../../etc/passwd\n", "outside the capture folder"),
-        ("rgb.txt", "5.0 rgb/1000.000000.png\n", "none of the 1 picture"),
+        ("rgb.txt", "5.0 rgb/1000.000000.png\n", "none of the 1 image"),
         ("groundtruth.txt", "1000.0 0 0 0 0 0 0 0\n", "not a rotation"),
         ("groundtruth.txt", "1000.0 0 0 0 nan 0 0 1\n", "not a rotation"),
         ("groundtruth.txt", "1000.0 inf 0 0 0 0 0 1\n", "not finite"),
@@ -100,4 +100,4 @@ def test_depth_listed_outside_the_folder_is_not_read(tmp_path: Path) -> None:
     (tmp_path / "depth.txt").write_text("1000.0 /etc/passwd\n")
     capture = read_tum(tmp_path)
     assert not capture.has_depth
-    assert "1 listed depth picture not found" in capture.warnings
+    assert "1 listed depth image not found" in capture.warnings
