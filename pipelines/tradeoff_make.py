@@ -15,8 +15,8 @@ from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.config import Settings, TsdfSettings
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json
-from fieldfuse.pipelines.memory import PeakMemory, own_bytes
 from fieldfuse.pipelines.rendered import Picture, to_picture
+from fieldfuse.pipelines.stages import PeakMemory, own_bytes
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Capture, Views
@@ -111,8 +111,9 @@ class Cost:
 def make_field(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dict[str, Any]]:
     """Fit a field, then show it as it is kept (16-bit features) and in each of the variants."""
     from fieldfuse.render.field import Field
+    from fieldfuse.training.fit import Begin
     from fieldfuse.training.guided import fit_guided
-    from fieldfuse.volume.grid_host import host_for
+    from fieldfuse.volume.grid import host_for
 
     settings, wanted = ground.settings, spec["wanted"]
     settings.fit = replace(settings.fit, budget=float(wanted["iterations"]), patience=False)
@@ -122,7 +123,7 @@ def make_field(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[dict
     )
     path = scratch / "field.safetensors"
     with Cost(ground) as cost:
-        result = fit_guided(ground.chosen, ground.scene, settings, host=host_for(settings.device))
+        result = fit_guided(ground.chosen, ground.scene, settings, begin=Begin(host_for(settings.device)))
         cost.lap("fit")
         result.field.save(path, ground.scene.working_from_input)
         cost.lap("save")
@@ -266,7 +267,7 @@ def fuse(ground: Ground, method: str, settings: TsdfSettings) -> TsdfVolume:
         with_depth = [int(index) for index in ground.used if ground.posed.frames[int(index)].depth is not None]
         return fuse_capture(ground.posed, ground.scene.working_from_input, with_depth, settings, tones=ground.views.toned())
     from fieldfuse.stereo.maps import load_stereo
-    from fieldfuse.tsdf.stereo_frames import fuse_stereo
+    from fieldfuse.tsdf.fuse import fuse_stereo
 
     names, depths = load_stereo(ground.folder / "stereo" / "depths.safetensors")
     training = ground.views.subset(np.flatnonzero(~ground.views.test))

@@ -13,17 +13,16 @@ from safetensors.numpy import load_file
 
 from fieldfuse.camera import Array, Intrinsics, project
 from fieldfuse.capture.types import Views
-from fieldfuse.effects import passers
-from fieldfuse.effects.listed import parse
-from fieldfuse.effects.passers import EYES, PRESETS, Passers, Walk
+from fieldfuse.effects.effect_specs import STRENGTHS, parse, preset
+from fieldfuse.effects.scenery import EYES, Pedestrians, Walk
 from fieldfuse.simulate.eye import eye_of, take
-from fieldfuse.simulate.film import Film
+from fieldfuse.simulate.film import Film, FilmCamera
 from fieldfuse.simulate.materials import TextureBank, texture_bank
 from fieldfuse.simulate.mesh_scene import load_mesh_scene
 from fieldfuse.simulate.paths import PathSettings, plan
 from fieldfuse.simulate.people import Peopled, peopled
 from fieldfuse.simulate.procedural import random_scene
-from fieldfuse.stereo import moving
+from fieldfuse.stereo import transients
 from tests.simulate.test_film import CAMERA
 from tests.simulate.test_mesh_scene import wall
 from tests.simulate.test_simulate import made
@@ -38,7 +37,8 @@ def bank() -> TextureBank:
 
 def filmed(bank: TextureBank, *listing: object, camera: Intrinsics = CAMERA) -> Film:
     scene = random_scene("room", np.random.default_rng(4), bank)
-    return Film(scene, camera, plan(scene, PATH, np.random.default_rng(4)), PATH.times(), parse(list(listing), "test"), 4, True)
+    motion = plan(scene, PATH, np.random.default_rng(4))
+    return Film(scene, FilmCamera(camera, depth=True), motion, PATH.times(), parse(list(listing), "test"), 4)
 
 
 def around(mask: Array, pixels: int = 1) -> Array:
@@ -65,14 +65,14 @@ def test_people_are_where_the_mask_says(bank: TextureBank) -> None:
     assert 0.1 < np.mean(np.array(shares) > 0.01) < 0.9 and 0.05 < max(shares) < 0.7
 
 
-@pytest.mark.parametrize("strength", sorted(PRESETS))
+@pytest.mark.parametrize("strength", STRENGTHS)
 def test_so_much_of_the_time_somebody_is_in_the_picture(strength: str) -> None:
-    effect, times = PRESETS[strength], np.arange(0, 120, 0.5)
+    effect, times = preset("passers", strength), np.arange(0, 120, 0.5)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     poses[:, :3, :3] = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # ahead is +y, z is up
     poses[:, 2, 3] = EYES
     focus, wide = np.array([0.0, 4.0, 1.0]), 1.2
-    walks = passers.draw(effect, times, poses, focus, wide, 0.0, np.random.default_rng(0))
+    walks = effect.walks(times, poses, focus, wide, 0.0, np.random.default_rng(0))
     in_view = np.zeros(len(times), bool)
     for walk in walks:
         assert effect.near * 3.9 < walk.foot[1] < effect.far * 4.2 and walk.foot[2] == 0 and abs(walk.foot[0]) < 1e-9
@@ -83,14 +83,15 @@ def test_so_much_of_the_time_somebody_is_in_the_picture(strength: str) -> None:
             in_view[number] |= inside
             assert walk.near(float(seconds)) or not inside  # who is not near is never seen
     assert 0.4 * effect.share < in_view.mean() < 1.2 * effect.share
-    assert not passers.draw(Passers(share=0), times, poses, focus, wide, 0.0, np.random.default_rng(0))
+    assert not Pedestrians(share=0).walks(times, poses, focus, wide, 0.0, np.random.default_rng(0))
 
 
 def test_they_cross_the_optical_axis_at_their_moment() -> None:
     times, pose = np.arange(4.0), np.eye(4)
     pose[:3, :3] = np.array([[1.0, 0, 0], [0, 0.2, 0.98], [0, -0.98, 0.2]])
     pose[:3, 3] = 1, 2, 1.5
-    walks = passers.draw(PRESETS["strong"], times, np.tile(pose, (4, 1, 1)), np.array([1.0, 6.0, 1.0]), 1.2, None, np.random.default_rng(1))
+    poses, focus = np.tile(pose, (4, 1, 1)), np.array([1.0, 6.0, 1.0])
+    walks = preset("passers", "strong").walks(times, poses, focus, 1.2, None, np.random.default_rng(1))
     for walk in walks:
         assert walk.foot[2] == pytest.approx(1.5 - EYES)
         beside = walk.foot_at(walk.moment) + np.array([0, 0, walk.height / 2])
@@ -140,7 +141,7 @@ def test_what_passes_in_a_film_is_found_as_moving(bank: TextureBank) -> None:
     names, poses = [f"{shot.index:03d}" for shot in shots], np.array([shot.world_from_camera for shot in shots])
     views = Views(names, [shot.rgb for shot in shots], [camera] * len(shots), poses, np.zeros(len(shots), bool))
     median = float(np.median([np.median(shot.depth[shot.depth > 0]) for shot in shots]))
-    found = moving.moving(views, [shot.sensor_depth for shot in shots], [camera] * len(shots), median, measured=True)
+    found = transients.moving(views, [shot.sensor_depth for shot in shots], [camera] * len(shots), median, measured=True)
     truth = [shot.passed for shot in shots if shot.passed is not None]
     assert np.mean([mask.mean() for mask in truth]) > 0.05
     hit = sum(int((one & mask).sum()) for one, mask in zip(found, truth, strict=True)) / sum(int(mask.sum()) for mask in truth)

@@ -18,11 +18,12 @@ import torch
 from numba.core.dispatcher import Dispatcher
 
 from fieldfuse.capture.types import Views
-from fieldfuse.stereo import moving
+from fieldfuse.stereo import transients
 from fieldfuse.training import depth_start, fit
+from fieldfuse.training.fit import Begin
 from fieldfuse.training.guided import fit_guided
-from fieldfuse.volume.grid_host import GridHost
-from tests.stereo.test_moving import with_passer
+from fieldfuse.volume.grid import GridHost
+from tests.stereo.made import with_passer
 from tests.training.test_guided import SCENE, wanted
 
 Kernels = set[tuple[str, str]]
@@ -54,7 +55,7 @@ def missed(views: Views, decoder: str, host: GridHost | None) -> Kernels:
             before[0] = ready()
         return 0.02 * look
 
-    result = fit_guided(views, SCENE, wanted("budget=1", f"field.decoder={decoder}"), ticks=ticks, host=host)
+    result = fit_guided(views, SCENE, wanted("budget=1", f"field.decoder={decoder}"), begin=Begin(host), ticks=ticks)
     assert result.steps > 20 and result.field.resolution > 16  # it went from one level to the next
     assert views.background is not None or (result.left_out is not None and len(result.left_out.masks) > 0)
     return ready() - before[0]
@@ -62,7 +63,7 @@ def missed(views: Views, decoder: str, host: GridHost | None) -> Kernels:
 
 def main(decoder: str) -> None:
     torch.set_num_threads(1)
-    moving.FEWEST = depth_start.FEW_VIEWS = 6  # six pictures are enough here …
+    transients.FEWEST = depth_start.FEW_VIEWS = 6  # six pictures are enough here …
     fit.TIMELINE_PIXELS = 256  # … and few pixels
     told = {name: sorted(missed(views, decoder, GridHost() if name == "depth" else None)) for name, views in captures().items()}
     several = [name for name, number in Counter(name for name, _ in ready()).items() if number > 1]

@@ -18,12 +18,11 @@ from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import Progress
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import make_renderer, render_view
-from fieldfuse.stereo import moving, quick
+from fieldfuse.stereo import fast_mvs, transients
 from fieldfuse.training import depth_start
-from fieldfuse.training.fit import LEAST_VIEWS
+from fieldfuse.training.fit import LEAST_VIEWS, Begin
 from fieldfuse.training.guided import find_moving, fit_guided, looks_for_moving, wants_matching
-from tests.stereo.made import FAR, MEDIAN, NEAR, corner
-from tests.stereo.test_moving import PASSED, with_passer
+from tests.stereo.made import FAR, MEDIAN, NEAR, PASSED, corner, with_passer
 
 SCENE = Scene(Similarity.identity(), np.array([0.0, 0.0, 0.0]), np.full(3, 1.5), MEDIAN, NEAR, FAR, 0.0, True, False)
 
@@ -63,13 +62,13 @@ def test_depth_by_matching_makes_geometry_better() -> None:
 
 def test_matching_is_a_part_of_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
     now = steady()
-    whole, took = quick.guided, []
+    whole, took = fast_mvs.guided, []
 
     def slow(*given: object, **options: object) -> object:
         took.append([now() for _ in range(100)])  # a second
         return whole(*given, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(quick, "guided", slow)
+    monkeypatch.setattr(fast_mvs, "guided", slow)
     result = fit_guided(views(), SCENE, wanted(), ticks=now)
     assert len(took) == 1 and result.matched is not None and 1 <= result.matched["seconds"] < 1.1
     assert 3.9 < result.seconds < 4.2
@@ -85,7 +84,7 @@ def psnr(field: Field) -> float:
 
 @pytest.mark.parametrize("measured", [False, True])
 def test_a_fit_does_without_what_moves(measured: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(moving, "FEWEST", 6)
+    monkeypatch.setattr(transients, "FEWEST", 6)
     made, depths, masks = with_passer()
     given = replace(made, test=np.arange(len(made)) == 3, depths=list(depths) if measured else [])
     without = fit_guided(given, SCENE, wanted(), ticks=steady(0.005))
@@ -97,7 +96,7 @@ def test_a_fit_does_without_what_moves(measured: bool, monkeypatch: pytest.Monke
 
 
 def test_held_out_pictures_are_not_looked_at_for_what_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(moving, "FEWEST", 6)
+    monkeypatch.setattr(transients, "FEWEST", 6)
     made, _, _ = with_passer()
     views = replace(made, test=np.arange(len(made)) == 4)
     first = fit_guided(views, SCENE, wanted("budget=1"), ticks=steady()).left_out
@@ -114,19 +113,6 @@ def test_a_stop_while_looking_for_what_moves_ends_the_fit() -> None:
 
     result = fit_guided(replace(views(), depths=corner()[1]), SCENE, wanted(), Stopping())
     assert result.interrupted and result.left_out is None and result.steps == 0
-
-
-def test_looking_for_what_moves_is_a_part_of_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
-    now, whole = steady(), moving.moving
-
-    def slow(*given: object, **options: object) -> object:
-        assert [now() for _ in range(100)]  # a second
-        return whole(*given, **options)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(moving, "moving", slow)
-    result = fit_guided(replace(views(), depths=corner()[1]), SCENE, wanted(), ticks=now)
-    assert result.matched is None and result.left_out is not None and 1 <= result.left_out.seconds < 1.1
-    assert 3.9 < result.seconds < 4.2
 
 
 def test_what_moves_is_looked_for_where_depth_is_known_and_nothing_is_cut_out() -> None:
@@ -178,7 +164,7 @@ def test_progress_goes_on_from_matching_to_fitting() -> None:
     told = Told()
     fit_guided(views(), SCENE, wanted("budget=1"), told, ticks=steady())
     matching = [share for share, note in zip(told.shares, told.notes, strict=True) if "matched" in note]
-    assert matching and matching == sorted(matching) and max(matching) <= quick.SHARE + 1e-9
+    assert matching and matching == sorted(matching) and max(matching) <= fast_mvs.SHARE + 1e-9
     fitting = [share for share, note in zip(told.shares, told.notes, strict=True) if "³" in note]
     assert fitting and fitting == sorted(fitting) and fitting[-1] > 0.9 and max(told.shares) < 1.05
 
@@ -196,7 +182,7 @@ def test_a_fit_begins_with_what_is_known_of_depth_within_its_budget(monkeypatch:
     result = fit_guided(measured, SCENE, wanted("fit.moving=off"), ticks=now)
     assert len(begun) == 1 and 3.9 < result.seconds < 4.2 and result.timeline[0]["seconds"] > 1
     assert depth_error(result.field) < 0.02
-    fit_guided(measured, SCENE, wanted("budget=1"), start=result.field, ticks=now)
+    fit_guided(measured, SCENE, wanted("budget=1"), begin=Begin(start=result.field), ticks=now)
     fit_guided(measured, SCENE, wanted("budget=1", "fit.depth=0"), ticks=now)
     fit_guided(views(), SCENE, wanted("budget=1"), ticks=now)  # six pictures were matched: too few
     assert len(begun) == 1
@@ -233,10 +219,10 @@ def test_a_guess_leaves_the_coarsest_lattice_sooner_where_validation_views_tell_
     many = few.subset(np.tile(np.arange(len(few)), -(-LEAST_VIEWS // np.count_nonzero(~few.test))))
     for shown, factor, tick in ((many, 0.7, 0.002), (few, 1.0, 0.005)):
         shares = []
-        for begin in ({}, {"start": rough, "coarse": True}):
+        for begin in (Begin(), Begin(start=rough, coarse=True)):
             told = Levels()
             settings = wanted("fit.depth_from=sensor", "fit.moving=off")
-            fit_guided(shown, SCENE, settings, told, ticks=steady(tick), **begin)  # type: ignore[arg-type]
+            fit_guided(shown, SCENE, settings, told, begin, steady(tick))
             assert set(told.seen) == {"32³", "64³"}
             shares.append(told.seen.count("32³") / len(told.seen))
         assert shares[1] <= factor * shares[0]

@@ -22,12 +22,12 @@ def self_test(settings: Settings) -> Speed:
     """Units of every kind in seconds: a megapixel decoded, a picture's features found and matched, a ray rendered, a ray fitted, a
     megapixel scored."""
     from fieldfuse.progress import SILENT
-    from fieldfuse.stereo import quick
+    from fieldfuse.stereo import fast_mvs
     from fieldfuse.training import depth_start
     from fieldfuse.training.engine import warm_up
 
     warm_up(settings, SILENT)
-    quick.warm_up()
+    fast_mvs.warm_up()
     depth_start.warm_up()
     makers: dict[str, Callable[[], tuple[Callable[[], object], float]]] = {
         "decode": _decode,
@@ -98,10 +98,10 @@ def _ray() -> tuple[Callable[[], object], float]:
 
 
 def _fit() -> tuple[Callable[[], object], float]:
-    from fieldfuse.training.numba_engine import NumbaOptimiser
-    from fieldfuse.training.step import Rates
+    from fieldfuse.training.losses import Rates
+    from fieldfuse.training.numba_engine import NumbaEngine
 
-    engine, rates = NumbaOptimiser(sphere_field(SIDE), sphere_pixels(), 0), Rates(0.01, 0.01, 0.001, 0.01, 0.01)
+    engine, rates = NumbaEngine(sphere_field(SIDE), sphere_pixels(), 0), Rates(0.01, 0.01, 0.001, 0.01, 0.01)
     return lambda: engine.step(RAYS, rates), float(RAYS)
 
 

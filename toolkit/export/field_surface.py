@@ -13,7 +13,7 @@ from fieldfuse import memory
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.types import Capture, Views
 from fieldfuse.config import ExportSettings, Settings
-from fieldfuse.memory_limits import PICTURE_BYTES, SURFACE_BYTES, pixels, require_pictures
+from fieldfuse.memory import PICTURE_BYTES, SURFACE_BYTES, pixels, require_pictures
 from fieldfuse.progress import SILENT, Progress
 
 if TYPE_CHECKING:
@@ -101,8 +101,7 @@ def surface_of_field(
     """
     from fieldfuse.export.surface import field_volume
     from fieldfuse.render.image import make_renderer, render_view
-    from fieldfuse.stereo.polish import Polisher
-    from fieldfuse.stereo.settle import settled
+    from fieldfuse.stereo.depth_refinement import FieldDepths, Polisher, settled
 
     shown, cameras = originals.finer(views, np.flatnonzero(~views.test), settings.export)
     chosen = spread(len(shown), settings.export.mesh_views)
@@ -118,7 +117,7 @@ def surface_of_field(
         lenses,
         region=scene.surface_box(),
         polish=[partial(polisher.polished, index, measured=measured[at] if measured else None) for at, index in enumerate(chosen)],
-        settle=lambda depths, opaque, told: settled(depths, opaque, told, seen, lenses, scene.median_depth, measured, progress=progress),
+        settle=lambda *given: settled(FieldDepths(*given), seen, lenses, scene.median_depth, measured, progress),
         progress=progress,
     )
 
