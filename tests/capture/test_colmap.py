@@ -12,7 +12,7 @@ import pytest
 
 from fieldfuse.camera import Intrinsics, project
 from fieldfuse.capture import open_capture
-from fieldfuse.capture.colmap import candidate_captures, read_colmap
+from fieldfuse.capture.colmap import candidate_capture, candidate_models, read_colmap
 from fieldfuse.capture.colmap_model import MODELS, intrinsics_of, read_model
 from fieldfuse.errors import InputError
 from tests.capture.layouts import OFF_CENTRE, POINTS, half_size, write_colmap_bin, write_colmap_txt
@@ -48,7 +48,7 @@ def test_each_camera_model_projects_like_pycolmap(model: str) -> None:
 
 def test_model_numbers_and_parameter_counts_are_pycolmaps() -> None:
     pycolmap = pytest.importorskip("pycolmap")
-    for number, name, count in MODELS:
+    for number, (name, count, _) in enumerate(MODELS):
         if name in pycolmap.CameraModelId.__members__:
             assert int(pycolmap.CameraModelId.__members__[name]) == number
             assert len(pycolmap.Camera(model=name, width=80, height=60, params=[1.0] * count).params) == count
@@ -242,7 +242,7 @@ def test_the_model_is_taken_whose_sizes_fit(tmp_path: Path) -> None:
     move(tmp_path, ("images", "dense/0/images"))
     shutil.copytree(tmp_path / "sparse/0", tmp_path / "dense/0/sparse")
     (tmp_path / "sparse/0/cameras.txt").write_text("7 PINHOLE 400 300 500 500 200 150\n")  # of the same shape
-    captures = list(candidate_captures(tmp_path))
+    captures = [candidate_capture(tmp_path, candidate) for candidate in candidate_models(tmp_path)]
     assert pixel_error(captures[0], eyes(), OFF_CENTRE) < 1e-3
     assert "dense/0/sparse is used" in captures[0].warnings[0]
     assert "not used: sparse/0 (5 images, 5 of which fit)" in captures[0].warnings[0]

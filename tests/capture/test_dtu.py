@@ -13,7 +13,7 @@ from fieldfuse.capture import open_capture
 from fieldfuse.capture.dtu import camera_for, decompose, read_dtu
 from fieldfuse.errors import InputError
 from tests.capture.layouts import OFF_CENTRE, write_dtu
-from tests.capture.made import Pinhole, eyes, pixel_error, render, save_picture
+from tests.capture.made import eyes, pixel_error, save_picture
 from tests.conftest import shared_data
 
 
@@ -129,15 +129,6 @@ def test_pickled_and_broken_archives(tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "cameras.npz", world_mat_0=np.zeros((2000, 2000)))
     with pytest.raises(InputError, match="far too large"):
         read_dtu(tmp_path)
-
-
-def test_other_sizes_of_other_sets_are_taken_as_they_are(tmp_path: Path) -> None:
-    write_dtu(tmp_path)
-    assert open_capture(tmp_path).warnings == ()
-    for index, eye in enumerate(eyes()):
-        save_picture(tmp_path / f"image/{index:06d}.png", render(eye, Pinhole(40, 30, 35.5, 36.5, 21, 14))[0])
-    with pytest.raises(InputError, match="image is 40×30"):
-        open_capture(tmp_path)
 
 
 def test_scan24() -> None:

@@ -14,7 +14,6 @@ from PIL import Image
 
 from fieldfuse.camera import Array
 from fieldfuse.capture import open_capture
-from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.convert import CONVERTED, all_converted, convert_images, to_convert
 from fieldfuse.capture.headers import read_header
 from fieldfuse.capture.images import load_image
@@ -86,13 +85,6 @@ def test_alpha_grey_and_ten_bits(tmp_path: Path) -> None:
     assert close(load_image(Frame("w", tmp_path / "w.heic")), smooth())
 
 
-def test_a_folder_of_them_is_a_folder_of_photos(tmp_path: Path) -> None:
-    capture = open_capture(folder(tmp_path))
-    assert capture.kind == "photos" and [frame.name for frame in capture.frames] == [f"IMG_{i:04d}" for i in range(6)]
-    assert capture.frames[0].focal_prior == pytest.approx(26 / 43.2666 * 150, rel=1e-3)
-    assert check_capture(capture).extra["sizes"] == {"120x90": 6}
-
-
 def test_what_is_there_as_jpeg_too_is_used_once(tmp_path: Path) -> None:
     folder(tmp_path, 3)
     for index in (0, 2):
@@ -116,16 +108,6 @@ def test_the_small_copy_in_the_file_is_looked_at_where_there_is_one(tmp_path: Pa
 
 
 # ---------------------------------------------------------------------------------------------------- damaged
-
-
-@pytest.mark.parametrize("share", [0.2, 0.7, 0.99])
-def test_a_truncated_picture_is_refused_by_name(tmp_path: Path, share: float) -> None:
-    path = heic(tmp_path / "photo.heic", smooth())
-    data = path.read_bytes()
-    path.write_bytes(data[: int(len(data) * share)])
-    with pytest.raises(InputError, match=r"photo\.heic.*(cut short|damaged|cannot be read)"):
-        load_image(Frame("a", path))
-    assert any("left out" in text and "photo.heic" in text for text in check_capture(open_capture(folder(tmp_path))).warnings)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

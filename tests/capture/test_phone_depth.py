@@ -41,14 +41,6 @@ def test_corrected_cameras_are_better_than_those_before(tmp_path: Path) -> None:
     assert pixel_error(open_capture(tmp_path), eyes(), PHONE) > 1
 
 
-def test_polycam_whose_better_pictures_are_not_there(tmp_path: Path) -> None:
-    write_polycam(tmp_path)
-    place = tmp_path / "keyframes"
-    (place / "corrected_images").rename(place / "images")
-    (place / "corrected_images").mkdir()
-    assert [frame.image.parent.name for frame in open_capture(tmp_path).frames] == ["images"] * 5
-
-
 def test_polycam_without_depth_or_camera(tmp_path: Path) -> None:
     write_polycam(tmp_path)
     place = tmp_path / "keyframes"

@@ -105,13 +105,6 @@ def test_pictures_and_poses_go_together_by_number_where_some_are_missing(recordi
     assert capture.warnings == ("the recording has 4 images and 5 poses; 4 are used, which go together by number",)
 
 
-def test_fewer_poses_than_pictures(recording: Path) -> None:
-    poses = json.loads((recording / "metadata").read_text())["poses"]
-    capture = open_capture(told(recording, poses=poses[:3]))
-    assert pixel_error(capture, eyes()[:3], PHONE) < 1e-3
-    assert capture.warnings == ("the recording has 5 images and 3 poses; 3 are used, which go together by number",)
-
-
 def test_a_cut_recording_whose_pictures_go_on_counting(recording: Path) -> None:
     for path in sorted((recording / "rgbd").iterdir()):
         path.rename(path.with_name(f"{int(path.stem) + 40}{path.suffix}"))

@@ -121,16 +121,6 @@ def test_other_logs_make_no_trajectory(tmp_path: Path) -> None:
     assert detect_kind(tmp_path) != "redwood"
 
 
-@pytest.mark.parametrize("folder", ["image", "rgb", "images", "colors"])
-def test_folders_of_pictures(tmp_path: Path, folder: str) -> None:
-    write_redwood(tmp_path)
-    (tmp_path / "color").rename(tmp_path / folder)
-    assert len(open_capture(tmp_path).frames) == 5
-    (tmp_path / folder).rename(tmp_path / "elsewhere")
-    with pytest.raises(InputError, match="no images in image/"):
-        open_capture(tmp_path)
-
-
 def test_depth_at_another_size_has_a_scaled_camera(tmp_path: Path) -> None:
     write_redwood(tmp_path)
     for index, eye in enumerate(eyes()):

@@ -71,14 +71,6 @@ def test_pictures_that_were_taken_away_take_no_other_pose(tmp_path: Path) -> Non
         open_capture(tmp_path)
 
 
-def test_no_pictures(tmp_path: Path) -> None:
-    write_replica(tmp_path)
-    for path in (tmp_path / "results").glob("frame*"):
-        path.unlink()
-    with pytest.raises(InputError, match=r"holds no images frame000000\.jpg"):
-        open_capture(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [("", "whole poses"), ("1 0 0 0\n", "whole poses"), ("x", "numbers only"), ("nan " * 80, r"traj\.txt, pose 1: the pose holds")],

@@ -18,7 +18,7 @@ from fieldfuse.capture.video import iterate_video, read_video
 from fieldfuse.config import CaptureSettings, PosesSettings
 from fieldfuse.errors import InputError
 from fieldfuse.poses.job import plan
-from tests.capture.films import film, hide_first, names, quarters, turn
+from tests.capture.films import film, hide_first, quarters, turn
 from tests.capture.layouts import PHONE, write_stray
 from tests.capture.made import eyes, left_out, pixel_error, render
 
@@ -122,14 +122,6 @@ def test_a_first_frame_that_players_leave_out_counts(tmp_path: Path) -> None:
     assert shown(chosen) == [int(frame.name.removeprefix("frame_")) for frame in chosen.frames] and not chosen.warnings
 
 
-def test_frames_chosen_from_what_a_player_shows_are_chosen_again(tmp_path: Path) -> None:
-    write_stray(tmp_path)
-    hide_first(tmp_path / "rgb.mp4")
-    select_frames(read_video(tmp_path / "rgb.mp4"), tmp_path / "run", CaptureSettings(max_frames=10))
-    chosen = select_frames(open_capture(tmp_path), tmp_path / "run", CaptureSettings(max_frames=10))
-    assert shown(chosen) == [int(frame.name.removeprefix("frame_")) for frame in chosen.frames]
-
-
 @pytest.mark.parametrize("before", [None, "threads;1"])
 def test_other_videos_open_as_ever_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str | None) -> None:
     path = hide_first(film(tmp_path / "a.mp4", quarters(6)))
@@ -166,11 +158,6 @@ def test_a_video_that_is_to_be_shown_turned_stays_as_its_matrix_is(tmp_path: Pat
                 (tmp_path / name).rename(tmp_path / f"no_{name}")
     alone = read_video(tmp_path / "rgb.mp4")
     assert (alone.extra["width"] == PHONE.height) == (degrees != 180)  # a video by itself is turned, as ever
-
-
-def test_turned_quarters_as_stored(tmp_path: Path) -> None:
-    path = turn(film(tmp_path / "a.mp4", quarters()), 90)
-    assert names(next(iterate_video(path))[1]) != "rgbk" and names(next(iterate_video(path, as_stored=True))[1]) == "rgbk"
 
 
 @pytest.mark.parametrize("rows", [3, 4])

@@ -43,11 +43,6 @@ def test_places_are_spread_evenly(count: int, some: int) -> None:
         assert np.ptp(np.diff(places)) <= 1
 
 
-def test_names_are_ordered_as_people_do() -> None:
-    shuffled = capture(20).with_frames(capture(20).frames[::-1])
-    assert set(names(limited(shuffled, 0, 3), 0, False)) == {"0.png", "10.png", "19.png"}
-
-
 def test_a_blurred_picture_is_less_sharp() -> None:
     import cv2
 

@@ -95,18 +95,6 @@ def test_a_pinhole_with_lens_coefficients_is_told(root: Path) -> None:
     assert read_transforms(root).warnings == ()
 
 
-def test_names_without_suffix_and_with_backslashes(root: Path) -> None:
-    edit(root, lambda data: [frame.update(file_path=f".\\images\\{index:04d}") for index, frame in enumerate(data["frames"])])
-    assert [frame.name for frame in read_transforms(root).frames] == ["0000", "0001", "0002", "0003", "0004"]
-
-
-def test_frames_are_sorted_by_name(root: Path) -> None:
-    edit(root, lambda data: data["frames"].reverse())
-    capture = read_transforms(root)
-    assert [frame.name for frame in capture.frames] == ["0000", "0001", "0002", "0003", "0004"]
-    assert pixel_error(capture, eyes(), OFF_CENTRE) < 1e-3
-
-
 def test_listed_files_that_do_not_exist_are_counted(root: Path) -> None:
     for name in ("images/0001.png", "images/0003.png", "depth/0004.png"):
         (root / name).unlink()
@@ -369,12 +357,6 @@ def test_hostile_json_is_refused_in_seconds(root: Path, text: str) -> None:
     with pytest.raises(InputError):
         open_capture(root)
     assert time.process_time() - started < 60  # it takes one where it was measured
-
-
-def test_bytes_that_are_no_text(root: Path) -> None:
-    (root / "transforms.json").write_bytes(b"\xff\xfe\x00{")
-    with pytest.raises(InputError, match="not valid JSON"):
-        open_capture(root)
 
 
 def test_fox_as_it_is_published() -> None:

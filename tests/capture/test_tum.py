@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -39,12 +38,6 @@ def test_the_folder_tells_the_camera(tmp_path: Path, folder: str, focal: float) 
     assert capture.frames[0].intrinsics.fx == pytest.approx(focal / 8)
     assert (capture.frames[0].intrinsics.lens == OPENCV) == (focal in (517.3, 520.9))
     assert bool(capture.warnings) == (focal == 525.0)
-
-
-def test_a_camera_file_goes_before_the_name(tmp_path: Path) -> None:
-    write_tum(tmp_path / "fr1")
-    (tmp_path / "fr1/camera_intrinsics.json").write_text(json.dumps({"width": 80, "height": 60, "fx": 60, "fy": 61, "cx": 40, "cy": 30}))
-    assert open_capture(tmp_path / "fr1").frames[0].intrinsics.fx == 60
 
 
 def test_pictures_far_from_any_pose_or_without_file_are_counted(tmp_path: Path) -> None:
