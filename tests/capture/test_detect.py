@@ -186,7 +186,7 @@ def test_nothing_there_is_said_in_one_sentence(tmp_path: Path) -> None:
 def test_a_file_that_is_no_picture_is_named(tmp_path: Path, layout: str) -> None:
     LAYOUTS[layout][1](tmp_path)
     victim = open_capture(tmp_path).frames[-1].image
-    victim.write_bytes(b"not a image")
+    victim.write_bytes(b"not an image")
     try:
         said = " ".join(check_capture(open_capture(tmp_path)).warnings)  # one of many is left out
     except InputError as error:

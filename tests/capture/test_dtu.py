@@ -105,7 +105,7 @@ def test_pictures_and_cameras_must_be_as_many(tmp_path: Path) -> None:
         (np.full((4, 4), np.nan), "not finite"),
         (np.zeros((4, 4)), "singular"),
         (np.eye(3), "shape"),
-        (np.diag([500.0, 500, 1, 1]), "for a image of about"),
+        (np.diag([500.0, 500, 1, 1]), "for an image of about"),
         (np.array([["a"] * 4] * 4), "does not hold numbers"),
     ],
 )

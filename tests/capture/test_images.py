@@ -164,7 +164,7 @@ def test_a_changed_byte_in_the_header_never_ends_in_a_traceback(position: int, v
 def test_missing_empty_and_foreign_files(tmp_path: Path) -> None:
     (tmp_path / "empty.png").write_bytes(b"")
     (tmp_path / "text.png").write_text("no image")
-    for name, text in (("missing.png", "cannot read"), ("empty.png", "empty"), ("text.png", "not a image")):
+    for name, text in (("missing.png", "cannot read"), ("empty.png", "empty"), ("text.png", "not an image")):
         with pytest.raises(InputError, match=rf"{text}|{name}.*{text}"):
             load_image(frame(tmp_path / name))
 

@@ -105,7 +105,7 @@ def test_chosen_frames_keep_their_poses_and_depth(tmp_path: Path) -> None:
         ("odometry.csv", "0,0,0,0,0,0,1\n0,0,1\n", "different length"),
         ("odometry.csv", "h\n1,-3,0,0,0,0,0,0,1\n", "number is -3"),
         ("camera_matrix.csv", "1,0\n0,1", "3×3"),
-        ("camera_matrix.csv", "a,b,c", "numbers with commas"),
+        ("camera_matrix.csv", "a,b,c", "must hold numbers only"),
         ("camera_matrix.csv", "0,0,0\n0,0,0\n0,0,1", "camera_matrix"),
     ],
 )

@@ -128,7 +128,7 @@ def test_up_is_not_told_where_the_first_pose_is_zero(recording: Path) -> None:
 
 @pytest.mark.parametrize("packed", [True, False])
 def test_chosen_frames_are_the_files_of_the_recording(recording: Path, tmp_path: Path, packed: bool) -> None:
-    (recording / "rgbd" / "2.jpg").write_bytes(b"not a image")  # as the app leaves some behind
+    (recording / "rgbd" / "2.jpg").write_bytes(b"not an image")  # as the app leaves some behind
     (recording / "rgbd" / "3.depth").write_bytes(b"not a map")
     capture = open_capture(zipped(recording, tmp_path / "a.r3d") if packed else recording)
     assert check_capture(capture) is capture
@@ -158,7 +158,7 @@ def test_chosen_frames_are_the_files_of_the_recording(recording: Path, tmp_path:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"K": None, "perFrameIntrinsicCoeffs": None}, "tells no camera"),
+        ({"K": None, "perFrameIntrinsicCoeffs": None}, "has no camera"),
         ({"K": [1, 2, 3]}, "nine numbers"),
         ({"K": [1e400] * 9}, "not finite"),
         ({"K": "wide"}, "numbers only"),
@@ -229,7 +229,7 @@ def test_members_whose_names_lead_elsewhere_are_not_read(recording: Path, tmp_pa
 def test_all_pictures_damaged(recording: Path) -> None:
     for path in (recording / "rgbd").glob("*.jpg"):
         path.write_bytes(b"x")
-    with pytest.raises(InputError, match=r"0\.jpg is not a image"):
+    with pytest.raises(InputError, match=r"0\.jpg is not an image"):
         open_capture(recording)
 
 

@@ -162,7 +162,7 @@ def test_broken_logs(tmp_path: Path, text: str, message: str) -> None:
         ({"intrinsic_matrix": [-70.0, 0, 0, 0, 70, 0, 40, 30, 1]}, "must be positive"),
         ({"intrinsic_matrix": None}, "must hold 'fx'"),
         ({"intrinsic_matrix": None, "fx": "a"}, "'fx' must be a finite number"),
-        ({"width": None}, "no usable 'width'"),
+        ({"width": None}, "is not usable"),
         ({"width": 10**400}, "'width' must be a finite number"),
         ({"depth_scale": -1}, "'depth_scale'"),
     ],

@@ -126,8 +126,8 @@ HOSTILE = {
     "no unit of depth": (lambda data: packed(data, HEAD + 280, "<f", 0), "0 for each metre"),
     "2^60 frames": (lambda data: packed(data, HEAD + 284, "<Q", 2**60), f"announces {2**60} frames"),
     "two frames more": (lambda data: packed(data, HEAD + 284, "<Q", 8), "ends within frame 7 of 8"),
-    "a image of 2^63 bytes": (lambda data: packed(data, BODY + 80, "<Q", 2**63), "ends within frame 0 of 6"),
-    "ends in a image": (lambda data: bytes(data[: BODY + 500]), "ends within frame 0|bytes can hold"),
+    "an image of 2^63 bytes": (lambda data: packed(data, BODY + 80, "<Q", 2**63), "ends within frame 0 of 6"),
+    "ends in an image": (lambda data: bytes(data[: BODY + 500]), "ends within frame 0|bytes can hold"),
     "no focal length": (lambda data: packed(data, HEAD, "<f", 0), "the colour camera"),
     "no frame": (lambda data: packed(data, HEAD + 284, "<Q", 0), "holds no image"),
 }

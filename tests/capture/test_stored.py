@@ -59,7 +59,7 @@ def found(capture: Capture, cameras: list[Intrinsics]) -> tuple[PoseResult, Capt
 
 
 def stored_places(orientation: int, places: Array) -> Array:
-    """(N, 2) pixels of the upright image → where the file has them, by turning a image of the pixels' own places."""
+    """(N, 2) pixels of the upright image → where the file has them, by turning an image of the pixels' own places."""
     grid = upright(pixel_grid(WIDTH, HEIGHT).reshape(HEIGHT, WIDTH, 2), orientation)
     shown = pixel_grid(grid.shape[1], grid.shape[0])
     way = np.linalg.lstsq(np.hstack([shown, np.ones((len(shown), 1))]), grid.reshape(-1, 2), rcond=None)[0]

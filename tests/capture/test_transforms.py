@@ -238,7 +238,7 @@ def first(data: dict) -> dict:
         (lambda d: d.update(cy=-1.0), "outside the 80×60 image"),
         (lambda d: d.update(cx=0.51, cy=0.49), "shares of the image's size"),
         (lambda d: (d.pop("w"), d.pop("h"), d.update(cx=2 * 42.25, cy=2 * 27.5)), "2 times as large as the 80×60 one at hand; add 'w'"),
-        (lambda d: (d.pop("w"), d.pop("h"), d.update(cx=4 * 42.25, cy=4 * 27.5)), "a image 4 times as large"),
+        (lambda d: (d.pop("w"), d.pop("h"), d.update(cx=4 * 42.25, cy=4 * 27.5)), "an image 4 times as large"),
         (lambda d: d.update(w=1e30), "image size"),
         (lambda d: d.update(w=-80), "image size"),
         (lambda d: d.update(w=60, h=80), "another shape"),

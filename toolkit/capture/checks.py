@@ -90,7 +90,7 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
             f"all {len(capture.frames)} images in {capture.root} show the same view; depth needs a camera that moves, "
             "take each image from another place"
         )
-    double = {**exact, **_copies([look for look in looks if look.deviation >= FLAT], headers)}
+    double = {**exact, **_copies([look for look in looks if look.deviation >= FLAT and look.frame.image not in exact], headers)}
     copy_warnings = []
     if double:
         capture, remark = _once_each(capture, double)
