@@ -152,9 +152,9 @@ def test_names_as_other_programs_write_them(tmp_path: Path, name: str) -> None:
     write_colmap_txt(tmp_path)
     rename_images(tmp_path, name)
     if "day" in name:
-        (tmp_path / "images").rename(tmp_path / "images")
+        (tmp_path / "images").rename(tmp_path / "pictures")
         (tmp_path / "images").mkdir()
-        (tmp_path / "images").rename(tmp_path / "images/of day  1")
+        (tmp_path / "pictures").rename(tmp_path / "images/of day  1")
         if " " in name:
             (tmp_path / "images/of day  1").rename(tmp_path / "images/of day 1")
     capture = open_capture(tmp_path)
@@ -192,7 +192,7 @@ def test_a_principal_point_far_outside_is_refused(tmp_path: Path) -> None:
     path.write_text("7 PINHOLE 80 60 71 73 100 27.5\n")
     assert open_capture(tmp_path).frames[0].intrinsics.cx == 100
     path.write_text("7 PINHOLE 80 60 71 73 169 110\n")
-    with pytest.raises(InputError, match=r"cameras\.txt, camera 7: the principal point \(169, 110\) lies outside the 80×60 image"):
+    with pytest.raises(InputError, match=r"cameras\.txt, camera 7: the principal point \(169, 110\) lies outside the 80×60 picture"):
         open_capture(tmp_path)
 
 
@@ -229,7 +229,7 @@ def move(root: Path, *moves: tuple[str, str]) -> None:
 def test_where_models_and_images_are_found(tmp_path: Path, moves: list[tuple[str, str]], said: str | None) -> None:
     write_colmap_txt(tmp_path)
     if moves == [("images", "images/kitchen")]:
-        moves = [("images", "images"), ("images", "images/kitchen")]
+        moves = [("images", "pictures"), ("pictures", "images/kitchen")]
     move(tmp_path, *moves)
     capture = open_capture(tmp_path)
     assert pixel_error(capture, eyes(), OFF_CENTRE) < 1e-3

@@ -185,5 +185,5 @@ def test_a_principal_point_outside_the_picture(tmp_path: Path) -> None:
     write_redwood(tmp_path)
     camera = {"width": 80, "height": 60, "fx": 71, "fy": 73, "cx": 169, "cy": 110}
     (tmp_path / "camera_intrinsics.json").write_text(json.dumps(camera))
-    with pytest.raises(InputError, match=r"camera_intrinsics\.json.*outside the 80×60 image"):
+    with pytest.raises(InputError, match=r"camera_intrinsics\.json.*outside the 80×60 picture"):
         open_capture(tmp_path)

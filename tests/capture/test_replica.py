@@ -88,10 +88,10 @@ def test_broken_poses(tmp_path: Path, text: str, said: str) -> None:
         ({"fx": None}, "has no 'fx'"),
         ({"fx": "a"}, "'fx' must be a finite number"),
         ({"fx": -1}, "must be positive"),
-        ({"cx": 599.5}, "outside the 80×60 image"),
+        ({"cx": 599.5}, "outside the 80×60 picture"),
         ({"scale": 0}, "a 'scale' of 0"),
         ({"h": 90}, "another shape"),
-        ({"w": 0}, "a size of 0×60"),
+        ({"w": 0}, "image size 0×60"),
     ],
 )
 def test_broken_cameras(tmp_path: Path, change: dict, said: str) -> None:

@@ -45,7 +45,7 @@ def found(root: Path, *names: str, **options: object) -> list[str | None]:
         "C:\\data\\images\\a b.jpg",
         "\\\\server\\share\\images\\a b.jpg",
         "file:///data/images/a%20b.jpg",
-        "images/a b.jpg",
+        "pictures/a b.jpg",
         "images/kitchen/a b.jpg",
     ],
 )

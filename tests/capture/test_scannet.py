@@ -73,7 +73,7 @@ def test_pictures_exported_smaller_than_the_sensors(tmp_path: Path) -> None:
     assert "is for 1296×968 images" in capture.warnings[0]
 
 
-@pytest.mark.parametrize(("cx", "cy", "message"), [(90, 400, "outside the 96×72 image"), (0.49, 0.5, "shares of the image")])
+@pytest.mark.parametrize(("cx", "cy", "message"), [(90, 400, "outside the 96×72 picture"), (0.49, 0.5, "shares of the picture")])
 def test_a_principal_point_that_cannot_be(tmp_path: Path, cx: float, cy: float, message: str) -> None:
     write_scannet(tmp_path)
     (tmp_path / "intrinsic/intrinsic_color.txt").write_text(f"86 0 {cx}\n0 87 {cy}\n0 0 1\n")

@@ -124,7 +124,7 @@ def test_smaller_pictures_scale_the_camera_and_say_so(root: Path) -> None:
         save_picture(root / f"images/{index:04d}.png", render(eye, half_size(OFF_CENTRE))[0])
     capture = read_transforms(root)
     assert pixel_error(capture, eyes(), half_size(OFF_CENTRE)) < 1e-3
-    assert capture.warnings == ("5 images of another size than the json tells; intrinsics were scaled to fit",)
+    assert capture.warnings == ("5 images of another size than in the json; intrinsics were scaled to fit",)
     assert capture.frames[0].depth_intrinsics.width == 80
 
 
@@ -196,7 +196,7 @@ def test_a_split_that_names_no_frame_is_told(root: Path) -> None:
     capture = read_transforms(root)
     assert [frame.split for frame in capture.frames] == [None, "test", None, None, None], "validation stands in for a missing test"
     assert capture.warnings == tuple(
-        f"'{split}_filenames' of transforms.json names none of its frames and is left out of account" for split in ("train", "test")
+        f"'{split}_filenames' of transforms.json names none of its frames and is ignored" for split in ("train", "test")
     )
 
 
@@ -234,16 +234,16 @@ def first(data: dict) -> dict:
         (lambda d: d.update(fl_x="wide"), "'fl_x' must be a finite number"),
         (lambda d: d.update(cx=float("inf")), "'cx' must be a finite number"),
         (lambda d: d.update(k1=True), "'k1' must be a finite number"),
-        (lambda d: d.update(cx=169.0, cy=110.0), r"principal point \(169, 110\) lies outside the 80×60 image"),
-        (lambda d: d.update(cy=-1.0), "outside the 80×60 image"),
-        (lambda d: d.update(cx=0.51, cy=0.49), "shares of the image's size"),
+        (lambda d: d.update(cx=169.0, cy=110.0), r"principal point \(169, 110\) lies outside the 80×60 picture"),
+        (lambda d: d.update(cy=-1.0), "outside the 80×60 picture"),
+        (lambda d: d.update(cx=0.51, cy=0.49), "shares of the picture's size"),
         (lambda d: (d.pop("w"), d.pop("h"), d.update(cx=2 * 42.25, cy=2 * 27.5)), "2 times as large as the 80×60 one at hand; add 'w'"),
         (lambda d: (d.pop("w"), d.pop("h"), d.update(cx=4 * 42.25, cy=4 * 27.5)), "an image 4 times as large"),
         (lambda d: d.update(w=1e30), "image size"),
         (lambda d: d.update(w=-80), "image size"),
         (lambda d: d.update(w=60, h=80), "another shape"),
         (lambda d: d.update(camera_model="EQUIRECTANGULAR"), "panoramas"),
-        (lambda d: d.update(camera_model="MIRROR_BALL"), "not known"),
+        (lambda d: d.update(camera_model="MIRROR_BALL"), "not supported"),
         (lambda d: d.update(camera_model="OPENCV", k4=0.1), "k4"),
         (lambda d: d.update(applied_scale=0), "'applied_scale'"),
         (lambda d: d.update(applied_transform=[1, 2]), "'applied_transform'"),
