@@ -1,4 +1,7 @@
-"""Captures: one reader a source kind, one file each, all returning a `Capture` of `Frame`s."""
+"""Captures: one reader a source kind, one file each, all returning a `Capture` of `Frame`s.
+
+Whatever is wrong with a file raises `InputError`, with one sentence that names it and what to do.
+"""
 
 from __future__ import annotations
 

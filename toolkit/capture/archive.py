@@ -21,11 +21,7 @@ def archive_of(path: Path) -> Path | None:
 
 
 def members(archive: Path) -> list[str]:
-    """Names of everything in a zip file.
-
-    Raises:
-        InputError: no such file, no zip file, or one that is cut short.
-    """
+    """Names of everything in a zip file."""
     return _opened(archive).namelist()
 
 
@@ -47,11 +43,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_member(path: Path, most: int = MOST_BYTES) -> bytes:
-    """All bytes of a member; `path` is that of the archive with the member's name behind it.
-
-    Raises:
-        InputError: no such member, damaged, encrypted, or larger than `most` bytes when it is inflated.
-    """
+    """All bytes of a member; `path` is that of the archive with the member's name behind it."""
     archive = archive_of(path)
     if archive is None:
         raise InputError(f"cannot read {path}: it does not lie in a zip file; check the name")

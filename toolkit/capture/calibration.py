@@ -37,11 +37,7 @@ PRIMESENSE = sensor(640, 480, 525.0, 525.0, 319.5, 239.5)  # default of Open3D a
 
 
 def usable_size(width: float, height: float, where: str) -> tuple[int, int]:
-    """An image size as a file has it, in whole pixels.
-
-    Raises:
-        InputError: no image is that large, or that small.
-    """
+    """An image size as a file has it, in whole pixels."""
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise InputError(f"{where}: the image size {width:g}×{height:g} is not usable; correct it")
     return round(width), round(height)
@@ -83,9 +79,6 @@ def posed_frame(
     Args:
         where: what errors call the pose.
         more: other fields of the frame; `depth_intrinsics` where depth has a camera of its own, `confidence` if that file exists.
-
-    Raises:
-        InputError: the pose is not rigid, or the image or the depth map has another shape than its camera.
     """
     size = image_header(image).size
     intrinsics = fitted(camera, size, str(image))
@@ -126,9 +119,6 @@ def off_centre(camera: Intrinsics) -> float:
 def read_matrix_for(path: Path, size: tuple[int, int], usual: tuple[int, int], shift: float = 0.5) -> tuple[Intrinsics, bool]:
     """The camera in a text file with a 3×3, 4×4 or 3×4 matrix, for images of `size` (width, height), and whether it had to be scaled from
     the sensor's `usual` size: the file is for the one of the two whose centre is nearer to the principal point.
-
-    Raises:
-        InputError: not such a file, for images of another shape, or with a principal point outside the image.
     """
     where = str(path)
     camera = from_matrix(read_matrix(path, (3, 3), (4, 4), (3, 4)), *size, where, shift)
@@ -141,9 +131,6 @@ def find_json(root: Path) -> tuple[Intrinsics, dict[str, Any]] | None:
     """The camera in one of `JSON_NAMES` and the whole object, or None when there is no such file.
 
     Either Open3D's form (`width`, `height`, `intrinsic_matrix` of nine numbers, column by column) or `fx`, `fy`, `cx`, `cy`.
-
-    Raises:
-        InputError: the file is there and is not usable.
     """
     path = next((root / name for name in JSON_NAMES if (root / name).is_file()), None)
     if path is None:

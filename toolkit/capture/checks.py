@@ -166,9 +166,6 @@ def floats_to_white(capture: Capture, progress: Progress = SILENT) -> Capture:
 def _look_at_all(capture: Capture, progress: Progress) -> tuple[Capture, dict[Path, Header], list[Look], dict[Path, Path]]:
     """The capture without images that cannot be used, headers of all others, thumbnail measures of as many as `PIXEL_BUDGET` allows and of
     all that may be copies by their names, and exact copies with what they are copies of.
-
-    Raises:
-        InputError: more than a few images cannot be used.
     """
     headers: dict[Path, Header] = {}
     looks: list[Look] = []
@@ -217,11 +214,7 @@ def _look(frame: Frame, data: bytes, header: Header, exif: bool) -> Look:
 
 
 def thumbnail(data: bytes, header: Header, path: Path, white: int | None = None) -> Array:
-    """A small grey image (h, w) uint8, long side about `THUMB_SIDE`; JPEG is decoded at an eighth, a quarter or half its size.
-
-    Raises:
-        InputError: the image cannot be decoded.
-    """
+    """A small grey image (h, w) uint8, long side about `THUMB_SIDE`; JPEG is decoded at an eighth, a quarter or half its size."""
     ratio = max(header.width, header.height) / THUMB_SIDE
     reduced = ((8, cv2.IMREAD_REDUCED_GRAYSCALE_8), (4, cv2.IMREAD_REDUCED_GRAYSCALE_4), (2, cv2.IMREAD_REDUCED_GRAYSCALE_2))
     flags = next((flag for factor, flag in reduced if ratio >= factor and header.format in ("JPEG", "MPO")), cv2.IMREAD_GRAYSCALE)

@@ -70,11 +70,7 @@ def has_images(root: Path) -> bool:
 
 
 def candidate_models(root: Path) -> list[CandidateModel]:
-    """The models that can be read, best first: the one that most images fit, by name and size.
-
-    Raises:
-        InputError: none is there, none can be read, or images of the same names lie in two places.
-    """
+    """The models that can be read, best first: the one that most images fit, by name and size."""
     folders = model_folders(root)
     if not folders:
         raise InputError(f"{root} holds no COLMAP model (cameras and images as .bin or .txt in sparse/0); export one there")
@@ -121,11 +117,7 @@ def read_colmap(path: Path | str) -> Capture:
 
 
 def candidate_capture(root: Path, candidate: CandidateModel) -> Capture:
-    """The capture that one of the models makes.
-
-    Raises:
-        InputError: none of its images is on disk, or an image has another shape than its camera.
-    """
+    """The capture that one of the models makes."""
     model, images = candidate.model, candidate.images
     listed = len(model.images)
     if not images:

@@ -69,11 +69,7 @@ def holds_model(folder: Path) -> bool:
 
 
 def read_model(folder: Path) -> Model:
-    """The model in `folder`; binary files go before text files.
-
-    Raises:
-        InputError: a file is cut short, holds counts that cannot be, an unsupported camera or an unusable pose.
-    """
+    """The model in `folder`; binary files go before text files."""
     binary = all((folder / f"{part}.bin").is_file() for part in ("cameras", "images"))
     cameras, images, points = (folder / f"{part}.{'bin' if binary else 'txt'}" for part in ("cameras", "images", "points3D"))
     positions = np.zeros((0, 3))
@@ -93,11 +89,7 @@ def read_model(folder: Path) -> Model:
 
 
 def intrinsics_of(model: str, width: int, height: int, values: list[float], where: str) -> Intrinsics:
-    """A COLMAP camera as ours; its radial models are OpenCV's with the absent coefficients 0.
-
-    Raises:
-        InputError: the model has no counterpart here, or the values are no usable camera.
-    """
+    """A COLMAP camera as ours; its radial models are OpenCV's with the absent coefficients 0."""
     if model not in SUPPORTED:
         raise InputError(f"{where}: the camera model {model} is not supported; run `colmap image_undistorter` and give its output")
     count, kind = SUPPORTED[model]

@@ -85,12 +85,7 @@ def convert_images(capture: Capture, out: Path, threads: int, progress: Progress
 
 
 def write_image(source: Path, target: Path) -> Path:
-    """Write an image, upright, as `target` with `.jpg` added, or `.png` where it has alpha, and return that path.
-
-    Raises:
-        InputError: it cannot be decoded.
-        OutputError: it cannot be written.
-    """
+    """Write an image, upright, as `target` with `.jpg` added, or `.png` where it has alpha, and return that path."""
     image = upright(*read_image(source))
     alpha = image.shape[2] == 4
     path = target.with_name(f"{target.name}.{'png' if alpha else 'jpg'}")

@@ -49,11 +49,7 @@ class Sample:
 
     @classmethod
     def of(cls, depth: Array, frame: Frame) -> Sample | None:
-        """Of a frame's depth (H, W) in any unit; None where it is empty, or the frame has no camera or pose.
-
-        Raises:
-            InputError: the map has another shape than its camera.
-        """
+        """Of a frame's depth (H, W) in any unit; None where it is empty, or the frame has no camera or pose."""
         camera = frame.depth_intrinsics or frame.intrinsics
         camera = None if camera is None else fitted(camera, (depth.shape[1], depth.shape[0]), str(frame.depth)).pinhole()
         row, column = np.nonzero(depth > 0)
@@ -66,11 +62,7 @@ class Sample:
 
 
 def check_depth(capture: Capture, progress: Progress = SILENT) -> list[str]:
-    """Warnings about the depth maps of `capture`; none when it has no depth.
-
-    Raises:
-        InputError: a depth file is missing or damaged, no map holds a value, or depth and poses are in different units.
-    """
+    """Warnings about the depth maps of `capture`; none when it has no depth."""
     frames = [frame for frame in capture.frames if frame.depth is not None]
     if not frames:
         return []

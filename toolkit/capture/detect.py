@@ -82,9 +82,6 @@ def _read_below(folder: Path) -> Capture | None:
     """The only capture in the folders below: of those with poses, else of photos, or a video; None where there is none.
 
     Several folders of images may be one capture's colour and depth, which only a layout shows.
-
-    Raises:
-        InputError: there are several.
     """
     found = captures_below(folder)
     if len(found) > 1:

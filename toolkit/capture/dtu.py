@@ -75,11 +75,7 @@ def read_dtu(path: Path | str) -> Capture:
 
 
 def decompose(projection: Array, where: str) -> tuple[Array, Array]:
-    """(3 or 4, 4) projection, of any scale and sign → K (3, 3) with K[2, 2] = 1 and world_from_camera (4, 4).
-
-    Raises:
-        InputError: not the projection of a camera.
-    """
+    """(3 or 4, 4) projection, of any scale and sign → K (3, 3) with K[2, 2] = 1 and world_from_camera (4, 4)."""
     if projection.shape not in ((3, 4), (4, 4)):
         raise InputError(f"{where} has shape {projection.shape}, a 4×4 projection is expected; check how it was written")
     projection = projection[:3].astype(np.float64)
@@ -102,9 +98,6 @@ def camera_for(matrix: Array, size: tuple[int, int], where: str) -> tuple[Intrin
 
     K is taken as it is when twice its principal point is near the image's size. When it is near DTU's 1600×1200 instead, the
     image is taken as that original resized (same shape) or cropped to its middle square and resized (square image).
-
-    Raises:
-        InputError: neither.
     """
     width, height = size
     camera = from_matrix(matrix, width, height, where)

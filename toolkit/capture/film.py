@@ -64,11 +64,7 @@ class Film:
         return [fingerprint(*(path for frame in self.capture.frames for path in (frame.image, frame.depth) if path is not None))]
 
     def images(self, numbers: Collection[int] | None = None) -> Iterator[tuple[int, Array | None]]:
-        """The frames (all, or `numbers`) as (H, W, 3) uint8 RGB, one at a time; None for a recording's image that is damaged.
-
-        Raises:
-            InputError: the video cannot be opened, or an image in a `.sens` file is damaged.
-        """
+        """The frames (all, or `numbers`) as (H, W, 3) uint8 RGB, one at a time; None for a recording's image that is damaged."""
         if not self.capture.film:
             yield from iterate_video(self.path, numbers, as_stored=self.as_stored)
             return
@@ -80,12 +76,7 @@ class Film:
             yield number, image
 
     def jpegs(self, numbers: Collection[int]) -> Iterator[tuple[int, bytes]]:
-        """Frames `numbers` as JPEG files: what is JPEG already stays so, and a video's are made.
-
-        Raises:
-            InputError: a frame is damaged.
-            OutputError: it cannot be encoded.
-        """
+        """Frames `numbers` as JPEG files: what is JPEG already stays so, and a video's are made."""
         if self.capture.film:
             for number in sorted(numbers):
                 image = self.known[number].image
@@ -110,12 +101,7 @@ class Film:
         return image.parent / DEPTH / f"{image.stem}.{'png' if self.packed else 'npy'}"
 
     def write_depth(self, number: int, target: Path) -> None:
-        """Frame `number`'s depth at `target`; nothing where a recording's is damaged.
-
-        Raises:
-            InputError: it is damaged in a `.sens` file.
-            OutputError: it cannot be encoded.
-        """
+        """Frame `number`'s depth at `target`; nothing where a recording's is damaged."""
         if self.packed:
             data = _encoded(".png", sens_depth(self.path, number), f"the depth of frame {number} of {self.path}", [])
             with atomic_path(target) as temporary:

@@ -126,11 +126,7 @@ def image_header(path: Path) -> Header:
 
 
 def image_size(path: Path, others: Sequence[Path] = ()) -> tuple[int, int]:
-    """Size (width, height) of an image; where it cannot be read, that of the first of the `others` that can.
-
-    Raises:
-        InputError: none of them can.
-    """
+    """Size (width, height) of an image; where it cannot be read, that of the first of the `others` that can."""
     sizes = (image_header(one).size for one in (path, *others))
     size = next((size for size in sizes if size != UNREADABLE.size), None)
     if size is None:

@@ -33,11 +33,7 @@ def file_is_heif(path: Path) -> bool:
 
 
 def register(path: Path) -> None:
-    """Let Pillow read HEIF, of which `path` is the first.
-
-    Raises:
-        InputError: pillow-heif is not installed.
-    """
+    """Let Pillow read HEIF, of which `path` is the first."""
     try:
         from pillow_heif import register_heif_opener
     except ImportError as error:
@@ -49,11 +45,7 @@ def register(path: Path) -> None:
 
 
 def decode(data: bytes, path: Path) -> Array:
-    """(H, W), (H, W, 3) or (H, W, 4) uint8, BGR(A), turned as the file has it; ten and twelve bits become eight.
-
-    Raises:
-        InputError: it cannot be decoded, or pillow-heif is not installed.
-    """
+    """(H, W), (H, W, 3) or (H, W, 4) uint8, BGR(A), turned as the file has it; ten and twelve bits become eight."""
     register(path)
     import pillow_heif
 
@@ -65,9 +57,6 @@ def decode(data: bytes, path: Path) -> Array:
 
 def small(data: bytes, side: int, path: Path) -> Array:
     """(h, w) uint8 grey, at least `side` pixels along the long side if the image has them: its embedded thumbnail if that is large enough.
-
-    Raises:
-        InputError: it cannot be decoded, or pillow-heif is not installed.
     """
     register(path)
     try:

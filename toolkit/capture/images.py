@@ -67,11 +67,7 @@ def load_image(frame: Frame, *, exif: bool = False) -> Array:
 
 
 def read_image(path: Path, white: int | None = None) -> tuple[Array, int]:
-    """The image in the file `path` as `load_image` has it, pixels as stored, and the EXIF orientation; `white` as `Frame.white`.
-
-    Raises:
-        InputError: naming the file.
-    """
+    """The image in the file `path` as `load_image` has it, pixels as stored, and the EXIF orientation; `white` as `Frame.white`."""
     image, header = decode(path)
     return to_srgb(to_rgba(image, white), header.profile), 1 if header.format == heif.FORMAT else header.orientation
 

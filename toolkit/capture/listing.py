@@ -119,11 +119,7 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
 
 
 def read_numbers(path: Path) -> Array:
-    """All numbers of a text file, float64; values may be infinite or NaN, the latter also as Microsoft's C library has it (`-1.#IND`).
-
-    Raises:
-        InputError: missing, not text, or a word that is not a number.
-    """
+    """All numbers of a text file, float64; values may be infinite or NaN, the latter also as Microsoft's C library has it (`-1.#IND`)."""
     words = read_text(path).split()
     try:
         return np.array([float("nan") if word.lower().lstrip("+-").startswith(("1.#", "nan")) else float(word) for word in words])
@@ -146,11 +142,7 @@ def read_matrix(path: Path, *shapes: tuple[int, int]) -> Array:
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """A JSON file whose top level is an object.
-
-    Raises:
-        InputError: missing, too large, not JSON, not an object.
-    """
+    """A JSON file whose top level is an object."""
     data = files.read_json(path)
     if not isinstance(data, dict):
         raise InputError(f"{path} must hold a JSON object at its top level; check how it was written")
@@ -158,11 +150,7 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def number(data: Mapping[str, Any], key: str, where: str) -> float | None:
-    """`data[key]` as a finite float, None when absent.
-
-    Raises:
-        InputError: something else stands there.
-    """
+    """`data[key]` as a finite float, None when absent."""
     value = data.get(key)
     if value is None:
         return None
@@ -175,11 +163,7 @@ def number(data: Mapping[str, Any], key: str, where: str) -> float | None:
 
 
 def numbers(value: Any, where: str, count: int | None = None, advice: str = "check how it was written") -> Array:
-    """Lists of numbers, or of words that are, as finite float64; `count` of them in all, if it is given.
-
-    Raises:
-        InputError: something else stands there.
-    """
+    """Lists of numbers, or of words that are, as finite float64; `count` of them in all, if it is given."""
     try:
         array = np.array(value, dtype=np.float64)
     except (ValueError, TypeError, OverflowError) as error:

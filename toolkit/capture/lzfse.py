@@ -19,11 +19,7 @@ MOST_PIXELS = 4_000_000  # of a map of unknown size: the largest is the front ca
 
 
 def require(path: Path) -> Any:
-    """The package that reads LZFSE, for `path`.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """The package that reads LZFSE, for `path`."""
     try:
         import imagecodecs
 
@@ -37,11 +33,7 @@ def require(path: Path) -> Any:
 
 
 def load_map(path: Path, width: int, height: int) -> Array:
-    """The map in a `.depth` or `.conf` file, (height, width), float32 or uint8 by its suffix.
-
-    Raises:
-        InputError: it cannot be read, is damaged, or has another number of pixels; the decoder is not installed.
-    """
+    """The map in a `.depth` or `.conf` file, (height, width), float32 or uint8 by its suffix."""
     kind = TYPES[path.suffix.lower()]
     data = _inflated(path, width * height * kind.itemsize)
     if len(data) != width * height * kind.itemsize:
@@ -50,11 +42,7 @@ def load_map(path: Path, width: int, height: int) -> Array:
 
 
 def count_pixels(path: Path) -> int:
-    """How many values a map of unknown size holds.
-
-    Raises:
-        InputError: as `load_map`; it holds more than `MOST_PIXELS`.
-    """
+    """How many values a map of unknown size holds."""
     kind = TYPES[path.suffix.lower()]
     size = len(_inflated(path, MOST_PIXELS * kind.itemsize))
     if size > MOST_PIXELS * kind.itemsize or size % kind.itemsize:

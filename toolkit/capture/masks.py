@@ -55,9 +55,6 @@ def with_masks(capture: Capture, use: str = "auto") -> Capture:
 
     Args:
         use: auto | inverted (white is excluded) | off.
-
-    Raises:
-        InputError: the masks leave nothing of any image.
     """
     if use == "off":
         return capture.with_frames(map(_unmasked, capture.frames))

@@ -40,11 +40,7 @@ REMARKS = {
 
 
 def matrix(value: Any, where: str) -> Array:
-    """A (4, 4) float64 matrix from nested lists of 3×4 or 4×4 numbers. Its values are not judged.
-
-    Raises:
-        InputError: something else stands there.
-    """
+    """A (4, 4) float64 matrix from nested lists of 3×4 or 4×4 numbers. Its values are not judged."""
     try:
         array = np.array(value, dtype=np.float64)
     except (ValueError, TypeError, OverflowError) as error:
@@ -57,11 +53,7 @@ def matrix(value: Any, where: str) -> Array:
 
 
 def frame_list(data: Mapping[str, Any], path: Path) -> list[dict[str, Any]]:
-    """The entries of `frames`, each with a `file_path`.
-
-    Raises:
-        InputError: there is no such list, or it is empty.
-    """
+    """The entries of `frames`, each with a `file_path`."""
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path} lists no frames; a list named 'frames' is expected")
@@ -72,11 +64,7 @@ def frame_list(data: Mapping[str, Any], path: Path) -> list[dict[str, Any]]:
 
 
 def listed_names(entries: Sequence[Mapping[str, Any]], keys: Sequence[str], path: Path) -> list[str | None]:
-    """What each entry lists under the first of `keys` that it has; None where it has none of them.
-
-    Raises:
-        InputError: not a name.
-    """
+    """What each entry lists under the first of `keys` that it has; None where it has none of them."""
     out: list[str | None] = []
     for index, entry in enumerate(entries):
         listed = next((entry[key] for key in keys if entry.get(key) is not None), None)
@@ -87,11 +75,7 @@ def listed_names(entries: Sequence[Mapping[str, Any]], keys: Sequence[str], path
 
 
 def read_listed(folder: CaptureFiles, listed: Sequence[Listed], source: str, base: str = "") -> tuple[list[int], list[Frame], list[str]]:
-    """Of the entries whose images are there: their places in `listed`, their frames (without names), and remarks.
-
-    Raises:
-        InputError: no image is there, a pose or camera is not usable, or an image is of another shape than its camera.
-    """
+    """Of the entries whose images are there: their places in `listed`, their frames (without names), and remarks."""
     found = folder.find([entry["file_path"] for _, entry, _ in listed], source=source, base=base)
     if not found.count:
         raise folder.none_exists(source, len(listed), found)
@@ -121,11 +105,7 @@ def read_listed(folder: CaptureFiles, listed: Sequence[Listed], source: str, bas
 
 
 def once_each(frames: Sequence[Frame]) -> tuple[list[Frame], list[str]]:
-    """Frames without those that list an image once more with the same pose and camera.
-
-    Raises:
-        InputError: an image is listed with two poses or cameras.
-    """
+    """Frames without those that list an image once more with the same pose and camera."""
     first: dict[Path, Frame] = {}
     for frame in frames:
         other = first.setdefault(frame.image, frame)

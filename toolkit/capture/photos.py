@@ -182,9 +182,6 @@ def focal_from_exif(path: Path) -> float | None:
     """The focal length in pixels of the stored image, or None when EXIF has no believable one.
 
     From the 35 mm equivalent (which compares diagonals), else from the focal length and the sensor's resolution.
-
-    Raises:
-        InputError: the file is not an image.
     """
     width, height = image_header(path).size
     if not width:  # it cannot be read, which is reported elsewhere

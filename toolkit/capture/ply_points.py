@@ -19,11 +19,7 @@ ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 
 
 def read_ply_points(path: Path) -> Array:
-    """(N, 3) float64 vertex positions; points that are not finite are left out.
-
-    Raises:
-        InputError: not a PLY file whose first element is a plain list of vertices.
-    """
+    """(N, 3) float64 vertex positions; points that are not finite are left out."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path} is larger than {MAX_BYTES / 2**20:.0f} MB; give a sparse point cloud, or none")

@@ -124,11 +124,7 @@ def checked_pose(pose: Array, where: str) -> Array:
 
 
 def checked_place(place: Array, where: str) -> None:
-    """Refuse a translation (3,) further than `FARTHEST` from the origin: it leaves no digits for all else.
-
-    Raises:
-        InputError: it is.
-    """
+    """Refuse a translation (3,) further than `FARTHEST` from the origin: it leaves no digits for all else."""
     farthest = float(np.abs(place).max())
     if not farthest <= FARTHEST:
         raise InputError(

@@ -69,11 +69,7 @@ def looks_like_record3d(path: Path) -> bool:
 
 
 def holds_record3d(archive: Path) -> bool:
-    """Whether a zip file holds such a recording.
-
-    Raises:
-        InputError: it is no zip file, or cut short.
-    """
+    """Whether a zip file holds such a recording."""
     return _root(members(archive)) is not None
 
 

@@ -104,9 +104,6 @@ class CaptureFiles:
             anywhere: also in other folders than the listed ones.
             kind: for what is no image (DEPTH, MASK, POINTS): the word by which its folder is known where it has another name.
             taken: files that stand for something else.
-
-        Raises:
-            InputError: two folders or files fit equally well, or a link leads outside the capture's folder.
         """
         parsed = [_Name.of(base, listed) for listed in dict.fromkeys(names)]
         chosen = {name.listed: exact for name in parsed if (exact := self._exact(base, name.listed)) is not None}

@@ -283,11 +283,7 @@ def _poses_of(images: Sequence[Path], poses: _Poses, root: Path) -> dict[int, Ar
 
 
 def _camera(root: Path, layout: _Layout, size: tuple[int, int]) -> tuple[Intrinsics, float | None, str]:
-    """The colour camera, stored depth values for each unit (None: not given), and the file that has them.
-
-    Raises:
-        InputError: no file has a camera.
-    """
+    """The colour camera, stored depth values for each unit (None: not given), and the file that has them."""
     places = dict.fromkeys((layout.depth.parent, root, layout.colour))
     candidates = [file for place in places for pattern in CAMERA_FILES for file in files_in(place, pattern) if file != layout.poses.file]
     named = [file for file in candidates if words_of(file.stem) & CAMERA_WORDS or file.suffix in (".yaml", ".yml")]

@@ -56,11 +56,7 @@ def is_sens(path: Path) -> bool:
 
 
 def scan(path: Path) -> Sens:
-    """The headers of a file.
-
-    Raises:
-        InputError: missing, not such a file, of another version, of a coding that is not read, or cut short.
-    """
+    """The headers of a file."""
     try:
         state = Path(path).stat()
         return _scan(Path(path), state.st_size, state.st_mtime_ns)
@@ -120,11 +116,7 @@ def _read(file: BinaryIO, path: Path, size: int) -> Sens:
 
 
 def iterate_sens(path: Path, indices: Collection[int] | None = None) -> Iterator[tuple[int, Array]]:
-    """The images of a file (of `indices`; None: all that there are) as (index, (H, W, 3) uint8 RGB), in order.
-
-    Raises:
-        InputError: the file cannot be read, or an image in it is damaged.
-    """
+    """The images of a file (of `indices`; None: all that there are) as (index, (H, W, 3) uint8 RGB), in order."""
     found = scan(path)
     for index in range(len(found)) if indices is None else sorted(indices):
         if indices is not None or found.places[index, 1]:
@@ -132,11 +124,7 @@ def iterate_sens(path: Path, indices: Collection[int] | None = None) -> Iterator
 
 
 def sens_size(found: Sens, index: int, data: bytes | None = None) -> tuple[int, int]:
-    """Width and height of image number `index` (its bytes are `data`, or read), which may be smaller than the file's header has it.
-
-    Raises:
-        InputError: there is none, or it is damaged.
-    """
+    """Width and height of image number `index` (its bytes are `data`, or read), which may be smaller than the file's header has it."""
     data = sens_bytes(found, index) if data is None else data
     if found.codings[0] == RAW:
         if len(data) != 3 * found.size[0] * found.size[1]:
@@ -163,11 +151,7 @@ def _image(found: Sens, index: int) -> Array:
 
 
 def sens_depth(path: Path, index: int) -> Array:
-    """The depth of frame `index` as it is stored, (H, W) uint16; 0 = missing.
-
-    Raises:
-        InputError: there is none, or it is damaged.
-    """
+    """The depth of frame `index` as it is stored, (H, W) uint16; 0 = missing."""
     found = scan(path)
     data = sens_bytes(found, index, depth=True)
     width, height = found.depth_size
@@ -182,11 +166,7 @@ def sens_depth(path: Path, index: int) -> Array:
 
 
 def sens_bytes(found: Sens, index: int, depth: bool = False) -> bytes:
-    """The image or the depth of frame `index` as it is coded.
-
-    Raises:
-        InputError: there is none, or the file cannot be read.
-    """
+    """The image or the depth of frame `index` as it is coded."""
     if not 0 <= index < len(found) or not found.places[index, 1 + depth]:
         what = "depth" if depth else "image"
         raise InputError(f"{found.path} holds no {what} of a frame {index}; give the file that the run began with")

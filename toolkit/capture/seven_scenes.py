@@ -71,11 +71,7 @@ def frame_folders(root: Path) -> list[Path]:
 
 
 def frame_files(root: Path) -> list[FrameFiles]:
-    """All frames below `root`, in the order of their folders and numbers.
-
-    Raises:
-        InputError: no frames, or not one pose for each image.
-    """
+    """All frames below `root`, in the order of their folders and numbers."""
     found: list[FrameFiles] = []
     for folder in frame_folders(root):
         images = [path for path in images_in(folder) if path.name.startswith("frame-")]
@@ -101,11 +97,7 @@ def frame_names(found: list[FrameFiles]) -> list[str]:
 def posed_frames(
     found: list[FrameFiles], names: list[str], colour: Intrinsics, depth: Intrinsics, root: Path
 ) -> tuple[list[Frame], list[str]]:
-    """The frames that have a pose, and a remark on those that were lost (-inf or NaN). The cameras are scaled to the images' sizes.
-
-    Raises:
-        InputError: all are lost, a pose is not rigid, or an image has another shape than its camera.
-    """
+    """The frames that have a pose, and a remark on those that were lost (-inf or NaN). The cameras are scaled to the images' sizes."""
     frames = []
     lost = 0
     for entry, name in zip(found, names, strict=True):
@@ -119,11 +111,7 @@ def posed_frames(
 
 
 def lost_frames(listed: int, tracked: int, where: Path) -> list[str]:
-    """A remark on frames whose tracking was lost, none where none was.
-
-    Raises:
-        InputError: all of them are.
-    """
+    """A remark on frames whose tracking was lost, none where none was."""
     lost = listed - tracked
     if not tracked:
         raise InputError(f"all {counted(lost, 'pose')} in {where} are -inf or NaN (tracking lost); no frame is left to use")

@@ -86,11 +86,7 @@ def _frame(root: Path, row: dict[str, str], index: int, shared: Intrinsics) -> F
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    """The rows of `odometry.csv`, at least one, each as name of a column → word.
-
-    Raises:
-        InputError: missing, not text, rows of different length, or too few numbers a row.
-    """
+    """The rows of `odometry.csv`, at least one, each as name of a column → word."""
     lines = [[word.strip() for word in line.split(",")] for line in read_text(path).splitlines() if line.strip()]
     header: list[str] = []
     if lines and any(letter.isalpha() for word in lines[0] for letter in word.lower().replace("e", "")):

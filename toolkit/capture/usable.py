@@ -26,9 +26,6 @@ def without(capture: Capture, bad: Mapping[str, str], refusal: str | None = None
 
     Args:
         refusal: the error where too many are bad; None: the first one's sentence.
-
-    Raises:
-        InputError: too many are bad.
     """
     if not bad:
         return capture
@@ -43,11 +40,7 @@ def without(capture: Capture, bad: Mapping[str, str], refusal: str | None = None
 
 
 def with_usable_depth(capture: Capture) -> Capture:
-    """The capture without those few depth maps that are missing, empty or damaged; their frames stay.
-
-    Raises:
-        InputError: too many depth maps are.
-    """
+    """The capture without those few depth maps that are missing, empty or damaged; their frames stay."""
     total, bad = 0, dict[str, str]()
     for frame in capture.frames:
         if frame.depth is None or frame.video_index is not None:
@@ -97,11 +90,7 @@ def turned_by_exif(capture: Capture) -> Capture:
 
 
 def with_usable_poses(capture: Capture, notes: PoseNotes) -> Capture:
-    """The capture without frames whose pose holds nothing usable, and with remarks on poses that were made rigid.
-
-    Raises:
-        InputError: too many poses are unusable.
-    """
+    """The capture without frames whose pose holds nothing usable, and with remarks on poses that were made rigid."""
     lost = [frame for frame in capture.frames if frame.world_from_camera is not None and not np.isfinite(frame.world_from_camera).all()]
     sentences = [*notes.unusable[: len(lost)], *[""] * (len(lost) - len(notes.unusable))]
     refusal = None

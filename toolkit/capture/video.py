@@ -90,9 +90,6 @@ def iterate_video(path: Path, indices: Collection[int] | None = None, *, as_stor
 
     Frames are counted in decoding order rather than sought by time, so an index always means the same image. With `indices`
     only those are converted and yielded, and decoding ends after the last of them. A `.sens` file is a video too.
-
-    Raises:
-        InputError: the video cannot be opened.
     """
     if is_sens(Path(path)):
         yield from iterate_sens(Path(path), indices)
