@@ -159,7 +159,7 @@ def test_chosen_frames_are_the_files_of_the_recording(recording: Path, tmp_path:
     ("changes", "said"),
     [
         ({"K": None, "perFrameIntrinsicCoeffs": None}, "has no camera"),
-        ({"K": [1, 2, 3]}, "nine numbers"),
+        ({"K": [1, 2, 3]}, "must hold 9 numbers"),
         ({"K": [1e400] * 9}, "not finite"),
         ({"K": "wide"}, "numbers only"),
         ({"K": [128, 0, 81, 0, 128, 59, 0, 0, 1]}, "corner"),  # row by row

@@ -82,7 +82,7 @@ def test_columns_are_found_by_their_names(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda number, line: line + (NOW if number == 0 else ", 1, nan, 3, 4"), r"odometry\.csv, row 1 holds numbers that are not finite"),
+        (lambda number, line: line + (NOW if number == 0 else ", 1, nan, 3, 4"), r"odometry\.csv, row 1 holds values that are not finite"),
         (lambda number, line: line + (NOW if number == 0 else ", 0, 1, 3, 4"), r"odometry\.csv, row 1: the focal length is 0"),
         (lambda number, line: line if number != 3 else line.rsplit(",", 1)[0], "rows of different length"),
         (lambda number, line: line.replace("qw", "q"), "number"),

@@ -241,7 +241,7 @@ def _copies(looks: Sequence[Look], headers: dict[Path, Header]) -> dict[Path, Pa
     """An image that shows the same as another → that other one: the larger, then the one with the shorter name."""
     pixels = {look.frame.image: headers[look.frame.image].width * headers[look.frame.image].height for look in looks}
     order = sorted(looks, key=lambda look: (-pixels[look.frame.image], len(look.frame.name)))
-    flat = np.array([look.tiny.ravel() for look in order], dtype=np.float32).reshape(len(order), -1)
+    flat = np.array([look.tiny.ravel() for look in order], dtype=np.float32).reshape(len(order), 48 * 48)
     means = flat.mean(axis=1)
     contrast = np.minimum(1.0, flat.std(axis=1) / CONTRAST)
     out: dict[Path, Path] = {}

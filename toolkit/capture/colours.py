@@ -91,7 +91,7 @@ def profile_of(primaries: object, transfer: object) -> bytes | None:
     text = b"mluc" + struct.pack(">3I2s2sII", 0, 1, 12, b"en", b"US", 4, 28) + "it".encode("utf-16-be")
     tags = {b"desc": text, b"cprt": text, b"wtpt": struct.pack(">4sI3i", b"XYZ ", 0, *D50)}
     curve = struct.pack(">4sIHH5i", b"para", 0, 3, 0, *(round(65536 * value) for value in CURVE))
-    for name, values in zip((b"r", b"g", b"b"), PRIMARIES[primaries], strict=True):  # type: ignore[index]
+    for name, values in zip((b"r", b"g", b"b"), PRIMARIES[primaries], strict=True):
         tags |= {name + b"XYZ": struct.pack(">4sI3i", b"XYZ ", 0, *values), name + b"TRC": curve}
     table, body = struct.pack(">I", len(tags)), b""
     first = 128 + len(table) + 12 * len(tags)

@@ -99,7 +99,7 @@ class Views:
     def subset(self, indices: list[int] | Array) -> Views:
         """The views at `indices`, sharing the pixels."""
         keep = [int(i) for i in indices]
-        lists = {
+        lists: dict[str, Any] = {
             one.name: [values[i] for i in keep] if values else []
             for one in fields(self)
             if isinstance(values := getattr(self, one.name), list)
