@@ -58,7 +58,7 @@ def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
     from fieldfuse.capture.beside import unused
     from fieldfuse.capture.checks import check_capture
     from fieldfuse.pipelines.console import make_progress
-    from fieldfuse.pipelines.summary import describe_capture
+    from fieldfuse.pipelines.source import describe_capture
     from fieldfuse.poses.check_given import best_fitting
 
     capture, agreement = open_capture(source, choose=None if fast else best_fitting), None

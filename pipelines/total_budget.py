@@ -9,24 +9,25 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import psutil
 
-from fieldfuse.config import EXPORTS, settings_dict
+from fieldfuse.capture.convert import to_convert
+from fieldfuse.capture.prepare import held_out
+from fieldfuse.capture.types import Capture
+from fieldfuse.config import EXPORTS, Settings, settings_dict
 from fieldfuse.errors import FieldfuseError
 from fieldfuse.evaluation import budget as model
+from fieldfuse.evaluation.budget_probe import self_test
 from fieldfuse.files import fingerprint, read_json, write_json
 from fieldfuse.pipelines.exports import TEXTURE
+from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.page import PAGE
+from fieldfuse.pipelines.prepare import Prepared
 from fieldfuse.pipelines.source import picture_size
 from fieldfuse.pipelines.textured import TSDF_TEXTURE
-
-if TYPE_CHECKING:
-    from fieldfuse.capture.types import Capture
-    from fieldfuse.config import Settings
-    from fieldfuse.pipelines.job import Job
-    from fieldfuse.pipelines.prepare import Prepared
+from fieldfuse.training.start import MARGIN, ROOM_MARGIN, finest_resolution, make_space, worth_a_level
 
 FILE = "plan.json"
 LONGEST_START = 60.0  # seconds; a process that is older was not started for this command
@@ -63,8 +64,6 @@ class TotalBudget:
 
     def choose_pictures(self, job: Job, capture: Capture) -> None:
         """Decide picture size and a video's frames; predict every stage."""
-        from fieldfuse.evaluation.budget_probe import self_test
-
         settings = job.settings
         threads = settings.threads or psutil.cpu_count() or 1
         self.name = model.signature(threads, settings.device)
@@ -135,8 +134,6 @@ class TotalBudget:
 
     def choose_fit(self, job: Job, ready: Prepared) -> None:
         """Decide the fit's seconds and its finest lattice from what is left, and whether meshes get textures and the field its page."""
-        from fieldfuse.training.start import worth_a_level
-
         if not self.again:
             for extra in (TEXTURE, PAGE) if self.all_wanted else ():
                 if getattr(self.work, extra) and self._left(job) < self._least_fit:
@@ -293,9 +290,6 @@ def _round(value: float | None) -> float | None:
 
 def work_of(capture: Capture, settings: Any) -> model.Work:
     """What the capture asks for, from what its headers say."""
-    from fieldfuse.capture.convert import to_convert
-    from fieldfuse.capture.prepare import held_out
-
     width, height = picture_size(capture)
     video = capture.filmed
     frames = settings.capture.max_frames if video else len(capture.frames)
@@ -329,8 +323,6 @@ def work_of(capture: Capture, settings: Any) -> model.Work:
 
 def finest(job: Job, ready: Prepared) -> int:
     """The lattice that a fit would end at without a budget."""
-    from fieldfuse.training.start import MARGIN, ROOM_MARGIN, finest_resolution, make_space
-
     settings, scene, views = job.settings.field, ready.scene, ready.views
     if settings.resolution is not None:
         return settings.resolution
