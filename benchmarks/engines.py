@@ -26,8 +26,8 @@ from fieldfuse.render.image import make_renderer, render_view
 from fieldfuse.steps import choose_device
 from fieldfuse.training.engine import chosen_engine, fit_device, make_engine
 from fieldfuse.training.guided import fit_guided
-from fieldfuse.training.rays import PixelPool
-from fieldfuse.training.step import Rates
+from fieldfuse.training.losses import Rates
+from fieldfuse.training.pixels import PixelPool
 
 IMAGE = (640, 480)
 RENDERS, STEPS, ENOUGH = 9, 50, 3.0  # repetitions at most, and seconds after which fewer will do

@@ -31,7 +31,7 @@ from fieldfuse.render.image import make_renderer, render_view
 from fieldfuse.stereo.transients import LeftOut, load_left_out, save_left_out
 from fieldfuse.tone import exposed
 from fieldfuse.training.finer_colours import finer_colours
-from fieldfuse.training.fit import FitResult
+from fieldfuse.training.fit import Begin, FitResult
 from fieldfuse.training.from_network import Inference
 from fieldfuse.training.guided import fit_guided
 from fieldfuse.training.network_start import network_start
@@ -188,7 +188,7 @@ def fit_radiance_field(job: Job, ready: Prepared, network: NetworkField | None, 
         network: the start of the fit, and the result itself without fine-tuning; None: the start is classical.
         go_on: the field that the folder has is the start, and the budget is for what is added.
     """
-    from fieldfuse.volume.grid_host import host_for
+    from fieldfuse.volume.grid import host_for
 
     settings, scene, folder = job.settings, ready.scene, job.folder
     path, times = folder / "field.safetensors", folder / "timeline.json"
@@ -209,18 +209,18 @@ def fit_radiance_field(job: Job, ready: Prepared, network: NetworkField | None, 
 
     def make() -> Fitted:
         steps.set_seeds(settings.seed)
-        fit = partial(fit_guided, scene=scene, progress=job.progress, host=host_for(settings.device))
+        fit, host = partial(fit_guided, scene=scene, progress=job.progress), host_for(settings.device)
         if start is not None:
             # It has its surfaces, and what moves was found: to match the images again takes a third of a short fit for nothing.
             before = load()
             shown = views if before.left_out is None else before.left_out.without(views)
-            result = fit(shown, settings=replace(settings, fit=going_on(settings.fit)), start=before.field)
+            result = fit(shown, settings=replace(settings, fit=going_on(settings.fit)), begin=Begin(host, before.field))
             spent = before.timeline[-1]["seconds"] if before.timeline else 0.0
             return replace(before, field=result.field, timeline=before.timeline + result.after(spent), notes=result.notes)
         if network is not None and not settings.fit.finetune:
             return Fitted(direct_result(job, ready, network), [])
         first = None if network is None else network_start(network.field, views, scene, settings)
-        return Fitted.of(fit(views, settings=settings, start=first, coarse=first is not None))
+        return Fitted.of(fit(views, settings=settings, begin=Begin(host, first, coarse=first is not None)))
 
     def save(value: Fitted) -> list[Path]:
         value.field.save(path, scene.working_from_input, {"budget": settings.fit.budget, "seed": settings.seed})

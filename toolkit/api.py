@@ -102,9 +102,10 @@ def fit(scene: Scene, budget: float | None = None, *, progress: Listener = None,
     Raises:
         InputError: a setting is not usable, or there are no training views.
     """
+    from fieldfuse.training.fit import Begin
     from fieldfuse.training.guided import fit_guided
     from fieldfuse.training.network_start import network_start
-    from fieldfuse.volume.grid_host import host_for
+    from fieldfuse.volume.grid import host_for
 
     settings = changed_settings(scene.settings, {**options, **({} if budget is None else {"budget": budget})}, OF_FIT)
     if not settings.fit.finetune:
@@ -121,9 +122,7 @@ def fit(scene: Scene, budget: float | None = None, *, progress: Listener = None,
             scene.geometry,
             settings,
             listening(progress, "fit"),
-            host=host_for(settings.device),
-            start=first,
-            coarse=first is not None and start is None,
+            Begin(host_for(settings.device), first, coarse=first is not None and start is None),
         )
     for note in result.notes:
         log.warning("%s", note)

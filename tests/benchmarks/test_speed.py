@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from benchmarks import speed_cases
-from benchmarks.speed import fit_curves, growth, table, tsdf_frames
-from benchmarks.timing import Case, Timed, compare, exponent
+from benchmarks.speed import fit_curves, table, tsdf_frames
+from benchmarks.timing import Case, Timed, exponent
 from fieldfuse.evaluation.sphere import CHANNELS, around, lens, sphere_field, sphere_pixels
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_image import BakedRenderer
-from fieldfuse.training.numba_engine import NumbaOptimiser
+from fieldfuse.training.numba_engine import NumbaEngine
 from tests.pipelines.made import bench
 
 
@@ -28,7 +28,7 @@ def test_a_ray_looks_up_and_touches_a_bounded_number_of_rows() -> None:
     """A wall of eight voxels with an optical thickness of about ½ each, crossed at most twice, is left after few samples."""
     counts = {}
     for size in (32, 64):
-        engine = NumbaOptimiser(sphere_field(size), sphere_pixels(48), threads=1)
+        engine = NumbaEngine(sphere_field(size), sphere_pixels(48), threads=1)
         counts[size] = speed_cases.step_counts(engine)
         assert 3 < counts[size]["looked_up_a_ray"] < 24
         # A first step touches the corners beside what it saw, each once: never more than eight a sample, and far fewer when rays meet.
@@ -51,7 +51,7 @@ def test_memory_a_voxel() -> None:
     baked = bake(field)
     assert field.bytes / field.voxels < 4 * (CHANNELS + 1) * 4
     assert baked.bytes / baked.voxels < 70
-    engine = NumbaOptimiser(field, sphere_pixels(16), threads=1)
+    engine = NumbaEngine(field, sphere_pixels(16), threads=1)
     rows = len(field.density_rows)
     assert engine.index.nbytes == rows * 8 and engine.marks.nbytes == len(field.occupied) * 2
     assert engine.records.shape == (rows, CHANNELS + 2) and engine.records.itemsize == 2
@@ -66,22 +66,6 @@ def test_ratios_are_of_the_clock_that_is_asked_for() -> None:
 def test_growth_is_fitted() -> None:
     sizes = np.array([10.0, 20.0, 40.0])
     assert exponent(list(sizes), list(3 * sizes**1.7)) == pytest.approx(1.7)
-
-
-def test_growth_is_measured_over_rays_and_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, sizes in (("GROWING_RAYS", (64, 256)), ("GROWING_SIDES", (16, 32)), ("GROWING_VIEWS", (4, 8)), ("LATTICE", 32)):
-        monkeypatch.setattr(speed_cases, name, sizes)
-    cases = list(speed_cases.growth_cases(1))
-    assert [case.size for case in cases] == ["64 rays", "256 rays", "16 pixels", "32 pixels", "4 images", "8 images"]
-    assert set(growth(cases)) == {case.name for case in cases}
-    assert [case.units for case in cases[:2]] == [256, 1024]
-
-
-def test_pieces_of_work_are_timed_in_turns() -> None:
-    order: list[str] = []
-    ours, reference = compare(lambda: order.append("a"), lambda: order.append("b"), 2)
-    assert order == ["a", "b", "a", "b", "b", "a"]
-    assert 0 <= ours.wall < 1 and 0 <= reference.processor < 1
 
 
 def test_some_parts_are_measured_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

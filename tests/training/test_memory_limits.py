@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from itertools import product
 from multiprocessing import get_context
 
 import pytest
@@ -12,39 +11,20 @@ import torch
 
 from fieldfuse import memory
 from fieldfuse.errors import InputError
-from fieldfuse.training import room
+from fieldfuse.training import memory_limits
 from fieldfuse.training.engine import make_engine
-from fieldfuse.training.fit import fit_field
+from fieldfuse.training.fit import Begin, fit_field
 from fieldfuse.training.levels import finer
-from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.losses import Rates
+from fieldfuse.training.pixels import PixelPool
 from fieldfuse.training.schedule import Schedule
-from fieldfuse.training.step import Rates
-from fieldfuse.volume.compiled import finer_blocks
-from fieldfuse.volume.grid_host import GridHost
-from fieldfuse.volume.host import TorchHost
+from fieldfuse.volume.grid import GridHost
 from tests.pages import in_memory
 from tests.training.test_fit import scene, sphere_views, ticking, wanted
 
 
 def allow(monkeypatch: pytest.MonkeyPatch, free: int | None) -> None:
     monkeypatch.setattr(memory, "available", lambda: free)
-
-
-def test_rows_of_a_finer_level_are_about_what_is_foreseen(monkeypatch: pytest.MonkeyPatch) -> None:
-    ticking(monkeypatch, 0.1)
-    field = fit_field(sphere_views(), scene(), wanted("engine=torch", "budget=3", "field.resolution=32")).field
-    for ratio, share in product((2.0, 1.5), (1.0, 0.3, 0.02)):
-        keep = field.occupied & (torch.rand(len(field.occupied), generator=torch.Generator().manual_seed(1)) < share)
-        made = len(finer(field, keep, int(ratio * field.resolution), TorchHost()).density_rows)
-        assert 0.6 < room.level_rows(keep, ratio) / made < 2.5, (ratio, share)
-
-
-def test_blocks_of_a_finer_level_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    ticking(monkeypatch, 0.2)
-    field = fit_field(sphere_views(), scene(), wanted("engine=numba", "budget=2", "field.resolution=32")).field
-    for ratio in (1.0, 1.5, 2.0, 3.75):
-        keep = field.occupied & (torch.rand(len(field.occupied), generator=torch.Generator().manual_seed(1)) < 0.3)
-        assert len(finer_blocks(field.topology, keep, ratio)) == finer(field, keep, int(ratio * field.resolution), TorchHost()).blocks
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +39,7 @@ def apart() -> Iterator[ProcessPoolExecutor]:
 @pytest.mark.parametrize("threads", [1, 2])
 def test_what_the_compiled_engine_needs_is_what_it_takes(decoder: str, threads: int, apart: ProcessPoolExecutor) -> None:
     held, foreseen, replacing = apart.submit(held_and_foreseen, decoder, threads).result()
-    assert 0.8 * held < foreseen < 2 * held + threads * room.SUMS  # this ball has more of its rows touched than captures have
+    assert 0.8 * held < foreseen < 2 * held + threads * memory_limits.SUMS  # this ball has more of its rows touched than captures have
     assert replacing < foreseen
 
 
@@ -78,12 +58,12 @@ def held_and_foreseen(decoder: str, threads: int) -> tuple[float, int, int]:
     for _ in range(40):
         engine.step(512, Rates(0.1, 0.1, 1e-3, 0.01))
     torch.set_num_threads(before)
-    arrays = [getattr(engine, name) for name in ("index", "records", "touched", "density_sums", "feature_sums", "marks")]
+    arrays = [*(rows for rows in engine.rows if rows is not engine.rows.bases), engine.marks]
     arrays += [grown.density_rows.numpy(), grown.feature_rows.numpy()]
     held = sum(in_memory(rows) * rows.nbytes for rows in arrays)
     everything = torch.ones_like(field.occupied)
-    foreseen = room.compiled_bytes(field, everything, 128, settings, replaced=False)
-    replacing = room.compiled_bytes(field, everything, 128, settings)
+    foreseen = memory_limits.level_bytes(field, everything, 128, settings, replaced=False)
+    replacing = memory_limits.level_bytes(field, everything, 128, settings)
     host.close()
     return held, foreseen, replacing
 
@@ -96,7 +76,7 @@ def test_a_fit_climbs_where_there_is_little_memory_but_enough(monkeypatch: pytes
     for free in (2**21, 2**26):
         ticking(monkeypatch, 0.02)
         allow(monkeypatch, memory.SPARE + free)
-        result = fit_field(sphere_views(), scene(), settings, host=GridHost())
+        result = fit_field(sphere_views(), scene(), settings, begin=Begin(GridHost()))
         reached.append(result.field.resolution)
         assert len(result.notes) == (result.field.resolution < 64)
     assert reached == [32, 64]
@@ -124,8 +104,8 @@ def test_what_cannot_begin_is_refused_with_numbers(monkeypatch: pytest.MonkeyPat
         fit_field(sphere_views(), scene(), settings)
     allow(monkeypatch, memory.SPARE + 2**20)
     with pytest.raises(InputError, match=r"going on from a field of [\d,]+ blocks needs about .* is free; fit it anew"):
-        fit_field(sphere_views(), scene(), settings, start=field)
+        fit_field(sphere_views(), scene(), settings, begin=Begin(start=field))
     with pytest.raises(InputError, match=r"going on from a field of [\d,]+ blocks needs about"):
-        fit_field(sphere_views(), scene(), wanted("engine=numba", "budget=2", "field.resolution=32"), start=field)
+        fit_field(sphere_views(), scene(), wanted("engine=numba", "budget=2", "field.resolution=32"), begin=Begin(start=field))
     allow(monkeypatch, None)
-    assert not fit_field(sphere_views(), scene(), settings, start=field).notes
+    assert not fit_field(sphere_views(), scene(), settings, begin=Begin(start=field)).notes

@@ -1,17 +1,29 @@
-"""The pixels that a fit may look at, and rays through them; `importance` draws them."""
+"""The pixels of a fit: rays through them, and which of them a step looks at.
+
+More of those where the field was wrong lately are drawn, each counted by how rarely such a pixel is drawn. A step's losses estimate means
+over all pixels. The estimate's gradient varies least when a pixel is drawn in proportion to the size of its own gradient, which goes with
+the root of its squared error. So every tile of a training image stores the error that rays from it had, and a pixel of it is drawn with a
+density
+
+    q = 1 − S + S · min(√e / mean √e, M)
+
+and counts 1 / q in all losses, which leaves their means as they are but for a factor (importance sampling; the paper draws evenly). What
+no ray came to has q = 1. Pixels are drawn by lot from evenly drawn ones, so masks and weights of images need no index. Here for any
+device; compiled twins are in `backends/numba/train_batch.py`.
+"""
 
 from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 import torch
 
+from fieldfuse.backends.constants import KEEP, MOST, RENEW, SHARE, TILE, TOP
+from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.types import Views
-from fieldfuse.training.depth import ray_distances
 
 Tensor = torch.Tensor
 REACH = 3.0  # deviations of a Gaussian beyond which nothing counts
@@ -27,11 +39,19 @@ class Batch:
     weight: Tensor | None = None  # (B,) what each ray counts in the means over the batch; None: 1
 
 
+def ray_distances(depth: Array, camera: Intrinsics) -> Array:
+    """(H, W) float32 depth along z → distance along each pixel's ray; 0, missing, stays 0. The camera is a pinhole."""
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    length = np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2)
+    return np.asarray(np.where(np.isfinite(depth) & (depth > 0), depth * length, 0), dtype=np.float32)
+
+
 class PixelPool:
     """The valid pixels of some views, as uint8 on the device, view after view, with what is needed to make their rays.
 
-    A view's pixels are starts[v] … starts[v + 1], in the order of its picture; which place each has in it is kept only where pixels are
-    left out. Of a view that counts for less, so many are drawn by lot (always the same ones) as its weight says: rays come evenly from
+    A view's pixels are starts[v] … starts[v + 1], in the order of its image; which place each has in it is stored only where pixels are
+    excluded. Of a view that counts for less, so many are drawn by lot (always the same ones) as its weight says: rays come evenly from
     what is kept.
     """
 
@@ -62,7 +82,7 @@ class PixelPool:
 
     def soften(self, views: Views, radius: float) -> None:
         """Set the colours to those of the `views` that the pool was made of, as means over a Gaussian of a deviation of `radius` pixels (0:
-        as they are). Pixels that do not take part go into no mean. The array stays the same: whoever holds it sees the new colours."""
+        as they are). Pixels that do not take part go into no mean. The array stays the same: its views see the new colours."""
         for index, image in enumerate(views.images):
             begin, end = int(self.starts[index]), int(self.starts[index + 1])
             valid = views.valid[index] if views.valid else None
@@ -71,7 +91,7 @@ class PixelPool:
             self.colour[begin:end] = torch.from_numpy(np.ascontiguousarray(colour[places])).to(self.colour.device)
 
     @staticmethod
-    def _kept(views: Views, index: int) -> np.ndarray[Any, Any] | None:
+    def _kept(views: Views, index: int) -> Array | None:
         """(P,) int32 places of a view's pixels that take part, ascending; None: all."""
         valid, image = views.valid[index] if views.valid else None, views.images[index]
         flat = None if valid is None or valid.all() else np.flatnonzero(valid).astype(np.int32)
@@ -103,7 +123,7 @@ class PixelPool:
         return Batch(pose[:, :3, 3], directions, self.colour[pick].float() / 255, view, distance)
 
 
-def softened(image: np.ndarray[Any, Any], valid: np.ndarray[Any, Any] | None, radius: float) -> np.ndarray[Any, Any]:
+def softened(image: Array, valid: Array | None, radius: float) -> Array:
     """(H, W, 3) uint8 → the same, each of the `valid` (H, W) pixels the mean over a Gaussian with a deviation of `radius` pixels; those
     that are not valid go into no mean, and stay as they are. None: all are valid."""
     if radius <= 0:
@@ -114,14 +134,66 @@ def softened(image: np.ndarray[Any, Any], valid: np.ndarray[Any, Any] | None, ra
     return np.asarray(cv2.copyTo(image, (~valid).view(np.uint8), soft))
 
 
-def _filled(image: np.ndarray[Any, Any], valid: np.ndarray[Any, Any], reach: int) -> np.ndarray[Any, Any]:
+def _filled(image: Array, valid: Array, reach: int) -> Array:
     """A copy with the pixels that are not `valid` as the mean of those that are, over a square up to `reach` pixels to either side: a
-    Gaussian over it takes a quarter of the time of one over a picture with holes. As they were, where nothing valid is as near."""
+    Gaussian over it takes a quarter of the time of one over a image with holes. As they were, where nothing valid is as near."""
     side, holes = (2 * reach + 1, 2 * reach + 1), np.flatnonzero(~valid)
     known = valid.view(np.uint8)
     count = cv2.boxFilter(known, cv2.CV_32F, side, normalize=False, borderType=cv2.BORDER_CONSTANT).reshape(-1)[holes]
     total = cv2.boxFilter(cv2.bitwise_and(image, image, mask=known), cv2.CV_32F, side, normalize=False, borderType=cv2.BORDER_CONSTANT)
     out = image.copy()
-    told = count > 0
-    out.reshape(-1, 3)[holes[told]] = np.rint(total.reshape(-1, 3)[holes[told]] / count[told, None])
+    near = count > 0
+    out.reshape(-1, 3)[holes[near]] = np.rint(total.reshape(-1, 3)[holes[near]] / count[near, None])
     return out
+
+
+def tile_grid(pool: PixelPool) -> tuple[int, int]:
+    """Rows and columns of tiles of the largest image."""
+    return int(pool.height) // TILE + 1, int(pool.camera[:, 4].max()) // TILE + 1
+
+
+class TileErrors:
+    """The squared error that rays from each tile had, and the draw of pixels by it."""
+
+    def __init__(self, pool: PixelPool) -> None:
+        self.pool, (self.high, self.wide) = pool, tile_grid(pool)
+        device = pool.camera.device
+        self.error = torch.zeros(len(pool.pose) * self.high * self.wide, device=device)  # (T,) 0: no ray yet
+        self.density = torch.ones_like(self.error)
+        self.steps = 0
+
+    def tiles(self, picks: Tensor) -> Tensor:
+        """(B,) pixels → (B,) tiles."""
+        view, row, column = self.pool.seen_at(picks)
+        return (view * self.high + row // TILE) * self.wide + column // TILE
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """(count,) pixels before the pool's limit, with replacement, and (count,) what each of them counts."""
+        if self.steps % RENEW == 0:
+            self.density = densities(self.error)
+        self.steps += 1
+        device, found, missing = self.error.device, [], count
+        while missing > 0:
+            more = int(missing * TOP * 1.2) + 16
+            picks = torch.randint(self.pool.limit, (more,), generator=generator).to(device)
+            luck = torch.rand(more, generator=generator).to(device)
+            picks = picks[luck * TOP < self.density[self.tiles(picks)]][:missing]
+            found.append(picks)
+            missing -= len(picks)
+        picks = torch.cat(found)
+        return picks, 1 / self.density[self.tiles(picks)]
+
+    def remember(self, picks: Tensor, error: Tensor) -> None:
+        """The squared errors (B,) ≥ 0 of the rays of a batch; of several rays of a tile any one counts."""
+        tiles = self.tiles(picks)
+        old = self.error[tiles]
+        self.error[tiles] = torch.where(old > 0, KEEP * old + (1 - KEEP) * error, error)
+
+
+def densities(error: Tensor) -> Tensor:
+    """(T,) squared errors, 0 where no ray came to → (T,) q, between 1 − S and `TOP`."""
+    known = error > 0
+    root = torch.where(known, error, torch.zeros_like(error)).sqrt()
+    mean = root.sum() / known.sum().clamp_min(1)
+    ratio = torch.where(known, (root / mean.clamp_min(1e-12)).clamp_max(MOST), torch.ones_like(root))
+    return 1 - SHARE + SHARE * ratio
