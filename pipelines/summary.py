@@ -239,7 +239,7 @@ def _apart(capture: Capture, some: Array, others: Array) -> tuple[str, str]:
 
 
 def effects_warnings(job: Job) -> list[str]:
-    """What a user has to know: effects that are there and cannot be corrected."""
+    """What a user has to be aware of: effects that are there and cannot be corrected."""
     part = effects_part(job, None)
     if part is None:
         return []
