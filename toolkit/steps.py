@@ -212,14 +212,11 @@ def key_frames(views: Views, scene: Scene, settings: Settings, sharp: bool = Tru
     train = np.flatnonzero(~np.asarray(views.test))
     if len(train) == 0:
         return KeyFrames(np.zeros(0, np.int64), np.zeros((0, 0), np.int64))
-    wanted = settings.keyframes
     return select_keyframes(
         views.world_from_camera[train],
         [views.intrinsics[int(index)] for index in train],
         scene.median_depth,
-        method=wanted.method,
-        most=wanted.most,
-        every=wanted.every,
+        settings.keyframes,
         sharpness=np.array([sharpness(views.images[int(index)]) for index in train]) if sharp else None,
     )
 

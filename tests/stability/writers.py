@@ -44,10 +44,9 @@ from fieldfuse.export.page import Tour, write_page
 from fieldfuse.export.ply import write_points
 from fieldfuse.export.video import write_video
 from fieldfuse.files import write_json
-from fieldfuse.nerfusion.training.caution import Caution
-from fieldfuse.nerfusion.training.checkpoint import save_checkpoint
+from fieldfuse.nerfusion.training.checkpoint import TrainState, save_checkpoint
 from fieldfuse.nerfusion.training.curve import Curve
-from fieldfuse.nerfusion.training.shards import write_shard
+from fieldfuse.nerfusion.training.scenes import write_shard
 from fieldfuse.nerfusion.training.train import make_model
 from fieldfuse.nerfusion.weights import save_model
 from fieldfuse.pipelines.folder import RunFolder
@@ -164,7 +163,7 @@ def more_writers(place: Path) -> dict[str, Write]:
         "write_baked": lambda folder: write_baked(folder / "baked.safetensors", baked),
         "write_page": lambda folder: write_page(folder / "field.html", baked, tour, "page"),
         "save_model": lambda folder: save_model(folder / "weights.safetensors", model),
-        "save_checkpoint": lambda folder: save_checkpoint(folder, 3, model, adam, {}, 2, Caution()),
+        "save_checkpoint": lambda folder: save_checkpoint(folder, TrainState(model, adam, step=3), {}, 2),
         "Curve.write": curve,
         "write_shard": shard,
         "save_left_out": lambda folder: save_left_out(folder / "left_out.safetensors", LeftOut.of(["a"], [np.ones((96, 128), bool)])),

@@ -148,12 +148,12 @@ class Inference:
         Raises:
             Interrupted: the user asked to stop.
         """
-        measured, precision = self.options.measured, self.options.precision
-        options = FusionOptions(self.options.levels, self.near, self.far, measured=measured, precision=precision)
+        given = {"measured": self.options.measured, "precision": self.options.precision, "empty": self.hull}
+        options = FusionOptions(self.options.levels, self.near, self.far, **given)  # type: ignore[arg-type]
         # Things without texture that stand before nothing lead all sweeps astray in the same way; the hull is the better guide.
         agree = self.options.agreement and self.hull is None and (self.near > 0 or math.isfinite(self.far))
-        witnesses = overlapping(self.keys, self.train.world_from_camera, self.train.intrinsics, self.median_depth) if agree else None
-        for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress, self.hull, witnesses):
+        others = overlapping(self.keys, self.train.world_from_camera, self.train.intrinsics, self.median_depth) if agree else None
+        for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress, others):
             self._latest = fused
             self.seconds += fused.seconds
             self.fusion_seconds += fused.seconds

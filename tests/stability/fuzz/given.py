@@ -15,11 +15,17 @@ from fieldfuse.capture import open_capture
 from fieldfuse.capture.types import Views
 from fieldfuse.evaluation.compare_truth import find_truth, true_depths
 from fieldfuse.files import write_json
-from fieldfuse.nerfusion.training.captured import CapturedScene
-from fieldfuse.nerfusion.training.datasets.dtu import dtu_scene, dtu_scenes
-from fieldfuse.nerfusion.training.datasets.scanned_objects import scanned_object_folders, scanned_object_scene
-from fieldfuse.nerfusion.training.datasets.scannet import scannet_folders, scannet_scene
-from fieldfuse.nerfusion.training.datasets.synthetic import synthetic_folders, synthetic_scene
+from fieldfuse.nerfusion.training.scenes import (
+    CapturedScene,
+    dtu_scene,
+    dtu_scenes,
+    scanned_object_folders,
+    scanned_object_scene,
+    scannet_folders,
+    scannet_scene,
+    synthetic_folders,
+    synthetic_scene,
+)
 from fieldfuse.simulate.eye import Rays
 from fieldfuse.simulate.mesh_scene import load_mesh_scene
 from tests.capture.layouts import LAYOUTS
