@@ -23,14 +23,17 @@ from fieldfuse.camera import (
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError, PoseError
 from fieldfuse.poses.cloud import cloud_of_depth, cloud_of_points
-from fieldfuse.poses.gravity import camera_frame, tight_turn, turn_about_z, up_direction
 from fieldfuse.poses.points import intersect, tracks, triangulate, undistorted
 from fieldfuse.poses.region import (
     FORWARD,
     OBJECT,
     ROOM,
     box,
+    camera_frame,
     layout,
+    tight_turn,
+    turn_about_z,
+    up_direction,
     weighted_percentiles,
 )
 from fieldfuse.poses.scene import Scene, describe_scene

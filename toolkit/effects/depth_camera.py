@@ -22,7 +22,8 @@ from fieldfuse.capture.sizes import fitted
 from fieldfuse.capture.types import Capture
 from fieldfuse.effects import geometry
 from fieldfuse.effects.adjust import Problem, adjust, predict, residuals, uncertainty
-from fieldfuse.effects.diagnostics import CLOSE, FIRST_FRAMES, MOST_FRAMES, Finding
+from fieldfuse.effects.diagnostics import CLOSE, FIRST_FRAMES, MOST_FRAMES
+from fieldfuse.effects.evidence import Finding
 from fieldfuse.effects.tracks import Look, Tracks, choose, gather
 from fieldfuse.poses.cloud import every
 from fieldfuse.poses.points import undistorted

@@ -39,17 +39,32 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class HeldOut:
-    """Evidence from patches of images, and how well it predicts held-out images."""
+class Finding:
+    """What was found about one effect, and whether it is there."""
 
-    evidence: Evidence
-    least: float  # relative fall of the error that counts
-    before: float | None = None  # stops: error of the patches in held-out images without the effect; None: there are none
+    effect: str
+    number: float
+    threshold: float
+    reason: str
+    there: bool  # the number is above its threshold, and held-out points agree by a margin
+    before: float | None = None  # what held-out points are off without the effect, in `unit`; None where nothing is fitted
     after: float | None = None  # and with it
+    unit: str = ""
 
-    @property
-    def found(self) -> bool:
-        return self.evidence.found and self.before is not None and self.after is not None and self.after < (1 - self.least) * self.before
+    def to_dict(self) -> dict[str, Any]:
+        out: dict[str, Any] = {
+            "effect": self.effect,
+            "number": round(float(self.number), 4),
+            "threshold": self.threshold,
+            "there": bool(self.there),  # NumPy's own truth values are not JSON
+            "reason": self.reason,
+        }
+        if self.before is not None and self.after is not None:
+            before, after = float(self.before), float(self.after)
+            out["held_out"] = {"before": round(before, 4), "after": round(after, 4), "unit": self.unit}
+            if before > 0 and after > 0:
+                out["held_out"]["decibels"] = round(20 * float(np.log10(before / after)), 2)
+        return out
 
 
 def without_points_and_frames(values: Array, frame: Array, point: Array, weight: Array, frames: int) -> tuple[Array, Array]:

@@ -21,7 +21,7 @@ import numpy as np
 
 from fieldfuse.camera import Array, distort
 from fieldfuse.effects.adjust import Problem
-from fieldfuse.effects.evidence import Evidence, HeldOut, median_of_finite
+from fieldfuse.effects.evidence import Finding, median_of_finite
 from fieldfuse.effects.tracks import Tracks
 from fieldfuse.poses.cloud import every
 from fieldfuse.poses.points import undistorted
@@ -43,7 +43,7 @@ AROUND = np.stack(np.meshgrid(*[np.arange(-HALF, HALF + 1)] * 2), axis=-1).resha
 GAIN = 0.3  # least relative fall of the held-out error
 
 
-def find_far_background(seen: Tracks, problem: Problem, usual: float) -> HeldOut:
+def find_far_background(seen: Tracks, problem: Problem, usual: float) -> Finding:
     """Look at patches of some images in others.
 
     Args:
@@ -63,11 +63,12 @@ def find_far_background(seen: Tracks, problem: Problem, usual: float) -> HeldOut
             tells, distant, errors = tells + told, distant + gone, np.concatenate([errors, off])
     share = distant / tells if tells >= FEWEST and distant >= MIN_FAR else 0.0
     before, after = (float(value) for value in np.sqrt(np.median(errors, axis=0))) if len(errors) else (None, None)
+    there = share > THRESHOLD and before is not None and after is not None and after < (1 - GAIN) * before
     reason = (
         f"{100 * share:.1f}% of the patches lie more than {2 * NEAR_LIMIT:g} times as far as the scene usually is: other pictures show them"
         f" where infinity would be; {100 * THRESHOLD:.1f}% or more speak for a distant background"
     )
-    return HeldOut(Evidence("background", share, THRESHOLD, reason), GAIN, before, after)
+    return Finding("background", share, THRESHOLD, reason, there, before, after, "stops")
 
 
 def _others(poses: Array, one: int) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fieldfuse.camera import Array
-from fieldfuse.effects.evidence import ROUNDS, Evidence, robust_weights, without_points_and_frames
+from fieldfuse.effects.evidence import ROUNDS, Evidence, Finding, robust_weights, without_points_and_frames
 from fieldfuse.tone import share
 
 EXPOSURE, VIGNETTING = "exposure", "vignetting"
@@ -64,6 +64,11 @@ class Light:
     after: dict[str, float]  # and with it
     gain: Array  # (frames, 3) gains of the frames, geometric mean 1, with the vignetting taken out first when it is kept
     corner: float  # share of the light that is left at half a diagonal
+
+    def finding(self, name: str) -> Finding:
+        """About exposure or vignetting."""
+        one = self.evidence[name]
+        return Finding(name, one.number, one.threshold, one.reason, name in self.kept, self.before[name], self.after[name], "stops")
 
 
 def exposure_evidence(tracks: LightTracks, frames: int) -> Evidence:
@@ -138,7 +143,8 @@ def explain(tracks: LightTracks, frames: int) -> Light:
         for kept in deviations
         if (VIGNETTING not in kept or falloff.found) and (EXPOSURE not in kept or found[kept - {EXPOSURE}].found)
     ]
-    kept = min(allowed, key=lambda one: deviations[one] / (1 - _margin(one)) + MIN_FALL * len(one))
+    margin = {kept: BOTH if len(kept) > 1 else sum(MARGIN[name] for name in kept) for kept in allowed}
+    kept = min(allowed, key=lambda one: deviations[one] / (1 - margin[one]) + MIN_FALL * len(one))
     final = vignetting_evidence(tracks, frames)
     corner = float(final.parameters.get("corner", 1.0))
     drift = exposure_evidence(tracks.without_vignetting(corner) if VIGNETTING in kept else tracks, frames)
@@ -150,11 +156,6 @@ def explain(tracks: LightTracks, frames: int) -> Light:
         gain=np.array(drift.parameters.get("gain", np.ones((frames, 3)))),
         corner=corner,
     )
-
-
-def _margin(kept: frozenset[str]) -> float:
-    """By what share the held-out deviation has to fall for all of `kept` to be corrected."""
-    return BOTH if len(kept) > 1 else MARGIN[next(iter(kept))] if kept else 0.0
 
 
 def spread(tracks: LightTracks) -> float:

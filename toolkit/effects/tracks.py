@@ -188,7 +188,7 @@ def _look(image: Array, mask: Array | None, camera: Intrinsics, effort: Effort) 
     size = 0.5 * np.array([k.size for k in keypoints], dtype=np.float32)
     log = np.log2(np.maximum(LINEAR[grey], LINEAR[8]))
     gx, gy = cv2.Sobel(log, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(log, cv2.CV_32F, 0, 1, scale=0.125)
-    slopes = cv2.GaussianBlur(np.stack([gx * gx, gy * gy], axis=2), (0, 0), WINDOW)
+    slopes = cv2.GaussianBlur(np.stack([gx * gx, gx * gy, gy * gy], axis=2), (0, 0), WINDOW)  # of two channels OpenCV samples coarsely
     keep = np.ones(len(at), dtype=bool)
     for shown in (image[..., 3] if image.shape[2] == 4 else None, None if mask is None else mask.astype(np.uint8) * 255):
         if shown is not None:
@@ -199,7 +199,7 @@ def _look(image: Array, mask: Array | None, camera: Intrinsics, effort: Effort) 
         pixel=((at.astype(np.float64) + 0.5) * [camera.width / small.shape[1], camera.height / small.shape[0]])[keep],
         descriptor=root_sift(descriptors)[keep],
         linear=_around(LINEAR[small], at[keep], size[keep]),
-        slope=slope[keep].astype(np.float64).sum(1),
+        slope=slope[keep].astype(np.float64)[:, ::2].sum(1),
         scale=scale * width / camera.width,
         grey=grey,
     )

@@ -69,7 +69,7 @@ def check_given(
     """The poses as they fit the images, with warnings of what was changed or left out; `agreement` says how well they fit.
 
     Args:
-        convention: `as_is` keeps the poses whatever is found; it is still said.
+        convention: `as_is` keeps the poses whatever is found; the warning stays.
         known: features by name; those found are added.
 
     Raises:
@@ -96,11 +96,10 @@ def check_given(
     if reading is not None:
         if keep_all:
             text = f"{_low(agreement)} of {_what(capture)}, and more would {reading.text}; they are kept as they came"
-            return _told(replace(given, warnings=[*given.warnings, text]), agreement)
+            return _told(given.warned(text), agreement)
         before, matches = agreement, _seen_by(reading, matches, posed, chosen)
         agreement = _agreement(reading.poses[chosen], matches)
-        checked = _read_so(given, reading)
-        checked.warnings.append(
+        checked = _read_so(given, reading).warned(
             f"the poses of {_what(capture)} do not fit its images as they came ({before.share:.0%} of {before.matches:,} matches agree); "
             f"they fit {reading.text} ({agreement.share:.0%} agree), and are used so; --set poses.convention=as_is keeps them as they came"
         )
@@ -124,15 +123,11 @@ def best_fitting(captures: Sequence[Capture], progress: Progress = SILENT) -> in
     """Of several captures with the same images and poses from different sources, the one whose poses fit best; of equals the first."""
     scores = []
     for capture in captures:
-        known: dict[str, Features] = {}
         posed = [i for i, frame in enumerate(capture.frames) if frame.world_from_camera is not None and frame.intrinsics is not None]
         poses = np.array([capture.frames[i].world_from_camera for i in posed], dtype=np.float64).reshape(-1, 4, 4)
-        if len(poses) < 2:
-            scores.append(0.0)
-            continue
-        chosen = choose_images(poses, same_poses(poses))
-        matches = find_matches(capture, [posed[i] for i in chosen], progress=progress, known=known)
-        scores.append(float(_score(poses[chosen], matches)) if len(matches.pair) >= LEAST_MATCHES else 0.0)
+        chosen = choose_images(poses, same_poses(poses)) if len(poses) > 1 else []
+        matches = find_matches(capture, [posed[i] for i in chosen], progress=progress)
+        scores.append(_score(poses[chosen], matches) if len(matches.pair) >= LEAST_MATCHES else 0.0)
     return int(np.argmax(scores))
 
 
@@ -166,11 +161,8 @@ def choose_images(poses: Array, twins: Array) -> list[int]:
 
 def _links(chosen: list[int], twins: Array) -> list[tuple[int, int]]:
     """Pairs of cameras that are said to have one pose."""
-    groups: dict[int, list[int]] = {}
-    for position, index in enumerate(chosen):
-        if twins[index] >= 0:
-            groups.setdefault(int(twins[index]), []).append(position)
-    return [(group[0], other) for group in groups.values() for other in group[1 : 1 + SUSPECTS]]
+    groups = [[position for position, index in enumerate(chosen) if twins[index] == group] for group in np.unique(twins[twins >= 0])]
+    return [(group[0], other) for group in groups for other in group[1 : 1 + SUSPECTS]]
 
 
 def _distances(centres: Array) -> Array:
@@ -254,13 +246,7 @@ def _read_so(given: PoseResult, reading: Reading) -> PoseResult:
         camera = replace(camera, fx=camera.fx * reading.focal, fy=camera.fy * reading.focal)
         return replace(camera, cx=camera.width / 2, cy=camera.height / 2) if reading.centred else camera
 
-    return replace(
-        given,
-        intrinsics=[lens(camera) for camera in given.intrinsics],
-        world_from_camera=reading.poses,
-        points=None,
-        warnings=list(given.warnings),
-    )
+    return replace(given, intrinsics=[lens(camera) for camera in given.intrinsics], world_from_camera=reading.poses, points=None)
 
 
 def _doubt(
@@ -281,8 +267,7 @@ def _doubt(
     noisy = len(rough) >= FEW_PAIRS and rough.mean() > 1 - ROUGH
     inexact = "are inexact, and refined as far as the images allow" if noisy else "may be inexact or wrong"
     what = "are kept as they came" if strong else inexact
-    text = f"{_low(agreement)} of {_what(capture)}{other}: they {what}; --poses sfm finds own ones"
-    return replace(given, warnings=[*given.warnings, text])
+    return given.warned(f"{_low(agreement)} of {_what(capture)}{other}: they {what}; --poses sfm finds own ones")
 
 
 def _low(agreement: Agreement) -> str:
@@ -351,7 +336,7 @@ def _leave_out(given: PoseResult, wrong: list[int], twins: set[int], keep_all: b
         return given, []
     if len([i for i in wrong if i not in twins]) > MOST_WRONG * count or keep_all:
         text = f"the images contradict the poses of {len(wrong)} of {count} frames, which are kept"
-        return replace(given, warnings=[*given.warnings, f"{text}: {listed([given.names[i] for i in wrong])}"]), []
+        return given.warned(f"{text}: {listed([given.names[i] for i in wrong])}"), []
     keep = [i for i in range(count) if i not in set(wrong)]
     names = [given.names[i] for i in wrong]
     same = sum(i in twins for i in wrong)
@@ -365,5 +350,4 @@ def _leave_out(given: PoseResult, wrong: list[int], twins: set[int], keep_all: b
         world_from_camera=given.world_from_camera[keep],
         models=[len(keep)],
         missing=[*given.missing, *names],
-        warnings=[*given.warnings, text],
-    ), wrong
+    ).warned(text), wrong

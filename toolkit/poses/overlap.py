@@ -8,7 +8,7 @@ import numpy as np
 
 from fieldfuse.camera import Array, Intrinsics, invert
 
-GRID = 5  # pixels a side of the lattice that stands for a picture
+GRID = 5  # pixels a side of the lattice that stands for an image
 SWEET = 8.0  # degrees of parallax that suit matching and triangulation best
 NARROW = 3.0  # degrees: how fast the worth falls below the sweet spot
 WIDE = 12.0  # degrees: how fast it falls above
@@ -46,7 +46,7 @@ def guessed_depth(world_from_camera: Array) -> float:
 
 
 def overlap(world_from_camera: Array, intrinsics: Sequence[Intrinsics], depth: float | Array) -> Array:
-    """(N, N) share of picture i, taken as a plane at `depth` (one, or (N,) one a frame), that lies inside picture j. Lenses are ignored."""
+    """(N, N) share of image i, taken as a plane at `depth` (one, or (N,) one a frame), that lies inside image j. Lenses are ignored."""
     count = len(world_from_camera)
     depths = np.broadcast_to(np.asarray(depth, dtype=np.float64), (count,))
     steps = (np.arange(GRID) + 0.5) / GRID
@@ -80,8 +80,8 @@ def parallax(world_from_camera: Array, depth: float | Array) -> Array:
 
 
 def spread_parallax(world_from_camera: Array, intrinsics: Sequence[Intrinsics], depth: float) -> Array:
-    """(N, N) mean degrees under which a lattice of frame i's points at `depth` sees the two cameras, the whole picture over. A camera that
-    moves along its axis sees the middle of its picture from one direction, and what lies around it from several. Lenses are ignored."""
+    """(N, N) mean degrees under which a lattice of frame i's points at `depth` sees the two cameras, the whole image over. A camera that
+    moves along its axis sees the middle of its image from one direction, and what lies around it from several. Lenses are ignored."""
     steps = (np.arange(GRID) + 0.5) / GRID
     u, v = (axis.ravel() for axis in np.meshgrid(steps, steps))
     centres = world_from_camera[:, :3, 3]

@@ -1,7 +1,7 @@
 """Matches between posed images, found without their poses, and how far they are off the epipolar geometry of any poses.
 
-Pairs are chosen by order and by what the images share; matches are verified by a fundamental matrix of their own. What they say about the
-given poses is therefore evidence, not an echo.
+Pairs are chosen by order and by what the images share; matches are verified by a fundamental matrix of their own. So they are
+evidence about the given poses, not an echo of them.
 """
 
 from __future__ import annotations

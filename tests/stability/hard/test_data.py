@@ -12,7 +12,7 @@ import pytest
 
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.errors import FieldfuseError, InputError, PoseError
-from fieldfuse.poses.given import given_poses
+from fieldfuse.poses.result import given_poses
 from fieldfuse.poses.scene import describe_scene
 from fieldfuse.render.paths import look_at
 from fieldfuse.tsdf.frames import DepthFrame
