@@ -13,7 +13,7 @@ from fieldfuse.effects.specularity import THRESHOLD, find_specularity
 from fieldfuse.effects.tracks import Tracks
 from tests.effects.walls import AWAY, FRAMES, WIDTH, problem_of, wall
 
-PLAIN = Light({}, frozenset(), {}, {}, np.ones((FRAMES, 3)), 1.0)
+PLAIN = Light({}, frozenset(), {}, {}, 1.0)
 
 
 def looked(seen: Tracks, found: Light = PLAIN, wrong: float = 0.0) -> Finding:

@@ -162,7 +162,7 @@ def test_hopeless_pictures_are_refused_before_matching():
 
 
 def test_components_and_runs():
-    groups = components(8, [pair(0, 1), pair(1, 2), pair(5, 6), pair(2, 3, inliers=3)])
+    groups = components(8, [pair(0, 1), pair(1, 2), pair(5, 6)])
     assert groups == [[0, 1, 2], [5, 6], [3], [4], [7]]
     assert runs(["a", "b", "c", "f", "x", "y"], [0, 1, 2, 5, 8, 9]) == ["a to c", "f", "x", "y"]
 

@@ -62,7 +62,6 @@ class Light:
     kept: frozenset[str]
     before: dict[str, float]  # stops: the deviation of held-out points without the effect, beside what else is kept
     after: dict[str, float]  # and with it
-    gain: Array  # (frames, 3) gains of the frames, geometric mean 1, with the vignetting taken out first when it is kept
     corner: float  # share of the light that is left at half a diagonal
 
     def finding(self, name: str) -> Finding:
@@ -153,7 +152,6 @@ def explain(tracks: LightTracks, frames: int) -> Light:
         kept=kept,
         before={name: deviations[kept - {name}] for name in (EXPOSURE, VIGNETTING)},
         after={name: deviations[kept | {name}] for name in (EXPOSURE, VIGNETTING)},
-        gain=np.array(drift.parameters.get("gain", np.ones((frames, 3)))),
         corner=corner,
     )
 

@@ -179,9 +179,9 @@ def way(facts: dict[str, Any]) -> float:
     return float(np.median(np.linalg.norm(first - second, axis=1))) / max(depth, 1e-12)
 
 
-def components(count: int, pairs: Sequence[dict[str, Any]], least: int = 15) -> list[list[int]]:
-    """Groups of images connected by verified pairs with `least` inliers or more, largest first."""
-    linked = [(pair["first"], pair["second"]) for pair in pairs if pair["inliers"] >= least]
+def components(count: int, pairs: Sequence[dict[str, Any]]) -> list[list[int]]:
+    """Groups of images connected by verified pairs, largest first."""
+    linked = [(pair["first"], pair["second"]) for pair in pairs]
     graph = coo_array((np.ones(len(linked)), np.array(linked, dtype=np.int64).reshape(-1, 2).T), shape=(count, count))
     number, label = connected_components(graph, directed=False)
     groups = [np.flatnonzero(label == group).tolist() for group in range(number)]

@@ -276,11 +276,7 @@ def plain(model: Model) -> dict[str, Any]:
 
 
 def _intrinsics(camera: pycolmap.Camera) -> Intrinsics:
-    """COLMAP's camera in our terms; both put pixel centres at +0.5.
-
-    Raises:
-        PoseError: a lens model that the database is never given.
-    """
+    """COLMAP's camera in our terms; both put pixel centres at +0.5."""
     values = [float(value) for value in camera.params]
     if camera.model_name == "OPENCV":
         fx, fy, cx, cy, *lens = values

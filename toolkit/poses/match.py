@@ -82,11 +82,8 @@ def _steps(pairs: list[tuple[int, int]]) -> list[list[tuple[int, int]]]:
 
 
 def _together(job: Job, pairs: list[tuple[int, int]], tell: Callable[[int], None]) -> None:
-    """Match in several processes, where there is more than one thread and one step, and room; else nothing.
-
-    Raises:
-        RuntimeError: one of them failed; what the others did is kept.
-    """
+    """Match in several processes, where there is more than one thread and one step, and room; else nothing. A RuntimeError where one of
+    them failed; what the others did stays."""
     steps, done, lock = _steps(pairs), 0, threading.Lock()
     free: SimpleQueue[Path] = SimpleQueue()
     with _copies(job, min(job.threads, MOST_MATCHERS, len(steps))) as folders:
