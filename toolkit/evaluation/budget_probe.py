@@ -22,12 +22,12 @@ def self_test(settings: Settings) -> Speed:
     """Units of every kind in seconds: a megapixel decoded, a picture's features found and matched, a ray rendered, a ray fitted, a
     megapixel scored."""
     from fieldfuse.progress import SILENT
-    from fieldfuse.stereo import quick
+    from fieldfuse.stereo import fast_mvs
     from fieldfuse.training import depth_start
     from fieldfuse.training.engine import warm_up
 
     warm_up(settings, SILENT)
-    quick.warm_up()
+    fast_mvs.warm_up()
     depth_start.warm_up()
     makers: dict[str, Callable[[], tuple[Callable[[], object], float]]] = {
         "decode": _decode,

@@ -101,8 +101,7 @@ def surface_of_field(
     """
     from fieldfuse.export.surface import field_volume
     from fieldfuse.render.image import make_renderer, render_view
-    from fieldfuse.stereo.polish import Polisher
-    from fieldfuse.stereo.settle import settled
+    from fieldfuse.stereo.depth_refinement import FieldDepths, Polisher, settled
 
     shown, cameras = originals.finer(views, np.flatnonzero(~views.test), settings.export)
     chosen = spread(len(shown), settings.export.mesh_views)
@@ -118,7 +117,7 @@ def surface_of_field(
         lenses,
         region=scene.surface_box(),
         polish=[partial(polisher.polished, index, measured=measured[at] if measured else None) for at, index in enumerate(chosen)],
-        settle=lambda depths, opaque, told: settled(depths, opaque, told, seen, lenses, scene.median_depth, measured, progress=progress),
+        settle=lambda *given: settled(FieldDepths(*given), seen, lenses, scene.median_depth, measured, progress),
         progress=progress,
     )
 

@@ -13,10 +13,9 @@ from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.errors import InputError
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.stereo.maps import enlarged
-from fieldfuse.tsdf.frames import DepthFrame
-from fieldfuse.tsdf.held import fuse_held
+from fieldfuse.tsdf.fuse import fuse_held
 from fieldfuse.tsdf.mesh import as_bytes
-from fieldfuse.tsdf.volume import TsdfVolume
+from fieldfuse.tsdf.volume import DepthFrame, TsdfVolume
 
 # (intrinsics, world_from_camera) → (rgb, depth, opacity), or an object with these names, as `render_view` gives.
 Render = Callable[[Intrinsics, Array], Any]
@@ -96,8 +95,8 @@ def field_volume(
         voxel_size, depth_max: working units; None: from the rendered depth, the voxel size made coarser until it fits into memory.
         region: lowest and highest corner (3,) of the box that is kept, working frame.
         carve: views also empty what others put in front of their surface, which removes most floaters.
-        polish: for each pose what its rendered depth is made better by; see `stereo/polish.py`.
-        settle: what all depth maps together are made better by; see `stereo/settle.py`.
+        polish: for each pose what its rendered depth is made better by; see `stereo/depth_refinement.py`.
+        settle: what all depth maps together are made better by; see `stereo/depth_refinement.py`.
 
     Raises:
         InputError: no view shows a surface, or the voxel size that was asked for is too fine for the memory.
@@ -126,7 +125,6 @@ def field_volume(
     del opaque, told
     return fuse_held(
         made if region is None else [within(frame, region) for frame in made],
-        len(poses),
         voxel_size,
         depth_max,
         # What pictures tell beyond what was rendered makes depth better, not voxels finer: those would keep its noise.
