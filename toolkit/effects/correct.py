@@ -1,7 +1,7 @@
 """What is taken out of a capture before anything is fitted to it, as plain data: colours, the lens, errors of poses, weights.
 
 Gains have geometric mean 1 over the training images, the vignetting is 1 in the middle, refined poses are held to the given ones
-(`refine.believed`): every freedom that images cannot tell is fixed. What would then be too bright for an image is made room for
+(`refine.believed`): every freedom that images do not decide is fixed. What would then be too bright for an image is made room for
 (`dimmed`). Where nothing is to be corrected, the very same objects come back. What no camera explains is not corrected (`beyond`,
 `beyond_depth`, `bounded_gains`), whatever evidence speaks for it.
 """

@@ -2,7 +2,7 @@
 
 What evidence speaks for is corrected only if three guards let it pass: no correction is larger than cameras explain (`correct.beyond`),
 held-out frames are placed by their own points or like their neighbours (`refine`), and a short fit to some training frames shows others
-better with it than without (`Trial`). What the user switches on by name is corrected whatever the guards say.
+better with it than without (`Trial`). What the user switches on by name is corrected whatever the guards find.
 """
 
 from __future__ import annotations
@@ -244,7 +244,7 @@ def choose_field(field: FieldSettings, effects: list[dict[str, Any]], off: Seque
     """Set what is left to `auto` in `field` by the decisions (as in `Decision.to_dict`); the scene decides on a background not found.
 
     Args:
-        off: effects that are off by name. (That nothing is to be corrected, `effects.mode=off`, says nothing about the field.)
+        off: effects that are off by name. (That nothing is to be corrected, `effects.mode=off`, does not concern the field.)
     """
     for entry in effects:
         name, unwanted = entry["effect"], entry["effect"] in off

@@ -193,7 +193,7 @@ def look_for_offset(
         capture: with the poses and lenses that depth is going to be used with.
         train: frames that may be looked at.
         seen: what was found in its images, whatever poses and lenses it had then; a quick look at few of them is followed by a closer
-            one where it comes near to speaking for an offset, or tells nothing.
+            one where it comes near to speaking for an offset, or finds nothing.
 
     Raises:
         InputError: an image or a depth map cannot be read.

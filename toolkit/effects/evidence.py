@@ -99,7 +99,7 @@ def without_points_and_frames(values: Array, frame: Array, point: Array, weight:
 
 
 def robust_weights(residual: Array) -> Array:
-    """Huber's weights (O,) for residuals (O,) or (O, C), whose deviation is told by the median (1.4826 · MAD)."""
+    """Huber's weights (O,) for residuals (O,) or (O, C), whose deviation is that of the median (1.4826 · MAD)."""
     size = np.abs(residual) if residual.ndim == 1 else np.linalg.norm(residual, axis=1) / np.sqrt(residual.shape[1])
     deviation = 1.4826 * float(np.median(size)) if len(size) else 0.0
     return np.minimum(1.0, TUNING * max(deviation, 1e-9) / np.maximum(size, 1e-12))
@@ -119,7 +119,7 @@ BLUR = "motion_blur"
 BLURRED = 0.033  # factors of two of the slopes' energy
 FEWEST_SLOPES = 100  # observations
 DARK, BRIGHT = 0.02, 0.6  # linear light of a patch: noise and clipping change slopes too, and exposure decides how much
-TREND = 8  # frames from which on a slow trend is told from blur, which comes and goes
+TREND = 8  # frames from which on a slow trend is separated from blur, which comes and goes
 
 
 def _sharpness(energy: Array, distance: Array, frame: Array, point: Array, frames: int) -> tuple[Array, Array, Array]:
@@ -143,7 +143,7 @@ def blur_evidence(slope: Array, depth: Array, frame: Array, point: Array, frames
 
     Args:
         slope: (O,) mean square of the slopes of log light round the observation. depth: (O,) along z. frame, point: (O,).
-        linear: (O, 3) light of the patch, as it was stored; what is dark or bright is left out.
+        linear: (O, 3) light of the patch, as it was stored; what is dark or bright is excluded.
 
     Returns:
         `parameters["sharpness"]`: (frames,) factors of two of the energy, mean 0; 0 where nothing was measured.

@@ -15,7 +15,7 @@ DARKEST, BRIGHTEST = 0.01, 0.85  # linear light between which a color shows its 
 DRIFTS, DIMS = 0.04, 0.05  # thresholds: stops; share of the light that corners lose
 FEWEST_GAINS, FEWEST_FALLS = 30, 60  # observations without which nothing is known of exposure and of vignetting
 STRONGEST = 20.0  # of a in V(r) = (1 + a·r²)⁻²: a corner with a four-hundredth of the light
-HELD_OUT = 4  # every n-th point is kept out of the fits
+HELD_OUT = 4  # every n-th point is held out of the fits
 MARGIN = {EXPOSURE: 0.24, VIGNETTING: 0.1}  # least relative fall of the held-out deviation: less did not pay on real captures
 BOTH = 0.25  # … by both: each hides some of the other, so that alone neither may come as far as it does beside the other
 MIN_FALL = 0.0015  # stops by which it has to fall at least

@@ -176,7 +176,7 @@ def believed(problem: Problem, before: float, left: float) -> Belief:
     """The problem's poses, taken to be off by as much as its points show: each by a turn, and by a move at the points' distance, that shift
     what is seen by `before` working pixels.
 
-    What fits leave, `left` working pixels, hardly tells a slow turn along a walk from a slow move, nor the scale; where a lens
+    What fits leave, `left` working pixels, hardly separates a slow turn along a walk from a slow move, nor the scale; where a lens
     is not quite as it is taken to be, all depths drift by some percent. What images do show outweighs this by far.
     """
     focal, depth = float(np.median(problem.focal)), float(np.median(predict(problem)[0][:, 2]))

@@ -4,7 +4,7 @@ Measured is the share of matches that agree with the epipolar geometry of the gi
 these (`two_view`). Right poses reach 0.7 to 1 where wrong ones mostly stay below 0.5. Where the share is low, other readings of the poses
 are tried (`mistakes`): one that clearly fits, on pairs that had no part in choosing it too, is used. Poses that no reading saves are
 refused if the evidence is strong: many pairs with parallax, most of which contradict even the rough motion. Noisy poses pass.
-Single cameras that all of their matches contradict are left out.
+Single cameras that all of their matches contradict are excluded.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ PLATEAU = 0.01  # of the score within which focal lengths fit alike
 ROUGH = 0.4  # of the pairs with parallax: fewer that agree roughly with the poses contradict them (noise of 3° leaves 0.7)
 EXACT = 0.8  # median of the pairs' shares from which what is only nearly right stands out as wrong
 FEW_PAIRS = 6  # pairs with parallax that a refusal needs
-LEAST_MATCHES = 100  # below which nothing is said
+LEAST_MATCHES = 100  # below which nothing is concluded
 WRONG, RIGHT = 0.3, 0.5  # share of a pair's matches that agree: below, the pair contradicts its poses; above, it confirms them
-MOST_WRONG = 0.2  # share of the cameras that may be left out
+MOST_WRONG = 0.2  # share of the cameras that may be excluded
 OUTLYING = 20.0  # times the median distance of cameras from their middle
-LOST = 100.0  # the same, of cameras that are left out if no match confirms them
+LOST = 100.0  # the same, of cameras that are excluded if no match confirms them
 SUSPECTS = 8  # images that are looked at because their poses are odd
 SAME_TURN, SAME_WAY = 1.0, 5.0  # degrees within which two readings are one geometry
 
@@ -66,7 +66,7 @@ def check_given(
     progress: Progress = SILENT,
     known: dict[str, Features] | None = None,
 ) -> PoseResult:
-    """The poses as they fit the images, with warnings of what was changed or left out; `agreement` says how well they fit.
+    """The poses as they fit the images, with warnings of what was changed or excluded; `agreement` is how well they fit.
 
     Args:
         convention: `as_is` keeps the poses whatever is found; the warning stays.
@@ -160,7 +160,7 @@ def choose_images(poses: Array, twins: Array) -> list[int]:
 
 
 def _links(chosen: list[int], twins: Array) -> list[tuple[int, int]]:
-    """Pairs of cameras that are said to have one pose."""
+    """Pairs of cameras to which the capture gives one pose."""
     groups = [[position for position, index in enumerate(chosen) if twins[index] == group] for group in np.unique(twins[twins >= 0])]
     return [(group[0], other) for group in groups for other in group[1 : 1 + SUSPECTS]]
 
@@ -296,7 +296,7 @@ def _contradicted(poses: Array, matches: Matches) -> list[int]:
     off = deviation(poses, matches)
     share, near = matches.by_pair(off < 1), matches.by_pair(off < NEAR)
     one = np.abs(poses[matches.pairs[:, 0]] - poses[matches.pairs[:, 1]]).max(axis=(1, 2)) < 1e-9
-    # Two images with one pose are the same image, or one of the poses is wrong; that a third is right nobody can tell from them.
+    # Two images with one pose are the same image, or one of the poses is wrong; whether a third is right does not follow from them.
     within = share if np.median(share) >= EXACT else near
     against = np.where(one, share < RIGHT, within < WRONG)
     confirms = (within >= RIGHT) & ~one

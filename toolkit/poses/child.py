@@ -147,16 +147,16 @@ def _listen(
         lines.put(None)
 
     threading.Thread(target=pump, daemon=True).start()
-    heard = time.monotonic()
+    last = time.monotonic()
     while True:
         progress.check()
         try:
             line = lines.get(timeout=TICK)
         except queue.Empty:
-            if time.monotonic() - heard > silence:
+            if time.monotonic() - last > silence:
                 raise PoseError(f"the process that finds poses said nothing for {silence:.0f} seconds and was ended; see {log}") from None
             continue
-        heard = time.monotonic()
+        last = time.monotonic()
         if line is None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(timeout=30)

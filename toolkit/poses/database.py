@@ -211,12 +211,12 @@ def _write_image(job: Job, database: pycolmap.Database, index: int, record: dict
 
 
 def lens_model(images: int) -> str:
-    """Fewer parameters for fewer images: those that a handful of views cannot separate are left out."""
+    """Fewer parameters for fewer images: those that a handful of views cannot separate are not there."""
     return "OPENCV" if images >= 30 else "SIMPLE_RADIAL"
 
 
 def _camera(job: Job, database: pycolmap.Database, frame: Frame, width: int, height: int) -> tuple[int, int]:
-    """The (camera, rig) ids for an image: shared by images of one size when the job says that there is one camera."""
+    """The (camera, rig) ids for an image: shared by images of one size when the job has one camera."""
     focal = frame.focal_prior or GUESSED_FOCAL * max(width, height)
     if job.one_camera:
         for rig in database.read_all_rigs():

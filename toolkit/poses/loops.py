@@ -1,7 +1,7 @@
 """Frames far apart that look alike and are not the same place: what they seem to share is taken back, and mapping repeated.
 
 A can with the same print on both sides, a table with four legs, a corridor of equal doors: matched across, they fold the way of the
-camera together, and all frames are registered with a small error. The way itself tells. Neighbouring frames see the same side, so how far
+camera together, and all frames are registered with a small error. The way shows it. Neighbouring frames see the same side, so how far
 the camera turned between two of them does not hang on what was matched far off, and a model that has them turned otherwise is folded. Then
 frames are mapped by their near neighbours alone, and of the matches between frames far apart those stay that agree with that.
 

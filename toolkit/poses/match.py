@@ -39,23 +39,23 @@ def match(job: Job, pairs: list[tuple[int, int]], report: Report) -> None:
     left = _left(job, pairs)
     total = len(left)
 
-    def tell(done: int) -> None:
+    def show(done: int) -> None:
         before = 0.5 if job.features == XFEAT else 0.0
         report(before * total + (1 - before) * done, total, f"matching, pair {done} of {total}")
 
     if job.features == XFEAT:
         _compare(job, left, lambda done: report(done / 2, total, f"matching, pair {done} of {total}"))
-    tell(0)
+    show(0)
     with suppress(RuntimeError):  # no room for what copies grow to, or a process ended for its memory: what is left is matched here
-        _together(job, left, tell)
+        _together(job, left, show)
     left = _left(job, left)
     done = total - len(left)
     for step in _steps(left):
         _match(job, Path(job.folder), step)
-        tell(done := done + len(step))
+        show(done := done + len(step))
 
 
-def _compare(job: Job, pairs: list[tuple[int, int]], tell: Callable[[int], None]) -> None:
+def _compare(job: Job, pairs: list[tuple[int, int]], show: Callable[[int], None]) -> None:
     """Put the matches of learned features into the job's database, which COLMAP's matcher then only verifies."""
     from fieldfuse.poses.xfeat import mutual
 
@@ -69,7 +69,7 @@ def _compare(job: Job, pairs: list[tuple[int, int]], tell: Callable[[int], None]
         new = [(i, j) for i, j in pairs if not database.exists_matches(ids[i], ids[j])]
         with ThreadPoolExecutor(job.threads) as pool:
             for done, step in enumerate(_steps(new)):
-                tell(len(pairs) - len(new) + done * PAIRS_A_STEP)
+                show(len(pairs) - len(new) + done * PAIRS_A_STEP)
                 found = pool.map(mutual, [described(i) for i, _ in step], [described(j) for _, j in step])
                 with pycolmap.DatabaseTransaction(database):
                     for (i, j), matches in zip(step, found, strict=True):
@@ -81,7 +81,7 @@ def _steps(pairs: list[tuple[int, int]]) -> list[list[tuple[int, int]]]:
     return [pairs[start : start + PAIRS_A_STEP] for start in range(0, len(pairs), PAIRS_A_STEP)]
 
 
-def _together(job: Job, pairs: list[tuple[int, int]], tell: Callable[[int], None]) -> None:
+def _together(job: Job, pairs: list[tuple[int, int]], show: Callable[[int], None]) -> None:
     """Match in several processes, where there is more than one thread and one step, and room; else nothing. A RuntimeError where one of
     them failed; what the others did stays."""
     steps, done, lock = _steps(pairs), 0, threading.Lock()
@@ -103,7 +103,7 @@ def _together(job: Job, pairs: list[tuple[int, int]], tell: Callable[[int], None
                     processes.submit(_match, job, folder, step).result()
                     with lock:
                         _bring(folder / job.database.name, job.database, step)
-                        tell(done := done + len(step))
+                        show(done := done + len(step))
                 finally:
                     free.put(folder)
 

@@ -17,7 +17,7 @@ NEAR = 60.0  # degrees that an estimate may lie off the mean up vector of the ca
 TURNED = 0.01  # least share of the x axes' second direction: about 6° of turning
 UNDECIDED = 0.15  # length of a mean of unit vectors below which it points nowhere
 SHORT = 0.5  # and below which it does not overrule the x axes
-STEEP = 0.7  # cosine between a camera's axis and up above which that axis tells no heading
+STEEP = 0.7  # cosine between a camera's axis and up above which that axis has no heading
 PERCENTILES = (0.5, 99.5)  # of points, that a footprint spans
 
 OBJECT = "object"  # cameras look inwards at one place
@@ -39,8 +39,8 @@ MIN_POINTS = 100  # points that make percentiles meaningful
 def up_direction(world_from_camera: Array, given: tuple[float, float, float] | None = None) -> tuple[Array, str]:
     """A unit up vector (3,) in the frame of the poses, and the reason for it.
 
-    Without a given one: people hold cameras level, so the direction across all x axes is up, when the cameras turned enough to
-    tell; else the mean up vector of the cameras (−y). Where the camera centres lie in a plane whose normal agrees within
+    Without a given one: people hold cameras level, so the direction across all x axes is up, when the cameras turned enough for
+    that; else the mean up vector of the cameras (−y). Where the camera centres lie in a plane whose normal agrees within
     15°, as on an orbit, the two are averaged.
     """
     if given is not None:

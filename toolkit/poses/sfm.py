@@ -37,7 +37,7 @@ def find_poses(
     threads: int | None = None,
     progress: Progress = SILENT,
 ) -> PoseResult:
-    """Structure from motion over the capture's images; poses and intrinsics that it brings are not looked at.
+    """Structure from motion over the capture's images; poses and intrinsics that it brings are not used.
 
     COLMAP's database, log and model stay in `out/sparse`; features and matches there are used again when the images and
     settings are the same. With the same seed the result repeats; up to `job.REPEATABLE` images that of the incremental
@@ -132,7 +132,7 @@ def _run(job: Job, seconds: dict[str, float], progress: Progress) -> dict[str, A
             kind = getattr(errors, str(message["kind"]), PoseError)
             refusals.append(kind(str(message["message"])))
 
-    # BLAS and OpenMP spin up a thread a core each unless told; COLMAP's own threads are set by the worker.
+    # BLAS and OpenMP start a thread a core each by default; COLMAP's own threads are set by the worker.
     counts = {name: str(job.threads) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
     run_child(WORKER, [str(folder / "job.json")], job.log, hear, progress, counts)
     if refusals:

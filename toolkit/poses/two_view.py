@@ -192,7 +192,7 @@ def deviation(poses: Array, matches: Matches) -> Array:
 
 
 def own_motions(matches: Matches) -> tuple[Array, Array, Array]:
-    """What each pair's own essential matrix says.
+    """Rotation and direction by each pair's own essential matrix.
 
     Returns:
         (P, 3, 3) rotation and (P, 3) direction, second camera from first, and (P,) degrees between the rays of its matches in the median
