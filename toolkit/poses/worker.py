@@ -24,7 +24,7 @@ from fieldfuse.poses.health import AGREES, failure, hopeless, turned_only
 from fieldfuse.poses.job import GLOBAL, LOOSE, MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, Job
 from fieldfuse.poses.mapping import Model, Report, agreement, leave_out
 from fieldfuse.poses.match import match
-from fieldfuse.poses.pairs import choose_pairs, pairs_with
+from fieldfuse.poses.pairs import Pairs, choose_pairs, pairs_with
 
 Placed = tuple[Model | None, dict[str, Any]]
 PROBE_BYTES = 4 * 2**20
@@ -54,14 +54,10 @@ def work(job_file: Path, messages: Messages) -> None:
 
         return report
 
-    database = store.open_database(job)
-    records = store.extract(job, database, reporter("features"))
+    job, records, pairs = _features(job, reporter("features"), reporter("matching"))
     facts: dict[str, Any] = {"pictures": records, "pairs": [], "attempts": [], "folded": None, "model": None}
     finished("features")
-    job, reason = store.tolerant(job, records), hopeless(records)
-    pairs = [] if reason else choose_pairs(job, lambda: store.sketches(job, database), reporter("matching"))
-    database.close()
-    if reason is None or job.second is not None:
+    if hopeless(records) is None or job.second is not None:
         match(job, pairs, reporter("matching"))
         finished("matching")
         model, found = place(job, reporter("mapping"))
@@ -72,6 +68,17 @@ def work(job_file: Path, messages: Messages) -> None:
             mapping.save_model(model, [image.name for image in job.images], Path(job.folder) / "model")
         finished("mapping")
     write_json(job.result, facts)
+
+
+def _features(job: Job, extracting: Report, choosing: Report) -> tuple[Job, list[dict[str, Any]], Pairs]:
+    """The job with the tolerance of its features, which are then in its database, a record of each image, and the pairs to match."""
+    database = store.open_database(job)
+    try:
+        records = store.extract(job, database, extracting)
+        pairs = [] if hopeless(records) else choose_pairs(job, lambda: store.sketches(job, database), choosing)
+        return store.tolerant(job, records), records, pairs
+    finally:
+        database.close()
 
 
 # ------------------------------------------------------------------------------------------------- placing
@@ -123,13 +130,7 @@ def _otherwise(job: Job, before: Placed, report: Report) -> Placed:
     def again(done: float, of: float, note: str) -> None:
         report(total, total, f"{note} (by other features)")
 
-    database = store.open_database(other)
-    try:
-        records = store.extract(other, database, again)
-        other = store.tolerant(other, records)
-        pairs = [] if hopeless(records) else choose_pairs(other, lambda: store.sketches(other, database), again)
-    finally:
-        database.close()
+    other, records, pairs = _features(other, again, again)
     match(other, pairs, again)
     model, facts = _mapped(other, again)
     facts |= {"pictures": records, "agreement": {} if model is None else agreement(other, model)}
