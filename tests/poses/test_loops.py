@@ -184,13 +184,6 @@ def test_turns_put_one_after_the_other_are_the_way(seed, count):
     assert all(np.allclose(found[i], rotations[i] @ rotations[0].T) for i in range(count))
 
 
-def test_what_hangs_on_no_earlier_frame_is_not_in_the_chain():
-    seen, _ = made_up(0, 12, 0.0)
-    kept = ~((seen.first < 6) & (seen.second >= 6))
-    parted = loops.Turns(*(part[kept] for part in (seen.first, seen.second, seen.turn, seen.images, seen.shared)))
-    assert set(loops.chained(parted, 12)) == set(range(6))
-
-
 def test_frames_that_are_not_in_the_model_say_nothing():
     seen, rotations = made_up(0, 10, 0.0)
     off = loops.disagreement(seen, {i: rotation for i, rotation in rotations.items() if i != 4})

@@ -178,9 +178,9 @@ def turns(job: Job, lenses: Mapping[int, pycolmap.Camera] | None = None) -> Turn
             if pycolmap.estimate_two_view_geometry_pose(pair[0], points[a], pair[1], points[b], geometry):
                 turn, shared = geometry.cam2_from_cam1.rotation.matrix(), len(geometry.inlier_matches)
                 rows.append((int(images[a].name), int(images[b].name), turn, (a, b), shared))
-    first, second, turn, ids, shared = zip(*rows, strict=True) if rows else ((),) * 5
-    whole = [np.array(column, dtype=np.int64) for column in (first, second, ids, shared)]
-    return Turns(whole[0], whole[1], np.array(turn, dtype=np.float64).reshape(-1, 3, 3), whole[2].reshape(-1, 2), whole[3])
+    columns = list(zip(*rows, strict=True)) if rows else [()] * 5
+    first, second, ids, number = (np.array(columns[k], dtype=np.int64) for k in (0, 1, 3, 4))
+    return Turns(first, second, np.array(columns[2], dtype=np.float64).reshape(-1, 3, 3), ids.reshape(-1, 2), number)
 
 
 def axes(model: Model) -> dict[int, Array]:

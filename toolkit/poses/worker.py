@@ -20,9 +20,10 @@ from fieldfuse.files import read_json, remove, write_json
 from fieldfuse.poses import database as store
 from fieldfuse.poses import loops, mapping
 from fieldfuse.poses.child import Messages, die_with_parent
+from fieldfuse.poses.database import Report
 from fieldfuse.poses.health import AGREES, failure, hopeless, turned_only
 from fieldfuse.poses.job import GLOBAL, LOOSE, MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, Job
-from fieldfuse.poses.mapping import Model, Report, agreement, leave_out
+from fieldfuse.poses.mapping import Model, agreement, leave_out
 from fieldfuse.poses.match import match
 from fieldfuse.poses.pairs import Pairs, choose_pairs, pairs_with
 
