@@ -3,45 +3,40 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from fieldfuse.pipelines.baking import SEEN
-from fieldfuse.pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
+from fieldfuse.pipelines.options import Options, Place, bound_threads, show, takes
 
 
+@takes("threads config pairs quiet json")
 def bake(
-    target: Target,
-    out: OptionalOut = None,
+    place: Place,
     seen: Annotated[
         float, typer.Option(min=0, max=1, help="Voxels in which no training pixel has more of its light are left out; 0 keeps all.")
     ] = SEEN,
     to: Annotated[Path | None, typer.Option(help="The file. Default: DIR/exports/baked.safetensors.", show_default=False)] = None,
-    threads: Threads = None,
-    config: Config = None,
-    pairs: Pairs = None,
-    quiet: Quiet = False,
-    json: Json = False,
+    *,
+    options: Options,
 ) -> None:
     """Quantise the field of a run to bytes and say what that costs at the held-out views."""
-    from fieldfuse.pipelines.thread_limits import bound_threads
+    settings = options.settings()
+    bound_threads(settings)
+    data = bake_run(place, settings, seen, to, options.quiet)
 
-    options = gather(None, config, pairs, threads=threads)
-    bound_threads(options)
-    data = bake_run(target, out, options, seen, to, quiet)
-    if json:
-        import json as writer
-
-        typer.echo(writer.dumps(data, indent=1))
-    elif not quiet:
+    def lines() -> Iterator[str]:
         loss = "" if data["loss"] is None else f", {data['loss']:.2f} dB below the field ({data['psnr']:.2f}) at the held-out views"
         size, before = data["bytes"] / 1e6, data["field_bytes"] / 1e6
-        typer.echo(f"{data['voxels']:,} voxels in {size:.1f} MB (field: {before:.1f} MB){loss}: {data['to']}")
+        yield f"{data['voxels']:,} voxels in {size:.1f} MB (field: {before:.1f} MB){loss}: {data['to']}"
+
+    show(data, options, lines)
 
 
-def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: float, to: Path | None, quiet: bool) -> dict[str, Any]:
+def bake_run(place: Place, options: dict[str, Any], seen: float, to: Path | None, quiet: bool) -> dict[str, Any]:
     """Bake the field of a run, write it, read it back, and compare both at the held-out views.
 
     Returns:
@@ -59,21 +54,21 @@ def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: floa
     from fieldfuse.evaluation.score import as_photo
     from fieldfuse.pipelines.baking import default_place, write
     from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.fields import finished_field
     from fieldfuse.pipelines.job import open_job
-    from fieldfuse.pipelines.reconstruct import BEFORE, stand
+    from fieldfuse.pipelines.prepare import BEFORE, prepare
     from fieldfuse.pipelines.rendered import to_picture
-    from fieldfuse.pipelines.steps_results import fit_radiance_field
     from fieldfuse.render.bake_image import BakedRenderer
     from fieldfuse.render.image import make_renderer, render_view
 
-    with open_job(target, out, options, make_progress(quiet), (*BEFORE, "field")) as job:
-        _, _, _, scene, views = stand(job)
-        field, _ = fit_radiance_field(job, views, scene)
-        field = field.to("cpu")
+    with open_job(place, options, make_progress(quiet), (*BEFORE, "field")) as job:
+        ready = prepare(job)
+        scene, views = ready.scene, ready.views
+        field = finished_field(job, ready).field.to("cpu")
         job.progress.begin("bake")
         start = time.monotonic()
-        place = to or default_place(job)
-        baked = write(job, field, views, scene, seen, place)
+        target = to or default_place(job)
+        baked = write(job, field, views, scene, seen, target)
         renderer, view = BakedRenderer(baked, torch.get_num_threads()), make_renderer(field)
         scores = []
         for index in np.flatnonzero(views.test):
@@ -89,8 +84,8 @@ def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: floa
         job.progress.finish("bake", time.monotonic() - start, False)
     mean = np.mean(np.array(scores, np.float64), 0) if scores else None
     return {
-        "to": str(place),
-        "bytes": place.stat().st_size,
+        "to": str(target),
+        "bytes": target.stat().st_size,
         "field_bytes": field.bytes,
         "voxels": baked.voxels,
         "field_voxels": field.voxels,

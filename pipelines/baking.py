@@ -42,7 +42,7 @@ def baked(job: Job, field: Field, views: Views, seen: float = SEEN) -> BakedFiel
     import numpy as np
     import torch
 
-    from fieldfuse.memory_limits import require_baking
+    from fieldfuse.memory import require_baking
     from fieldfuse.render.bake import bake as quantise
     from fieldfuse.render.bake_views import seen_voxels
 

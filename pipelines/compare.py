@@ -2,31 +2,15 @@
 
 from __future__ import annotations
 
-import json as writer
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from fieldfuse.pipelines.options import (
-    Budget,
-    Config,
-    Device,
-    Holdout,
-    ImageSize,
-    Json,
-    OptionalOut,
-    Pairs,
-    PosesFrom,
-    Preset,
-    Quiet,
-    Seed,
-    Target,
-    Threads,
-    gather,
-)
+from fieldfuse.pipelines.options import Options, Place, bound_threads, show, takes
 
 Depth = Annotated[
     str,
@@ -39,44 +23,24 @@ FORMATS = "export.formats=[ply]"  # the mesh alone: what is compared
 DEPTH_FROM = "fit.depth_from=any"  # where pictures are matched for a surface, the field may know that depth, too
 
 
-def compare(
-    target: Target,
-    out: OptionalOut = None,
-    depth: Depth = "auto",
-    preset: Preset = None,
-    budget: Budget = None,
-    image_size: ImageSize = None,
-    holdout: Holdout = None,
-    device: Device = None,
-    threads: Threads = None,
-    seed: Seed = None,
-    poses: PosesFrom = None,
-    config: Config = None,
-    pairs: Pairs = None,
-    quiet: Quiet = False,
-    json: Json = False,
-) -> None:
+@takes("preset budget image_size holdout device threads seed poses config pairs quiet json")
+def compare(place: Place, depth: Depth = "auto", *, options: Options) -> None:
     """Make the field, fitted and not, and the TSDF surface, score all on the same test views, and put them side by side on one page.
 
     With the folder of an earlier run its results are used as they are. A capture with `ground_truth/mesh.ply` has its meshes measured.
     """
-    from fieldfuse.pipelines.thread_limits import bound_threads
-
-    flags = {"budget": budget, "image_size": image_size, "holdout": holdout, "device": device, "threads": threads, "seed": seed}
-    wanted = list(pairs or [])
-    if out is not None and not any(pair.startswith("export.formats=") for pair in wanted):
-        wanted.insert(0, FORMATS)
-    if out is not None and (depth == "auto" or "matching" in depth) and not any(pair.startswith("fit.depth_from=") for pair in wanted):
-        wanted.insert(0, DEPTH_FROM)
-    options = gather(preset, config, wanted, **flags, **{"poses.source": poses})
-    bound_threads(options)
+    added = [] if place.out is None else [FORMATS]
+    if place.out is not None and (depth == "auto" or "matching" in depth):
+        added.append(DEPTH_FROM)
+    settings = options.settings(*added)  # what --set says comes later, and wins
+    bound_threads(settings)
     from fieldfuse.pipelines.console import make_progress
 
-    data = compare_run(target, out, options, depth, make_progress(quiet))
-    show(data, target if out is None else out, quiet, json)
+    data = compare_run(place, settings, depth, make_progress(options.quiet))
+    show(data, options, lambda: lines(data, place.folder))
 
 
-def compare_run(target: Path, out: Path | None, options: dict[str, Any], depth: str, progress: Any) -> dict[str, Any]:
+def compare_run(place: Place, options: dict[str, Any], depth: str, progress: Any) -> dict[str, Any]:
     """Make what is missing and write the comparison; answers `compare.json`.
 
     Raises:
@@ -85,36 +49,36 @@ def compare_run(target: Path, out: Path | None, options: dict[str, Any], depth: 
     from fieldfuse.errors import InputError
     from fieldfuse.evaluation.compare_truth import find_truth
     from fieldfuse.pipelines.comparison import put_comparison
+    from fieldfuse.pipelines.exports import Wish, export_results
+    from fieldfuse.pipelines.fields import fit_radiance_field, render_test_views, starting_field
     from fieldfuse.pipelines.job import open_job
-    from fieldfuse.pipelines.reconstruct import BEFORE, FOR_FIELD, RESULTS, stand
+    from fieldfuse.pipelines.prepare import BEFORE, prepare
+    from fieldfuse.pipelines.reconstruct import FOR_FIELD, RESULTS
     from fieldfuse.pipelines.steps_compare import SURFACES, Compared, choose_surfaces, measure, not_fitted
-    from fieldfuse.pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views
+    from fieldfuse.pipelines.surfaces import fuse_tsdf
 
     start = time.monotonic()
-    with open_job(target, out, options, progress, (*BEFORE, *FOR_FIELD, *RESULTS, *SURFACES.values())) as job:
-        capture, poses, posed, scene, views = stand(job)
-        if not views.test.any():
+    with open_job(place, options, progress, (*BEFORE, *FOR_FIELD, *RESULTS, *SURFACES.values())) as job:
+        ready = prepare(job)
+        if not ready.views.test.any():
             raise InputError("a comparison needs pictures that were kept for testing; give --holdout 8")
-        truth = find_truth(posed) if poses.source == "given" else None
-        surfaces = {SURFACES[kind]: kind for kind in choose_surfaces(depth, posed, truth)}
-        pictures = {name: fuse_tsdf(job, posed, scene, views, name, kind) for name, kind in surfaces.items()}
-        field, _ = fit_radiance_field(job, views, scene)
-        pictures = {"field": render_test_views(job, field, views, scene), **not_fitted(job, views, scene), **pictures}
-        facts = export_results(job, field, poses, posed, scene, views)
-        everything = Compared(capture, poses, posed, scene, views, field, pictures, truth)
+        truth = find_truth(ready.posed) if ready.poses.source == "given" else None
+        surfaces = {SURFACES[kind]: kind for kind in choose_surfaces(depth, ready.posed, truth)}
+        pictures = {name: fuse_tsdf(job, ready, name, kind) for name, kind in surfaces.items()}
+        network = starting_field(job, ready)
+        fitted = fit_radiance_field(job, ready, network)
+        pictures = {"field": render_test_views(job, ready, fitted.field), **not_fitted(job, ready, network), **pictures}
+        facts = export_results(job, ready, fitted, Wish())
+        everything = Compared(ready, fitted, pictures, truth)
         found = measure(job, everything)
         return put_comparison(job, everything, found, facts.get("mesh"), time.monotonic() - start)
 
 
-def show(data: dict[str, Any], folder: Path, quiet: bool, as_json: bool) -> None:
-    """The result on stdout: JSON, or the table and where the page is."""
+def lines(data: dict[str, Any], folder: Path) -> Iterator[str]:
+    """The table, remarks, and where the page is."""
     from fieldfuse.evaluation.compare_text import comparison_text
     from fieldfuse.pipelines.console import columns
 
-    if as_json:
-        sys.stdout.write(writer.dumps(data, indent=1) + "\n")
-    elif not quiet:
-        sys.stdout.write(comparison_text(data, columns(sys.stdout)))
-        for warning in data["warnings"]:
-            sys.stdout.write(f"note: {warning}\n")
-        sys.stdout.write(f"{folder / 'compare.html'}\n")
+    yield comparison_text(data, columns(sys.stdout)).removesuffix("\n")
+    yield from (f"note: {warning}" for warning in data["warnings"])
+    yield str(folder / "compare.html")

@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fieldfuse.pipelines.fit_files import fit_matched
+from fieldfuse.pipelines.fields import DIRECT
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.steps_compare import Compared, common_voxel, depths_of_test_views, working_meshes
-from fieldfuse.pipelines.steps_network import DIRECT
 from fieldfuse.pipelines.summary import base_data, warnings_of
 
 if TYPE_CHECKING:
     from fieldfuse.camera import Array
-    from fieldfuse.capture.types import Views
     from fieldfuse.evaluation.compare_meshes import MeshPictures
 
 SHOWN_VIEWS = 8
@@ -50,7 +48,7 @@ def put_comparison(
     from fieldfuse.evaluation.compare_page import write_comparison
     from fieldfuse.evaluation.pictures import method_pictures
 
-    views, scene = all_of_it.views, all_of_it.scene
+    views, scene = all_of_it.ready.views, all_of_it.ready.scene
     exact = depths_of_test_views(all_of_it)
     indices = np.flatnonzero(views.test)
     if exact is not None:
@@ -61,8 +59,8 @@ def put_comparison(
     scale = next((score["depth_scale"] for score in found["scores"].values() if score["depth_scale"] is not None), None)
     top = None if scale is None else DEPTH_ERROR_TOP * scale
     data = {
-        **base_data(job, all_of_it.capture, all_of_it.poses),
-        "warnings": [*warnings_of(job, all_of_it.capture, all_of_it.poses, scene, all_of_it.views), *little_depth(all_of_it)],
+        **base_data(job, all_of_it.ready.capture, all_of_it.ready.poses),
+        "warnings": [*warnings_of(job, all_of_it.ready, all_of_it.fitted), *little_depth(all_of_it)],
         "scene": scene.to_dict(),
         "truth": {
             "mesh": found["geometry"] is not None,
@@ -73,7 +71,7 @@ def put_comparison(
         "methods": [describe_method(job, all_of_it, name, found, mesh_facts) for name in all_of_it.pictures],
         "matching": found["matching"],
         "machine": machine(job),
-        "seconds_total": round(seconds + job.stages.fresh_seconds(), 3),
+        "seconds_total": round(seconds + job.stages.reused_seconds(), 3),
     }
     shown = {name: pictures.pictures for name, pictures in all_of_it.pictures.items()}
     tiles = method_pictures(views, indices, shown, "m" if scene.metric else "units", SHOWN_VIEWS, top)
@@ -99,7 +97,7 @@ def describe_method(job: Job, all_of_it: Compared, name: str, found: dict[str, A
     own = OWN_STAGES.get(name, (name,))
     note = NOTES.get(name, "")
     if name == "field":
-        matched, note = depth_in_fit(job, all_of_it.views)
+        matched, note = depth_in_fit(job, all_of_it)
         own = (*matched, *own)
     path = job.folder / KEPT.get(name, f"{name}/mesh.ply")
     facts = all_of_it.pictures[name].facts
@@ -111,21 +109,21 @@ def describe_method(job: Job, all_of_it: Compared, name: str, found: dict[str, A
         "stages": [stages[stage] for stage in own if stage in stages],
         "mesh_seconds": stages["export"]["seconds"] if name == "field" else None,
         "disk_bytes": path.stat().st_size if path.is_file() else None,
-        "memory_bytes": all_of_it.field.bytes if name == "field" else facts.get("bytes"),
+        "memory_bytes": all_of_it.fitted.field.bytes if name == "field" else facts.get("bytes"),
         "score": found["scores"].get(name),
         "geometry": (found["geometry"] or {}).get(name),
         "mesh": mesh_facts if name == "field" else facts.get("mesh"),
     }
 
 
-def depth_in_fit(job: Job, views: Views) -> tuple[tuple[str, ...], str]:
+def depth_in_fit(job: Job, all_of_it: Compared) -> tuple[tuple[str, ...], str]:
     """The stages before the fit that its depth comes from, and the words for it."""
     fit = job.settings.fit
     if "stereo" in job.stages.records["field"].after:
         return ("stereo",), "fitted to colours and matched depth"
-    if fit.finetune and fit.depth > 0 and fit.depth_from != "off" and any(depth is not None for depth in views.depths):
+    if fit.finetune and fit.depth > 0 and fit.depth_from != "off" and any(depth is not None for depth in all_of_it.ready.views.depths):
         return (), "fitted to colours and the sensor's depth"
-    if fit_matched(job) is not None:
+    if all_of_it.fitted.matched is not None:
         return (), "fitted to colours and depth by quick matching"
     return (), ""
 
@@ -138,7 +136,7 @@ def shown_meshes(job: Job, all_of_it: Compared) -> list[MeshPictures]:
     meshes, truth = working_meshes(job, all_of_it)
     if not meshes:
         return []
-    views, scene, voxel = all_of_it.views, all_of_it.scene, common_voxel(all_of_it)
+    views, scene, voxel = all_of_it.ready.views, all_of_it.ready.scene, common_voxel(all_of_it)
     outside = ("Seen from outside", *from_outside(scene.centre, scene.half_size, views.world_from_camera, MESH_SIDE, 3 * MESH_SIDE // 4))
     out = mesh_pictures(meshes, truth, [outside], voxel, cut_box(scene.centre, scene.half_size))
     test = np.flatnonzero(views.test)

@@ -16,36 +16,25 @@ from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture import nerf_json
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json, remove
-from fieldfuse.memory_limits import require_pictures
+from fieldfuse.memory import require_pictures
 from fieldfuse.pipelines.console import make_progress
+from fieldfuse.pipelines.fields import finished_field
 from fieldfuse.pipelines.job import Job, open_job
 from fieldfuse.pipelines.pictures import Camera, camera_of, orbit_cameras, pictures
-from fieldfuse.pipelines.reconstruct import BEFORE, stand
+from fieldfuse.pipelines.prepare import BEFORE, prepare
 from fieldfuse.pipelines.rendered import file_name, write_png
-from fieldfuse.pipelines.steps_results import fit_radiance_field
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Views
+    from fieldfuse.pipelines.options import Place
+    from fieldfuse.pipelines.render import CameraPath
 
 VIDEO = (".mp4",)
 NUMBERED = re.compile(r"\d{4,}_.*\.png")
 MAX_CAMERAS = 100_000
 
 
-def render_run(
-    target: Path,
-    out: Path | None,
-    options: dict[str, Any],
-    *,
-    views: str,
-    cameras: Path | None,
-    to: Path | None,
-    frames: int,
-    fps: float,
-    image_size: int | None,
-    baked: bool,
-    quiet: bool,
-) -> dict[str, Any]:
+def render_run(place: Place, path: CameraPath, options: dict[str, Any], baked: bool, quiet: bool) -> dict[str, Any]:
     """Render what is asked for; the field of a run's folder is taken as it is.
 
     Returns:
@@ -55,33 +44,35 @@ def render_run(
         InputError: an unknown path of cameras, cameras that cannot be used, a folder without a field and without its source.
         OutputError: the result cannot be written.
     """
+    views, cameras, to = path.views, path.cameras, path.to
     if views not in ("orbit", "test"):
         raise InputError(f"--views is {views!r}; it must be orbit or test")
     if to is not None and to.suffix and to.suffix.lower() not in VIDEO:
         raise InputError(f"--to {to} must be an .mp4 file or a folder")
     given = read_cameras(cameras) if cameras is not None else None
-    with open_job(target, out, options, make_progress(quiet), (*BEFORE, "field")) as job:
-        _, _, _, scene, ready = stand(job)
-        field, _ = fit_radiance_field(job, ready, scene)
+    with open_job(place, options, make_progress(quiet), (*BEFORE, "field")) as job:
+        prepared = prepare(job)
+        scene, ready = prepared.scene, prepared.views
+        field = finished_field(job, prepared).field
         if given is not None:
             names, lenses, poses = given[0], given[1], scene.working_from_input.poses(given[2])
         elif views == "test":
             names, lenses, poses = test_cameras(ready)
         else:
-            names, lenses, poses = orbit_cameras(ready, scene, frames)
-        lenses = [sized(lens, image_size) for lens in lenses]
+            names, lenses, poses = orbit_cameras(ready, scene, path.frames)
+        lenses = [sized(lens, path.image_size) for lens in lenses]
         own = job.folder / "renders" / (
             "orbit.mp4" if given is None and views == "orbit" else "cameras" if given is not None else "test"
         )
-        place = to or own
+        target = to or own
         require_pictures(lenses, kept=False)
         start = time.monotonic()
         job.progress.begin("render")
-        others = write(job, camera_of(job, field, ready, scene, baked), names, lenses, poses, place, fps, alone=to is None)
+        others = write(job, camera_of(job, field, ready, scene, baked), names, lenses, poses, target, path.fps, alone=to is None)
         seconds = time.monotonic() - start
         job.progress.finish("render", seconds, False)
     size = {"width": lenses[0].width, "height": lenses[0].height}
-    return {"pictures": len(names), **size, "seconds": round(seconds, 3), "to": str(place), "others": others}
+    return {"pictures": len(names), **size, "seconds": round(seconds, 3), "to": str(target), "others": others}
 
 
 def write(

@@ -11,18 +11,18 @@ import numpy as np
 
 from fieldfuse.errors import InputError
 from fieldfuse.files import write_json
-from fieldfuse.memory_limits import require_meshes, require_scores
+from fieldfuse.memory import require_meshes, require_scores
 from fieldfuse.pipelines.job import Job
-from fieldfuse.pipelines.kept import COMPARED, read_kept
 from fieldfuse.pipelines.rendered import Pictures
+from fieldfuse.pipelines.schemas import CompareScores, read_checked
+from fieldfuse.pipelines.stages import Stage
 
 if TYPE_CHECKING:
     from fieldfuse.camera import Array
-    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.capture.types import Capture
     from fieldfuse.evaluation.compare_truth import GroundTruth
-    from fieldfuse.poses.result import PoseResult
-    from fieldfuse.poses.scene import Scene
-    from fieldfuse.render.field import Field
+    from fieldfuse.pipelines.fields import Fitted, NetworkField
+    from fieldfuse.pipelines.prepare import Prepared
     from fieldfuse.tsdf.mesh import Mesh
 
 SURFACES = {"sensor": "tsdf", "matching": "tsdf_stereo", "exact": "tsdf_exact"}  # where depth comes from → stage and folder
@@ -32,12 +32,8 @@ SURFACES = {"sensor": "tsdf", "matching": "tsdf_stereo", "exact": "tsdf_exact"} 
 class Compared:
     """Everything that the page is made of."""
 
-    capture: Capture
-    poses: PoseResult
-    posed: Capture
-    scene: Scene
-    views: Views
-    field: Field
+    ready: Prepared
+    fitted: Fitted
     pictures: dict[str, Pictures]  # by method, the field first
     truth: GroundTruth | None
 
@@ -66,16 +62,16 @@ def choose_surfaces(wanted: str, posed: Capture, truth: GroundTruth | None) -> l
     return [kind for kind in SURFACES if kind in names]
 
 
-def not_fitted(job: Job, views: Views, scene: Scene) -> dict[str, Pictures]:
+def not_fitted(job: Job, ready: Prepared, network: NetworkField | None) -> dict[str, Pictures]:
     """The networks' field without any fitting, as a method of its own; nothing without weights, where it is not wanted
-    (`init=classical`), and where it is the field itself (`--no-finetune`)."""
-    from fieldfuse.pipelines.steps_network import make_network_field, render_network_views
+    (`init=classical`), and where it is the field itself (`--no-finetune`). `network`: where the fit started from it."""
+    from fieldfuse.pipelines.fields import make_network_field, render_network_views
     from fieldfuse.steps import network_weights
 
     settings = job.settings
     if settings.field.init == "classical" or not settings.fit.finetune or not network_weights(settings).is_file():
         return {}
-    return {"direct": render_network_views(job, make_network_field(job, views, scene), views, scene, keep=True)}
+    return {"direct": render_network_views(job, ready, network or make_network_field(job, ready), keep=True)}
 
 
 def measure(job: Job, all_of_it: Compared) -> dict[str, Any]:
@@ -86,17 +82,19 @@ def measure(job: Job, all_of_it: Compared) -> dict[str, Any]:
         write_json(path, value)
         return [path]
 
-    return job.stages.run(
-        "compare",
-        make=lambda: {
-            "scores": score_methods(job, all_of_it),
-            **measure_meshes(job, all_of_it),
-            "matching": measure_matching(job, all_of_it),
-        },
-        save=save,
-        load=lambda: read_kept(path, COMPARED),
-        uses=list(all_of_it.pictures),
-        after=["views", "render", "export", *(name for name in all_of_it.pictures if name != "field")],
+    return job.run(
+        Stage(
+            "compare",
+            make=lambda: {
+                "scores": score_methods(job, all_of_it),
+                **measure_meshes(job, all_of_it),
+                "matching": measure_matching(job, all_of_it),
+            },
+            save=save,
+            load=lambda: read_checked(path, CompareScores),
+            inputs=["views", "render", "export", *(name for name in all_of_it.pictures if name != "field")],
+            settings=list(all_of_it.pictures),
+        )
     )
 
 
@@ -105,7 +103,7 @@ def score_methods(job: Job, all_of_it: Compared) -> dict[str, Any]:
     from fieldfuse.evaluation.compare_score import compare_views
     from fieldfuse.evaluation.report import plain
 
-    views = all_of_it.views
+    views = all_of_it.ready.views
     indices = np.flatnonzero(views.test)
     require_scores(views, len(all_of_it.pictures))
     pictures = {name: shown.pictures for name, shown in all_of_it.pictures.items()}
@@ -118,30 +116,30 @@ def score_methods(job: Job, all_of_it: Compared) -> dict[str, Any]:
 
 def depths_of_test_views(all_of_it: Compared) -> list[Array | None] | None:
     """The exact depth of the test views; None when the capture brings none."""
-    return exact_depths_of(all_of_it, np.flatnonzero(all_of_it.views.test))
+    return exact_depths_of(all_of_it, np.flatnonzero(all_of_it.ready.views.test))
 
 
 def exact_depths_of(all_of_it: Compared, indices: Array) -> list[Array | None] | None:
     """The exact depth of the views at `indices`, None when the capture brings none."""
     from fieldfuse.evaluation.compare_truth import true_depths
 
-    truth, views = all_of_it.truth, all_of_it.views
+    truth, views = all_of_it.truth, all_of_it.ready.views
     if truth is None or not truth.depths:
         return None
-    return true_depths(truth, all_of_it.posed, views, indices, all_of_it.scene.working_from_input.scale)
+    return true_depths(truth, all_of_it.ready.posed, views, indices, all_of_it.ready.scene.working_from_input.scale)
 
 
 def measure_matching(job: Job, all_of_it: Compared) -> dict[str, Any] | None:
     """How good the depth by matching of the training views is, against the exact depth or the sensor's; None without either."""
     from fieldfuse.evaluation.compare_stereo import matched_depth_scores
-    from fieldfuse.pipelines.steps_stereo import match_pictures
+    from fieldfuse.pipelines.surfaces import match_images
 
     if "tsdf_stereo" not in all_of_it.pictures:
         return None
-    training = np.flatnonzero(~all_of_it.views.test)
-    views = all_of_it.views.subset(training)
+    training = np.flatnonzero(~all_of_it.ready.views.test)
+    views = all_of_it.ready.views.subset(training)
     known = exact_depths_of(all_of_it, training) or views.depths
-    return matched_depth_scores(views, match_pictures(job, all_of_it.scene, all_of_it.views), known) if known else None
+    return matched_depth_scores(views, match_images(job, all_of_it.ready), known) if known else None
 
 
 def mesh_files(job: Job, methods: Mapping[str, Any]) -> dict[str, Path]:
@@ -154,7 +152,7 @@ def working_meshes(job: Job, all_of_it: Compared) -> tuple[dict[str, Mesh], Mesh
     """The methods' meshes that have triangles, and the true one, in the working frame."""
     from fieldfuse.evaluation.geometry import read_mesh
 
-    to_working = all_of_it.scene.working_from_input
+    to_working = all_of_it.ready.scene.working_from_input
     meshes = {}
     for name, path in mesh_files(job, all_of_it.pictures).items():
         try:
@@ -182,7 +180,7 @@ def measure_meshes(job: Job, all_of_it: Compared) -> dict[str, Any]:
     meshes, truth = working_meshes(job, all_of_it)
     if truth is None:
         return {"geometry": None, "seen_share": None}
-    views, scene = all_of_it.views, all_of_it.scene
+    views, scene = all_of_it.ready.views, all_of_it.ready.scene
     training = np.flatnonzero(~views.test)
     region = (scene.centre - scene.half_size, scene.centre + scene.half_size)
     voxel, scale = common_voxel(all_of_it), scene.working_from_input.scale

@@ -2,31 +2,14 @@
 
 from __future__ import annotations
 
-import json as writer
 import shlex
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from fieldfuse.pipelines.options import (
-    Config,
-    Decoder,
-    Device,
-    Holdout,
-    ImageSize,
-    Json,
-    OptionalOut,
-    Pairs,
-    PosesFrom,
-    Preset,
-    Quiet,
-    Seed,
-    Target,
-    Threads,
-    gather,
-)
+from fieldfuse.pipelines.options import Options, Place, bound_threads, show, takes
 
 Axes = Annotated[
     str | None,
@@ -45,44 +28,24 @@ SweepBudget = Annotated[
 ]
 
 
+@takes("preset image_size holdout device threads seed decoder poses config pairs quiet json")
 def tradeoff(
-    target: Target,
-    out: OptionalOut = None,
-    axes: Axes = None,
-    times: Times = None,
-    seeds: Seeds = 1,
-    budget: SweepBudget = None,
-    preset: Preset = None,
-    image_size: ImageSize = None,
-    holdout: Holdout = None,
-    device: Device = None,
-    threads: Threads = None,
-    seed: Seed = None,
-    decoder: Decoder = None,
-    poses: PosesFrom = None,
-    config: Config = None,
-    pairs: Pairs = None,
-    quiet: Quiet = False,
-    json: Json = False,
+    place: Place, axes: Axes = None, times: Times = None, seeds: Seeds = 1, budget: SweepBudget = None, *, options: Options
 ) -> None:
     """Make fields and surfaces with one setting changed at a time, measure each, and show quality against time and memory.
 
     Each point is kept as soon as it is measured: run the same command again after an interruption and it goes on.
     """
-    from fieldfuse.pipelines.thread_limits import bound_threads
-
-    flags = {"image_size": image_size, "holdout": holdout, "device": device, "threads": threads, "seed": seed, "decoder": decoder}
-    options = gather(preset, config, pairs, **flags, **{"poses.source": poses})
-    bound_threads(options)
+    settings = options.settings()
+    bound_threads(settings)
     from fieldfuse.pipelines.console import make_progress
 
-    data = tradeoff_run(target, out, options, axes, times, seeds, budget, make_progress(quiet))
-    show(data, target if out is None else out, quiet, json)
+    data = tradeoff_run(place, settings, axes, times, seeds, budget, make_progress(options.quiet))
+    show(data, options, lambda: lines(data, place.folder))
 
 
 def tradeoff_run(
-    target: Path,
-    out: Path | None,
+    place: Place,
     options: dict[str, Any],
     axes: str | None = None,
     times: str | None = None,
@@ -99,24 +62,24 @@ def tradeoff_run(
     from fieldfuse.errors import InputError
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.job import open_job
-    from fieldfuse.pipelines.reconstruct import BEFORE, stand
-    from fieldfuse.pipelines.steps_stereo import match_pictures
+    from fieldfuse.pipelines.prepare import BEFORE, prepare
+    from fieldfuse.pipelines.surfaces import match_images
     from fieldfuse.pipelines.tradeoff_plan import chosen_axes, chosen_times, plan
     from fieldfuse.pipelines.tradeoff_sweep import Swept, sweep
 
     ladder = chosen_times(times)
     progress = make_progress(True) if progress is None else progress
-    with open_job(target, out, options, progress, (*BEFORE, "stereo")) as job:
+    with open_job(place, options, progress, (*BEFORE, "stereo")) as job:
         can_vary, why_not = axes_here(job.settings)
         chosen = chosen_axes(axes, can_vary, why_not)
-        capture, poses, posed, scene, views = stand(job)
-        if not views.test.any():
+        ready = prepare(job)
+        if not ready.views.test.any():
             raise InputError("what accuracy costs is measured on pictures kept for testing, and there is none; give --holdout 8")
-        surface: str | None = "tsdf" if posed.has_depth else "tsdf_stereo"
+        surface: str | None = "tsdf" if ready.posed.has_depth else "tsdf_stereo"
         refused = [f"The axis {name} was not varied: {why}." for name, why in why_not.items()]
         if surface == "tsdf_stereo":
             try:
-                match_pictures(job, scene, views)
+                match_images(job, ready)
             except InputError as error:  # a camera that only moves forward leaves nothing to match; the field can still be measured
                 surface = None
                 refused.append(f"No surface was made: {error}.")
@@ -128,7 +91,7 @@ def tradeoff_run(
             done = {(row["id"], row["seed"]) for row in swept.rows}
             swept.left_out = [one.name for one in wanted if (one.id, one.seed) not in done]
             # What was measured is shown, however the sweep ends.
-            data = put(job, swept, capture, poses, scene, views, refused)
+            data = put(job, swept, ready, refused)
     return data
 
 
@@ -146,17 +109,17 @@ def axes_here(settings: Any) -> tuple[list[str], dict[str, str]]:
     return [axis for axis in AXES if axis not in why_not], why_not
 
 
-def put(job: Any, swept: Any, capture: Any, poses: Any, scene: Any, views: Any, refused: list[str]) -> dict[str, Any]:
+def put(job: Any, swept: Any, ready: Any, refused: list[str]) -> dict[str, Any]:
     """Write what is known so far into the run's folder."""
     from fieldfuse.evaluation.tradeoff_page import write_tradeoff
     from fieldfuse.pipelines.comparison import machine
     from fieldfuse.pipelines.summary import base_data, warnings_of
 
-    base = base_data(job, capture, poses)
+    base, scene, views = base_data(job, ready.capture, ready.poses), ready.scene, ready.views
     data = {
         **base,
         "command": unbounded(base["command"]),
-        "warnings": warnings_of(job, capture, poses, scene, views),
+        "warnings": warnings_of(job, ready),
         "scene": scene.to_dict(),
         "unit": "m" if scene.metric else "units",
         "views": {
@@ -181,18 +144,15 @@ def unbounded(command: str) -> str:
     return shlex.join(part for index, part in enumerate(parts) if index not in drop)
 
 
-def show(data: dict[str, Any], folder: Path, quiet: bool, as_json: bool) -> None:
-    """The result on stdout: JSON, or the sentences and where the page is."""
+def lines(data: dict[str, Any], folder: Path) -> Iterator[str]:
+    """Sentences on what was measured, remarks, and where the page is."""
     from fieldfuse.evaluation.tradeoff import points_of
     from fieldfuse.evaluation.tradeoff_text import front_sentence, sentence, steps
 
-    if as_json:
-        sys.stdout.write(writer.dumps(data, indent=1) + "\n")
-    elif not quiet:
-        points, unit = points_of(data["rows"]), data["unit"] or "units"
-        lines = [sentence(step, unit) for step in steps(points)]
-        lines += [text for cost in ("seconds", "memory_mb") if (text := front_sentence(points, cost, "psnr", unit)) is not None]
-        lines += [f"note: {row['id']}: {row['error']}" for row in data["rows"] if row["error"] is not None]
-        lines += [f"note: not measured yet: {name}" for name in data["left_out"]]
-        lines += [f"note: {warning}" for warning in data["warnings"]]
-        sys.stdout.write("".join(f"{line}\n" for line in lines) + f"{folder / 'tradeoff.html'}\n")
+    points, unit = points_of(data["rows"]), data["unit"] or "units"
+    yield from (sentence(step, unit) for step in steps(points))
+    yield from (text for cost in ("seconds", "memory_mb") if (text := front_sentence(points, cost, "psnr", unit)) is not None)
+    yield from (f"note: {row['id']}: {row['error']}" for row in data["rows"] if row["error"] is not None)
+    yield from (f"note: not measured yet: {name}" for name in data["left_out"])
+    yield from (f"note: {warning}" for warning in data["warnings"])
+    yield str(folder / "tradeoff.html")

@@ -14,7 +14,7 @@ from fieldfuse.errors import InputError
 from fieldfuse.files import fingerprint, read_json, remove, write_json
 from fieldfuse.pipelines.direct_field import weights_state
 from fieldfuse.pipelines.job import Job
-from fieldfuse.pipelines.kept import MEASURED_POINT, read_kept
+from fieldfuse.pipelines.schemas import MeasuredPoint, read_checked
 from fieldfuse.pipelines.tradeoff_plan import Wanted, point_id
 from fieldfuse.poses.child import log_tail, run_logged
 
@@ -97,7 +97,7 @@ def rows_at(path: Path, key: str) -> list[dict[str, Any]] | None:
     if not path.is_file():
         return None
     try:
-        kept = read_kept(path, MEASURED_POINT)
+        kept = read_checked(path, MeasuredPoint)
         if kept["key"] == key and not kept["crashed"] and kept["rows"]:
             return [dict(row) for row in kept["rows"]]
     except (InputError, KeyError, TypeError, ValueError):

@@ -14,7 +14,7 @@ from benchmarks.timing import Case, Timed, compare, exponent
 from fieldfuse.evaluation.sphere import CHANNELS, around, lens, sphere_field, sphere_pixels
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_image import BakedRenderer
-from fieldfuse.training.numba_engine import NumbaOptimiser
+from fieldfuse.training.numba_engine import NumbaEngine
 from tests.pipelines.made import bench
 
 
@@ -28,7 +28,7 @@ def test_a_ray_looks_up_and_touches_a_bounded_number_of_rows() -> None:
     """A wall of eight voxels with an optical thickness of about ½ each, crossed at most twice, is left after few samples."""
     counts = {}
     for size in (32, 64):
-        engine = NumbaOptimiser(sphere_field(size), sphere_pixels(48), threads=1)
+        engine = NumbaEngine(sphere_field(size), sphere_pixels(48), threads=1)
         counts[size] = speed_cases.step_counts(engine)
         assert 3 < counts[size]["looked_up_a_ray"] < 24
         # A first step touches the corners beside what it saw, each once: never more than eight a sample, and far fewer when rays meet.
@@ -51,7 +51,7 @@ def test_memory_a_voxel() -> None:
     baked = bake(field)
     assert field.bytes / field.voxels < 4 * (CHANNELS + 1) * 4
     assert baked.bytes / baked.voxels < 70
-    engine = NumbaOptimiser(field, sphere_pixels(16), threads=1)
+    engine = NumbaEngine(field, sphere_pixels(16), threads=1)
     rows = len(field.density_rows)
     assert engine.index.nbytes == rows * 8 and engine.marks.nbytes == len(field.occupied) * 2
     assert engine.records.shape == (rows, CHANNELS + 2) and engine.records.itemsize == 2

@@ -1,7 +1,7 @@
 """`field.html`: a baked field and what draws it in one file, for whatever browser has WebGL 2: to walk through, to keep, to send.
 
 The page holds only what cannot be worked out (occupied voxels, a byte of density and sixteen of features a corner, the decoder), deflated;
-the scripts in `web/` unpack it and march through it as `backends/numba/baked_march.py` does. It asks no server for anything.
+the scripts in `web/` unpack it and march through it as `backends/numba/baked.py` does. It asks no server for anything.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 
 from fieldfuse import __version__
-from fieldfuse.backends.numba.baked_march import CORNERS, FINER
+from fieldfuse.backends.numba.baked import CORNERS, FINER
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.errors import InputError
 from fieldfuse.files import atomic_path

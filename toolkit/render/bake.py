@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from fieldfuse.backends.numba import common as K
-from fieldfuse.backends.numba.baked_march import CORNERS, FINER, LEVELS, Baked
-from fieldfuse.backends.numba.render_rays import chessboard_distance
+from fieldfuse.backends.numba.baked import CORNERS, FINER, LEVELS, Baked
+from fieldfuse.backends.numba.volume import chessboard_distance
 from fieldfuse.errors import InputError
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render.composite import RAW_MAX, UNITS
@@ -99,7 +99,6 @@ def bake(field: Field, keep: torch.Tensor | None = None) -> BakedField:
     if field.voxels == 0:
         raise InputError("the field holds no voxel that training views see, so there is nothing to bake; fit it for longer")
     topology = field.topology
-    assert topology.table is not None
     occupied = field.occupied.numpy().reshape(-1, VOXELS)
     occupied = occupied[: int(occupied.any(1).sum())]  # the blocks behind them only lend corners
     counts = occupied.reshape(-1, 64).sum(1, dtype=np.int64)

@@ -1,6 +1,6 @@
 """`baked.safetensors`: a baked field on disk, rendered from where it lies.
 
-Tensors carry the names of `baked_march.Baked` and `decoder.<name>` of `common.Decoder`. Densities and features, nearly all of the file,
+Tensors carry the names of `baked.Baked` and `decoder.<name>` of `common.Decoder`. Densities and features, nearly all of the file,
 stay windows into it and are read page by page as rays come to them. Every index is copied and checked, because compiled code follows it.
 """
 
@@ -17,7 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from fieldfuse.backends.numba import common as K
-from fieldfuse.backends.numba.baked_march import CORNERS, FINER, LEVELS, Baked
+from fieldfuse.backends.numba.baked import CORNERS, FINER, LEVELS, Baked
 from fieldfuse.camera import Similarity
 from fieldfuse.errors import InputError, OutputError, all_lines, first_line
 from fieldfuse.files import atomic_path

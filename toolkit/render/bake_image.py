@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from fieldfuse.backends.numba.baked_tiles import TILE, render_tiles
+from fieldfuse.backends.numba.baked import TILE, render_tiles
 from fieldfuse.backends.numba.decode import layers_of, rays_of
 from fieldfuse.camera import Array, Intrinsics, pixel_grid, rays
 from fieldfuse.errors import InputError

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from fieldfuse.backends.numba.mark_views import mark_pass
+from fieldfuse.backends.numba.march import mark_pass
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.composite import STOP
 from fieldfuse.render.field import Field
 from fieldfuse.render.numba_renderer import make_space, make_volume
 from fieldfuse.threads import share
-from fieldfuse.volume.compiled import dilated
+from fieldfuse.volume.edit import dilate
 
 SEEN = 0.01  # largest weight below which a voxel is left out …
 FIRM = 0.3  # … but for those beside one with as much: where thin surfaces have holes, pictures from between the views see through them
@@ -53,4 +53,4 @@ def seen_voxels(
     share(part, range(threads), threads)
     progress.check()
     weight = torch.from_numpy((marks.max(0) >> 4).astype(np.float32) / 4095)
-    return (weight > least) | (dilated(field.topology, weight > max(FIRM, least)) & field.occupied)
+    return (weight > least) | (dilate(field.topology, weight > max(FIRM, least), 1, grow=False)[1] & field.occupied)
