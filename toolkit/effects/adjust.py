@@ -146,11 +146,8 @@ def adjust(problem: Problem, unknown: frozenset[str] = frozenset(), steps: int =
 def _descend(
     current: Problem, step: Callable[[Problem, Array, float, float], Problem], steps: int, ease: float, belief: Belief | None = None
 ) -> tuple[Problem, Array]:
-    """Levenberg-Marquardt: the problem after damped steps, by what is left, Huber's width and the damping, and what is left then.
-
-    Args:
-        ease: by what damping is divided after a step that lowers the cost.
-    """
+    """Levenberg-Marquardt: the problem after damped steps, and what is left then. A `step` takes what is left before it, Huber's width and
+    the damping, which is divided by `ease` where the cost falls."""
     left, damping = _left(current), 1e-3
     for _ in range(steps):
         width = TUNING * max(scatter(left[:, :2]), 1e-3)

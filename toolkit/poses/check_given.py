@@ -197,10 +197,8 @@ def _seen_by(reading: Reading, matches: Matches, posed: Capture, chosen: Sequenc
 def _other_reading(
     posed: Capture, poses: Array, chosen: list[int], matches: Matches, lens_alone: bool = False
 ) -> tuple[Reading | None, Reading | None]:
-    """The reading of the poses that clearly fits, if one does; and the best guess, if there is one.
-
-    With `lens_alone` only other focal lengths are tried. Where there is depth, they are not: it may be of the same camera.
-    """
+    """The reading of the poses that clearly fits, if one does; and the best guess, if there is one. With `lens_alone` only other focal
+    lengths are tried. Where there is depth, they are not: it may be of the same camera."""
     first = np.arange(len(matches.pairs)) % 2 == 0
     choosing, proving = matches.subset(first), matches.subset(~first)
     if len(proving.pair) == 0:

@@ -82,10 +82,8 @@ def motion(facts: dict[str, Any]) -> Motion | None:
 
 
 def rotation_residual(homographies: Array, width: int, height: int) -> float:
-    """How far (N, 3, 3) pixel homographies are from K R K⁻¹ with one focal length for all: the least median over focal lengths.
-
-    A camera that only turns gives 0 whatever it looks at; one that moves before a plane does not.
-    """
+    """How far (N, 3, 3) pixel homographies are from K R K⁻¹ with one focal length for all: the least median over focal lengths. A camera
+    that only turns gives 0 whatever it looks at; one that moves before a plane does not."""
     if len(homographies) == 0:
         return float("inf")
     best = float("inf")
@@ -162,10 +160,8 @@ def failure(facts: dict[str, Any]) -> str | None:
 
 
 def way(facts: dict[str, Any]) -> float:
-    """How far the model's cameras moved between two images that a homography connects, in shares of the scene's depth: the median.
-
-    A homography is off from a rotation by about as much.
-    """
+    """How far the model's cameras moved between two images that a homography connects, in shares of the scene's depth: the median. A
+    homography is off from a rotation by about as much."""
     model = facts["model"]
     poses, points = np.array(model["world_from_camera"], dtype=np.float64), np.array(model["points"], dtype=np.float64).reshape(-1, 3)
     at = {image: number for number, image in enumerate(model["pictures"])}
@@ -238,11 +234,8 @@ def doubts(facts: dict[str, Any]) -> list[str]:
 
 
 def fold(facts: dict[str, Any], ordered: bool) -> list[str]:
-    """A warning when places that look alike were taken for one (`loops.without_folds`): what was done about it, or that nothing helped.
-
-    Args:
-        ordered: images that stand next to each other were taken one after the other. Else what did not help may well be no fold.
-    """
+    """A warning when places that look alike were taken for one (`loops.without_folds`): what was done about it, or that nothing helped,
+    which of images that are not `ordered` in time is not to be concluded."""
     folded = facts.get("folded")
     if folded is None:
         return []
@@ -260,10 +253,8 @@ def fold(facts: dict[str, Any], ordered: bool) -> list[str]:
 
 
 def standing(facts: dict[str, Any]) -> list[str]:
-    """A warning where something stands still in the images of many pairs while the rest moves, in some as no camera motion explains.
-
-    In most pairs of a turntable's neighbouring images all moves sideways, as before a camera that does so.
-    """
+    """A warning where something stands still in the images of many pairs while the rest moves, in some as no camera motion explains. (In
+    most pairs of a turntable's neighbouring images all moves sideways, as before a camera that does so.)"""
     pairs = facts["pairs"]
     extents = [pair["stands"][0] for pair in pairs if pair.get("stands")]
     against = sum(pair["stands"][1] for pair in pairs if pair.get("stands"))

@@ -236,10 +236,8 @@ def finish(job: Job, model: Model, report: Report) -> None:
 
 
 def settle(model: Model) -> None:
-    """Fix the frame that structure from motion leaves free: the first registered camera's axes, cameras at mean distance 1 of their centre.
-
-    COLMAP's own choice depends on the order in which threads finish.
-    """
+    """Fix the frame that structure from motion leaves free: the first registered camera's axes, cameras at mean distance 1 of their
+    centre. COLMAP's own choice depends on the order in which threads finish."""
     reconstruction = model.reconstruction
     first = min(model.registered, key=lambda image_id: int(reconstruction.image(image_id).name))
     centres = np.array([reconstruction.image(image_id).projection_center() for image_id in model.registered])

@@ -174,10 +174,8 @@ def _match(job: Job, folder: Path, pairs: list[tuple[int, int]]) -> None:
 
 
 def _bring(source: Path, target: Path, pairs: list[tuple[int, int]]) -> None:
-    """Copy what was found for `pairs` from one database to another with the same images.
-
-    By COLMAP's own SQLite: two of these libraries in one process do not respect each other's locks.
-    """
+    """Copy what was found for `pairs` from one database to another with the same images. By COLMAP's own SQLite: two of these libraries in
+    one process do not respect each other's locks."""
     with opened(source) as found, opened(target) as database, pycolmap.DatabaseTransaction(database):
         ids = {int(image.name): image.image_id for image in found.read_all_images()}
         for i, j in pairs:

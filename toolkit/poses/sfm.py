@@ -76,11 +76,8 @@ def find_poses(
 
 
 def _features(wanted: str) -> tuple[str, str | None, list[str]]:
-    """The features to begin with, those to try where these are not enough, and warnings.
-
-    Raises:
-        InputError: learned ones are wanted, and their weights are not there or damaged.
-    """
+    """The features to begin with, those to try where these are not enough, and warnings; an InputError where learned ones are wanted and
+    not there."""
     if wanted == SIFT:
         return SIFT, None, []
     from fieldfuse.poses import xfeat
