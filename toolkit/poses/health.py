@@ -234,8 +234,8 @@ def doubts(facts: dict[str, Any]) -> list[str]:
 
 
 def fold(facts: dict[str, Any], ordered: bool) -> list[str]:
-    """A warning when places that look alike were taken for one (`loops.without_folds`): what was done about it, or that nothing helped,
-    which of images that are not `ordered` in time is not to be concluded."""
+    """A warning when places that look alike were taken for one (`loops.without_folds`): what was done about it, or, of images `ordered` in
+    time, that nothing helped."""
     folded = facts.get("folded")
     if folded is None:
         return []
