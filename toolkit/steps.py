@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from fieldfuse.poses.points import Features
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene
-    from fieldfuse.training.from_network import Inference, NetworkOptions
+    from fieldfuse.training.from_network import Inference
 
 
 def set_seeds(seed: int) -> None:
@@ -142,7 +142,7 @@ def camera_poses(
         PoseError: poses cannot be estimated, or those given do not fit the images.
     """
     from fieldfuse.poses.check_given import check_given
-    from fieldfuse.poses.given import given_poses
+    from fieldfuse.poses.result import given_poses
     from fieldfuse.poses.sfm import find_poses
 
     if uses_given_poses(capture, settings):
@@ -240,14 +240,12 @@ def require_weights(settings: Settings) -> Path:
     return weights
 
 
-def direct_inference(
-    views: Views, scene: Scene, keys: KeyFrames, settings: Settings, options: NetworkOptions | None = None
-) -> Inference:
-    """The networks, ready to fuse key frame after key frame; `options`: other ones than those of the settings."""
-    from fieldfuse.training.from_network import Inference, NetworkOptions, load_networks
+def direct_inference(views: Views, scene: Scene, keys: KeyFrames, settings: Settings) -> Inference:
+    """The networks, ready to fuse key frame after key frame."""
+    from fieldfuse.training.from_network import Inference, load_networks
 
     model = load_networks(require_weights(settings), settings.device)
-    return Inference(model, views, scene, keys, settings.field.background, options or NetworkOptions.of(settings.network))
+    return Inference(model, views, scene, keys, settings.field.background, settings.network)
 
 
 def starts_from_networks(views: Views, settings: Settings) -> bool:
