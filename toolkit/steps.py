@@ -142,7 +142,7 @@ def camera_poses(
         PoseError: poses cannot be estimated, or those given do not fit the images.
     """
     from fieldfuse.poses.check_given import check_given
-    from fieldfuse.poses.given import given_poses
+    from fieldfuse.poses.result import given_poses
     from fieldfuse.poses.sfm import find_poses
 
     if uses_given_poses(capture, settings):

@@ -117,7 +117,7 @@ def test_a_first_frame_that_players_leave_out_counts(tmp_path: Path) -> None:
     assert not capture.warnings and shown(capture) == [0, 1, 2, 3, 4]
     assert shown(capture_from_dict(capture_to_dict(capture))) == [0, 1, 2, 3, 4]
     job = plan(capture, tmp_path / "sparse", PosesSettings(), 0, 1)
-    assert shown(capture.with_frames([picture.frame() for picture in job.pictures])) == [0, 1, 2, 3, 4]
+    assert shown(capture.with_frames(list(job.images))) == [0, 1, 2, 3, 4]
     chosen = select_frames(capture, tmp_path / "run", CaptureSettings(max_frames=10))
     assert shown(chosen) == [int(frame.name.removeprefix("frame_")) for frame in chosen.frames] and not chosen.warnings
 

@@ -23,7 +23,7 @@ from fieldfuse.capture.types import Capture, Views
 from fieldfuse.capture.video import iterate_video, read_video
 from fieldfuse.config import CaptureSettings, load_settings
 from fieldfuse.files import read_json, write_json
-from fieldfuse.poses.given import given_poses
+from fieldfuse.poses.result import given_poses
 from fieldfuse.render.field import Field
 from fieldfuse.render.rays import render_rays
 from fieldfuse.tone import Tone
