@@ -1,7 +1,8 @@
 """`python -m benchmarks.before_after --before DIR --after DIR --data DATA --out DIR`: two checkouts of Fieldfuse beside each other.
 
-Each row is one and the same command of both checkouts. Scores: both run at the same time, a core each. Seconds: in turns on an otherwise
-idle machine, and the median ratio counts. A checkout is a folder with its own `.venv`.
+Each row is one and the same command of both checkouts. Scores: both run at the same time, a core each, with budgets in seconds of processor
+time, so that other work does not count. Seconds: in turns on an otherwise idle machine, and the median ratio counts. A checkout is a folder
+with its own `.venv`.
 """
 
 from __future__ import annotations
@@ -28,10 +29,14 @@ BARE = ["--threads", "1", "--quiet", "--image-size", "320", "--set", "export.for
 FITS = {"fox": "fox_540x960", "gum": "gum_360x640", "dtu": "dtu_scan24_384", "redkitchen": "redkitchen", "lego": "lego_400"}
 DIRECT, FEW = ("fox", "redkitchen", "lego"), ("fox", "dtu")
 ROOMS = ("room", "corridor")  # simulated; they come with their true meshes
-CLIP = "fox"  # what is timed
-PARTS = ("times", "direct", "fits", "few", "zoo", "meshes")
-STEPS = 600  # of a timed fit
+TIMED = ("step", "render", "keyframe", "tsdf")  # parts of `benchmarks.speed`
+PARTS = ("direct", "fits", "few", "zoo", "meshes", "times")
 LIMIT = 1800  # seconds of a command
+# Runs a module as `python -m` does, with processor time as the clock of fits.
+START = """import runpy, sys, time
+time.perf_counter = time.process_time
+sys.argv = sys.argv[1:]
+runpy.run_module(sys.argv[0], run_name="__main__")"""
 
 
 @dataclass(frozen=True)
@@ -41,15 +46,19 @@ class Checkout:
     name: str
     path: Path
 
-    def command(self, *words: str | Path) -> list[str]:
-        """Command line of its `fieldfuse`; before 0.2 the command's modules had other names."""
-        module = "fieldfuse" if (self.path / "toolkit" / "__main__.py").is_file() else "pipelines.cli"
-        return [str(self.path / ".venv" / "bin" / "python"), "-m", module, *map(str, words)]
-
     def run(self, *words: str | Path) -> None:
+        """A command of its `fieldfuse`; before 0.2 the command's modules had other names.
+
+        Raises:
+            InputError: the command failed.
+        """
+        module = "fieldfuse" if (self.path / "toolkit" / "__main__.py").is_file() else "pipelines.cli"
+        self.python("-c", START, module, *words)
+
+    def python(self, *words: str | Path) -> None:
         """Raises: InputError: the command failed."""
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "NUMBA_NUM_THREADS": "1"}
-        command = self.command(*words)
+        command = [str(self.path / ".venv" / "bin" / "python"), *map(str, words)]
         done = subprocess.run(command, cwd=self.path, env=environment, capture_output=True, text=True, timeout=LIMIT, check=False)
         if done.returncode:
             raise InputError(f"{self.name}: {done.stderr.strip()[-300:] or f'exit code {done.returncode}'}")
@@ -63,6 +72,7 @@ class Pair:
     after: Checkout
     data: Path
     out: Path
+    repetitions: int = 9  # of what is timed, in turns
 
     @property
     def sides(self) -> tuple[Checkout, Checkout]:
@@ -70,8 +80,8 @@ class Pair:
         return self.before, self.after
 
     def folder(self, side: Checkout, entry: Row) -> Path:
-        """Of the entry's run."""
-        return self.out / "runs" / "-".join(str(value) for value in (*entry.values(), side.name))
+        """Of the capture's runs: what comes before the fit is reused."""
+        return self.out / "runs" / f"{entry['part']}-{entry['capture']}-{side.name}"
 
     def scores(self, entry: Row) -> Row:
         """Held-out PSNR of both, run at the same time."""
@@ -81,7 +91,8 @@ class Pair:
             folder = self.folder(side, entry)
             side.run("run", source, "--out", folder, *BARE, "--seed", str(entry["seed"]), *options)
             report = json.loads((folder / "report.json").read_text())
-            shutil.rmtree(folder)
+            if entry["part"] == "zoo":
+                shutil.rmtree(folder)
             return float(report["evaluation"]["field"]["psnr"])
 
         with ThreadPoolExecutor(2) as pool:
@@ -119,35 +130,38 @@ class Pair:
         return {"before": round(before, 2), "after": round(after, 2)}
 
     def times(self, entry: Row) -> Row:
-        """Medians of seconds, of runs in turns: earlier stages are reused, the one that counts is made anew."""
-        kind, source, repetitions = str(entry["detail"]), self.data / FITS[entry["capture"]], 9
-        options = {
-            "fit": ["--budget", "600", "--set", f"fit.iterations={STEPS}"],
-            "render": ["--budget", "600", "--set", "fit.iterations=200", "--image-size", "640"],
-            "key frames": ["--set", "fit.finetune=false"],
-            "tsdf": ["--budget", "1", "--set", "tsdf.enabled=on"],
-        }[kind]
-        stage = {"fit": "field", "render": "field", "key frames": "network", "tsdf": "tsdf"}[kind]
-        seconds: dict[str, list[float]] = {side.name: [] for side in self.sides}
-        for number in range(repetitions + 1):  # the first has compiling in it
+        """Medians of processor seconds of a part of `benchmarks.speed`, in turns.
+
+        Returns:
+            `cases`: name and size → before, after, and the median of the ratios.
+        """
+        part, seconds = str(entry["detail"]), dict[str, dict[str, list[float]]]()
+        for number in range(self.repetitions + 1):  # the first has compiling in it
             for side in self.sides if number % 2 else self.sides[::-1]:
-                folder = self.folder(side, entry)
-                (folder / "stages" / f"{stage}.json").unlink(missing_ok=True)
-                side.run("run", source, "--out", folder, *BARE, *options)
-                report = json.loads((folder / "report.json").read_text())
-                if number:
-                    seconds[side.name].append(_seconds(report, kind, stage))
-        before, after = (seconds[side.name] for side in self.sides)
-        ratio = statistics.median(b / a for a, b in zip(before, after, strict=True))
-        return {"before": round(statistics.median(before), 4), "after": round(statistics.median(after), 4), "ratio": round(ratio, 4)}
+                found = self._speed(side, part)
+                for name, value in found.items() if number else ():
+                    seconds.setdefault(name, {}).setdefault(side.name, []).append(value)
+        cases = {}
+        for name, by_side in seconds.items():
+            if len(by_side) == 2:
+                before, after = (by_side[side.name] for side in self.sides)
+                ratio = statistics.median(b / a for a, b in zip(before, after, strict=True))
+                cases[name] = [statistics.median(before), statistics.median(after), round(ratio, 4)]
+        return {"cases": cases}
 
-
-def _seconds(report: dict[str, Any], kind: str, stage: str) -> float:
-    if kind == "render":
-        return float(report["evaluation"]["field"]["seconds_per_view"])
-    if kind == "fit":
-        return float(report["timeline"][-1]["seconds"])
-    return float(next(row["seconds"] for row in report["stages"] if row["name"] == stage))
+    def _speed(self, side: Checkout, part: str) -> dict[str, float]:
+        """Seconds a unit of each case."""
+        options = ["--parts", part, "--threads", "1", "--repetitions", "3", "--quiet"]
+        folder = self.out / "speed" / side.name
+        if (side.path / "benchmarks" / "speed.py").is_file():
+            side.python("-m", "benchmarks.speed", "--out", folder, *options)
+            (data,) = json.loads((folder / "speed.json").read_text())["rows"]
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
+            side.run("bench", "speed", "--json", folder / "speed.json", *options)
+            data = json.loads((folder / "speed.json").read_text())
+        found = {f"{case['name']}, {case['size']}": case["ours"]["processor"] / case["units"] for case in data.get("cases") or []}
+        return found | {f"tsdf {key}": value for key, value in (data.get("tsdf") or {}).items()}
 
 
 def f_score(compared: dict[str, Any]) -> float:
@@ -162,9 +176,9 @@ def plan(parts: Sequence[str], data: Path) -> list[Row]:
     """All rows."""
     zoo = sorted(path.name for path in (data / "zoo").iterdir()) if (data / "zoo").is_dir() else []
     rows: dict[str, list[tuple[str, Any, int]]] = {
-        "times": [(CLIP, "fit", 0), (CLIP, "render", 0), (CLIP, "key frames", 0), ("redkitchen", "tsdf", 0)],
+        "times": [("demo", part, 0) for part in TIMED],
         "direct": [(name, "", 0) for name in DIRECT],
-        "fits": [(name, budget, seed) for budget in (10, 30, 60) for name in FITS for seed in (0, 1)],
+        "fits": [(name, budget, seed) for name in FITS for seed in (0, 1) for budget in (10, 30, 60)],
         "few": [(name, count, 0) for name in FEW for count in (3, 6, 12)],
         "zoo": [(name, 20, 0) for name in zoo],
         "meshes": [(name, 20, 0) for name in ROOMS],
@@ -195,17 +209,20 @@ def before_after(
 
 def table(data: Row) -> str:
     """Markdown: a line a row, then the mean and the worst difference of each part."""
-    lines, parts = [], {}  # type: ignore[var-annotated]
+    lines: list[list[Any]] = []
+    parts: dict[str, list[float]] = {}
     for row in data["rows"]:
         what = [row["part"], row["capture"], row["detail"], row["seed"]]
         if row.get("error"):
             lines.append([*what, row["error"][:80], "", ""])
-            continue
-        change = f"×{row['ratio']:.3f}" if "ratio" in row else f"{row['after'] - row['before']:+.2f}"
-        if "ratio" not in row:
-            parts.setdefault(row["part"], []).append(row["after"] - row["before"])
-        lines.append([*what, row["before"], row["after"], change])
-    text = markdown(["part", "capture", "budget or what", "seed", "before", "after", "change"], lines)
+        elif "cases" in row:
+            for name, (before, after, ratio) in row["cases"].items():
+                lines.append([row["part"], name, row["detail"], "", f"{before:.4g}", f"{after:.4g}", f"×{ratio:.3f}"])
+        else:
+            change = row["after"] - row["before"]
+            parts.setdefault(row["part"], []).append(change)
+            lines.append([*what, row["before"], row["after"], f"{change:+.2f}"])
+    text = markdown(["part", "capture or case", "budget or what", "seed", "before", "after", "change"], lines)
     for part, changes in parts.items():
         text += f"\n{part}: mean {statistics.mean(changes):+.3f}, worst {min(changes):+.2f}, of {len(changes)}\n"
     return text
