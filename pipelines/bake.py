@@ -56,8 +56,9 @@ def bake_run(place: Place, options: dict[str, Any], seen: float, to: Path | None
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.fields import finished_field
     from fieldfuse.pipelines.job import open_job
-    from fieldfuse.pipelines.prepare import BEFORE, prepare
+    from fieldfuse.pipelines.prepare import prepare
     from fieldfuse.pipelines.rendered import to_picture
+    from fieldfuse.pipelines.stages import BEFORE
     from fieldfuse.render.bake_image import BakedRenderer
     from fieldfuse.render.image import make_renderer, render_view
 

@@ -52,8 +52,9 @@ def compare_run(place: Place, options: dict[str, Any], depth: str, progress: Any
     from fieldfuse.pipelines.exports import Wish, export_results
     from fieldfuse.pipelines.fields import fit_radiance_field, render_test_views, starting_field
     from fieldfuse.pipelines.job import open_job
-    from fieldfuse.pipelines.prepare import BEFORE, prepare
+    from fieldfuse.pipelines.prepare import prepare
     from fieldfuse.pipelines.reconstruct import FOR_FIELD, RESULTS
+    from fieldfuse.pipelines.stages import BEFORE
     from fieldfuse.pipelines.steps_compare import SURFACES, Compared, choose_surfaces, measure, not_fitted
     from fieldfuse.pipelines.surfaces import fuse_tsdf
 

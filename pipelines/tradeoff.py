@@ -62,7 +62,8 @@ def tradeoff_run(
     from fieldfuse.errors import InputError
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.job import open_job
-    from fieldfuse.pipelines.prepare import BEFORE, prepare
+    from fieldfuse.pipelines.prepare import prepare
+    from fieldfuse.pipelines.stages import BEFORE
     from fieldfuse.pipelines.surfaces import match_images
     from fieldfuse.pipelines.tradeoff_plan import chosen_axes, chosen_times, plan
     from fieldfuse.pipelines.tradeoff_sweep import Swept, sweep

@@ -83,7 +83,7 @@ def main(path: str) -> int:
     from fieldfuse.errors import FieldfuseError
     from fieldfuse.evaluation.report import plain
     from fieldfuse.files import read_json, write_json
-    from fieldfuse.poses.worker import die_with_parent
+    from fieldfuse.poses.child import die_with_parent
 
     die_with_parent()
     spec = read_json(path)

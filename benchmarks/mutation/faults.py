@@ -56,7 +56,12 @@ FAULTS = (
         ("(quaternion / length)[[1, 2, 3, 0]]", "(quaternion / length)[[0, 1, 2, 3]]"),
         ("w, x, y, z = quaternion / length", "x, y, z, w = quaternion / length"),
     ),
-    fault("TUM depth with Kinect's unit", "wrong unit", ("DEPTH_SCALE = 5000.0", "DEPTH_SCALE = 1000.0")),
+    fault(
+        "TUM depth with Kinect's unit",
+        "wrong unit",
+        ("DEPTH_SCALE = 5000.0", "DEPTH_SCALE = 1000.0"),
+        ("depth_scale=5000.0", "depth_scale=1000.0"),
+    ),
     fault(
         "DTU projection's sign test",
         "wrong comparison",
@@ -66,6 +71,7 @@ FAULTS = (
         "depth unit without the applied scale",
         "skipped step",
         ("return 1.0 / (factor * applied_scale)", "return 1.0 / factor"),
+        ("or 1e-3) * (applied_scale or 1.0)", "or 1e-3)"),
     ),
     fault(
         "farther surface wins where depth is carried over",
@@ -78,7 +84,12 @@ FAULTS = (
         ("if not resolved.is_relative_to(root) and Path(os.path.normpath(root / relative)).is_relative_to(root):", "if False:"),
     ),
     fault("size of text files", "dropped guard", ("if path.stat().st_size > max_bytes:", "if False:")),
-    fault("EXIF orientation 5 to 8 not transposed", "skipped step", ("picture = picture.swapaxes(0, 1)", "picture = picture[:, :]")),
+    fault(
+        "EXIF orientation 5 to 8 not transposed",
+        "skipped step",
+        ("picture = picture.swapaxes(0, 1)", "picture = picture[:, :]"),
+        ("image = image.swapaxes(0, 1)", "image = image[:, :]"),
+    ),
     fault(
         "focal length of a camera angle",
         "wrong constant",
@@ -87,7 +98,7 @@ FAULTS = (
     fault(
         "frames chosen for blur",
         "wrong comparison",
-        ("if kept is None or score[index] > score[kept]:", "if kept is None or score[index] < score[kept]:"),
+        ("is None or score[index] > score[", "is None or score[index] < score["),
     ),
     # Poses
     fault("scale of a sensor not applied to poses", "skipped step", ("poses[:, :3, 3] *= scale", "poses[:, :3, 3] *= 1.0")),
@@ -163,8 +174,8 @@ FAULTS = (
     fault(
         "reset gate left out",
         "skipped step",
-        ("self.candidate(_beside(r * h, v)", "self.candidate(_beside(h, v)"),
         ("self.candidate(_beside(r * state, local)", "self.candidate(_beside(state, local)"),
+        ("self.candidate(_beside(r * h, v)", "self.candidate(_beside(h, v)"),
     ),
     fault(
         "update gate's count with the wrong sign",
@@ -174,8 +185,8 @@ FAULTS = (
     fault(
         "key frames chosen when both are low",
         "wrong comparison",
-        ("(angle[i, chosen] > MIN_PARALLAX) | (common", "(angle[i, chosen] > MIN_PARALLAX) & (common"),
         ("np.all((angle > min_parallax) | (common < max_overlap))", "np.all((angle > min_parallax) & (common < max_overlap))"),
+        ("> MIN_PARALLAX) | (common[i, chosen] < MAX_OVERLAP)", "> MIN_PARALLAX) & (common[i, chosen] < MAX_OVERLAP)"),
     ),
     fault(
         "depth likelihood's window",
@@ -185,15 +196,9 @@ FAULTS = (
     fault(
         "opacity loss pulls to zero",
         "wrong sign",
-        ("torch.where(rays.solid, (1 - traced.opacity).square(), 0.0)", "torch.where(rays.solid, traced.opacity.square(), 0.0)"),
-        ("torch.where(solid, (1 - traced.opacity).square(), 0.0)", "torch.where(solid, traced.opacity.square(), 0.0)"),
+        ("solid, (1 - traced.opacity).square(), 0.0)", "solid, traced.opacity.square(), 0.0)"),
     ),
-    fault(
-        "warm-up off by one",
-        "off by one",
-        ("return wanted.rate * (step + 1) / wanted.warmup", "return wanted.rate * step / wanted.warmup"),
-        ("return asked.rate * (step + 1) / asked.warmup", "return asked.rate * step / asked.warmup"),
-    ),
+    fault("warm-up off by one", "off by one", (".rate * (step + 1) / ", ".rate * step / ")),
     fault("DTU's volumes in millimetres", "wrong unit", ("MILLIMETRES = 1 / 200", "MILLIMETRES = 1 / 1000")),
     fault(
         "rays through pixel corners",
@@ -208,6 +213,7 @@ FAULTS = (
     fault(
         "background over everything",
         "skipped step",
+        ("colour = colour + (1 - opacity)[:, None] * field.background", "colour = colour + field.background[None]"),
         ("colour = shown.colour + (1 - shown.opacity)[:, None] * field.background", "colour = shown.colour + field.background[None]"),
     ),
     # Per-scene fit
@@ -238,6 +244,7 @@ FAULTS = (
     fault(
         "numba: weight of thin samples",
         "wrong sign",
+        ("tau * (ONE - tau * HALF * (ONE - tau * THIRD))", "tau * (ONE + tau * HALF * (ONE - tau * THIRD))"),
         ("return before * tau * (ONE - tau * HALF * (ONE", "return before * tau * (ONE + tau * HALF * (ONE"),
     ),
     fault(
