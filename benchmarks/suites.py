@@ -17,8 +17,8 @@ from fieldfuse.capture.types import Views
 from fieldfuse.config import settings_dict
 from fieldfuse.errors import FieldfuseError, Interrupted, OutputError
 from fieldfuse.evaluation import words
-from fieldfuse.evaluation.compare_score import compare_views
 from fieldfuse.evaluation.report import plain
+from fieldfuse.evaluation.score import compare_views
 from fieldfuse.pipelines.console import ConsoleProgress, make_progress
 from fieldfuse.pipelines.direct_field import direct_field, weights_state
 from fieldfuse.pipelines.job import Job, open_job, read_settings

@@ -8,8 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from fieldfuse.pipelines.baking import SEEN
 from fieldfuse.pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
+
+SEEN = 0.01  # as `fieldfuse.render.bake` has it
 
 
 def bake(
@@ -53,37 +54,34 @@ def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: floa
         OutputError: the file cannot be written.
     """
     import numpy as np
-    import torch
 
-    from fieldfuse.evaluation.images import psnr
-    from fieldfuse.evaluation.score import as_photo
-    from fieldfuse.pipelines.baking import default_place, write
+    from fieldfuse.evaluation.metrics import psnr
+    from fieldfuse.evaluation.score import as_photo, entry
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.job import open_job
+    from fieldfuse.pipelines.pictures import baked, baked_place
     from fieldfuse.pipelines.reconstruct import BEFORE, stand
     from fieldfuse.pipelines.rendered import to_picture
     from fieldfuse.pipelines.steps_results import fit_radiance_field
-    from fieldfuse.render.bake_image import BakedRenderer
+    from fieldfuse.render.bake_file import read_baked, write_baked
     from fieldfuse.render.image import make_renderer, render_view
 
     with open_job(target, out, options, make_progress(quiet), (*BEFORE, "field")) as job:
         _, _, _, scene, views = stand(job)
         field, _ = fit_radiance_field(job, views, scene)
-        field = field.to("cpu")
         job.progress.begin("bake")
-        start = time.monotonic()
-        place = to or default_place(job)
-        baked = write(job, field, views, scene, seen, place)
-        renderer, view = BakedRenderer(baked, torch.get_num_threads()), make_renderer(field)
+        start, place = time.monotonic(), to or baked_place(job)
+        write_baked(place, baked(job, field, views, seen), scene.working_from_input)
+        small = read_baked(place)
+        shown = [(one, make_renderer(one)) for one in (field.to("cpu"), small.to_field())]
         scores = []
-        for index in np.flatnonzero(views.test):
+        for index in map(int, np.flatnonzero(views.test)):
             job.progress.check()
             lens, pose = views.intrinsics[index], views.world_from_camera[index]
-            truth = views.photo(int(index))
-            valid = views.valid[index] if views.valid else None
+            truth, valid = views.photo(index), entry(views.valid, index)
             # In 8 bits, as the report's are: without them a good field would have some hundredths of a decibel more here.
-            pictures = to_picture(render_view(field, lens, pose, view)), to_picture(renderer.render(lens, pose))
-            pair = [psnr(as_photo(picture, views, int(index)), truth, valid) for picture in pictures]
+            renders = [to_picture(render_view(one, lens, pose, view)) for one, view in shown]
+            pair = [psnr(as_photo(render, views, index), truth, valid) for render in renders]
             if None not in pair:
                 scores.append(pair)
         job.progress.finish("bake", time.monotonic() - start, False)
@@ -92,7 +90,7 @@ def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: floa
         "to": str(place),
         "bytes": place.stat().st_size,
         "field_bytes": field.bytes,
-        "voxels": baked.voxels,
+        "voxels": small.voxels,
         "field_voxels": field.voxels,
         "psnr": None if mean is None else round(float(mean[0]), 3),
         "loss": None if mean is None else round(float(mean[0] - mean[1]), 3),

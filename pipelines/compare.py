@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json as writer
 import sys
-import time
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -70,51 +68,13 @@ def compare(
         wanted.insert(0, DEPTH_FROM)
     options = gather(preset, config, wanted, **flags, **{"poses.source": poses})
     bound_threads(options)
-    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.evaluation.terminal import comparison_text
+    from fieldfuse.pipelines.comparison import compare_run
+    from fieldfuse.pipelines.console import columns, make_progress
 
     data = compare_run(target, out, options, depth, make_progress(quiet))
-    show(data, target if out is None else out, quiet, json)
-
-
-def compare_run(target: Path, out: Path | None, options: dict[str, Any], depth: str, progress: Any) -> dict[str, Any]:
-    """Make what is missing and write the comparison; answers `compare.json`.
-
-    Raises:
-        InputError: no test views, or depth that the capture does not bring.
-    """
-    from fieldfuse.errors import InputError
-    from fieldfuse.evaluation.compare_truth import find_truth
-    from fieldfuse.pipelines.comparison import put_comparison
-    from fieldfuse.pipelines.job import open_job
-    from fieldfuse.pipelines.reconstruct import BEFORE, FOR_FIELD, RESULTS, stand
-    from fieldfuse.pipelines.steps_compare import SURFACES, Compared, choose_surfaces, measure, not_fitted
-    from fieldfuse.pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views
-
-    start = time.monotonic()
-    with open_job(target, out, options, progress, (*BEFORE, *FOR_FIELD, *RESULTS, *SURFACES.values())) as job:
-        capture, poses, posed, scene, views = stand(job)
-        if not views.test.any():
-            raise InputError("a comparison needs pictures that were kept for testing; give --holdout 8")
-        truth = find_truth(posed) if poses.source == "given" else None
-        surfaces = {SURFACES[kind]: kind for kind in choose_surfaces(depth, posed, truth)}
-        pictures = {name: fuse_tsdf(job, posed, scene, views, name, kind) for name, kind in surfaces.items()}
-        field, _ = fit_radiance_field(job, views, scene)
-        pictures = {"field": render_test_views(job, field, views, scene), **not_fitted(job, views, scene), **pictures}
-        facts = export_results(job, field, poses, posed, scene, views)
-        everything = Compared(capture, poses, posed, scene, views, field, pictures, truth)
-        found = measure(job, everything)
-        return put_comparison(job, everything, found, facts.get("mesh"), time.monotonic() - start)
-
-
-def show(data: dict[str, Any], folder: Path, quiet: bool, as_json: bool) -> None:
-    """The result on stdout: JSON, or the table and where the page is."""
-    from fieldfuse.evaluation.compare_text import comparison_text
-    from fieldfuse.pipelines.console import columns
-
-    if as_json:
+    if json:
         sys.stdout.write(writer.dumps(data, indent=1) + "\n")
     elif not quiet:
-        sys.stdout.write(comparison_text(data, columns(sys.stdout)))
-        for warning in data["warnings"]:
-            sys.stdout.write(f"note: {warning}\n")
-        sys.stdout.write(f"{folder / 'compare.html'}\n")
+        notes = "".join(f"note: {warning}\n" for warning in data["warnings"])
+        sys.stdout.write(f"{comparison_text(data, columns(sys.stdout))}{notes}{(out or target) / 'compare.html'}\n")

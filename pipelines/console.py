@@ -227,10 +227,10 @@ def make_progress(quiet: bool = False, stream: IO[str] | None = None) -> Console
 
 def show_table(data: dict[str, Any], stream: IO[str] | None = None) -> None:
     """The report's numbers as one table."""
-    from fieldfuse.evaluation.table import WIDEST, table  # rich and the metrics are needed only here
+    from fieldfuse.evaluation.terminal import WIDEST, report_text  # rich and the metrics are needed only here
 
     stream = stream or sys.stdout
-    stream.write(str(table(data, min(columns(stream) or WIDEST, WIDEST))).rstrip() + "\n")
+    stream.write(str(report_text(data, min(columns(stream) or WIDEST, WIDEST))).rstrip() + "\n")
 
 
 def columns(stream: IO[str]) -> int | None:

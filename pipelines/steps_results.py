@@ -170,7 +170,7 @@ def going_on(fit: FitSettings) -> FitSettings:
 
 def render_test_views(job: Job, field: Field, views: Views, scene: Scene) -> Pictures:
     """The field's pictures at the held-out views."""
-    from fieldfuse.evaluation.observed import training_psnr
+    from fieldfuse.evaluation.score import training_psnr
     from fieldfuse.render.image import make_renderer, render_view
 
     kept = job.folder / "renders" / "field.safetensors"
@@ -247,9 +247,7 @@ def export_results(job: Job, field: Field, poses: PoseResult, posed: Capture, sc
 
 def score_pictures(job: Job, views: Views, pictures: dict[str, Pictures]) -> dict[str, Any]:
     """The same metrics for field and TSDF, beside those of the nearest training picture."""
-    from fieldfuse.evaluation.baseline import nearest_image_scores
-    from fieldfuse.evaluation.observed import seen_share
-    from fieldfuse.evaluation.score import score_views
+    from fieldfuse.evaluation.score import nearest_image_scores, score_views, seen_share
 
     path = job.folder / "evaluation.json"
 

@@ -16,8 +16,7 @@ from fieldfuse.export.field_surface import Originals, at_most, surface_of_field,
 from fieldfuse.memory_limits import require_pictures
 from fieldfuse.pipelines.fit_files import fit_left_out
 from fieldfuse.pipelines.job import Job
-from fieldfuse.pipelines.page import NAME, PAGE, put_page
-from fieldfuse.pipelines.pictures import camera_of, orbit_cameras, pictures
+from fieldfuse.pipelines.pictures import NAME, PAGE, camera_of, orbit_cameras, pictures, put_page
 from fieldfuse.pipelines.rendered import Pictures, to_picture
 from fieldfuse.pipelines.summary import put_cameras
 from fieldfuse.pipelines.taken import MESHES, SURFACES, TEXTURE, missing_originals, needs_originals

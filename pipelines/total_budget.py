@@ -17,7 +17,7 @@ from fieldfuse.config import EXPORTS, settings_dict
 from fieldfuse.errors import FieldfuseError
 from fieldfuse.evaluation import budget as model
 from fieldfuse.files import fingerprint, read_json, write_json
-from fieldfuse.pipelines.page import PAGE
+from fieldfuse.pipelines.pictures import PAGE
 from fieldfuse.pipelines.taken import TEXTURE
 from fieldfuse.pipelines.textured import TSDF_TEXTURE
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json as writer
-import shlex
 import sys
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -74,125 +72,19 @@ def tradeoff(
     flags = {"image_size": image_size, "holdout": holdout, "device": device, "threads": threads, "seed": seed, "decoder": decoder}
     options = gather(preset, config, pairs, **flags, **{"poses.source": poses})
     bound_threads(options)
+    from fieldfuse.evaluation.tradeoff import COSTS, front_sentence, points_of, sentence, steps
     from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.tradeoff_sweep import Choice, tradeoff_run
 
-    data = tradeoff_run(target, out, options, axes, times, seeds, budget, make_progress(quiet))
-    show(data, target if out is None else out, quiet, json)
-
-
-def tradeoff_run(
-    target: Path,
-    out: Path | None,
-    options: dict[str, Any],
-    axes: str | None = None,
-    times: str | None = None,
-    seeds: int = 1,
-    budget: float | None = None,
-    progress: Any = None,
-) -> dict[str, Any]:
-    """Measure what is missing and write `tradeoff.csv`, `tradeoff.html` and the plots; answers `tradeoff.json`.
-
-    Raises:
-        InputError: no test views, an axis that cannot be varied, times that are no numbers.
-        Interrupted: the user asked to stop; what was measured is written.
-    """
-    from fieldfuse.errors import InputError
-    from fieldfuse.pipelines.console import make_progress
-    from fieldfuse.pipelines.job import open_job
-    from fieldfuse.pipelines.reconstruct import BEFORE, stand
-    from fieldfuse.pipelines.steps_stereo import match_pictures
-    from fieldfuse.pipelines.tradeoff_plan import chosen_axes, chosen_times, plan
-    from fieldfuse.pipelines.tradeoff_sweep import Swept, sweep
-
-    ladder = chosen_times(times)
-    progress = make_progress(True) if progress is None else progress
-    with open_job(target, out, options, progress, (*BEFORE, "stereo")) as job:
-        can_vary, why_not = axes_here(job.settings)
-        chosen = chosen_axes(axes, can_vary, why_not)
-        capture, poses, posed, scene, views = stand(job)
-        if not views.test.any():
-            raise InputError("what accuracy costs is measured on pictures kept for testing, and there is none; give --holdout 8")
-        surface: str | None = "tsdf" if posed.has_depth else "tsdf_stereo"
-        refused = [f"The axis {name} was not varied: {why}." for name, why in why_not.items()]
-        if surface == "tsdf_stereo":
-            try:
-                match_pictures(job, scene, views)
-            except InputError as error:  # a camera that only moves forward leaves nothing to match; the field can still be measured
-                surface = None
-                refused.append(f"No surface was made: {error}.")
-        stereo = job.stages.records["stereo"].seconds if "stereo" in job.stages.records else 0.0
-        swept, wanted = Swept([], []), plan(chosen, ladder, seeds, surface)
-        try:
-            sweep(job, wanted, stereo, budget, swept)
-        finally:
-            done = {(row["id"], row["seed"]) for row in swept.rows}
-            swept.left_out = [one.name for one in wanted if (one.id, one.seed) not in done]
-            # What was measured is shown, however the sweep ends.
-            data = put(job, swept, capture, poses, scene, views, refused)
-    return data
-
-
-def axes_here(settings: Any) -> tuple[list[str], dict[str, str]]:
-    """The axes that can be varied, and for the others why not."""
-    from fieldfuse.evaluation.tradeoff import AXES
-    from fieldfuse.training.from_network import SHIPPED
-
-    why_not = {}
-    if not SHIPPED.is_file():
-        why_not["keyframes"] = "only the networks have key frames, and their weights are not installed"
-    if settings.field.decoder == "per_sample":
-        why_not["precision"] = "a field with the decoder per sample is stored in one precision only"
-        why_not["decoder"] = "it is set; leave out --decoder to compare both"
-    return [axis for axis in AXES if axis not in why_not], why_not
-
-
-def put(job: Any, swept: Any, capture: Any, poses: Any, scene: Any, views: Any, refused: list[str]) -> dict[str, Any]:
-    """Write what is known so far into the run's folder."""
-    from fieldfuse.evaluation.tradeoff_page import write_tradeoff
-    from fieldfuse.pipelines.comparison import machine
-    from fieldfuse.pipelines.summary import base_data, warnings_of
-
-    base = base_data(job, capture, poses)
-    data = {
-        **base,
-        "command": unbounded(base["command"]),
-        "warnings": warnings_of(job, capture, poses, scene, views),
-        "scene": scene.to_dict(),
-        "unit": "m" if scene.metric else "units",
-        "views": {
-            "total": len(views),
-            "test": int(views.test.sum()),
-            "width": views.intrinsics[0].width,
-            "height": views.intrinsics[0].height,
-        },
-        "rows": swept.rows,
-        "left_out": swept.left_out,
-        "refused": refused,
-        "machine": machine(job),
-    }
-    return write_tradeoff(job.folder.path, data)
-
-
-def unbounded(command: str) -> str:
-    """The command without `--budget`, which bounds one call of several: this one makes every row at once."""
-    parts = shlex.split(command)
-    named = [index for index, part in enumerate(parts) if part == "--budget"]
-    drop = {*named, *(index + 1 for index in named), *(index for index, part in enumerate(parts) if part.startswith("--budget="))}
-    return shlex.join(part for index, part in enumerate(parts) if index not in drop)
-
-
-def show(data: dict[str, Any], folder: Path, quiet: bool, as_json: bool) -> None:
-    """The result on stdout: JSON, or the sentences and where the page is."""
-    from fieldfuse.evaluation.tradeoff import points_of
-    from fieldfuse.evaluation.tradeoff_text import front_sentence, sentence, steps
-
-    if as_json:
+    data = tradeoff_run(target, out, options, Choice(axes, times, seeds, budget), make_progress(quiet))
+    if json:
         sys.stdout.write(writer.dumps(data, indent=1) + "\n")
     elif not quiet:
         points, unit = points_of(data["rows"]), data["unit"] or "units"
         lines = [sentence(step, unit) for step in steps(points)]
-        lines += [text for cost in ("seconds", "memory_mb") if (text := front_sentence(points, cost, "psnr", unit)) is not None]
+        lines += [text for cost in COSTS if (text := front_sentence(points, cost, unit)) is not None]
         lines += [f"note: {row['id']}: {row['error']}" for row in data["rows"] if row["error"] is not None]
         lines += [f"note: not measured yet: {name}" for name in data["left_out"]]
         lines += [f"note: {warning}" for warning in data["warnings"]]
-        sys.stdout.write("".join(f"{line}\n" for line in lines) + f"{folder / 'tradeoff.html'}\n")
+        lines.append(str((out or target) / "tradeoff.html"))
+        sys.stdout.write("".join(f"{line}\n" for line in lines))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fieldfuse.evaluation.affine import right_half_psnr
+from fieldfuse.evaluation.metrics import right_half_psnr
 
 
 def test_colour_is_forgiven_and_detail_is_not() -> None:

@@ -13,10 +13,9 @@ from safetensors.numpy import save_file
 from fieldfuse.camera import OPENCV, Array, Intrinsics
 from fieldfuse.capture.types import Capture, Frame, Views
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.compare_score import compare_views, depth_accuracy, depth_scale
-from fieldfuse.evaluation.compare_stereo import matched_depth_scores
 from fieldfuse.evaluation.compare_truth import find_truth, true_depths
-from fieldfuse.evaluation.images import psnr, ssim
+from fieldfuse.evaluation.metrics import depth_accuracy, psnr, ssim
+from fieldfuse.evaluation.score import compare_views, depth_scale, matched_depth_scores
 from fieldfuse.stereo.match import StereoDepth
 
 CAMERA = Intrinsics(48, 36, 40.0, 40.0, 24.0, 18.0)

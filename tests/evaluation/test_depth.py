@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.depth import KEYS, depth_metrics
+from fieldfuse.evaluation.metrics import DEPTH_KEYS, depth_metrics
 
 
 def test_by_hand() -> None:
@@ -47,7 +47,7 @@ def test_missing_depth_is_not_compared(missing: float) -> None:
 def test_empty_is_none_never_nan() -> None:
     full, nothing = np.ones((3, 3)), np.zeros((3, 3))
     for rendered, truth, valid in ((full, nothing, None), (nothing, nothing, None), (full, full, nothing.astype(bool))):
-        assert depth_metrics(rendered, truth, valid) == {**dict.fromkeys(KEYS), "pixels": 0}
+        assert depth_metrics(rendered, truth, valid) == {**dict.fromkeys(DEPTH_KEYS), "pixels": 0}
     unseen = depth_metrics(nothing, full)
     assert unseen["coverage"] == 0 and unseen["abs_err"] is None and unseen["delta_1"] is None
     assert depth_metrics(np.zeros((0, 0)), np.zeros((0, 0)))["coverage"] is None

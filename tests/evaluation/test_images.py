@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.images import C1, PSNR_CAP, psnr, ssim
+from fieldfuse.evaluation.metrics import C1, PSNR_CAP, psnr, ssim
 from tests.evaluation.samples import picture, ripple
 
 # scikit-image 0.26 on `picture()` and `ripple(picture())`: peak_signal_noise_ratio(data_range=1) and structural_similarity(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fieldfuse.camera import Array, Intrinsics, pixel_grid, rays
-from fieldfuse.evaluation.observed import every_nth, seen_share, training_psnr
+from fieldfuse.evaluation.score import every_nth, seen_share, training_psnr
 from tests.evaluation.samples import make_views
 
 

@@ -19,12 +19,11 @@ from hypothesis import strategies as st
 
 from fieldfuse import __version__
 from fieldfuse.errors import InputError, OutputError
-from fieldfuse.evaluation.baseline import nearest_image_scores
-from fieldfuse.evaluation.page import render_page
 from fieldfuse.evaluation.pictures import Pictures, method_pictures
 from fieldfuse.evaluation.report import CAPTURE, FIELD, POINT, POSES, SCORE, SFM_NOTE, STAGE, plain, report_data, write_report
-from fieldfuse.evaluation.score import score_views
-from fieldfuse.evaluation.table import table
+from fieldfuse.evaluation.report_page import render_page
+from fieldfuse.evaluation.score import nearest_image_scores, score_views
+from fieldfuse.evaluation.terminal import report_text
 from tests.evaluation.samples import draw, make_views
 
 NASTY = '<script>alert("x")</script><img src=x onerror=alert(1)>&"\'{{ 7 * 7 }}{% raw %}'
@@ -228,7 +227,7 @@ def test_a_column_of_depth_is_shown_where_there_is_depth() -> None:
             for score in (data["evaluation"]["field"], data["evaluation"]["tsdf"]):
                 score["depth_abs_err"] = None
         page = render_page(report_data(data), pictures)
-        assert ("Depth error" in page) is depth and ("depth error" in table(data)) is depth
+        assert ("Depth error" in page) is depth and ("depth error" in report_text(data)) is depth
         body = page[page.index("<h2>Quality on test views") :]
         rows = re.findall(r"<tr.*?</tr>", body[: body.index("</table>")], re.DOTALL)
         assert len(rows) > 3 and {len(re.findall(r"<t[hd][ >]", row)) for row in rows} == {6 if depth else 5}
@@ -308,14 +307,14 @@ def test_unwritable_folder(tmp_path: Path) -> None:
 
 def test_table_for_the_terminal() -> None:
     data, _ = sample()
-    text = table(data)
+    text = report_text(data)
     rows = {line.split("  ")[1].strip() if line.startswith("  ") else line: line for line in text.splitlines() if line}
     assert f"{data['evaluation']['field']['psnr']:.2f}" in rows["field"] and "0.4 s" in rows["field"]
     assert f"{data['evaluation']['tsdf']['ssim']:.3f}" in rows["TSDF"]
     assert "nearest training picture" in text and "50.0% of the pixels" in text
     assert "13 frames, 12 of 13 with a pose" in text and "6 min 12 s in all" in text
     assert max(map(len, text.splitlines())) <= 100
-    assert table(report_data(data)) == text
+    assert report_text(report_data(data)) == text
 
 
 def test_no_number_is_cut_off_in_the_terminal() -> None:
@@ -323,12 +322,12 @@ def test_no_number_is_cut_off_in_the_terminal() -> None:
     data["scene"]["metric"] = False
     data["evaluation"]["network"] = {**data["evaluation"]["field"], "key_frames": 12, "seconds": 191.0}
     for width in (60, 80, 100):
-        text = table(data, width)
+        text = report_text(data, width)
         assert "…" not in text and max(map(len, text.splitlines())) <= width
         assert text.count(f"{data['evaluation']['field']['psnr']:.2f}") >= 2 and "12 key" in text
 
 
 def test_table_without_scores_is_the_facts() -> None:
-    assert table({}) == ""
+    assert report_text({}) == ""
     data = {"capture": {"frames": 50}, "poses": {"registered": 48, "total": 50}, "exports": "run/exports/cameras"}
-    assert table(data) == "50 frames, 48 of 50 with a pose\n"
+    assert report_text(data) == "50 frames, 48 of 50 with a pose\n"

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.baseline import nearest_image_scores, nearest_training
-from fieldfuse.evaluation.images import PSNR_CAP, psnr, ssim
-from fieldfuse.evaluation.score import score_views
+from fieldfuse.evaluation.metrics import PSNR_CAP, psnr, ssim
+from fieldfuse.evaluation.score import nearest_image_scores, nearest_training, score_views
 from tests.evaluation.samples import Drawn, draw, make_views
 
 MEANS = {"psnr", "ssim", "lpips", "depth_abs_err", "psnr_corrected", "psnr_masked", "coverage"}

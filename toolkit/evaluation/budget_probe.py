@@ -106,7 +106,8 @@ def _fit() -> tuple[Callable[[], object], float]:
 
 
 def _score() -> tuple[Callable[[], object], float]:
-    from fieldfuse.evaluation.images import lpips, psnr, ssim
+    from fieldfuse.evaluation.metrics import psnr, ssim
+    from fieldfuse.evaluation.perceptual import lpips
 
     generator = np.random.default_rng(0)
     first, second = (generator.integers(0, 256, (120, 160, 3), dtype=np.uint8) for _ in range(2))

@@ -93,7 +93,7 @@ def cut_box(centre: Array, half_size: Array) -> tuple[Array, Array]:
 
 def _gap_colours(mesh: Mesh, truth: Mesh, voxel_size: float) -> Array:
     """(T, 3) uint8: each triangle's middle by its distance from the truth."""
-    gap = distances(mesh.vertices[mesh.triangles].mean(axis=1), truth)
+    gap, _ = distances(mesh.vertices[mesh.triangles].mean(axis=1), truth)
     return coloured(gap[None] / (ERROR_VOXELS * voxel_size), ERROR_COLOURS)[0]
 
 

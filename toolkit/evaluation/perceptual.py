@@ -21,7 +21,7 @@ import torch
 import torch.nn.functional as F
 
 from fieldfuse.camera import Array
-from fieldfuse.evaluation.pixels import checked_mask, pair
+from fieldfuse.evaluation.metrics import comparable
 
 log = logging.getLogger(__name__)
 
@@ -110,8 +110,7 @@ def lpips(rendered: Array, truth: Array, valid: Array | None = None) -> float | 
     Raises:
         InputError: sizes differ.
     """
-    first, second = pair(rendered, truth)
-    mask = checked_mask(valid, first.shape)
+    first, second, mask = comparable(rendered, truth, valid)
     layers = _layers()
     if layers is None or not mask.any() or min(mask.shape) < SMALLEST:
         return None

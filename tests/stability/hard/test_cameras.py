@@ -29,7 +29,7 @@ from fieldfuse.camera import (
 from fieldfuse.capture.poses import checked_pose
 from fieldfuse.capture.types import Capture, Frame, Views
 from fieldfuse.errors import InputError, PoseError
-from fieldfuse.evaluation.baseline import nearest_training
+from fieldfuse.evaluation.score import nearest_training
 from fieldfuse.nerfusion.keyframes import select_keyframes
 from fieldfuse.poses.given import given_poses
 from fieldfuse.poses.gravity import up_direction
