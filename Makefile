@@ -1,4 +1,4 @@
-# Two commands: `make demo` and `make test`. Both make the environment (.venv) when it is not there yet.
+# First commands: `make demo` and `make test`. Both make the environment (.venv) when it is not there yet.
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
@@ -32,11 +32,12 @@ SOURCES := toolkit pipelines configs benchmarks tests .ci
 # Static tools find packages by their folders' names: a folder of links that is laid out as the wheel is.
 LINKS := build/links
 
-.PHONY: help demo test lint ruff types imports links docs stability fuzz venv system lpips xfeat
+.PHONY: help demo test test-all lint ruff types imports links docs stability fuzz venv system lpips xfeat
 
 help:
 	@echo "make demo    film a small made-up scene, reconstruct it, and print where the results are (in demo/)"
-	@echo "make test    lint, type check, import layers and all tests"
+	@echo "make test    lint, type check, import layers, and the tests that take less than ten seconds each"
+	@echo "make test-all  the same with all tests, as CI runs them"
 	@echo "make lint    lint, type check and import layers; also one by one: ruff, types, imports"
 	@echo "make stability  the hard cases for the numbers, 50 kills and 156 stops of small runs (half an hour); renews docs/stability.md"
 	@echo "make fuzz    100,000 damaged files for every reader (half an hour); renews docs/stability.md"
@@ -49,16 +50,18 @@ demo: $(VENV)/.installed
 	@$(BIN)/python -m fieldfuse.pipelines.demo
 
 # Tests run in two processes where there are two cores; those of a file stay together, since they share what takes long to make.
-# `make test WORKERS=0` runs them in one.
+# `make test WORKERS=0` runs them in one. Kernels that both would compile are compiled before.
 WORKERS ?= $(if $(filter-out 0 1,$(shell nproc 2>/dev/null)),2,0)
 
 # Types take one core most of a minute, so they are checked beside the tests; their errors count all the same.
 # Bytecode is kept, also where the environment says otherwise: tests start many processes, and each would compile what it imports.
-test: $(VENV)/.installed-test links
+test: MARKED := -m "not slow"
+test test-all: $(VENV)/.installed-test links
 	$(RUFF) $(SOURCES)
 	PYTHONPATH=$(LINKS) $(BIN)/lint-imports
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m tests.kernels
 	$(BIN)/mypy & types=$$!; tests=0; \
-	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile || tests=$$?; wait $$types; exit $$tests
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest $(MARKED) --numprocesses $(WORKERS) --dist loadfile || tests=$$?; wait $$types; exit $$tests
 
 stability: $(VENV)/.installed-test
 	$(BIN)/python -m pytest tests/stability/hard --page docs/stability.md

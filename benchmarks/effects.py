@@ -29,7 +29,7 @@ from benchmarks.simulated import (
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.prepare import held_out
 from fieldfuse.config import Settings, load_settings
-from fieldfuse.effects.survey import VIEWS, survey
+from fieldfuse.effects.diagnostics import VIEWS, diagnose
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.options import Quiet
 from fieldfuse.progress import SILENT, Progress
@@ -79,7 +79,7 @@ def detection(planned: list[Planned], folder: Path) -> Experiment:
 
     def run(entry: Row) -> Row:
         one = named[entry["capture"]]
-        found = survey(open_capture(film(one, folder)))
+        found = diagnose(open_capture(film(one, folder)))
         names = {name: FOUND_AS.get(name, name) for name in found.findings}
         numbers = {names[name]: round(finding.number, 4) for name, finding in found.findings.items()}
         there = sorted(names[name] for name in found.there)

@@ -17,7 +17,7 @@ from benchmarks.experiment import Experiment, Row, application, chosen, markdown
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.prepare import held_out
 from fieldfuse.config import Settings, load_settings
-from fieldfuse.effects.survey import Survey, survey
+from fieldfuse.effects.diagnostics import Diagnostics, diagnose
 from fieldfuse.errors import InputError
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.options import Quiet
@@ -58,10 +58,10 @@ def switched(
     """A row for each capture (by the name that the table shows), seed and mode (of `SWITCHES`), with what `fit_with` answers."""
 
     @lru_cache(1)  # the same for every effect that is switched on alone
-    def found(name: str) -> Survey:
+    def found(name: str) -> Diagnostics:
         capture = open_capture(captures[name])
         train = np.flatnonzero(~held_out(capture, Settings().capture.holdout))
-        return survey(capture, [int(index) for index in train], progress, quick=False)
+        return diagnose(capture, [int(index) for index in train], progress, quick=False)
 
     def run(entry: Row) -> Row:
         mode, fixed = entry["mode"], [f"budget={seconds}", f"image_size={long_side}", f"seed={entry['seed']}", *FIXED]

@@ -18,7 +18,7 @@ from fieldfuse.capture.types import Capture, Views
 from fieldfuse.config import Settings
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.effects.decide import asleep, choose_field, decide
-from fieldfuse.effects.survey import Survey
+from fieldfuse.effects.diagnostics import Diagnostics
 from fieldfuse.evaluation.metrics import psnr, right_half_psnr
 from fieldfuse.evaluation.score import RenderedView, as_photo, entry, mean
 from fieldfuse.poses.scene import describe_scene
@@ -36,14 +36,14 @@ def fit_with(
     progress: Progress = SILENT,
     truth: Capture | None = None,
     known: Corrections | None = None,
-    found: Survey | None = None,
+    found: Diagnostics | None = None,
 ) -> dict[str, Any]:
     """Look for effects as the settings say, fit for `fit.budget` processor seconds, score the held-out views.
 
     Args:
         truth: the same capture with its held-out pictures in canonical colour.
         known: what is corrected, so that nothing is looked for.
-        found: what a survey of the training frames found before.
+        found: what `diagnose` found in the training frames before.
 
     Returns:
         `on` (what is corrected), `psnr` (in the colours of the photos), `psnr_corrected` (each test picture's colours fitted on

@@ -15,7 +15,7 @@ import typer
 
 from benchmarks.experiment import application, program
 from fieldfuse.camera import Array, Intrinsics
-from fieldfuse.effects import transfer
+from fieldfuse.effects.models import encode_srgb
 from fieldfuse.errors import InputError
 from fieldfuse.nerfusion.training.paths import hand_held
 from fieldfuse.nerfusion.training.shards import write_shard
@@ -47,7 +47,7 @@ def draw_walk(scene: MeshScene, rng: np.random.Generator, frames: int, long_side
         if poses is None or not all(_usable(take(scene, eye, poses[i][None]).depth) for i in (0, frames // 2, frames - 1)):
             continue
         drawn = [take(scene, eye, pose[None]) for pose in poses]
-        images = np.stack([(transfer.encode(one.linear) * 255).round().byte().permute(2, 0, 1).numpy() for one in drawn])
+        images = np.stack([(encode_srgb(one.linear) * 255).round().byte().permute(2, 0, 1).numpy() for one in drawn])
         intrinsics = np.tile([camera.fx, camera.fy, camera.cx, camera.cy], (frames, 1))
         return images, np.stack([one.depth.numpy() for one in drawn]), intrinsics, poses
     raise InputError("no walk through the mesh shows enough of it; is it a building, in metres, z up?")

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from fieldfuse.camera import Array, Intrinsics, project
 from fieldfuse.capture.types import Capture
 from fieldfuse.effects.correct import Corrections
-from fieldfuse.effects.listed import parse
+from fieldfuse.effects.effect_specs import parse
 from fieldfuse.errors import InputError
 from fieldfuse.files import atomic_path, read_json, write_json
 from fieldfuse.progress import SILENT, Progress

@@ -68,7 +68,7 @@ def _section(path: Path, content: Any, title: str, data: Path | None) -> str:
 
 def _table_of(name: str) -> Callable[[Row], str]:
     """The function `table` of a benchmark."""
-    if name not in [path.stem for path in Path(__file__).parent.glob("*.py")]:
+    if name not in [path.stem for path in Path(__file__).parent.iterdir()]:
         raise LookupError(f"no benchmark {name!r}")
     make: Callable[[Row], str] = import_module(f"benchmarks.{name}").table
     return make

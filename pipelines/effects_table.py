@@ -15,9 +15,8 @@ def effects_facts(target: Path, quiet: bool) -> dict[str, Any]:
         InputError: a source without poses: shared points cannot be told from wrong matches without them.
     """
     from fieldfuse.capture import open_capture
-    from fieldfuse.effects.depth_camera import look_for_offset
-    from fieldfuse.effects.registration import DEPTH_OFFSET
-    from fieldfuse.effects.survey import survey
+    from fieldfuse.effects.depth_camera import DEPTH_OFFSET, look_for_offset
+    from fieldfuse.effects.diagnostics import diagnose
     from fieldfuse.errors import InputError
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.folder import is_run_folder
@@ -38,15 +37,15 @@ def effects_facts(target: Path, quiet: bool) -> dict[str, Any]:
     with progress.listening():
         progress.begin("effects")
         shown = capture.with_frames(posed)
-        found = survey(shown, progress=progress)
+        found = diagnose(shown, progress=progress)
         findings = dict(found.findings)
         if shown.has_depth:
-            with found.paid.by(DEPTH_OFFSET):
+            with found.timing.by(DEPTH_OFFSET):
                 findings[DEPTH_OFFSET] = look_for_offset(shown, range(len(posed)), found.seen, progress)[0]
-    progress.finish("effects", found.seconds + found.paid.of(DEPTH_OFFSET), False)
+    progress.finish("effects", found.seconds + found.timing.of(DEPTH_OFFSET), False)
     return {
-        "effects": [{**finding.to_dict(), "seconds": found.paid.of(name)} for name, finding in findings.items()],
-        "seconds": round(found.seconds + found.paid.of(DEPTH_OFFSET), 3),
+        "effects": [{**finding.to_dict(), "seconds": found.timing.of(name)} for name, finding in findings.items()],
+        "seconds": round(found.seconds + found.timing.of(DEPTH_OFFSET), 3),
         "looked_at": found.facts,
     }
 

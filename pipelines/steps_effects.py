@@ -80,7 +80,7 @@ def moved_cameras(job: Job, capture: Capture) -> list[str]:
     """How far cameras that came with the capture were moved by what pictures and depth show: what is exported lies with the moved ones."""
     import numpy as np
 
-    from fieldfuse.effects.bounds import apart
+    from fieldfuse.effects.correct import apart
 
     given = {frame.name: frame.world_from_camera for frame in capture.frames if frame.world_from_camera is not None}
     names = [name for name in (job.corrections.poses if job.corrections else {}) if name in given]
@@ -102,7 +102,7 @@ def moved_depth(job: Job, capture: Capture) -> list[str]:
     """How far the depth camera stands from the pictures', where depth is carried from the one to the other."""
     import numpy as np
 
-    from fieldfuse.effects.bounds import apart
+    from fieldfuse.effects.correct import apart
 
     found = job.corrections.depth if job.corrections else None
     if found is None:

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldfuse.camera import Intrinsics
-from fieldfuse.effects import transfer, vignetting
+from fieldfuse.effects.models import decode_srgb, encode_srgb
 from fieldfuse.tone import LINEAR, SHOULDER, Tone, brighter, decode, encode, exposed, positive, share, square_radius
 
 CAMERA = Intrinsics(64, 48, 50.0, 50.0, 30.0, 25.0)
@@ -17,15 +17,16 @@ CAMERA = Intrinsics(64, 48, 50.0, 50.0, 30.0, 25.0)
 
 def test_srgb_is_that_of_the_simulator() -> None:
     shown = np.linspace(0, 1, 4001)
-    np.testing.assert_allclose(decode(shown), transfer.decode(torch.from_numpy(shown)).numpy(), atol=1e-12)
-    np.testing.assert_allclose(encode(shown), transfer.encode(torch.from_numpy(shown)).numpy(), atol=1e-12)
+    np.testing.assert_allclose(decode(shown), decode_srgb(torch.from_numpy(shown)).numpy(), atol=1e-12)
+    np.testing.assert_allclose(encode(shown), encode_srgb(torch.from_numpy(shown)).numpy(), atol=1e-12)
     np.testing.assert_allclose(encode(decode(shown)), shown, atol=1e-7)
     assert LINEAR[0] == 0 and LINEAR[255] == 1
     np.testing.assert_allclose(encode(np.array([-1.0, 2.0])), [0, 1])
 
 
-def test_light_falls_off_as_the_simulator_has_it() -> None:
-    falloff = vignetting.falloff(vignetting.Vignetting(0.4), vignetting.radii(CAMERA)).numpy()
+def test_light_falls_off_by_the_fourth_power_of_the_cosine() -> None:
+    x, y = np.meshgrid(np.arange(64) + 0.5 - 30, np.arange(48) + 0.5 - 25)
+    falloff = np.cos(np.arctan(np.sqrt(0.4**-0.5 - 1) * np.hypot(x, y) / 40)) ** 4  # half a diagonal is 40 pixels
     np.testing.assert_allclose(share(0.4, square_radius(CAMERA)), falloff, rtol=1e-5)
     np.testing.assert_allclose(Tone((2.0, 1.0, 0.5), 0.4).factor(CAMERA), falloff[..., None] * np.array([2, 1, 0.5]), rtol=1e-5)
     assert Tone((2.0, 1.0, 0.5)).factor(CAMERA).shape == (3,)

@@ -99,7 +99,7 @@ def _sentence(data: Any, error: ValidationError) -> str:
     first = error.errors(include_url=False)[0]
     name, value = "", data
     for part in first["loc"]:
-        if isinstance(part, int) and isinstance(value, list):
+        if isinstance(part, int) and isinstance(value, list) and part < len(value):
             name, value = f"{name}[{part}]", value[part]
         elif isinstance(value, Mapping) and part in value:  # what else stands there names pydantic's own branches
             name, value = f"{name}.{part}" if name else str(part), value[part]

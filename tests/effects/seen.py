@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.effects.adjust import Problem, predict
-from fieldfuse.effects.sightings import Sightings
+from fieldfuse.effects.tracks import Tracks
 
 CAMERA = Intrinsics(320, 240, 260.0, 260.0, 160.0, 120.0)
 FRAMES = 14
@@ -22,7 +22,7 @@ def made(
     points: int = 420,
     gain: Array | None = None,
     corner: float = 1.0,
-) -> Sightings:
+) -> Tracks:
     """Cameras on a walk before a cloud of points, as a capture would give them: poses and lens as the capture believes they are.
 
     Args:
@@ -56,7 +56,7 @@ def made(
     given = poses.copy()
     if pose_error:
         given[:, :3, :3] = given[:, :3, :3] @ Rotation.from_rotvec(rng.normal(0, pose_error, (FRAMES, 3))).as_matrix()
-    return Sightings(
+    return Tracks(
         names=[f"{index:03d}" for index in range(FRAMES)],
         cameras=[CAMERA] * FRAMES,
         poses=given,
@@ -66,7 +66,5 @@ def made(
         point=number,
         pixel=pixel,
         linear=own if gain is None else own * gain[frame],
-        slope=np.full((len(frame), 3), 0.01) * np.exp2(rng.normal(0, 0.1, (len(frame), 1))),
-        size=np.full(len(frame), 2.0),
-        sharpness=np.ones(FRAMES),
+        slope=0.02 * np.exp2(rng.normal(0, 0.1, len(frame))),
     )

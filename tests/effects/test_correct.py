@@ -11,14 +11,14 @@ import torch
 
 from fieldfuse.camera import FISHEYE, OPENCV, Intrinsics, distort
 from fieldfuse.capture.types import Capture, Frame, Views
-from fieldfuse.effects import transfer, vignetting
 from fieldfuse.effects.correct import Corrections, bent, correctable
 from fieldfuse.effects.decide import CLIPS, DIMMEST, room_for_light
-from fieldfuse.effects.sightings import Sightings
+from fieldfuse.effects.models import decode_srgb, encode_srgb, to_bytes
+from fieldfuse.effects.tracks import Tracks
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation.score import score_views
 from fieldfuse.render.image import Rendered
-from fieldfuse.tone import Tone
+from fieldfuse.tone import Tone, share, square_radius
 from fieldfuse.training.rays import PixelPool
 
 CAMERA = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -42,14 +42,14 @@ def test_nothing_to_correct_gives_the_very_same_objects() -> None:
 
 
 def test_gain_and_vignetting_are_undone() -> None:
-    linear = transfer.decode(torch.from_numpy(picture().astype(np.float32) / 255))
+    linear = decode_srgb(torch.from_numpy(picture().astype(np.float32) / 255))
     gain = (1.3, 1.1, 0.8)
-    dimmed = vignetting.forward(vignetting.Vignetting(0.5), linear, vignetting.radii(CAMERA)) * torch.tensor(gain)
-    stored = transfer.to_bytes(transfer.encode(dimmed)).numpy()
+    dimmed = linear * torch.from_numpy(share(0.5, square_radius(CAMERA)))[..., None] * torch.tensor(gain)
+    stored = to_bytes(encode_srgb(dimmed)).numpy()
     back, lost = Tone(gain, 0.5).undone(stored, CAMERA)
     assert lost is not None
     assert np.abs(back.astype(int) - picture())[~lost].max() <= 3  # 8 bits twice, brightened by 2 in the corner
-    even, _ = Tone(gain).undone(transfer.to_bytes(transfer.encode(linear * torch.tensor(gain))).numpy(), CAMERA)
+    even, _ = Tone(gain).undone(to_bytes(encode_srgb(linear * torch.tensor(gain))).numpy(), CAMERA)
     assert np.abs(even.astype(int) - picture()).max() <= 2
 
 
@@ -78,21 +78,21 @@ def test_held_out_views_keep_their_photo_and_all_of_its_pixels() -> None:
 def test_a_perfect_field_is_scored_as_perfect_whatever_was_corrected() -> None:
     """A picture exposed and darkened more than others is told from its canonical colours as they were taken, not brightened ones."""
     scene, gain = picture(5), (0.5, 0.45, 0.55)
-    linear = transfer.decode(torch.from_numpy(scene.astype(np.float32) / 255))
-    dimmed = vignetting.forward(vignetting.Vignetting(0.4), linear, vignetting.radii(CAMERA)) * torch.tensor(gain)
+    linear = decode_srgb(torch.from_numpy(scene.astype(np.float32) / 255))
+    dimmed = linear * torch.from_numpy(share(0.4, square_radius(CAMERA)))[..., None] * torch.tensor(gain)
     before = views()
-    before.images[0] = transfer.to_bytes(transfer.encode(dimmed)).numpy()
+    before.images[0] = to_bytes(encode_srgb(dimmed)).numpy()
     after = Corrections(gain={"a": gain}, corner=0.4, dimmed=1.3).on_views(before)
-    field = transfer.encode(linear / 1.3).numpy()  # what a fit to such pictures would show
+    field = encode_srgb(linear / 1.3).numpy()  # what a fit to such pictures would show
     shown = Rendered(field, np.zeros((48, 64), np.float32), np.ones((48, 64), np.float32))
     assert score_views([shown], after, [0])["psnr"] > 55
     assert score_views([shown], before, [0])["psnr"] < 25
 
 
-def seen(images: list[np.ndarray]) -> Sightings:
+def seen(images: list[np.ndarray]) -> Tracks:
     nothing = np.zeros((0, 3))
     greys = tuple(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images)
-    return Sightings(
+    return Tracks(
         names=list("abc"),
         cameras=[CAMERA] * 3,
         poses=np.tile(np.eye(4), (3, 1, 1)),
@@ -102,10 +102,8 @@ def seen(images: list[np.ndarray]) -> Sightings:
         point=np.zeros(0, int),
         pixel=nothing[:, :2],
         linear=nothing,
-        slope=nothing,
-        size=nothing[:, 0],
-        sharpness=np.ones(3),
-        pictures=greys,
+        slope=nothing[:, 0],
+        images=greys,
     )
 
 

@@ -15,13 +15,12 @@ from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.config import EffectsSettings
 from fieldfuse.effects import decide as module
 from fieldfuse.effects.adjust import LENS, POSES, ROWS
-from fieldfuse.effects.bounds import STOPS, apart, beyond, beyond_depth, bounded_gains
-from fieldfuse.effects.correct import Corrections
+from fieldfuse.effects.correct import STOPS, Corrections, apart, beyond, beyond_depth, bounded_gains
 from fieldfuse.effects.decide import FEWEST_TRIED, TRIED, Decision, Trial, better, decide, tried_frames
+from fieldfuse.effects.diagnostics import Diagnostics, diagnose_tracks
 from fieldfuse.effects.light import EXPOSURE, VIGNETTING
 from fieldfuse.effects.refine import refined_poses
-from fieldfuse.effects.sightings import Sightings
-from fieldfuse.effects.survey import Survey, look
+from fieldfuse.effects.tracks import Tracks
 from tests.effects.seen import CAMERA, FRAMES, made
 
 TRAIN = np.arange(FRAMES) % 5 != 2
@@ -126,10 +125,10 @@ def test_a_gain_that_hangs_on_one_frame_is_no_win() -> None:
 
 
 @pytest.fixture(scope="module")
-def walked() -> tuple[Sightings, Survey]:
+def walked() -> tuple[Tracks, Diagnostics]:
     """What is seen on a made-up walk with drifting exposure and poses that are off, and what its training frames speak for."""
     seen = made(9, noise=0.05, pose_error=0.004, points=200, gain=np.exp2(0.4 * np.sin(np.arange(FRAMES)))[:, None] * np.ones(3))
-    kept = seen.where(TRAIN[seen.frame])
+    kept = seen.rows(TRAIN[seen.frame])
     which = np.flatnonzero(TRAIN)
     own = replace(
         kept,
@@ -138,17 +137,17 @@ def walked() -> tuple[Sightings, Survey]:
         poses=seen.poses[which],
         times=seen.times[which],
         scale=seen.scale[which],
-        sharpness=seen.sharpness[which],
         frame=(np.cumsum(TRAIN) - 1)[kept.frame],
     )
-    return replace(seen, pictures=tuple(np.full((24, 32), 120, np.uint8) for _ in seen.names)), look(own)
+    return replace(seen, images=tuple(np.full((24, 32), 120, np.uint8) for _ in seen.names)), diagnose_tracks(own)
 
 
 Decisions = dict[str, Decision]
+Walked = tuple[Tracks, Diagnostics]
 
 
 def decided(
-    walked: tuple[Sightings, Survey], monkeypatch: pytest.MonkeyPatch, scores: dict[str, float] | None, **settings: list[str]
+    walked: Walked, monkeypatch: pytest.MonkeyPatch, scores: dict[str, float] | None, **settings: list[str]
 ) -> tuple[Decisions, Corrections, list[Corrections]]:
     """Decisions by name, where trials give 20 dB and so many more for each effect that is corrected in them; None: they give nothing."""
     seen, found = walked
@@ -172,7 +171,7 @@ def decided(
     return {one.finding.effect: one for one in got.decisions}, got.corrections, asked
 
 
-def test_what_a_trial_shows_to_be_better_is_corrected(walked: tuple[Sightings, Survey], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_trial_shows_to_be_better_is_corrected(walked: Walked, monkeypatch: pytest.MonkeyPatch) -> None:
     found, corrections, asked = decided(walked, monkeypatch, {POSES: 1.0, EXPOSURE: 0.5})
     assert found[POSES].on and found[EXPOSURE].on and found[POSES].decided_by == found[EXPOSURE].decided_by == "trial"
     assert found[EXPOSURE].trial == {"without": 21.0, "with": 21.5}
@@ -180,7 +179,7 @@ def test_what_a_trial_shows_to_be_better_is_corrected(walked: tuple[Sightings, S
     assert asked[0] == Corrections() and len(asked) == 3
 
 
-def test_what_a_trial_shows_to_be_worse_is_not(walked: tuple[Sightings, Survey], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_trial_shows_to_be_worse_is_not(walked: Walked, monkeypatch: pytest.MonkeyPatch) -> None:
     found, corrections, _ = decided(walked, monkeypatch, {POSES: -2.0, EXPOSURE: 0.5})
     assert not found[POSES].on and found[EXPOSURE].on
     assert not corrections.poses and corrections.gain
@@ -189,18 +188,18 @@ def test_what_a_trial_shows_to_be_worse_is_not(walked: tuple[Sightings, Survey],
     assert data["decided_by"] == "trial" and data["trial"] == {"without": 20.0, "with": 18.0} and data["on"] is False
 
 
-def test_what_the_user_wants_is_corrected_whatever_a_trial_says(walked: tuple[Sightings, Survey], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_user_wants_is_corrected_whatever_trials_say(walked: Walked, monkeypatch: pytest.MonkeyPatch) -> None:
     found, corrections, _ = decided(walked, monkeypatch, {POSES: -2.0, EXPOSURE: -2.0}, on=["poses"])
     assert found[POSES].on and corrections.poses
     assert not found[EXPOSURE].on and not corrections.gain
 
 
-def test_evidence_decides_where_no_trial_is_possible(walked: tuple[Sightings, Survey], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evidence_decides_where_no_trial_is_possible(walked: Walked, monkeypatch: pytest.MonkeyPatch) -> None:
     found, _, _ = decided(walked, monkeypatch, None)
     assert found[POSES].on and "a trial was not possible" in found[POSES].note and found[POSES].decided_by == "evidence"
 
 
-def test_poses_that_place_nothing_are_not_used(walked: tuple[Sightings, Survey], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_poses_that_place_nothing_are_not_used(walked: Walked, monkeypatch: pytest.MonkeyPatch) -> None:
     seen, found = walked
     anywhere = np.random.default_rng(0).uniform(0, [CAMERA.width, CAMERA.height], seen.pixel.shape)
     shaken = replace(seen, pixel=np.where(TRAIN[seen.frame, None], seen.pixel, anywhere))

@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fieldfuse.effects import exposure
-from fieldfuse.effects.evidence import Tracks
-from fieldfuse.effects.light import BOTH, EXPOSURE, MARGIN, VIGNETTING, explain, spread
+from fieldfuse.effects.light import BOTH, EXPOSURE, MARGIN, VIGNETTING, LightTracks, explain, exposure_evidence, spread
 
 FRAMES = 30
 
 
-def made(stops: float, corner: float, noise: float, seed: int = 0) -> Tracks:
+def made(stops: float, corner: float, noise: float, seed: int = 0) -> LightTracks:
     """Points that wander over neighbouring pictures, which differ by `stops` and lose light to `corner`; `noise` stops an observation."""
     rng = np.random.default_rng(seed)
     points, long = 1500, 6
@@ -23,7 +21,7 @@ def made(stops: float, corner: float, noise: float, seed: int = 0) -> Tracks:
     gain = rng.normal(0, stops, FRAMES)
     light = rng.uniform(-4, -2.2, points).repeat(long) + gain[frame] + rng.normal(0, noise, len(frame))
     light += np.log2((1 + (corner**-0.5 - 1) * radius**2) ** -2)
-    return Tracks(np.exp2(light)[:, None] * np.ones(3), frame, np.arange(points).repeat(long), radius)
+    return LightTracks(np.exp2(light)[:, None] * np.ones(3), frame, np.arange(points).repeat(long), radius)
 
 
 def test_nothing_is_told_of_noise() -> None:
@@ -41,8 +39,8 @@ def test_exposure_that_misses_its_margin_is_told_beside_vignetting() -> None:
     """As in a real video of a can on a table, whose pictures get darker to the corners and whose exposure drifts."""
     tracks = made(0.1, 0.4, 0.16)
     before = spread(tracks)
-    drift = np.array(exposure.evidence(tracks, FRAMES).parameters["gain"])
-    exposed = spread(Tracks(tracks.linear / drift[tracks.frame], tracks.frame, tracks.point, tracks.radius))
+    drift = np.array(exposure_evidence(tracks, FRAMES).parameters["gain"])
+    exposed = spread(LightTracks(tracks.linear / drift[tracks.frame], tracks.frame, tracks.point, tracks.radius))
     assert exposed > (1 - MARGIN[EXPOSURE]) * before
     found = explain(tracks, FRAMES)
     assert found.kept == {EXPOSURE, VIGNETTING}

@@ -7,7 +7,7 @@ import numpy as np
 
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.effects.adjust import Problem
-from fieldfuse.effects.sightings import Sightings
+from fieldfuse.effects.tracks import Tracks
 
 WIDTH, HEIGHT, FOCAL, FRAMES, AWAY = 200, 150, 170.0, 9, 4.0
 CAMERA = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
@@ -19,7 +19,7 @@ def stored(linear: Array) -> Array:
 
 def wall(
     lamp: float = 0.0, gain: Array | None = None, corner: float = 1.0, top: float = -9.0, away: float = AWAY, seed: int = 0
-) -> Sightings:
+) -> Tracks:
     """Cameras that pass a wall, which is all that is known of points. A lamp's image stands still in the picture, so wanders over the wall.
 
     Args:
@@ -51,10 +51,10 @@ def wall(
     some = np.zeros((len(frame), 3))
     times, ones = np.arange(FRAMES, dtype=np.float64), np.ones(FRAMES)
     names = [str(number) for number in range(FRAMES)]
-    return Sightings(names, [CAMERA] * FRAMES, poses, times, ones, frame, point, pixel, some, some, ones[:1], ones, tuple(pictures))
+    return Tracks(names, [CAMERA] * FRAMES, poses, times, ones, frame, point, pixel, some, some[:, 0], tuple(pictures))
 
 
-def problem_of(seen: Sightings) -> Problem:
+def problem_of(seen: Tracks) -> Problem:
     """Right poses, no lens; patches ask for no more."""
     nothing = np.zeros((0, 2))
     return Problem(seen.poses, np.zeros((0, 3)), seen.frame, seen.point, nothing, seen.focal, seen.row(), np.zeros((FRAMES, 6)))

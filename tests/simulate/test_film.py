@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from functools import cache
-from types import ModuleType
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -14,14 +14,15 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from fieldfuse.camera import Intrinsics, project, unproject
-from fieldfuse.effects import exposure, motion_blur, rolling_shutter, sensor_noise, transfer, vignetting
-from fieldfuse.effects.listed import MODULES, Effects, parse
+from fieldfuse.effects.effect_specs import PRESETS, Effects, parse, preset
+from fieldfuse.effects.models import MotionBlur, RollingShutter, decode_srgb, encode_srgb, to_bytes
 from fieldfuse.simulate.eye import eye_of, take
 from fieldfuse.simulate.film import Film, Shot
 from fieldfuse.simulate.materials import TextureBank, texture_bank
 from fieldfuse.simulate.paths import PathSettings, plan
 from fieldfuse.simulate.procedural import random_scene
 from fieldfuse.simulate.scene import Scene
+from fieldfuse.tone import share, square_radius
 
 CAMERA = Intrinsics(80, 60, 60.0, 60.0, 40.0, 30.0)
 PATH = PathSettings("walk", frames=6, fps=5.0, speed=0.6, shake=6.0)
@@ -62,20 +63,20 @@ def counted(film: Film) -> tuple[int, str]:
 
 
 def forbid(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """Make every function of an effect's module fail."""
-    module: ModuleType = MODULES[name]
-    for attribute, value in vars(module).items():
-        if callable(value) and getattr(value, "__module__", None) == module.__name__ and not isinstance(value, type):
+    """Make every method of an effect fail."""
+    kind = type(preset(name, "medium"))
+    for attribute, value in list(vars(kind).items()):
+        if not attribute.startswith("__") and isinstance(value, FunctionType | staticmethod | classmethod):
 
             def called(*_: Any, who: str = f"{name}.{attribute}", **__: Any) -> Any:
                 raise AssertionError(f"{who} was called, but is not listed")
 
-            monkeypatch.setattr(module, attribute, called)
+            monkeypatch.setattr(kind, attribute, called)
 
 
 def test_what_is_not_listed_is_never_called_and_changes_no_bit(bank: TextureBank, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = counted(filmed(bank, depth=True))
-    for name in MODULES:
+    for name in PRESETS:
         forbid(monkeypatch, name)
     assert counted(filmed(bank, depth=True)) == expected
 
@@ -86,13 +87,13 @@ def clean_of(bank: TextureBank) -> Callable[[str], tuple[int, str]]:
     return cache(lambda kind: counted(filmed(bank, kind=kind, depth=True)))
 
 
-@pytest.mark.parametrize("name", sorted(MODULES))
+@pytest.mark.parametrize("name", sorted(PRESETS))
 def test_each_effect_alone_calls_no_other(
     bank: TextureBank, clean_of: Callable[[str], tuple[int, str]], name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kind = {"background": "street", "highlights": "sphere"}.get(name, "room")
     clean = clean_of(kind)
-    for other in MODULES:
+    for other in PRESETS:
         if other != name:
             forbid(monkeypatch, other)
     operations, got = counted(filmed(bank, name, kind=kind, depth=True))
@@ -122,18 +123,18 @@ def test_light_goes_through_vignetting_and_exposure(bank: TextureBank) -> None:
     film = filmed(bank, "vignetting:strong", "exposure:strong")
     shot, clean = film.shot(1), linear_of(film, 1)
     gain = torch.tensor(shot.facts["exposure"]["gain"], dtype=torch.float32)
-    dimmed = vignetting.forward(vignetting.PRESETS["strong"], clean, vignetting.radii(CAMERA))
-    expected = transfer.to_bytes(transfer.encode(exposure.forward(dimmed, gain))).numpy()
+    dimmed = clean * torch.from_numpy(share(preset("vignetting", "strong").corner, square_radius(CAMERA)).astype(np.float32))[..., None]
+    expected = to_bytes(encode_srgb(dimmed * gain)).numpy()
     assert np.array_equal(shot.rgb, expected)
     assert np.array_equal(shot.depth, filmed(bank).shot(1).depth)  # geometry is untouched
 
 
 def test_noise_of_the_picture_is_the_formulas(bank: TextureBank) -> None:
-    film, effect = filmed(bank, "sensor_noise:strong"), sensor_noise.PRESETS["strong"]
+    film, effect = filmed(bank, "sensor_noise:strong"), preset("sensor_noise", "strong")
     residual, spread = [], []
     for index in range(4):
         clean = linear_of(film, index).numpy().clip(0, 1)
-        noisy = transfer.decode(torch.from_numpy(film.shot(index).rgb.astype(np.float32) / 255)).numpy()
+        noisy = decode_srgb(torch.from_numpy(film.shot(index).rgb.astype(np.float32) / 255)).numpy()
         inner = (clean > 0.15) & (clean < 0.7)
         residual.append((noisy - clean)[inner])
         spread.append(np.sqrt(clean[inner] / effect.well + (effect.read / effect.well) ** 2))
@@ -145,10 +146,10 @@ def test_rows_are_seen_from_where_the_camera_was(bank: TextureBank) -> None:
     """Row by row, the picture is that of a camera that stands still at the row's own time."""
     film = filmed(bank, {"rolling_shutter": {"readout": 0.2}})
     shot = film.shot(2)
-    rows = rolling_shutter.forward(rolling_shutter.RollingShutter(0.2), shot.seconds, 60)
+    rows = RollingShutter(0.2).rows(shot.seconds, 60)
     assert shot.facts["rolling_shutter"]["first_row_seconds"] == pytest.approx(rows[0])
     for row in (0, 17, 59):
-        still = transfer.to_bytes(transfer.encode(take(film.scene, film.eye, film.motion.poses(rows[row : row + 1])).linear)).numpy()
+        still = to_bytes(encode_srgb(take(film.scene, film.eye, film.motion.poses(rows[row : row + 1])).linear)).numpy()
         same = np.abs(still[row].astype(int) - shot.rgb[row]).max(axis=1)
         assert (same <= 1).mean() > 0.8  # edge pixels are found by neighbours, which differ
         assert np.median(same) == 0
@@ -160,9 +161,9 @@ def test_rows_are_seen_from_where_the_camera_was(bank: TextureBank) -> None:
 def test_blur_is_the_mean_of_instants_in_linear_light(bank: TextureBank) -> None:
     film = filmed(bank, {"motion_blur": {"exposure": 0.1, "samples": 5}})
     shot = film.shot(2)
-    times = shot.seconds + motion_blur.instants(motion_blur.MotionBlur(0.1, 5))
+    times = shot.seconds + MotionBlur(0.1, 5).instants()
     mean = torch.stack([take(film.scene, film.eye, film.motion.poses(t)).linear for t in times]).mean(0)
-    expected = transfer.to_bytes(transfer.encode(mean)).numpy()
+    expected = to_bytes(encode_srgb(mean)).numpy()
     assert np.abs(expected.astype(int) - shot.rgb).max() <= 1
     ends = np.array(shot.facts["motion_blur"]["path"])
     np.testing.assert_allclose(ends, film.motion.poses(shot.seconds + np.array([-0.05, 0, 0.05])))

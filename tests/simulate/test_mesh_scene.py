@@ -11,8 +11,7 @@ import torch
 from PIL import Image
 
 from fieldfuse.camera import Intrinsics
-from fieldfuse.effects.background import Background
-from fieldfuse.effects.highlights import Highlights
+from fieldfuse.effects.scenery import Background, Highlights
 from fieldfuse.errors import InputError
 from fieldfuse.export.mesh import write_mesh
 from fieldfuse.simulate.eye import eye_of, take

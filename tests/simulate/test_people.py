@@ -13,9 +13,8 @@ from safetensors.numpy import load_file
 
 from fieldfuse.camera import Array, Intrinsics, project
 from fieldfuse.capture.types import Views
-from fieldfuse.effects import passers
-from fieldfuse.effects.listed import parse
-from fieldfuse.effects.passers import EYES, PRESETS, Passers, Walk
+from fieldfuse.effects.effect_specs import STRENGTHS, parse, preset
+from fieldfuse.effects.scenery import EYES, Pedestrians, Walk
 from fieldfuse.simulate.eye import eye_of, take
 from fieldfuse.simulate.film import Film
 from fieldfuse.simulate.materials import TextureBank, texture_bank
@@ -65,14 +64,14 @@ def test_people_are_where_the_mask_says(bank: TextureBank) -> None:
     assert 0.1 < np.mean(np.array(shares) > 0.01) < 0.9 and 0.05 < max(shares) < 0.7
 
 
-@pytest.mark.parametrize("strength", sorted(PRESETS))
+@pytest.mark.parametrize("strength", STRENGTHS)
 def test_so_much_of_the_time_somebody_is_in_the_picture(strength: str) -> None:
-    effect, times = PRESETS[strength], np.arange(0, 120, 0.5)
+    effect, times = preset("passers", strength), np.arange(0, 120, 0.5)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     poses[:, :3, :3] = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # ahead is +y, z is up
     poses[:, 2, 3] = EYES
     focus, wide = np.array([0.0, 4.0, 1.0]), 1.2
-    walks = passers.draw(effect, times, poses, focus, wide, 0.0, np.random.default_rng(0))
+    walks = effect.walks(times, poses, focus, wide, 0.0, np.random.default_rng(0))
     in_view = np.zeros(len(times), bool)
     for walk in walks:
         assert effect.near * 3.9 < walk.foot[1] < effect.far * 4.2 and walk.foot[2] == 0 and abs(walk.foot[0]) < 1e-9
@@ -83,14 +82,15 @@ def test_so_much_of_the_time_somebody_is_in_the_picture(strength: str) -> None:
             in_view[number] |= inside
             assert walk.near(float(seconds)) or not inside  # who is not near is never seen
     assert 0.4 * effect.share < in_view.mean() < 1.2 * effect.share
-    assert not passers.draw(Passers(share=0), times, poses, focus, wide, 0.0, np.random.default_rng(0))
+    assert not Pedestrians(share=0).walks(times, poses, focus, wide, 0.0, np.random.default_rng(0))
 
 
 def test_they_cross_the_optical_axis_at_their_moment() -> None:
     times, pose = np.arange(4.0), np.eye(4)
     pose[:3, :3] = np.array([[1.0, 0, 0], [0, 0.2, 0.98], [0, -0.98, 0.2]])
     pose[:3, 3] = 1, 2, 1.5
-    walks = passers.draw(PRESETS["strong"], times, np.tile(pose, (4, 1, 1)), np.array([1.0, 6.0, 1.0]), 1.2, None, np.random.default_rng(1))
+    poses, focus = np.tile(pose, (4, 1, 1)), np.array([1.0, 6.0, 1.0])
+    walks = preset("passers", "strong").walks(times, poses, focus, 1.2, None, np.random.default_rng(1))
     for walk in walks:
         assert walk.foot[2] == pytest.approx(1.5 - EYES)
         beside = walk.foot_at(walk.moment) + np.array([0, 0, walk.height / 2])

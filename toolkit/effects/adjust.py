@@ -57,6 +57,11 @@ class Problem:
             depth=None if self.depth is None else self.depth[keep],
         )
 
+    def only_frames(self, frames: Array) -> Problem:
+        """The observations in some frames (F,) bool."""
+        keep = frames[self.frame]
+        return replace(self, frame=self.frame[keep], point=self.point[keep], place=self.place[keep], row=self.row[keep])
+
     def like(self, other: Problem) -> Problem:
         """These points, with the cameras of another."""
         return replace(self, poses=other.poses, lens=other.lens, motion=other.motion)

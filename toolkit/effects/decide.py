@@ -1,8 +1,8 @@
 """From evidence and the user's wishes to what is corrected.
 
-What evidence speaks for is corrected only if three guards let it pass: no correction is larger than cameras explain (`bounds`), held-out
-frames are placed by their own points or like their neighbours (`refine`), and a short fit to some training frames shows others better
-with it than without (`Trial`). What the user switches on by name is corrected whatever the guards say.
+What evidence speaks for is corrected only if three guards let it pass: no correction is larger than cameras explain (`correct.beyond`),
+held-out frames are placed by their own points or like their neighbours (`refine`), and a short fit to some training frames shows others
+better with it than without (`Trial`). What the user switches on by name is corrected whatever the guards say.
 """
 
 from __future__ import annotations
@@ -17,30 +17,26 @@ import numpy as np
 from fieldfuse.camera import Array
 from fieldfuse.capture.types import Capture
 from fieldfuse.config import EffectsSettings, FieldSettings
-from fieldfuse.effects import light, vignetting
+from fieldfuse.effects import light
 from fieldfuse.effects.adjust import LENS, POSES, ROWS, adjust, predict
-from fieldfuse.effects.bounds import beyond, beyond_depth, bounded_gains
-from fieldfuse.effects.correct import Corrections, correctable
-from fieldfuse.effects.depth_camera import NOTHING, look_for_offset
+from fieldfuse.effects.correct import Corrections, beyond, beyond_depth, bounded_gains, correctable
+from fieldfuse.effects.depth_camera import DEPTH_OFFSET, UNKNOWN, look_for_offset
+from fieldfuse.effects.depth_pose_refinement import DepthRefined
+from fieldfuse.effects.diagnostics import FAR, POINTS, VIEWS, Diagnostics, Finding, Timing, diagnose
+from fieldfuse.effects.evidence import BLUR
 from fieldfuse.effects.light import EXPOSURE, VIGNETTING
-from fieldfuse.effects.motion_blur import POWER
-from fieldfuse.effects.paid import POINTS, Paid
 from fieldfuse.effects.refine import refined_poses
-from fieldfuse.effects.registration import DEPTH_OFFSET
-from fieldfuse.effects.sensed import Agreed
-from fieldfuse.effects.sightings import Look, Sightings, gather
-from fieldfuse.effects.survey import BLUR, FAR, VIEWS, Finding, Survey, survey
+from fieldfuse.effects.tracks import Look, Tracks, gather
+from fieldfuse.poses.cloud import every
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.tone import LINEAR, Gain, Tone
 
+POWER = 2.0  # of a frame's sharpness: its weight in the fit, against that of sharp ones
 SHARP = 0.75  # quantile of the sharpness from which on a frame counts in full
 LEAST_WEIGHT = 0.1
-CLIPS = 0.01  # share of the pixels that corrections may make too bright for a picture …
+CLIPS = 0.01  # share of the pixels that corrections may make too bright for an image …
 DIMMEST = 2.0  # … unless all would have to become darker than by this
-STRIDE = 4  # working pixels between those that tell
-TOLD_ONLY = {
-    ROWS: "only told, not corrected",
-}
+STRIDE = 4  # working pixels between those that are looked at
 OF_FIELD = {  # no correction of pictures, but what the field is made of
     VIEWS: "what the decoder sees of the direction: field.view",
     FAR: "whether space beyond the region is modelled is decided with the scene (field.background)",
@@ -79,6 +75,10 @@ class Decision:
             **tried,
         }
 
+    def noted(self, note: str) -> Decision:
+        """With one more note."""
+        return replace(self, note="; ".join(filter(None, [self.note, note])))
+
     def dropped(self, guard: str, why: str, trial: dict[str, float] | None = None) -> Decision:
         """Not corrected after all."""
         return replace(self, on=False, note=f"not corrected: {why}", decided_by=guard, trial=trial or {})
@@ -92,13 +92,13 @@ class Decided:
     corrections: Corrections
     seconds: float
     facts: dict[str, Any]
-    paid: Paid
+    timing: Timing
 
     def to_dict(self) -> dict[str, Any]:
         return {
-            "effects": [{**one.to_dict(), "seconds": self.paid.of(one.finding.effect)} for one in self.decisions],
+            "effects": [{**one.to_dict(), "seconds": self.timing.of(one.finding.effect)} for one in self.decisions],
             "seconds": round(self.seconds, 3),
-            "looked_at": {**self.facts, "points_seconds": self.paid.of(POINTS)},
+            "looked_at": {**self.facts, "points_seconds": self.timing.of(POINTS)},
             "corrections": self.corrections.to_dict(),
         }
 
@@ -120,7 +120,7 @@ def decide(
     test: Array,
     settings: EffectsSettings,
     progress: Progress = SILENT,
-    found: Survey | None = None,
+    found: Diagnostics | None = None,
     trials: Trials | None = None,
 ) -> Decided:
     """Look at the training frames of a posed capture, decide, and work out the corrections of all frames.
@@ -128,52 +128,51 @@ def decide(
     Args:
         test: (N,) bool: held-out frames. They enter nothing that training frames get; afterwards they are brought to the same colours and
             poses by the points that training frames found.
-        found: what a survey of these training frames found before; None: they are looked at.
+        found: what `diagnose` found in these training frames before; None: they are looked at.
         trials: makes short fits that have the last word; None: there are none.
 
     Raises:
-        InputError: a picture cannot be read.
+        InputError: an image cannot be read.
     """
     began = time.monotonic()
     train = [int(index) for index in np.flatnonzero(~test)]
     known: dict[int, Look] = {}
-    found = found or survey(capture, train, progress, known=known, quick=not settings.on)
-    decisions = {name: _decision(finding, wish(settings, name), capture, found) for name, finding in found.findings.items()}
-    chosen, aside = tried_frames(train, len(test))
-    worked = _worked_out(capture, test, found, _corrected(decisions), progress, known, aside)
+    found = found or diagnose(capture, train, progress, known=known, quick=not settings.on)
+    decisions = {name: _first_decision(finding, wish(settings, name), capture, found) for name, finding in found.findings.items()}
+    worked = _worked_out(capture, test, found, _on(decisions), progress, known)
     decisions, worked = _guarded(decisions, worked, capture, found)
-    if trials is not None and any(one.wish == "auto" for one in decisions.values() if one.on and _tried(one)):
-        decisions = _judged(decisions, worked, capture, found, trials, chosen, aside)
-    corrections = worked.parts(_corrected(decisions))
+    if trials is not None and any(one.on and one.wish == "auto" for name, one in decisions.items() if name in WINS):
+        decisions = _judged(decisions, worked, capture, found, trials)
+    corrections = worked.parts(_on(decisions))
     if worked.borrowed and decisions[EXPOSURE].on:
         which = ", ".join(worked.borrowed[:3]) + (", …" if len(worked.borrowed) > 3 else "")
         note = f"held-out frames whose points disagree about their exposure have that of their neighbours: {which}"
-        decisions[EXPOSURE] = replace(decisions[EXPOSURE], note="; ".join(filter(None, [decisions[EXPOSURE].note, note])))
+        decisions[EXPOSURE] = decisions[EXPOSURE].noted(note)
     if worked.agreed is not None and decisions[POSES].on:
         decisions[POSES] = replace(decisions[POSES], note=worked.agreed.note)
     if capture.has_depth:
-        with found.paid.by(DEPTH_OFFSET):
+        with found.timing.by(DEPTH_OFFSET):
             finding, pose = look_for_offset(corrections.on_capture(capture), train, worked.seen, progress, known)
-        decision = _of_depth(finding, wish(settings, DEPTH_OFFSET), pose is not None)
+        decision = _decision(finding, wish(settings, DEPTH_OFFSET), "" if pose is not None else f"cannot be worked out: {UNKNOWN}")
         why = beyond_depth(pose, capture.metric, usual_depth(found)) if pose is not None else None
         if decision.on and decision.wish == "auto" and why is not None:
             decision = decision.dropped(BOUND, why)
         decisions[DEPTH_OFFSET] = decision
         corrections = replace(corrections, depth=pose if decision.on else None)
-    return Decided(tuple(decisions.values()), corrections, time.monotonic() - began, found.facts, found.paid)
+    return Decided(tuple(decisions.values()), corrections, time.monotonic() - began, found.facts, found.timing)
 
 
 def tried_frames(train: Sequence[int], count: int) -> tuple[list[int], Array]:
     """The training frames that a trial uses, evenly spread, and (count,) bool those of them that it scores."""
-    chosen = [train[k] for k in np.unique(np.linspace(0, len(train) - 1, min(TRIED, len(train))).round().astype(int))] if train else []
+    chosen = [train[k] for k in every(len(train), TRIED)]
     aside = np.zeros(count, dtype=bool)
     if len(chosen) >= FEWEST_TRIED:
-        every = max(len(chosen) // VALIDATED, 4)
-        aside[chosen[every // 2 :: every]] = True
+        step = max(len(chosen) // VALIDATED, 4)
+        aside[chosen[step // 2 :: step]] = True
     return chosen, aside
 
 
-def usual_depth(found: Survey) -> float:
+def usual_depth(found: Diagnostics) -> float:
     """Median depth of the points that images share, units of the poses; 0: there are none."""
     depth = np.zeros(0) if found.explained is None else predict(found.explained.problem)[0][:, 2]
     return float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
@@ -185,16 +184,12 @@ def better(without: Array, with_it: Array) -> float:
     return float(gain.mean() - gain.std(ddof=1) / np.sqrt(len(gain))) if len(gain) > 1 else float(gain.mean())
 
 
-def _corrected(decisions: dict[str, Decision]) -> frozenset[str]:
+def _on(decisions: dict[str, Decision]) -> frozenset[str]:
     return frozenset(name for name, decision in decisions.items() if decision.on)
 
 
-def _tried(decision: Decision) -> bool:
-    return any(decision.finding.effect in group for group in GROUPS)
-
-
 def _guarded(
-    decisions: dict[str, Decision], worked: Worked, capture: Capture, found: Survey
+    decisions: dict[str, Decision], worked: Worked, capture: Capture, found: Diagnostics
 ) -> tuple[dict[str, Decision], Worked]:
     """Without what no camera explains, and without poses by which held-out frames cannot be placed."""
     cameras = [frame.intrinsics for frame in capture.frames if frame.intrinsics is not None]
@@ -212,17 +207,9 @@ def _guarded(
     return out, replace(worked, all=both, tried=tried)
 
 
-def _judged(
-    decisions: dict[str, Decision],
-    worked: Worked,
-    capture: Capture,
-    found: Survey,
-    trials: Trials,
-    chosen: Sequence[int],
-    aside: Array,
-) -> dict[str, Decision]:
+def _judged(decisions: dict[str, Decision], worked: Worked, capture: Capture, found: Diagnostics, trials: Trials) -> dict[str, Decision]:
     """By short fits, group after group: what is not better with than without is not corrected."""
-    out = dict(decisions)
+    out, chosen = dict(decisions), worked.chosen
     names = [group for group in GROUPS if any(out[name].on and out[name].wish == "auto" for name in group)]
     if len(chosen) < FEWEST_TRIED:
         for name in (name for group in names for name in group if out[name].on and out[name].wish == "auto"):
@@ -231,16 +218,15 @@ def _judged(
     some = capture.with_frames([capture.frames[index] for index in chosen])
     if some.points is None and found.explained is not None:
         some = replace(some, points=found.explained.problem.points)
-    score = trials(some, aside[chosen])
+    score = trials(some, worked.aside[chosen])
     fixed = {name for name, decision in out.items() if decision.on and decision.wish != "auto"}
-    with found.paid.by(*(name for group in names for name in group if out[name].on)):
+    with found.timing.by(*(name for group in names for name in group if out[name].on)):
         best = score(worked.parts(frozenset(fixed), tried=True))
         for group in names:
             members = {name for name in group if out[name].on}
             value = score(worked.parts(frozenset(fixed | members), tried=True))
             if best is None or value is None:
-                for name in members:
-                    out[name] = replace(out[name], note="; ".join(filter(None, [out[name].note, "a trial was not possible"])))
+                out |= {name: out[name].noted("a trial was not possible") for name in members}
                 fixed |= members
                 continue
             trial = {"without": float(best.mean()), "with": float(value.mean())}
@@ -248,10 +234,9 @@ def _judged(
                 fixed, best = fixed | members, value
                 out |= {name: replace(out[name], decided_by=TRIAL, trial=trial) for name in members}
                 continue
-            for name in (name for name in members if out[name].wish == "auto"):
-                unsure = ", which differs too much between them to be believed" if trial["with"] > trial["without"] else ""
-                why = f"in a short fit validation images have {trial['with']:.2f} dB with it and {trial['without']:.2f} dB without{unsure}"
-                out[name] = out[name].dropped(TRIAL, why, trial)
+            unsure = ", which differs too much between them to be believed" if trial["with"] > trial["without"] else ""
+            why = f"in a short fit validation images have {trial['with']:.2f} dB with it and {trial['without']:.2f} dB without{unsure}"
+            out |= {name: out[name].dropped(TRIAL, why, trial) for name in members if out[name].wish == "auto"}
     return out
 
 
@@ -269,52 +254,43 @@ def choose_field(field: FieldSettings, effects: list[dict[str, Any]], off: Seque
             field.background = "on" if entry["on"] else "off"
 
 
-def _decision(finding: Finding, wished: str, capture: Capture, found: Survey) -> Decision:
-    name = finding.effect
-    wanted = wished == "on" or (wished == "auto" and finding.there)
+def _decision(finding: Finding, wished: str, obstacle: str = "") -> Decision:
+    if wished == "off" or (wished == "auto" and not finding.there):
+        return Decision(finding, wished, False, "there, and switched off" if finding.there and wished == "off" else "")
+    if obstacle:
+        return Decision(finding, wished, False, obstacle)
+    return Decision(finding, wished, True, "" if finding.there else "switched on by hand, nothing speaks for it")
+
+
+def _first_decision(finding: Finding, wished: str, capture: Capture, found: Diagnostics) -> Decision:
+    """By evidence and wish alone."""
+    name, obstacle = finding.effect, ""
     if name in OF_FIELD:
-        return Decision(finding, wished, wanted, OF_FIELD[name])
-    if name in TOLD_ONLY:
-        return Decision(finding, wished, False, TOLD_ONLY[name])
-    if not wanted:
-        return Decision(finding, wished, False, "there, and switched off" if finding.there and wished == "off" else "")
-    if found.explained is None:
-        return Decision(finding, wished, False, "cannot be worked out: too few points are shared between pictures")
-    if capture.alpha and name in (EXPOSURE, VIGNETTING):
-        return Decision(finding, wished, False, "not corrected where pictures have alpha: their background is known")
+        return Decision(finding, wished, wished == "on" or (wished == "auto" and finding.there), OF_FIELD[name])
+    if name == ROWS:
+        return Decision(finding, wished, False, "only told, not corrected")
     cameras = {frame.intrinsics for frame in capture.frames}
-    if name == LENS and (len({(c.width, c.height) for c in cameras if c}) > 1 or not all(c and correctable(c) for c in cameras)):
-        return Decision(finding, wished, False, "not corrected: the pictures have different cameras, or a lens of another kind")
-    return Decision(finding, wished, True, "" if finding.there else "switched on by hand, nothing speaks for it")
-
-
-def _of_depth(finding: Finding, wished: str, told: bool) -> Decision:
-    """Depth is used where it was measured, or is carried to where the pictures were taken."""
-    if not (wished == "on" or (wished == "auto" and finding.there)):
-        return Decision(finding, wished, False, "there, and switched off" if finding.there and wished == "off" else "")
-    if not told:
-        return Decision(finding, wished, False, f"cannot be worked out: {NOTHING}")
-    return Decision(finding, wished, True, "" if finding.there else "switched on by hand, nothing speaks for it")
+    if found.explained is None:
+        obstacle = "cannot be worked out: too few points are shared between pictures"
+    elif capture.alpha and name in (EXPOSURE, VIGNETTING):
+        obstacle = "not corrected where pictures have alpha: their background is known"
+    elif name == LENS and (len({(c.width, c.height) for c in cameras if c}) > 1 or not all(c and correctable(c) for c in cameras)):
+        obstacle = "not corrected: the pictures have different cameras, or a lens of another kind"
+    return _decision(finding, wished, obstacle)
 
 
 @dataclass(frozen=True)
 class Worked:
-    """Corrections of everything that evidence speaks for, of which some will be used.
-
-    Attributes:
-        tried: the same for a trial: its validation frames are placed and toned as if they were held out.
-        seen: what was seen in most images.
-        agreed: how poses agree with a sensor's depth, where it took part.
-        misplaced: why poses cannot be used; None: they can.
-        borrowed: held-out frames, by name, whose gain is their neighbours'.
-    """
+    """Corrections of everything that evidence speaks for, of which some will be used."""
 
     all: Corrections
-    tried: Corrections
-    seen: Sightings | None
-    agreed: Agreed | None = None
-    misplaced: str | None = None
-    borrowed: Sequence[str] = ()
+    tried: Corrections  # the same for a trial: its validation frames are placed and toned as if they were held out
+    chosen: list[int]  # training frames of a trial
+    aside: Array  # (N,) bool those of them that it holds out
+    seen: Tracks | None  # in most images
+    agreed: DepthRefined | None = None  # poses that agree with a sensor's depth, where it took part
+    misplaced: str | None = None  # why poses cannot be used; None: they can
+    borrowed: Sequence[str] = ()  # held-out frames, by name, whose gain is their neighbours'
 
     def parts(self, on: frozenset[str], tried: bool = False) -> Corrections:
         """What is corrected with the effects `on`."""
@@ -332,61 +308,55 @@ class Worked:
 
 
 def _worked_out(
-    capture: Capture, test: Array, found: Survey, on: frozenset[str], progress: Progress, known: dict[int, Look], aside: Array
+    capture: Capture, test: Array, found: Diagnostics, on: frozenset[str], progress: Progress, known: dict[int, Look]
 ) -> Worked:
-    """Corrections for the effects `on`.
-
-    Per-frame corrections need every frame: then all are looked at, and only then.
-
-    Args:
-        aside: (N,) bool training frames that a trial holds out.
-    """
+    """Corrections for the effects `on`. Those of single frames need every frame: then all are looked at, and only then."""
+    chosen, aside = tried_frames([int(index) for index in np.flatnonzero(~test)], len(test))
     seen, corner = found.seen, found.light.corner if found.light is not None and VIGNETTING in on else None
     lens = None
     if found.explained is not None and LENS in on:
         explained = found.explained
-        with found.paid.by(LENS):
+        with found.timing.by(LENS):
             lens = (explained.problem if LENS in explained.kept else adjust(explained.problem, explained.kept | {LENS}).problem).lens
     weight: dict[str, float] = {}
     if seen is not None and BLUR in on:
         weight = _weights([frame.name for frame, held in zip(capture.frames, test, strict=True) if not held], seen.names, found.sharpness)
     both = Corrections(corner=corner, lens=lens, weight=weight)
     if seen is None or not on & {EXPOSURE, POSES}:
-        return Worked(both, both, seen)
+        return Worked(both, both, chosen, aside, seen)
     tried, agreed, misplaced, borrowed = both, None, None, list[int]()
-    with found.paid.by(POINTS):
-        every = gather(capture, range(len(capture.frames)), progress, known=known)
+    with found.timing.by(POINTS):
+        whole = gather(capture, range(len(capture.frames)), progress, known=known)
     if EXPOSURE in on:
-        with found.paid.by(EXPOSURE):
-            tracks = every.tracks()
-            flat = tracks if corner is None else vignetting.corrected(tracks, corner)
-            (gain, borrowed), (gain_aside, _) = (light.frame_gains(flat, len(every.names), train) for train in (~test, ~test & ~aside))
-        both = replace(both, gain=_by_name(every.names, gain))
-        tried = replace(tried, gain=_by_name(every.names, gain_aside))
+        with found.timing.by(EXPOSURE):
+            tracks = whole.light() if corner is None else whole.light().without_vignetting(corner)
+            (gain, borrowed), (gain_aside, _) = (light.frame_gains(tracks, len(whole.names), train) for train in (~test, ~test & ~aside))
+        both = replace(both, gain=_by_name(whole.names, gain))
+        tried = replace(tried, gain=_by_name(whole.names, gain_aside))
     if POSES in on:
         kept = found.explained.kept if found.explained is not None else frozenset[str]()
-        with found.paid.by(POSES):
-            refined = refined_poses(every, ~test, kept | on, capture, progress, aside)
+        with found.timing.by(POSES):
+            refined = refined_poses(whole, ~test, kept | on, capture, progress, aside)
         agreed, lens = refined.agreed, refined.lens if LENS in on else None
         placed = refined.poses if refined.aside is None else refined.aside
-        both = replace(both, poses=dict(zip(every.names, refined.poses, strict=True)), lens=lens, by_depth=agreed is not None)
-        tried = replace(tried, poses=dict(zip(every.names, placed, strict=True)), lens=lens, by_depth=agreed is not None)
+        both = replace(both, poses=dict(zip(whole.names, refined.poses, strict=True)), lens=lens, by_depth=agreed is not None)
+        tried = replace(tried, poses=dict(zip(whole.names, placed, strict=True)), lens=lens, by_depth=agreed is not None)
         if refined.fails:
             misplaced = f"{refined.borrowed} of {refined.placed} held-out frames cannot be placed by the points that the others share"
-    return Worked(both, tried, every, agreed, misplaced, [every.names[frame] for frame in borrowed])
+    return Worked(both, tried, chosen, aside, whole, agreed, misplaced, [whole.names[frame] for frame in borrowed])
 
 
 def _by_name(names: Sequence[str], gains: Array) -> dict[str, Gain]:
     return {name: (float(r), float(g), float(b)) for name, (r, g, b) in zip(names, gains, strict=True)}
 
 
-def room_for_light(seen: Sightings | None, corner: float | None, gain: dict[str, Gain]) -> float:
+def room_for_light(seen: Tracks | None, corner: float | None, gain: dict[str, Gain]) -> float:
     """What canonical light is divided by so that hardly any of it is too bright for a picture, `DIMMEST` at most: what is clipped there
     is lost, and agrees with no photo that shows it because it was exposed less."""
     if seen is None or not (gain or corner is not None):
         return 1.0
     brightness = []
-    for name, grey, camera in zip(seen.names, seen.pictures, seen.cameras, strict=True):
+    for name, grey, camera in zip(seen.names, seen.images, seen.cameras, strict=True):
         factor = Tone(gain.get(name, (1.0, 1.0, 1.0)), corner).factor(camera.scaled(grey.shape[1], grey.shape[0]))
         brightness.append((LINEAR[grey] / factor.min(-1))[::STRIDE, ::STRIDE].ravel())
     return round(float(np.clip(np.quantile(np.concatenate(brightness), 1 - CLIPS), 1.0, DIMMEST)), 4)

@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array, invert
 from fieldfuse.effects.adjust import LENS, POSES, ROWS, UNKNOWNS, Problem, adjust, residuals, scatter
-from fieldfuse.effects.sightings import LONG_SIDE, LOOSE, Sightings
+from fieldfuse.effects.tracks import LONG_SIDE, LOOSE, Tracks
 from fieldfuse.poses.points import intersect
 
 MOST_POINTS = 1600  # that take part
-HELD_OUT = 4  # every so manieth point is kept out of the fits
-FEWEST = 60  # points without which nothing is told
+HELD_OUT = 4  # every n-th point is held out of the fits
+FEWEST = 60  # points without which nothing is known
 OUTLIER = 6.0  # deviations of a point's worst observation beyond which it is taken for a wrong match, once nothing explains it
 MARGIN = {LENS: 0.08, POSES: 0.4, ROWS: 0.15}  # least relative fall of the held-out residual, larger for what has more numbers
 MIN_FALL = 0.003  # working pixels by which it has to fall at least
@@ -38,11 +38,11 @@ class Explained:
     choices: dict[str, Choice]
     scatter: float  # working pixels, of held-out points, as the capture stands
     left: float  # the same with what was kept
-    observation: Array  # (O',) which of the sightings' observations the problem's are
+    observation: Array  # (O',) which of the tracks' observations the problem's are
     profile: list[float] = field(default_factory=list)  # radial residual at five radii, working pixels, before anything is explained
 
 
-def open_problem(seen: Sightings) -> tuple[Problem, Array]:
+def open_problem(seen: Tracks) -> tuple[Problem, Array]:
     """Points where rays meet, wide tolerance, and the observations (O',) that they have."""
     place = seen.ideal()
     focal = seen.focal
@@ -55,7 +55,7 @@ def open_problem(seen: Sightings) -> tuple[Problem, Array]:
     point, used = point[order], used[order]
     still = np.zeros((len(seen.poses), 6))
     problem = Problem(seen.poses, points, seen.frame[used], point, place[used], focal, seen.row()[used], still)
-    if len(points) > MOST_POINTS:  # those that most pictures show tell most
+    if len(points) > MOST_POINTS:  # those that most images show are worth most
         counts = np.bincount(point, minlength=len(points))
         chosen = np.zeros(len(points), dtype=bool)
         chosen[np.argsort(-counts, kind="stable")[:MOST_POINTS]] = True
@@ -94,7 +94,7 @@ def readout(motion: Array, steps: Array) -> tuple[float, float]:
     return product / size, product / np.sqrt(size * other)
 
 
-def explain(seen: Sightings) -> Explained | None:
+def explain(seen: Tracks) -> Explained | None:
     """Try the unknowns one by one and, where one helps held-out points by a margin, in every combination. None: too few points."""
     whole, used = open_problem(seen)
     if len(whole.points) < FEWEST:
@@ -132,7 +132,7 @@ def explain(seen: Sightings) -> Explained | None:
     return Explained(problem, kept, choices, start, value, used, _profile(seen, used, before.problem, before.residual))
 
 
-def _profile(seen: Sightings, used: Array, problem: Problem, residual: Array) -> list[float]:
+def _profile(seen: Tracks, used: Array, problem: Problem, residual: Array) -> list[float]:
     """Median residual away from the middle, in five rings of equal width."""
     length = np.linalg.norm(problem.place, axis=1, keepdims=True)
     outwards = -(residual * problem.place / np.maximum(length, 1e-9)).sum(1)

@@ -7,12 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fieldfuse.camera import Array
-from fieldfuse.effects import exposure, vignetting
-from fieldfuse.effects.evidence import BRIGHTEST, DARKEST, Evidence, Tracks
+from fieldfuse.effects.evidence import ROUNDS, Evidence, robust_weights, without_points_and_frames
+from fieldfuse.tone import share
 
 EXPOSURE, VIGNETTING = "exposure", "vignetting"
-HELD_OUT = 4  # every so manieth point is kept out of the fits
-MARGIN = {EXPOSURE: 0.24, VIGNETTING: 0.1}  # least relative fall of the held-out deviation: less did not pay on real pictures
+DARKEST, BRIGHTEST = 0.01, 0.85  # linear light between which a color shows its exposure: not noise, not clipped
+DRIFTS, DIMS = 0.04, 0.05  # thresholds: stops; share of the light that corners lose
+FEWEST_GAINS, FEWEST_FALLS = 30, 60  # observations without which nothing is known of exposure and of vignetting
+STRONGEST = 20.0  # of a in V(r) = (1 + a·r²)⁻²: a corner with a four-hundredth of the light
+HELD_OUT = 4  # every n-th point is kept out of the fits
+MARGIN = {EXPOSURE: 0.24, VIGNETTING: 0.1}  # least relative fall of the held-out deviation: less did not pay on real captures
 BOTH = 0.25  # … by both: each hides some of the other, so that alone neither may come as far as it does beside the other
 MIN_FALL = 0.0015  # stops by which it has to fall at least
 FEWEST_POINTS = 10  # that a held-out frame's gain is measured by
@@ -21,37 +25,112 @@ APART = 0.2  # … if it lies so many stops outside of its neighbours' gains as 
 
 
 @dataclass(frozen=True)
-class Light:
-    """What was found about the light of shared points.
+class LightTracks:
+    """Colors of points that several images show, one row an observation."""
 
-    Attributes:
-        gain: (frames, 3) gains of the frames, geometric mean 1, with the vignetting taken out first when it is kept.
-        corner: share of the light that is left at half a diagonal.
-        before, after: stops, the deviation of held-out points without the effect and with it, beside what else is kept.
-    """
+    linear: Array  # (O, 3) linear light
+    frame: Array  # (O,) int, 0 … F − 1
+    point: Array  # (O,) int, 0 … P − 1
+    radius: Array  # (O,) distance from the principal point in half diagonals
+
+    def rows(self, keep: Array) -> LightTracks:
+        """The observations `keep` (O,) bool, points numbered anew."""
+        point = np.unique(self.point[keep], return_inverse=True)[1]
+        return LightTracks(self.linear[keep], self.frame[keep], point, self.radius[keep])
+
+    def usable(self) -> LightTracks:
+        """Without what is too dark or clipped, and without points that are then seen only once."""
+        keep = self.exposed()
+        counts = np.bincount(self.point[keep], minlength=int(self.point.max(initial=-1)) + 1)
+        return self.rows(keep & (counts[self.point] > 1))
+
+    def exposed(self) -> Array:
+        """(O,) bool: neither too dark nor clipped."""
+        return np.asarray(((self.linear > DARKEST) & (self.linear < BRIGHTEST)).all(1))
+
+    def without_vignetting(self, corner: float) -> LightTracks:
+        """With a vignetting of this corner taken out: points that move towards the corners of one frame get darker in it as if it were
+        exposed less. (The other way round there is nothing to do: frames' gains are taken out.)"""
+        return replace(self, linear=self.linear / share(corner, self.radius**2)[:, None])
+
+
+@dataclass(frozen=True)
+class Light:
+    """What was found about the light of shared points."""
 
     evidence: dict[str, Evidence]
     kept: frozenset[str]
-    before: dict[str, float]
-    after: dict[str, float]
-    gain: Array
-    corner: float
+    before: dict[str, float]  # stops: the deviation of held-out points without the effect, beside what else is kept
+    after: dict[str, float]  # and with it
+    gain: Array  # (frames, 3) gains of the frames, geometric mean 1, with the vignetting taken out first when it is kept
+    corner: float  # share of the light that is left at half a diagonal
 
-def explain(tracks: Tracks, frames: int) -> Light:
+
+def exposure_evidence(tracks: LightTracks, frames: int) -> Evidence:
+    """Whether frames differ in exposure or white balance: the deviation over the frames of the gains by which shared points agree.
+
+    The gains' own uncertainty is taken off the deviation. `parameters["gain"]` are (frames, 3) gains with geometric mean 1.
+    """
+    used = tracks.usable()
+    if len(used.frame) < FEWEST_GAINS:
+        return Evidence(EXPOSURE, 0.0, DRIFTS, "too few points are shared between pictures to compare their exposure")
+    light, weight = np.log2(used.linear), np.ones(len(used.frame))
+    constants = np.zeros((frames, 3))
+    for _ in range(ROUNDS):
+        left, constants = without_points_and_frames(light, used.frame, used.point, weight, frames)
+        weight = robust_weights(left)
+    seen = np.bincount(used.frame, weight, frames)
+    noise = (weight[:, None] * left**2).sum(0) / max(float(weight.sum()), 1e-9)  # (3,) variance of one observation
+    known = seen > 0
+    chance = (noise / np.maximum(seen[known, None], 1)).mean(0)
+    number = float(np.sqrt(np.maximum((constants[known] ** 2).mean(0) - chance, 0)).max())
+    reason = f"the same points differ by {number:.3f} stops (deviation over frames) between pictures; {DRIFTS:g} or more speak for drift"
+    return Evidence(EXPOSURE, number, DRIFTS, reason, {"gain": np.exp2(constants).tolist()})
+
+
+def vignetting_evidence(tracks: LightTracks, frames: int) -> Evidence:
+    """Whether points get darker as they move towards the corners, in whichever frame: the share of light lost at half a diagonal.
+
+    a of V(r) = (1 + a·r²)⁻² is found by Gauss-Newton after each point's and each frame's own light is taken out; three standard errors
+    are taken off the loss. `parameters["corner"]` is V(1).
+    """
+    used = tracks.usable()
+    if len(used.frame) < FEWEST_FALLS:
+        return Evidence(VIGNETTING, 0.0, DIMS, "too few points are shared between pictures to compare middle and corners")
+    light = np.log2(used.linear).mean(1)
+    square, weight, a, error = used.radius**2, np.ones(len(used.frame)), 0.0, np.inf
+    for _ in range(2 * ROUNDS):
+        expected = -2 * np.log2(1 + a * square)
+        slope = -2 / np.log(2) * square / (1 + a * square)
+        left, _ = without_points_and_frames(np.stack([light - expected, slope], axis=1), used.frame, used.point, weight, frames)
+        bend = float((weight * left[:, 1] ** 2).sum())
+        if bend < 1e-9:  # no point moves towards the corner
+            break
+        step = float((weight * left[:, 0] * left[:, 1]).sum()) / bend
+        rest = left[:, 0] - step * left[:, 1]
+        error = float(np.sqrt((weight * rest**2).sum() / weight.sum() / bend))
+        a = float(np.clip(a + step, -0.5, STRONGEST))
+        weight = robust_weights(rest)
+    sure = a - 3 * error if np.isfinite(error) else 0.0
+    number = float(1 - (1 + max(sure, 0.0)) ** -2)
+    reason = (
+        f"points lose at least {100 * number:.0f}% of their light on the way to the corner; {100 * DIMS:g}% or more speak for vignetting"
+    )
+    return Evidence(VIGNETTING, number, DIMS, reason, {"corner": float((1 + max(a, 0.0)) ** -2)})
+
+
+def explain(tracks: LightTracks, frames: int) -> Light:
     """Evidence of both, and which of them help held-out points by a margin, alone or together."""
     out = tracks.point % HELD_OUT == HELD_OUT // 2
-    fit, held = _rows(tracks, ~out), _rows(tracks, out)
-    falloff = vignetting.evidence(fit, frames)
+    fit, held = tracks.rows(~out), tracks.rows(out)
+    falloff = vignetting_evidence(fit, frames)
     corner = float(falloff.parameters.get("corner", 1.0))
     deviations: dict[frozenset[str], float] = {}
     found: dict[frozenset[str], Evidence] = {}
-    for bent in (False, True):
-        base = frozenset({VIGNETTING} if bent else ())
-        flat = vignetting.corrected(fit, corner) if bent else fit
-        flat_held = vignetting.corrected(held, corner) if bent else held
-        drift = exposure.evidence(flat, frames)
-        gain = np.array(drift.parameters.get("gain", np.ones((frames, 3))))
-        found[base] = drift
+    for base in (frozenset[str](), frozenset({VIGNETTING})):
+        flat, flat_held = (one.without_vignetting(corner) if base else one for one in (fit, held))
+        found[base] = exposure_evidence(flat, frames)
+        gain = np.array(found[base].parameters.get("gain", np.ones((frames, 3))))
         deviations[base] = spread(flat_held)
         deviations[base | {EXPOSURE}] = spread(replace(flat_held, linear=flat_held.linear / gain[flat_held.frame]))
     allowed = [
@@ -60,9 +139,9 @@ def explain(tracks: Tracks, frames: int) -> Light:
         if (VIGNETTING not in kept or falloff.found) and (EXPOSURE not in kept or found[kept - {EXPOSURE}].found)
     ]
     kept = min(allowed, key=lambda one: deviations[one] / (1 - _margin(one)) + MIN_FALL * len(one))
-    final = vignetting.evidence(tracks, frames)
+    final = vignetting_evidence(tracks, frames)
     corner = float(final.parameters.get("corner", 1.0))
-    drift = exposure.evidence(vignetting.corrected(tracks, corner) if VIGNETTING in kept else tracks, frames)
+    drift = exposure_evidence(tracks.without_vignetting(corner) if VIGNETTING in kept else tracks, frames)
     return Light(
         evidence={EXPOSURE: drift, VIGNETTING: final},
         kept=kept,
@@ -78,8 +157,8 @@ def _margin(kept: frozenset[str]) -> float:
     return BOTH if len(kept) > 1 else MARGIN[next(iter(kept))] if kept else 0.0
 
 
-def spread(tracks: Tracks) -> float:
-    """Stops: robust deviation of points' light between the pictures that show them; 0 when there are none."""
+def spread(tracks: LightTracks) -> float:
+    """Stops: robust deviation of points' light between the images that show them; 0 when there are none."""
     used = tracks.usable()
     if not len(used.frame):
         return 0.0
@@ -87,12 +166,11 @@ def spread(tracks: Tracks) -> float:
     points = int(used.point.max()) + 1
     order = np.lexsort((light.mean(1), used.point))
     starts = np.searchsorted(used.point[order], np.arange(points))
-    counts = np.bincount(used.point, minlength=points)
-    middle = light[order[starts + counts // 2]]  # the observation of median light
+    middle = light[order[starts + np.bincount(used.point, minlength=points) // 2]]  # the observation of median light
     return float(1.4826 * np.median(np.abs(light - middle[used.point]).max(1)))
 
 
-def frame_gains(tracks: Tracks, frames: int, train: Array) -> tuple[Array, list[int]]:
+def frame_gains(tracks: LightTracks, frames: int, train: Array) -> tuple[Array, list[int]]:
     """Gains of training frames from the points that they share, with geometric mean 1; of others by comparison with these.
 
     A frame that is held out has its neighbours' gain (exposure changes smoothly) where it shows too few of the points, or where these
@@ -106,13 +184,13 @@ def frame_gains(tracks: Tracks, frames: int, train: Array) -> tuple[Array, list[
     """
     gain = np.ones((frames, 3))
     number = np.cumsum(train) - 1
-    mine = _rows(tracks, train[tracks.frame])
-    inner = exposure.evidence(replace(mine, frame=number[mine.frame]), int(train.sum()))
+    mine = tracks.rows(train[tracks.frame])
+    inner = exposure_evidence(replace(mine, frame=number[mine.frame]), int(train.sum()))
     if "gain" not in inner.parameters:
         return gain, []
     gain[train] = np.array(inner.parameters["gain"])
     points = int(tracks.point.max(initial=-1)) + 1
-    bright = ((tracks.linear > DARKEST) & (tracks.linear < BRIGHTEST)).all(1)
+    bright = tracks.exposed()
     light = np.log2(np.maximum(tracks.linear, 1e-6)) - np.log2(gain[tracks.frame])
     known = train[tracks.frame] & bright
     count = np.bincount(tracks.point[known], minlength=points)
@@ -139,8 +217,3 @@ def frame_gains(tracks: Tracks, frames: int, train: Array) -> tuple[Array, list[
         if found is not None or len(near):
             gain[frame] = np.exp2(theirs.mean(0) if found is None else found)
     return gain, borrowed
-
-
-def _rows(tracks: Tracks, keep: Array) -> Tracks:
-    point = np.unique(tracks.point[keep], return_inverse=True)[1]
-    return Tracks(tracks.linear[keep], tracks.frame[keep], point, tracks.radius[keep])

@@ -19,8 +19,8 @@ from fieldfuse.camera import Array
 from fieldfuse.capture.types import Capture
 from fieldfuse.effects import geometry
 from fieldfuse.effects.adjust import LENS, POSES, Belief, Problem, adjust, predict, resect, residuals
-from fieldfuse.effects.sensed import Agreed, agreeing
-from fieldfuse.effects.sightings import Sightings
+from fieldfuse.effects.depth_pose_refinement import DepthRefined, refine_by_depth
+from fieldfuse.effects.tracks import Tracks
 from fieldfuse.progress import SILENT, Progress
 
 STEPS, FREE_STEPS = 60, 30  # of the fit, and of one that only measures how much noise is left
@@ -39,7 +39,7 @@ class Refined:
 
     poses: Array  # (F, 4, 4) world_from_camera
     lens: tuple[float, float]  # k1, k2
-    agreed: Agreed | None = None  # with a sensor's depth; None: it took no part
+    agreed: DepthRefined | None = None  # with a sensor's depth; None: it took no part
     aside: Array | None = None  # (F, 4, 4) the same, with the frames that were set aside placed as held-out ones are
     borrowed: int = 0  # held-out frames that have their neighbours' correction, since their own points do not place them
     placed: int = 0  # held-out frames
@@ -51,7 +51,7 @@ class Refined:
 
 
 def refined_poses(
-    seen: Sightings,
+    seen: Tracks,
     train: Array,
     kept: frozenset[str],
     capture: Capture | None = None,
@@ -74,12 +74,12 @@ def refined_poses(
     whole, _ = geometry.open_problem(seen)
     mine = train[whole.frame]
     often = np.bincount(whole.point[mine], minlength=len(whole.points)) >= 2
-    problem = _only_frames(whole.only(often), train)
+    problem = whole.only(often).only_frames(train)
     unknown = frozenset({POSES, *(kept & {LENS})})
     before, free = adjust(problem).scatter, adjust(problem, unknown, FREE_STEPS).scatter
     belief = believed(problem, before, free)
     moved = adjust(problem, unknown, STEPS, belief).problem
-    agreed = None if capture is None or not capture.has_depth else agreeing(capture, moved, unknown, belief, progress)
+    agreed = None if capture is None or not capture.has_depth else refine_by_depth(capture, moved, unknown, belief, progress)
     if agreed is not None:
         moved, belief = agreed.problem, agreed.belief
     fitted = train & (np.bincount(problem.frame, minlength=len(train)) >= FEWEST)
@@ -185,8 +185,3 @@ def believed(problem: Problem, before: float, left: float) -> Belief:
     focal, depth = float(np.median(problem.focal)), float(np.median(predict(problem)[0][:, 2]))
     turn = (left * focal / max(before, 1e-9)) ** 2
     return Belief(problem.poses, np.array([turn] * 3 + [turn / max(depth, 1e-9) ** 2] * 3))
-
-
-def _only_frames(problem: Problem, frames: Array) -> Problem:
-    keep = frames[problem.frame]
-    return replace(problem, frame=problem.frame[keep], point=problem.point[keep], place=problem.place[keep], row=problem.row[keep])

@@ -1,7 +1,8 @@
-"""Points for posed pictures that come without any: SIFT, matches that respect the known epipolar geometry, triangulation."""
+"""Points for posed images that come without any: SIFT, matches that respect the known epipolar geometry, triangulation."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -37,9 +38,9 @@ class Features:
 
 
 def triangulate(capture: Capture, progress: Progress = SILENT, known: dict[str, Features] | None = None) -> Cloud:
-    """Sparse points of a posed capture from up to 100 of its pictures, each matched with up to 4 that overlap.
+    """Sparse points of a posed capture from up to 100 of its images, each matched with up to 4 that overlap.
 
-    A point is kept when all of its observations reproject within 2 pixels (of the picture at a long side of 640), and two
+    A point is kept when all of its observations reproject within 2 pixels (of the image at a long side of 640), and two
     of its rays meet at more than 1°. The result may be empty.
 
     Args:
@@ -59,42 +60,30 @@ def triangulate(capture: Capture, progress: Progress = SILENT, known: dict[str, 
         flat.append(undistorted(camera, found.pixel))
         descriptors.append(found.descriptor)
         focal[i] = 0.5 * (camera.fx + camera.fy) * found.scale
-    depth = guessed_depth(poses)
-    shares, angles = overlap(poses, cameras, depth), parallax(poses, depth)
-    partners = best_neighbours(poses, shares, angles, NEIGHBOURS)
-    pairs = sorted({(min(i, int(j)), max(i, int(j))) for i in range(len(frames)) for j in partners[i]})
-    starts = np.concatenate([[0], np.cumsum([len(f) for f in flat])])
-    links = []
-    for n, (i, j) in enumerate(pairs):
+
+    def tick(done: int, of: int) -> None:
         progress.check()
-        progress.update(len(frames) + n * len(frames) / len(pairs), 2 * len(frames), f"points, pair {n + 1} of {len(pairs)}")
-        matched = mutual_matches(descriptors[i], descriptors[j])
-        if len(matched):
-            off = epipolar_distance(poses[i], poses[j], flat[i][matched[:, 0]], flat[j][matched[:, 1]]) * 0.5 * (focal[i] + focal[j])
-            matched = matched[off < EPIPOLAR]
-            links.append(np.stack([matched[:, 0] + starts[i], matched[:, 1] + starts[j]], axis=1))
-    owner = np.repeat(np.arange(len(frames)), [len(f) for f in flat])
-    track, keypoint = tracks(np.concatenate(links) if links else np.zeros((0, 2), np.int64), owner)
+        progress.update(len(frames) * (1 + done / of), 2 * len(frames), f"points, pair {done + 1} of {of}")
+
+    pairs = neighbour_pairs(poses, cameras, NEIGHBOURS)
+    tolerance = [EPIPOLAR / (0.5 * (focal[i] + focal[j])) for i, j in pairs]
+    owner, track, keypoint = find_tracks(poses, flat, descriptors, pairs, tolerance, tick)
     image_plane = np.concatenate(flat) if flat else np.zeros((0, 2))
     points, point, kept, z = intersect(poses, owner[keypoint], image_plane[keypoint], track, REPROJECTION / focal[owner[keypoint]])
     return Cloud(points, point, chosen[owner[keypoint[kept]]], z, "triangulated")
 
 
 def features_of(frame: Frame, camera: Intrinsics, exif: bool) -> Features:
-    """SIFT features of a frame's image, of what its mask and alpha leave.
+    """SIFT features of a frame's image at a long side of 640, of what its mask and alpha leave.
 
     Raises:
         InputError: the image or its mask cannot be read.
     """
-    picture = load_image(frame, exif=exif)
-    return find_features(picture, camera, usable_pixels(frame, picture, exif=exif))
-
-
-def find_features(picture: Array, camera: Intrinsics, usable: Array | None = None) -> Features:
-    """SIFT features of a picture (H, W, 3 or 4) uint8 at a long side of 640, where it is `usable` (H, W) bool; None: everywhere."""
-    height, width = picture.shape[:2]
+    image = load_image(frame, exif=exif)
+    usable = usable_pixels(frame, image, exif=exif)
+    height, width = image.shape[:2]
     scale = min(1.0, LONG_SIDE / max(width, height))
-    grey = cv2.cvtColor(np.ascontiguousarray(picture[..., :3]), cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_RGB2GRAY)
     small = grey if scale == 1.0 else cv2.resize(grey, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
     keypoints, descriptors = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.02).detectAndCompute(small, None)
     if descriptors is None or len(keypoints) == 0:
@@ -102,13 +91,57 @@ def find_features(picture: Array, camera: Intrinsics, usable: Array | None = Non
     sizes = np.array([k.size for k in keypoints], dtype=np.float32)
     pixels = (np.array([k.pt for k in keypoints]) + 0.5) * [camera.width / small.shape[1], camera.height / small.shape[0]]
     if usable is not None:
-        column = np.clip((pixels[:, 0] * width / camera.width).astype(int), 0, width - 1)
-        row = np.clip((pixels[:, 1] * height / camera.height).astype(int), 0, height - 1)
-        kept = usable[row, column]
+        kept = at_pixels(usable, pixels * [width / camera.width, height / camera.height])
         pixels, descriptors, sizes = pixels[kept], descriptors[kept], sizes[kept]
-    # Root-SIFT: Euclidean distances of these compare histograms better than those of plain descriptors.
-    rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)).astype(np.float32)
-    return Features(pixels, rooted, sizes, scale * width / camera.width)
+    return Features(pixels, root_sift(descriptors), sizes, scale * width / camera.width)
+
+
+def at_pixels(values: Array, pixels: Array) -> Array:
+    """(N,) values (H, W) at pixels (N, 2), centres at +0.5; those outside count as at the rim."""
+    height, width = values.shape[:2]
+    return np.asarray(values[np.clip(pixels[:, 1].astype(int), 0, height - 1), np.clip(pixels[:, 0].astype(int), 0, width - 1)])
+
+
+def root_sift(descriptors: Array) -> Array:
+    """(N, 128) float32 of unit length: Euclidean distances of these compare histograms better than those of plain descriptors."""
+    return np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)).astype(np.float32)
+
+
+def neighbour_pairs(poses: Array, cameras: Sequence[Intrinsics], count: int) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j: each camera with the `count` that overlap under good parallax."""
+    depth = guessed_depth(poses)
+    partners = best_neighbours(poses, overlap(poses, cameras, depth), parallax(poses, depth), count)
+    return sorted({(min(i, int(j)), max(i, int(j))) for i in range(len(poses)) for j in partners[i]})
+
+
+def find_tracks(
+    poses: Array,
+    flat: Sequence[Array],
+    descriptors: Sequence[Array],
+    pairs: Sequence[tuple[int, int]],
+    tolerance: Sequence[float],
+    tick: Callable[[int, int], None],
+) -> tuple[Array, Array, Array]:
+    """Match pairs of posed images and gather what matches into tracks.
+
+    Args:
+        flat: of each image (N, 2) ideal image-plane points of its keypoints. descriptors: of each (N, 128), unit length.
+        tolerance: of each pair how far off its epipolar line a match may lie, image-plane units.
+        tick: called before each pair with its number and how many there are.
+
+    Returns:
+        (K,) image of every keypoint, numbered across images; and `tracks` of them.
+    """
+    starts = np.concatenate([[0], np.cumsum([len(points) for points in flat])])
+    links = [np.zeros((0, 2), np.int64)]
+    for number, ((i, j), near) in enumerate(zip(pairs, tolerance, strict=True)):
+        tick(number, len(pairs))
+        matched = mutual_matches(descriptors[i], descriptors[j])
+        if len(matched):
+            off = epipolar_distance(invert(poses[j]) @ poses[i], flat[i][matched[:, 0]], flat[j][matched[:, 1]])
+            links.append(matched[off < near] + [starts[i], starts[j]])
+    owner = np.repeat(np.arange(len(flat)), [len(points) for points in flat])
+    return owner, *tracks(np.concatenate(links), owner)
 
 
 def undistorted(camera: Intrinsics, pixels: Array) -> Array:
@@ -141,13 +174,14 @@ def mutual_matches(first: Array, second: Array) -> Array:
     return np.stack([rows, forward[rows]], axis=1)
 
 
-def epipolar_distance(first: Array, second: Array, points1: Array, points2: Array) -> Array:
-    """Sampson distance of (K, 2) ideal image-plane points of two posed cameras, in image-plane units (times focal: pixels)."""
-    relative = invert(second) @ first  # second camera from first
-    t = relative[:3, 3] / max(float(np.linalg.norm(relative[:3, 3])), 1e-15)
-    essential = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ relative[:3, :3]
-    x1 = np.concatenate([points1, np.ones((len(points1), 1))], axis=1)
-    x2 = np.concatenate([points2, np.ones((len(points2), 1))], axis=1)
+def epipolar_distance(second_from_first: Array, first: Array, second: Array) -> Array:
+    """(K,) Sampson distances of (K, 2) ideal image-plane points of two cameras, in image-plane units (times focal: pixels).
+
+    To first order how far both points together are from a pair that one point in space explains (Hartley and Zisserman, eq. 11.9).
+    """
+    t = second_from_first[:3, 3] / max(float(np.linalg.norm(second_from_first[:3, 3])), 1e-15)
+    essential = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ second_from_first[:3, :3]
+    x1, x2 = (np.concatenate([points, np.ones((len(points), 1))], axis=1) for points in (first, second))
     line2, line1 = x1 @ essential.T, x2 @ essential
     slope = np.sqrt(np.maximum((line2[:, :2] ** 2).sum(axis=1) + (line1[:, :2] ** 2).sum(axis=1), 1e-30))
     distance = np.abs((x2 * line2).sum(axis=1)) / slope

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from fieldfuse.camera import Array, Intrinsics, pixel_grid
-from fieldfuse.effects import distortion
+from fieldfuse.effects.models import Distortion
 from fieldfuse.simulate.cast import FAR, tile_order
 from fieldfuse.simulate.seen import Rays, Scenery
 
@@ -59,7 +59,7 @@ def eye_of(intrinsics: Intrinsics, side: int, device: torch.device) -> Eye:
 def _directions(intrinsics: Intrinsics, pixels: Array) -> tuple[Tensor, Tensor]:
     """Unit directions (N, 3) in camera axes through (N, 2) pixels, and their cosines with the optical axis (N,)."""
     place = (pixels - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy]
-    ideal = distortion.invert(distortion.of(intrinsics), torch.from_numpy(place)) if intrinsics.distorted else torch.from_numpy(place)
+    ideal = Distortion.of(intrinsics).invert(torch.from_numpy(place)) if intrinsics.distorted else torch.from_numpy(place)
     cosine = (1 + ideal.square().sum(1)).rsqrt()
     return torch.cat([ideal * cosine[:, None], cosine[:, None]], dim=1).float(), cosine.float()
 

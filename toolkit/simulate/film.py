@@ -14,25 +14,15 @@ import numpy as np
 import torch
 
 from fieldfuse.camera import Array, Intrinsics, invert
-from fieldfuse.effects import (
-    compression,
-    depth_noise,
-    depth_offset,
-    distortion,
-    exposure,
-    motion_blur,
-    passers,
-    rolling_shutter,
-    sensor_noise,
-    transfer,
-    vignetting,
-)
-from fieldfuse.effects.listed import Effects, generator
+from fieldfuse.effects.effect_specs import Effects, generator
+from fieldfuse.effects.models import encode_srgb, to_bytes
+from fieldfuse.effects.scenery import Walk
 from fieldfuse.simulate.curve import Motion
 from fieldfuse.simulate.eye import Eye, Picture, eye_of, measure, take
 from fieldfuse.simulate.people import peopled
 from fieldfuse.simulate.scene import Scene
 from fieldfuse.simulate.seen import Scenery
+from fieldfuse.tone import share, square_radius
 
 Tensor = torch.Tensor
 
@@ -85,15 +75,18 @@ class Film:
         self.scene, self.motion, self.effects, self.seed, self.has_depth = scene, motion, effects, seed, depth
         self.times = np.asarray(times, dtype=np.float64)
         self.world_from_camera = motion.poses(self.times)
-        self.intrinsics = intrinsics if effects.distortion is None else distortion.lens(effects.distortion, intrinsics)
+        self.intrinsics = intrinsics if effects.distortion is None else effects.distortion.before(intrinsics)
         self.eye = eye_of(self.intrinsics, side, scene.device)
-        self._radius = None if effects.vignetting is None else vignetting.radii(self.intrinsics).to(scene.device)
-        self._walks: list[passers.Walk] = []
+        self._falloff: Tensor | None = None
+        if effects.vignetting is not None:
+            falloff = share(effects.vignetting.corner, square_radius(self.intrinsics)).astype(np.float32)
+            self._falloff = torch.from_numpy(falloff)[..., None].to(scene.device)
+        self._walks: list[Walk] = []
         if effects.passers is not None:
             wide, floor = intrinsics.width / intrinsics.fx, FLOOR if isinstance(scene, Scene) else None
             who = generator(seed, "passers")
-            self._walks = passers.draw(effects.passers, self.times, self.world_from_camera, scene.focus, wide, floor, who)
-        self._gains = None if effects.exposure is None else exposure.draw(effects.exposure, len(self.times), generator(seed, "exposure"))
+            self._walks = effects.passers.walks(self.times, self.world_from_camera, scene.focus, wide, floor, who)
+        self._gains = None if effects.exposure is None else effects.exposure.gains(len(self.times), generator(seed, "exposure"))
 
     def __len__(self) -> int:
         return len(self.times)
@@ -115,7 +108,7 @@ class Film:
             passed = (seen > 0) & ((depth == 0) | (seen < depth - PASSED))
             facts["passers"] = {"share": float(passed.mean())}
         if effects.depth_offset is not None and self.has_depth:
-            still = take(there, plain(self.eye), (pose @ invert(depth_offset.forward(effects.depth_offset)))[None])
+            still = take(there, plain(self.eye), (pose @ invert(effects.depth_offset.forward()))[None])
             seen = still.depth.cpu().numpy()
         return Shot(
             index=index,
@@ -139,38 +132,39 @@ class Film:
         effects = self.effects
         rows = np.array([seconds])
         if effects.rolling_shutter is not None:
-            rows = rolling_shutter.forward(effects.rolling_shutter, seconds, self.intrinsics.height)
+            rows = effects.rolling_shutter.rows(seconds, self.intrinsics.height)
             facts["rolling_shutter"] = {"first_row_seconds": float(rows[0]), "last_row_seconds": float(rows[-1])}
         if effects.motion_blur is None:
             return take(self._there(seconds), self.eye, self.motion.poses(rows)).linear
-        offsets = motion_blur.instants(effects.motion_blur)
+        offsets = effects.motion_blur.instants()
         half = effects.motion_blur.exposure / 2
         facts["motion_blur"] = {
             "exposure_seconds": effects.motion_blur.exposure,
             "path": self.motion.poses(seconds + np.array([-half, 0.0, half])).tolist(),  # world_from_camera at start, middle and end
         }
-        return motion_blur.forward(
-            [take(self._there(seconds + offset), self.eye, self.motion.poses(rows + offset)).linear for offset in offsets]
-        )
+        total = take(self._there(seconds + offsets[0]), self.eye, self.motion.poses(rows + offsets[0])).linear.clone()
+        for offset in offsets[1:]:  # always summed in their order
+            total += take(self._there(seconds + offset), self.eye, self.motion.poses(rows + offset)).linear
+        return total / len(offsets)
 
     def _developed(self, linear: Tensor, index: int, facts: dict[str, Any]) -> tuple[Array, bytes | None]:
         """Linear light on the lens → the stored picture."""
         effects = self.effects
-        if effects.vignetting is not None and self._radius is not None:
-            linear = vignetting.forward(effects.vignetting, linear, self._radius)
+        if self._falloff is not None:
+            linear = linear * self._falloff
         if self._gains is not None:
             gain = self._gains[index]
             facts["exposure"] = {"gain": gain.tolist()}
-            linear = exposure.forward(linear, torch.tensor(gain, dtype=torch.float32, device=linear.device))
+            linear = linear * torch.tensor(gain, dtype=torch.float32, device=linear.device)
         if effects.sensor_noise is not None:
-            noisy = sensor_noise.forward(effects.sensor_noise, linear.cpu().numpy(), generator(self.seed, "sensor_noise", index))
+            noisy = effects.sensor_noise.forward(linear.cpu().numpy(), generator(self.seed, "sensor_noise", index))
             linear = torch.from_numpy(noisy)
-        rgb = transfer.to_bytes(transfer.encode(linear)).cpu().numpy()
+        rgb = to_bytes(encode_srgb(linear)).cpu().numpy()
         if effects.compression is None:
             return rgb, None
-        jpeg = compression.encode(effects.compression, rgb)
+        jpeg = effects.compression.encode(rgb)
         facts["compression"] = {"bytes": len(jpeg)}
-        return compression.decode(jpeg), jpeg
+        return effects.compression.decode(jpeg), jpeg
 
     def _truth(self, picture: Picture | None, pose: Array) -> tuple[Picture | None, Array, Array]:
         """What a perfect camera sees from the frame's pose: with materials only where the depth sensor asks for them."""
@@ -183,7 +177,7 @@ class Film:
         if self.effects.depth_noise is None or still is None:
             return depth
         albedo, gloss = still.albedo.mean(2).cpu().numpy(), still.gloss.cpu().numpy()
-        return depth_noise.forward(self.effects.depth_noise, depth, albedo, gloss, generator(self.seed, "depth_noise", index))
+        return self.effects.depth_noise.forward(depth, albedo, gloss, generator(self.seed, "depth_noise", index))
 
 
 def plain(eye: Eye) -> Eye:

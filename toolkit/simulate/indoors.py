@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fieldfuse.camera import Array
-from fieldfuse.effects.highlights import Highlights
+from fieldfuse.effects.scenery import Highlights
 from fieldfuse.simulate import furniture
 from fieldfuse.simulate.builder import FLOORS, WALLS, Builder
 from fieldfuse.simulate.scene import Lamp, Scene

@@ -10,9 +10,8 @@ import numpy as np
 import torch
 
 from fieldfuse.camera import Array
-from fieldfuse.effects import background, highlights, transfer
-from fieldfuse.effects.background import Background
-from fieldfuse.effects.highlights import Highlights
+from fieldfuse.effects.models import decode_srgb
+from fieldfuse.effects.scenery import Background, Highlights
 from fieldfuse.errors import InputError
 from fieldfuse.simulate.atlas import Atlas
 from fieldfuse.simulate.cast import FAR
@@ -104,7 +103,7 @@ class MeshScene:
         linear, gloss = self._shaded(origins, beam.directions, distance, normals, albedo, self.gloss[face] * hit)
         if self.background is not None and not bool(hit.all()):
             missed = (~hit).nonzero()[:, 0]
-            linear[missed] = background.forward(self.background, beam.directions[missed])
+            linear[missed] = self.background.forward(beam.directions[missed])
         return Seen(linear, distance, normals, albedo, gloss, part)
 
     def _shaded(
@@ -123,7 +122,7 @@ class MeshScene:
         linear = albedo * (sky + SUN_LIGHT * light)[:, None]
         if self.highlights is not None:
             sharpness = torch.full_like(gloss, 40.0)
-            shine = highlights.forward(self.highlights, directions, normals, sun.expand_as(normals), gloss, sharpness)
+            shine = self.highlights.forward(directions, normals, sun.expand_as(normals), gloss, sharpness)
             linear = linear + (SUN_LIGHT * shine * (light > 0))[:, None]
         return linear, gloss
 
@@ -222,4 +221,4 @@ def _surface(part: Any, pictures: list[Array], known: dict[int, int], gltf: bool
 
 
 def _linear(stored: Array) -> Array:
-    return np.asarray(transfer.decode(torch.from_numpy(np.asarray(stored, dtype=np.float32))).numpy())
+    return np.asarray(decode_srgb(torch.from_numpy(np.asarray(stored, dtype=np.float32))).numpy())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fieldfuse.effects.background import Background
+from fieldfuse.effects.scenery import Background
 from fieldfuse.simulate.builder import Builder
 from fieldfuse.simulate.scene import Lamp, Scene
 from fieldfuse.simulate.solids import BALL, rod, upright

@@ -8,9 +8,7 @@ import numpy as np
 import torch
 
 from fieldfuse.camera import Array
-from fieldfuse.effects.background import Background
-from fieldfuse.effects.highlights import Highlights
-from fieldfuse.effects.passers import STEPS, Walk
+from fieldfuse.effects.scenery import STEPS, Background, Highlights, Walk
 from fieldfuse.simulate.builder import Builder, turned
 from fieldfuse.simulate.materials import Material, TextureBank, texture_bank
 from fieldfuse.simulate.scene import Lamp, Scene

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 import torch
 
 from fieldfuse.camera import Array, Intrinsics
-from fieldfuse.effects import background, highlights, transfer
-from fieldfuse.effects.background import Background
-from fieldfuse.effects.highlights import Highlights
+from fieldfuse.effects.models import encode_srgb
+from fieldfuse.effects.scenery import Background, Highlights
 from fieldfuse.simulate.cast import cast
 from fieldfuse.simulate.eye import eye_of, take
 from fieldfuse.simulate.materials import Material, Materials, TextureBank
@@ -93,7 +92,7 @@ class Scene:
             side: pixels that hold an edge are the mean of side × side rays; 1: one ray a pixel everywhere.
         """
         picture = take(self, eye_of(intrinsics, side, self.device), world_from_camera[None])
-        return Rendered(transfer.encode(picture.linear), picture.depth, picture.normals)
+        return Rendered(encode_srgb(picture.linear), picture.depth, picture.normals)
 
     def see(self, beam: Rays, lit: bool = True) -> Seen:
         """What rays see: light, distance, normals and material, one row a ray. Not `lit`: distance and normals only."""
@@ -127,13 +126,13 @@ class Scene:
             colour = torch.tensor(lamp.colour, dtype=torch.float32, device=self.device)
             linear = torch.addcmul(linear, albedo * colour, light[:, None])
             if self.highlights is not None:
-                shine = highlights.forward(self.highlights, ray, normals, to_lamp, gloss, self.materials.sharpness[material])
+                shine = self.highlights.forward(ray, normals, to_lamp, gloss, self.materials.sharpness[material])
                 linear = torch.addcmul(linear, (shine * (light > 0))[:, None], colour)
             part = 2 * part + shadow
         linear, part = spread_out(linear), spread_out(part)
         if not every and self.background is not None:
             missed = (solid < 0).nonzero()[:, 0]
-            linear[missed] = background.forward(self.background, directions[missed])
+            linear[missed] = self.background.forward(directions[missed])
         return Seen(linear, distance, spread_out(normals), spread_out(albedo), spread_out(gloss), part)
 
     def _ambient(self, points: Tensor, normals: Tensor) -> Tensor:

@@ -8,8 +8,7 @@ from typing import Protocol
 import torch
 
 from fieldfuse.camera import Array
-from fieldfuse.effects.background import Background
-from fieldfuse.effects.highlights import Highlights
+from fieldfuse.effects.scenery import Background, Highlights
 
 Tensor = torch.Tensor
 

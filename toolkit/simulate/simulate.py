@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fieldfuse.effects.listed import Effects, parse
+from fieldfuse.effects.effect_specs import Effects, parse
 from fieldfuse.errors import InputError
 from fieldfuse.files import atomic_path
 from fieldfuse.progress import SILENT, Progress

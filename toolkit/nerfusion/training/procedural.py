@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from fieldfuse.camera import Array, Intrinsics
-from fieldfuse.effects import transfer
+from fieldfuse.effects.models import encode_srgb
 from fieldfuse.errors import InputError
 from fieldfuse.nerfusion.training.paths import around, hand_held
 from fieldfuse.nerfusion.training.samples import Pictures
@@ -102,7 +102,7 @@ class ProceduralScene:
             parts = [new[first : first + few] for first in range(0, len(new), few)]
             taken = [one for part in parts for one in take_all(self._scene, self._eye, self._poses[part])]
         for index, seen in zip(new, taken, strict=True):
-            picture = transfer.encode(seen.linear).permute(2, 0, 1) * self._gain[:, None, None]
+            picture = encode_srgb(seen.linear).permute(2, 0, 1) * self._gain[:, None, None]
             if self._noise > 0:
                 generator = torch.Generator(self._device).manual_seed(self._seed + index)
                 picture = picture + self._noise * torch.randn(picture.shape, generator=generator, device=self._device)

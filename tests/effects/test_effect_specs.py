@@ -7,29 +7,29 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fieldfuse.effects import exposure, motion_blur, vignetting
-from fieldfuse.effects.listed import MODULES, STRENGTHS, Effects, generator, parse
+from fieldfuse.effects.effect_specs import PRESETS, STRENGTHS, Effects, generator, parse, preset
+from fieldfuse.effects.models import MotionBlur
 from fieldfuse.errors import InputError
 
 
 def test_all_ways_to_list() -> None:
     assert parse(None, "x") == parse([], "x") == Effects()
     got = parse(["exposure", "vignetting:strong", {"motion_blur": {"exposure": 0.02}}], "x")
-    assert got.exposure == exposure.PRESETS["medium"]
-    assert got.vignetting == vignetting.PRESETS["strong"]
-    assert got.motion_blur == motion_blur.MotionBlur(0.02, motion_blur.PRESETS["medium"].samples)
+    assert got.exposure == preset("exposure", "medium")
+    assert got.vignetting == preset("vignetting", "strong")
+    assert got.motion_blur == MotionBlur(0.02, preset("motion_blur", "medium").samples)
     assert set(got.names()) == {"exposure", "vignetting", "motion_blur"}
     mapping = parse({"exposure": "weak", "vignetting": False, "compression": {"strength": "strong", "quality": 30}}, "x")
     assert set(mapping.names()) == {"exposure", "compression"}
     assert mapping.compression is not None and mapping.compression.quality == 30
 
 
-@pytest.mark.parametrize("name", sorted(MODULES))
+@pytest.mark.parametrize("name", sorted(PRESETS))
 def test_every_effect_has_three_strengths_and_describes_itself(name: str) -> None:
     made = [getattr(parse([f"{name}:{strength}"], "x"), name) for strength in STRENGTHS]
     assert len(set(made)) == 3
     assert parse([f"{name}:weak"], "x").describe()[name]
-    assert MODULES[name].__doc__ and len(MODULES[name].__doc__.splitlines()) >= 3  # the formula
+    assert made[0].__doc__ and len(made[0].__doc__.splitlines()) >= 3  # the formula
 
 
 @pytest.mark.parametrize(
@@ -40,13 +40,13 @@ def test_every_effect_has_three_strengths_and_describes_itself(name: str) -> Non
         (["exposure", "exposure:weak"], "listed twice"),
         ("exposure", "must be a list"),
         ([{"exposure": {"stop": 1}}], "did you mean 'stops'"),
-        ([{"exposure": {"stops": "much"}}], "takes a number"),
-        ([{"exposure": {"stops": float("nan")}}], "takes a number"),
+        ([{"exposure": {"stops": "much"}}], "must be a valid number"),
+        ([{"exposure": {"stops": float("nan")}}], "stops"),
         ([{"exposure": 3}], "takes a strength or parameters"),
-        ([{"motion_blur": {"samples": 2.5}}], "whole number"),
-        ([{"motion_blur": {"samples": 0}}], "between 1 and 256"),
-        ([{"vignetting": {"corner": 0}}], "between 0.01 and 1"),
-        ([{"background": {"haze": [1, 2]}}], "takes 3 numbers"),
+        ([{"motion_blur": {"samples": 2.5}}], "must be a valid integer"),
+        ([{"motion_blur": {"samples": 0}}], "at least 1"),
+        ([{"vignetting": {"corner": 0}}], "at least 0.01"),
+        ([{"background": {"haze": [1, 2]}}], "haze"),
     ],
 )
 def test_mistakes_are_told(listing: Any, sentence: str) -> None:

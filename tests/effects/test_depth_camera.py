@@ -15,11 +15,10 @@ from fieldfuse.capture import open_capture
 from fieldfuse.capture.images import load_depth
 from fieldfuse.capture.prepare import held_out
 from fieldfuse.config import EffectsSettings
-from fieldfuse.effects import depth_offset
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.effects.decide import Decided, decide
-from fieldfuse.effects.depth_maps import DepthMaps
-from fieldfuse.effects.registration import DEPTH_OFFSET, FEWEST, Observations, solved
+from fieldfuse.effects.depth_camera import DEPTH_OFFSET, FEWEST, DepthMaps, Observations, register
+from fieldfuse.effects.effect_specs import preset
 from fieldfuse.simulate import procedural
 from fieldfuse.simulate.materials import texture_bank
 from fieldfuse.simulate.settings import scene_file
@@ -40,7 +39,7 @@ def walls(pixels: Array, from_world: Array) -> Array:
     return np.minimum.reduce(depths)
 
 
-def observations(depth_from_picture: Array, noise: float = 0.005, count: int = 1500, seed: int = 0, maps: int = 4) -> Observations:
+def observations(depth_from_image: Array, noise: float = 0.005, count: int = 1500, seed: int = 0, maps: int = 4) -> Observations:
     """Points on the walls, and depth maps of a camera that stands beside that of the pictures."""
     rng = np.random.default_rng(seed)
     places, point, owner, values = [], [], [], []
@@ -53,7 +52,7 @@ def observations(depth_from_picture: Array, noise: float = 0.005, count: int = 1
         places.append(np.concatenate([(at - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy], np.ones((count, 1))], axis=1) * z[:, None])
         point.append(number * count + np.arange(count))
         owner.append(np.full(count, number))
-        sensed = walls(pixel_grid(CAMERA.width, CAMERA.height), depth_from_picture @ world)
+        sensed = walls(pixel_grid(CAMERA.width, CAMERA.height), depth_from_image @ world)
         values.append((sensed * (1 + rng.normal(0, noise, sensed.shape))).astype(np.float32).ravel())
     start = np.arange(maps) * CAMERA.width * CAMERA.height
     size = np.tile([CAMERA.width, CAMERA.height], (maps, 1))
@@ -74,67 +73,67 @@ def apart(one: Array, other: Array) -> tuple[float, float]:
 @pytest.mark.parametrize("strength", ["weak", "medium", "strong"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_an_offset_is_recovered(strength: str, seed: int) -> None:
-    true = depth_offset.forward(depth_offset.PRESETS[strength])
-    found = solved(observations(true, seed=seed))
+    true = preset("depth_offset", strength).forward()
+    found = register(observations(true, seed=seed))
     assert found is not None and found.there and found.after < 0.01
-    turn, move = apart(found.depth_from_picture, true)
+    turn, move = apart(found.depth_from_image, true)
     assert turn < 0.15 and move < 0.006
 
 
 def test_nothing_is_found_where_nothing_is_nor_a_scale_taken_for_it() -> None:
-    found = solved(observations(np.eye(4)))
+    found = register(observations(np.eye(4)))
     assert found is not None and not found.there and abs(found.gain) < 0.02
     larger = observations(np.eye(4))
-    found = solved(replace(larger, places=1.03 * larger.places))  # poses that are three percent too large
+    found = register(replace(larger, places=1.03 * larger.places))  # poses that are three percent too large
     assert found is not None and not found.there
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1e3])
 def test_the_unit_of_length_does_not_matter(unit: float) -> None:
-    true = depth_offset.forward(depth_offset.PRESETS["medium"])
+    true = preset("depth_offset", "medium").forward()
     some = observations(true)
-    one, other = solved(some), solved(with_values(replace(some, places=unit * some.places), np.float32(unit) * some.maps.values))
+    one, other = register(some), register(with_values(replace(some, places=unit * some.places), np.float32(unit) * some.maps.values))
     assert one is not None and other is not None
-    np.testing.assert_allclose(other.depth_from_picture[:3, :3], one.depth_from_picture[:3, :3], atol=1e-3)
-    np.testing.assert_allclose(other.depth_from_picture[:3, 3] / unit, one.depth_from_picture[:3, 3], atol=2e-3)
+    np.testing.assert_allclose(other.depth_from_image[:3, :3], one.depth_from_image[:3, :3], atol=1e-3)
+    np.testing.assert_allclose(other.depth_from_image[:3, 3] / unit, one.depth_from_image[:3, 3], atol=2e-3)
     assert other.gain == pytest.approx(one.gain, abs=0.01)
 
 
 def test_each_frame_may_have_its_own_camera_and_a_lens() -> None:
-    true = depth_offset.forward(depth_offset.PRESETS["medium"])
+    true = preset("depth_offset", "medium").forward()
     some = observations(true)
-    one = solved(some)
+    one = register(some)
     cameras = tuple(replace(CAMERA, fx=140.0 + 1e-9 * number) for number in range(4))
-    other = solved(replace(some, maps=replace(some.maps, cameras=cameras)))
+    other = register(replace(some, maps=replace(some.maps, cameras=cameras)))
     bent = (replace(CAMERA, lens=OPENCV, distortion=(1e-9, 0.0, 0.0, 0.0)),) * 4
-    lens = solved(replace(some, maps=replace(some.maps, cameras=bent)))
+    lens = register(replace(some, maps=replace(some.maps, cameras=bent)))
     assert one is not None and other is not None and lens is not None
     for found in (other, lens):
-        np.testing.assert_allclose(found.depth_from_picture, one.depth_from_picture, atol=1e-3)
+        np.testing.assert_allclose(found.depth_from_image, one.depth_from_image, atol=1e-3)
 
 
 def test_a_wall_straight_ahead_without_noise_moves_nothing() -> None:
     some = observations(np.eye(4), noise=0)
     flat = with_values(replace(some, places=2 * some.places / some.places[:, 2:]), np.full_like(some.maps.values, 2))
-    found = solved(flat)
+    found = register(flat)
     assert found is not None and not found.there
-    np.testing.assert_allclose(found.depth_from_picture, np.eye(4), atol=1e-6)
+    np.testing.assert_allclose(found.depth_from_image, np.eye(4), atol=1e-6)
 
 
 def test_a_third_of_wrong_points_does_no_harm() -> None:
-    true = depth_offset.forward(depth_offset.PRESETS["medium"])
+    true = preset("depth_offset", "medium").forward()
     some = observations(true)
     wrong = np.random.default_rng(5).random(len(some.places)) < 0.3
-    found = solved(replace(some, places=np.where(wrong[:, None], 1.3 * some.places, some.places)))
+    found = register(replace(some, places=np.where(wrong[:, None], 1.3 * some.places, some.places)))
     assert found is not None
-    turn, move = apart(found.depth_from_picture, true)
+    turn, move = apart(found.depth_from_image, true)
     assert turn < 0.2 and move < 0.01
 
 
 def test_too_little_tells_nothing() -> None:
     some = observations(np.eye(4))
-    assert solved(some.some(np.arange(FEWEST - 1))) is None
-    assert solved(with_values(some, np.zeros_like(some.maps.values))) is None
+    assert register(some.some(np.arange(FEWEST - 1))) is None
+    assert register(with_values(some, np.zeros_like(some.maps.values))) is None
 
 
 def filmed(tmp_path: Path, *effects: str) -> Path:
@@ -167,7 +166,7 @@ def test_a_filmed_offset_is_found_and_its_depth_carried_over(tmp_path: Path, mon
     folder = filmed(tmp_path, "depth_offset:strong", "depth_noise:weak")
     found = decided(folder)
     assert of_depth(found) == (True, True)
-    turn, move = apart(np.linalg.inv(found.corrections.depth), depth_offset.forward(depth_offset.PRESETS["strong"]))
+    turn, move = apart(np.linalg.inv(found.corrections.depth), preset("depth_offset", "strong").forward())
     assert turn < 0.5 and move < 0.03
     again = Corrections.from_dict(found.corrections.to_dict())
     np.testing.assert_allclose(again.depth, found.corrections.depth)

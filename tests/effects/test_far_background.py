@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fieldfuse.effects.beyond import THRESHOLD, far
+from fieldfuse.effects.far_background import THRESHOLD, find_far_background
 from tests.effects.walls import AWAY, FRAMES, problem_of, wall
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_what_is_endlessly_far_is_found_and_held_out_pictures_agree(seed: int) -> None:
     seen = wall(top=-0.1, away=1e6, seed=seed)
-    found = far(seen, problem_of(seen), AWAY)
+    found = find_far_background(seen, problem_of(seen), AWAY)
     assert found.found and found.evidence.number > 20 * THRESHOLD, found.evidence.reason
     assert found.before is not None and found.after is not None and found.after < 0.5 * found.before
 
@@ -22,15 +22,15 @@ def test_what_is_endlessly_far_is_found_and_held_out_pictures_agree(seed: int) -
 @pytest.mark.parametrize("away", [AWAY, 2 * AWAY, 5 * AWAY])
 def test_what_is_near_or_only_behind_is_not(away: float) -> None:
     seen = wall(top=-0.1, away=away)
-    assert not far(seen, problem_of(seen), AWAY).found
+    assert not find_far_background(seen, problem_of(seen), AWAY).found
 
 
 def test_exposure_does_not_matter() -> None:
     seen = wall(top=-0.1, away=1e6, gain=np.exp2(0.4 * np.sin(np.arange(FRAMES))))
-    assert far(seen, problem_of(seen), AWAY).found
+    assert find_far_background(seen, problem_of(seen), AWAY).found
 
 
 def test_from_one_place_nothing_is_told() -> None:
     seen = replace(wall(top=-0.1, away=1e6), poses=np.tile(np.eye(4), (FRAMES, 1, 1)))
-    found = far(seen, problem_of(seen), AWAY)
+    found = find_far_background(seen, problem_of(seen), AWAY)
     assert not found.found and found.evidence.number == 0 and found.before is None

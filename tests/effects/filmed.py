@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from fieldfuse.camera import Array, Intrinsics, project, unproject
-from fieldfuse.effects import transfer
-from fieldfuse.effects.evidence import Tracks
-from fieldfuse.effects.listed import parse
+from fieldfuse.effects.effect_specs import parse
+from fieldfuse.effects.light import LightTracks
+from fieldfuse.effects.models import decode_srgb
 from fieldfuse.simulate.film import Film
 from fieldfuse.simulate.materials import TextureBank
 from fieldfuse.simulate.paths import PathSettings, plan
@@ -24,7 +24,7 @@ FRAMES = 12
 @dataclass(frozen=True)
 class Filmed:
     film: Film
-    tracks: Tracks
+    tracks: LightTracks
 
 
 def film_tracks(bank: TextureBank, seed: int, effects: list[str], count: int = 60, kind: str = "room") -> Filmed:
@@ -33,7 +33,7 @@ def film_tracks(bank: TextureBank, seed: int, effects: list[str], count: int = 6
     settings = PathSettings("walk", frames=FRAMES, fps=2.0, speed=0.4, shake=8.0)
     film = Film(scene, CAMERA, plan(scene, settings, np.random.default_rng(seed)), settings.times(), parse(effects, "test"), seed, side=2)
     shots = [film.shot(index) for index in range(FRAMES)]
-    linear = [transfer.decode(torch.from_numpy(cv2.blur(shot.rgb, (3, 3)).astype(np.float32) / 255)).numpy() for shot in shots]
+    linear = [decode_srgb(torch.from_numpy(cv2.blur(shot.rgb, (3, 3)).astype(np.float32) / 255)).numpy() for shot in shots]
     rng = np.random.default_rng(seed)
     columns: dict[str, list[Array]] = {"linear": [], "frame": [], "point": [], "radius": []}
     points = []
@@ -56,4 +56,4 @@ def film_tracks(bank: TextureBank, seed: int, effects: list[str], count: int = 6
             columns["point"].append(first + np.flatnonzero(seen))
             off = np.linalg.norm(pixels[seen] - [CAMERA.cx, CAMERA.cy], axis=1)
             columns["radius"].append(off / (0.5 * np.hypot(CAMERA.width, CAMERA.height)))
-    return Filmed(film, Tracks(**{name: np.concatenate(values) for name, values in columns.items()}))
+    return Filmed(film, LightTracks(**{name: np.concatenate(values) for name, values in columns.items()}))

@@ -11,15 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array, invert, pixel_grid
 from fieldfuse.capture.types import Capture, Frame
-from fieldfuse.effects import depth_offset
 from fieldfuse.effects.adjust import POSES, Belief, Problem, _slopes, _with, adjust, depth_residuals, predict, residuals, scatter
+from fieldfuse.effects.depth_pose_refinement import MARGIN, refine_by_depth, scaled
+from fieldfuse.effects.effect_specs import preset
 from fieldfuse.effects.refine import believed
-from fieldfuse.effects.sensed import MARGIN, agreeing, scaled
-from tests.effects.test_registration import CAMERA, walls
+from tests.effects.test_depth_camera import CAMERA, walls
 
 FRAMES, POINTS = 12, 160
 UNKNOWN = frozenset({POSES})
-OFFSET = depth_offset.forward(depth_offset.PRESETS["medium"])
+OFFSET = preset("depth_offset", "medium").forward()
 
 
 def walk(seed: int) -> tuple[Array, Problem]:
@@ -74,7 +74,7 @@ def apart(poses: Array, true: Array) -> float:
 def test_depth_makes_refined_poses_better(tmp_path: Path, offset: Array | None) -> None:
     true, given = walk(1)
     alone, belief = refined(given)
-    found = agreeing(filmed(tmp_path, true, offset=offset), alone, UNKNOWN, belief)
+    found = refine_by_depth(filmed(tmp_path, true, offset=offset), alone, UNKNOWN, belief)
     assert found is not None
     assert found.after < (1 - MARGIN) * found.before
     assert "held to the sensor's depth" in found.note
@@ -90,7 +90,7 @@ def test_depth_that_does_not_agree_takes_no_part(tmp_path: Path, wrong: dict[str
     capture = filmed(tmp_path, true, **wrong)
     if "mixed" in wrong:
         capture = capture.with_frames([replace(frame, name=f"{number:02d}") for number, frame in enumerate(capture.frames)])
-    assert agreeing(capture, alone, UNKNOWN, belief) is None
+    assert refine_by_depth(capture, alone, UNKNOWN, belief) is None
 
 
 def test_frames_without_depth_need_none(tmp_path: Path) -> None:
@@ -98,11 +98,11 @@ def test_frames_without_depth_need_none(tmp_path: Path) -> None:
     alone, belief = refined(given)
     capture = filmed(tmp_path, true)
     some = capture.with_frames([replace(frame, depth=frame.depth if k % 2 else None) for k, frame in enumerate(capture.frames)])
-    found = agreeing(some, alone, UNKNOWN, belief)
+    found = refine_by_depth(some, alone, UNKNOWN, belief)
     assert found is not None
     assert apart(found.problem.poses, true) < 0.7 * apart(alone.poses, true)
     none = capture.with_frames([replace(frame, depth=None) for frame in capture.frames])
-    assert agreeing(none, alone, UNKNOWN, belief) is None
+    assert refine_by_depth(none, alone, UNKNOWN, belief) is None
 
 
 def test_growing_changes_no_place_and_no_belief() -> None:

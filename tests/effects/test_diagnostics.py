@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fieldfuse.effects import geometry, light, motion_blur
+from fieldfuse.effects import geometry, light
 from fieldfuse.effects.adjust import LENS, POSES, ROWS, adjust, predict, residuals, scatter
-from fieldfuse.effects.paid import Paid
+from fieldfuse.effects.diagnostics import ORDER, Timing, _lens, _poses, _rows, diagnose_tracks
+from fieldfuse.effects.evidence import blur_evidence
 from fieldfuse.effects.refine import believed, refined_poses
-from fieldfuse.effects.survey import ORDER, _lens, _poses, _rows, look
 from tests.effects.seen import CAMERA, FRAMES, made
 
 
@@ -25,7 +25,7 @@ def drift(seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_nothing_is_found_where_nothing_is(seed: int) -> None:
-    found = look(made(seed))
+    found = diagnose_tracks(made(seed))
     assert found.there == frozenset(), [finding.reason for finding in found.findings.values() if finding.there]
     assert tuple(found.findings) == ORDER
 
@@ -41,7 +41,7 @@ def test_nothing_is_found_where_nothing_is(seed: int) -> None:
     ],
 )
 def test_each_effect_alone_is_found_and_nothing_else(effect: str, arguments: dict, seed: int) -> None:
-    found = look(made(seed, **arguments))
+    found = diagnose_tracks(made(seed, **arguments))
     assert found.there == {effect}, [finding.reason for finding in found.findings.values() if finding.there]
     finding = found.findings[effect]
     assert finding.number > finding.threshold
@@ -50,7 +50,7 @@ def test_each_effect_alone_is_found_and_nothing_else(effect: str, arguments: dic
 
 
 def test_two_at_once() -> None:
-    found = look(made(6, lens=(-0.2, 0.05), pose_error=0.004, gain=drift(6), corner=0.5))
+    found = diagnose_tracks(made(6, lens=(-0.2, 0.05), pose_error=0.004, gain=drift(6), corner=0.5))
     assert found.there == {"distortion", "poses", "exposure", "vignetting"}
     assert found.explained is not None
     assert found.explained.problem.lens == pytest.approx((-0.2, 0.05), abs=0.02)
@@ -60,17 +60,17 @@ def test_lens_and_light_are_measured() -> None:
     lens = geometry.explain(made(7, lens=(-0.12, 0.03)))
     assert lens is not None and lens.problem.lens[0] == pytest.approx(-0.12, abs=0.015)
     seen = made(7, gain=drift(7), corner=0.6)
-    found = light.explain(seen.tracks(), FRAMES)
+    found = light.explain(seen.light(), FRAMES)
     assert found.corner == pytest.approx(0.6, abs=0.03)
     np.testing.assert_allclose(np.log2(found.gain), np.log2(drift(7)) - np.log2(drift(7)).mean(0), atol=0.03)
 
 
 def test_gains_of_training_frames_have_mean_one_and_do_not_hang_on_the_others() -> None:
     seen, test = made(8, gain=drift(8)), np.arange(FRAMES) % 8 == 0
-    gain, borrowed = light.frame_gains(seen.tracks(), FRAMES, ~test)
+    gain, borrowed = light.frame_gains(seen.light(), FRAMES, ~test)
     np.testing.assert_allclose(np.log2(gain[~test]).mean(0), 0, atol=1e-9)
     changed = replace(seen, linear=np.where(test[seen.frame, None], 0.5 * seen.linear, seen.linear))
-    other, changed_borrowed = light.frame_gains(changed.tracks(), FRAMES, ~test)
+    other, changed_borrowed = light.frame_gains(changed.light(), FRAMES, ~test)
     np.testing.assert_array_equal(other[~test], gain[~test])
     np.testing.assert_allclose(other[test], 0.5 * gain[test], rtol=0.02)
     assert not borrowed and not changed_borrowed, "points that agree are believed, however far off they are"
@@ -78,10 +78,10 @@ def test_gains_of_training_frames_have_mean_one_and_do_not_hang_on_the_others() 
 
 def test_a_held_out_frame_whose_points_disagree_has_its_neighbours_gain() -> None:
     seen, test = made(8, gain=drift(8)), np.arange(FRAMES) % 8 == 0
-    expected, _ = light.frame_gains(seen.tracks(), FRAMES, ~test)
+    expected, _ = light.frame_gains(seen.light(), FRAMES, ~test)
     factor = np.exp2(np.random.default_rng(0).normal(1.0, 0.8, (len(seen.frame), 1)))
     torn = replace(seen, linear=np.where((seen.frame == 8)[:, None], factor * seen.linear, seen.linear))
-    gain, borrowed = light.frame_gains(torn.tracks(), FRAMES, ~test)
+    gain, borrowed = light.frame_gains(torn.light(), FRAMES, ~test)
     assert borrowed == [8]
     np.testing.assert_allclose(np.log2(gain[8]), np.log2(expected[[7, 9]]).mean(0), atol=1e-9)
     np.testing.assert_allclose(gain[test][[0]], expected[test][[0]])
@@ -178,15 +178,16 @@ def test_frames_that_are_less_sharp_than_others_are_told() -> None:
     frame, point = (index.ravel() for index in np.meshgrid(np.arange(12), np.arange(200)))
     depth = np.exp(rng.normal(0, 0.3, len(frame)))
     slope = 0.01 * depth * np.exp2(rng.normal(0, 0.2, len(frame)) + 0.5 * rng.normal(0, 1, 200)[point])
-    even = motion_blur.evidence(slope, depth, frame, point, 12)
-    blurred = motion_blur.evidence(np.where(frame == 5, 0.4, 1.0) * slope, depth, frame, point, 12)
+    light = np.full((len(frame), 3), 0.3)
+    even = blur_evidence(slope, depth, frame, point, 12, light)
+    blurred = blur_evidence(np.where(frame == 5, 0.4, 1.0) * slope, depth, frame, point, 12, light)
     assert not even.found and blurred.found, (even.reason, blurred.reason)
     assert int(np.argmin(blurred.parameters["sharpness"])) == 5
 
 
 def test_too_little_to_tell() -> None:
     seen = made(12, points=20)
-    found = look(seen)
+    found = diagnose_tracks(seen)
     assert found.there == frozenset() and all("too few" in finding.reason for finding in found.findings.values())
 
 
@@ -206,7 +207,7 @@ def test_no_shutter_takes_longer_than_from_picture_to_picture(share: float, ther
     steps = geometry.steps_of(poses, np.arange(6.0))
     problem = SimpleNamespace(motion=share * steps, poses=poses)
     found = SimpleNamespace(problem=problem, choices={ROWS: geometry.Choice(1.0, 0.5, True)})
-    finding = _rows(found, SimpleNamespace(times=np.arange(6.0)))  # type: ignore[arg-type]
+    finding = _rows(found, np.arange(6.0))  # type: ignore[arg-type]
     assert finding.there is there and f"{share:.2f} of the time between two pictures" in finding.reason
     assert ("more slowly" in finding.reason) is there
 
@@ -214,17 +215,17 @@ def test_no_shutter_takes_longer_than_from_picture_to_picture(share: float, ther
 @pytest.mark.parametrize(("after", "words"), [(0.66, ("lowers", "lower", "34% less")), (1.34, ("raises", "raise", "34% more"))])
 def test_what_makes_held_out_points_worse_is_said_to_do_so(after: float, words: tuple[str, str, str]) -> None:
     found = SimpleNamespace(choices=dict.fromkeys((LENS, ROWS, POSES), geometry.Choice(1.0, after, False)), profile=[0.0])
-    told = [_lens(found).reason, _rows(found, SimpleNamespace()).reason, _poses(found).reason]  # type: ignore[arg-type]
+    told = [_lens(found).reason, _rows(found, np.zeros(0)).reason, _poses(found).reason]  # type: ignore[arg-type]
     for reason, word in zip(told, words, strict=True):
         assert f" {word}" in reason and "34%" in reason and "-34" not in reason
 
 
 def test_seconds_of_several_effects_are_split_evenly_and_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     now = iter([10.0, 13.0, 20.0, 21.0])
-    monkeypatch.setattr("fieldfuse.effects.paid.time.monotonic", lambda: next(now))
-    paid = Paid()
-    with paid.by("poses", "distortion"):
+    monkeypatch.setattr("fieldfuse.effects.diagnostics.time.monotonic", lambda: next(now))
+    timing = Timing()
+    with timing.by("poses", "distortion"):
         pass
-    with pytest.raises(ValueError, match="stop"), paid.by("poses"):
+    with pytest.raises(ValueError, match="stop"), timing.by("poses"):
         raise ValueError("stop")
-    assert paid.of("poses") == 2.5 and paid.of("distortion") == 1.5 and paid.of("exposure") == 0
+    assert timing.of("poses") == 2.5 and timing.of("distortion") == 1.5 and timing.of("exposure") == 0

@@ -1,13 +1,13 @@
-"""View dependence between the points: patches that one picture shows brighter than others show the same surface.
+"""View dependence between the points: patches that one image shows brighter than others show the same surface.
 
-A highlight is small, wanders, and seldom lies where features do. So one patch a cell of picture r is carried into other pictures s by the
+A highlight is small, wanders, and seldom lies where features do. So one patch a cell of image r is carried into other images s by the
 plane through the points round it. With P the patch's log light without its mean, and l the logarithm of its mean light,
 
-    d_s = l_r − l_s − median of the same over all patches of r in s,     told where  mean (P_s − P_r)² < SAME · mean P_r² + NOISE
+    d_s = l_r − l_s − median of the same over all patches of r in s,     used where  mean (P_s − P_r)² < SAME · mean P_r² + NOISE
 
-so the texture has to agree while the light may differ, and exposure drops out. A patch's excess is the median of d_s over the pictures s.
+so the texture has to agree while the light may differ, and exposure drops out. A patch's excess is the median of d_s over the images s.
 It is *shiny* when at least three quarters of the patches round it are BRIGHTER: what noise, edges and wrong planes do is not alike over an
-area. Half of the pictures s predict, from the patches round each shiny one, what the other half sees.
+area. Half of the images s predict, from the patches round each shiny one, what the other half sees.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ import numpy as np
 
 from fieldfuse.camera import Array
 from fieldfuse.effects.adjust import Problem
-from fieldfuse.effects.beyond import carried, rays_of
-from fieldfuse.effects.evidence import Evidence, HeldOut
-from fieldfuse.effects.light import EXPOSURE, VIGNETTING, Light
-from fieldfuse.effects.sightings import Sightings
+from fieldfuse.effects.evidence import Evidence, HeldOut, median_of_finite
+from fieldfuse.effects.far_background import AROUND, BLUR, CELL, CROSS, HALF, carried, rays_of
+from fieldfuse.effects.light import VIGNETTING, Light
+from fieldfuse.effects.tracks import Tracks
+from fieldfuse.poses.cloud import every
 from fieldfuse.tone import LINEAR, share, square_radius
 
 THRESHOLD = 0.0014  # share of the patches
@@ -30,70 +31,66 @@ MIN_SHINY = 3  # shiny ones
 FEWEST = 150  # patches
 BRIGHTER = 0.1  # stops
 GAIN = 0.2  # least relative fall of the held-out error
-REFERENCES, OTHERS = 16, 8  # pictures whose patches are looked at, and in how many others each
-TURN = 40.0  # degrees between the axes of pictures that are compared
-HALF, CELL = 3, 10  # working pixels: half a patch, and one patch a cell
-BLUR = 1.0  # working pixels: planes and poses are a little off
+REFERENCES, OTHERS = 16, 8  # images whose patches are looked at, and in how many others each
+TURN = 40.0  # degrees between the axes of images that are compared
 SAME, NOISE = 0.4, 0.0012  # of the patch's variance, and squared stops
 STIFF = 0.01  # squared stops a pixel, over a patch: what keeps a patch without texture where its plane puts it
 FARTHEST = 2.0  # working pixels that a patch may be moved for its texture to agree
 ZOOM = 1.4  # most that a patch may be larger or smaller: blur takes light over the edges of what is small
-DARKEST, CLIPPED = 24, 200  # stored grey: noise below; beyond, a channel may have lost light that darker pictures show
+DARKEST, CLIPPED = 24, 200  # stored grey: noise below; beyond, a channel may have lost light that darker images show
 NEAREST, FLAT, REACH = 7, 0.02, 45.0  # points that make a plane, their relative error, and how far off the third of them may be
 VIEWS = 3  # others that show a patch
 
 
 @dataclass(frozen=True)
-class _Picture:
+class _Image:
     log: Array  # (h, w) log₂ light, a little blurred
-    dark: Array  # (h, w) darkest stored value round a pixel
-    bright: Array
+    usable: Array  # (h, w) bool: no pixel round it is too dark, nor clipped where exposure or vignetting differ
+
+    @classmethod
+    def of(cls, seen: Tracks, index: int, found: Light) -> _Image:
+        grey, camera = seen.images[index], seen.cameras[index]
+        light = np.maximum(LINEAR[grey], LINEAR[8])
+        if VIGNETTING in found.kept:
+            light = light / share(found.corner, square_radius(camera.scaled(grey.shape[1], grey.shape[0])))
+        log = np.log2(cv2.GaussianBlur(light, (0, 0), BLUR))
+        square = np.ones((2 * HALF + 1, 2 * HALF + 1), np.uint8)
+        usable = cv2.erode(grey, square) > DARKEST
+        return cls(log.astype(np.float32), usable & (cv2.dilate(grey, square) < CLIPPED) if found.kept else usable)
 
 
-def shiny(seen: Sightings, problem: Problem, depth: Array, found: Light) -> HeldOut:
-    """Look at patches of some pictures in others.
+def find_specularity(seen: Tracks, problem: Problem, depth: Array, found: Light) -> HeldOut:
+    """Look at patches of some images in others.
 
     Args:
         seen: the observations that `problem` explains. depth: (O,) along z, of each of them.
         found: what is known about light; vignetting that is there is taken out.
     """
-    count = len(seen.pictures)
-    uneven = EXPOSURE in found.kept or VIGNETTING in found.kept
-    pictures = [_picture(seen, index, found) for index in range(count)]
+    images = [_Image.of(seen, index, found) for index in range(len(seen.images))]
     total, hits, errors = 0, 0, np.zeros((0, 2))
-    for one in np.unique(np.linspace(0, count - 1, min(REFERENCES, count)).round().astype(int)) if count else ():
-        excess = _excess(seen, problem, depth, pictures, int(one), uneven)
+    for one in every(len(images), REFERENCES):
+        excess = _excess(seen, problem, depth, images, int(one))
         if excess is None:
             continue
-        least, _, told = _around(excess[0])
-        hit = told & (least > BRIGHTER)
+        least, _, known = _around(excess[0])
+        hit = known & (least > BRIGHTER)
         _, expected, _ = _around(excess[1])
         off = np.stack([np.abs(excess[2][hit]), np.abs(excess[2][hit] - expected[hit])], axis=1)
-        total, hits, errors = total + int(told.sum()), hits + int(hit.sum()), np.concatenate([errors, off])
-    share = hits / total if total >= FEWEST and hits >= MIN_SHINY else 0.0
+        total, hits, errors = total + int(known.sum()), hits + int(hit.sum()), np.concatenate([errors, off])
+    part = hits / total if total >= FEWEST and hits >= MIN_SHINY else 0.0
     errors = errors[np.isfinite(errors).all(1)]
     before, after = (float(value) for value in np.median(errors, axis=0)) if len(errors) else (None, None)
     reason = (
-        f"{100 * share:.2f}% of the patches lie in areas that one picture shows more than {BRIGHTER:g} stops brighter than others show the "
+        f"{100 * part:.2f}% of the patches lie in areas that one picture shows more than {BRIGHTER:g} stops brighter than others show the "
         f"same surface; {100 * THRESHOLD:.2f}% or more speak for highlights or reflections"
     )
-    return HeldOut(Evidence("view_dependence", share, THRESHOLD, reason), GAIN, before, after)
+    return HeldOut(Evidence("view_dependence", part, THRESHOLD, reason), GAIN, before, after)
 
 
-def _picture(seen: Sightings, index: int, found: Light) -> _Picture:
-    grey, camera = seen.pictures[index], seen.cameras[index]
-    light = np.maximum(LINEAR[grey], LINEAR[8])
-    if VIGNETTING in found.kept:
-        light = light / share(found.corner, square_radius(camera.scaled(grey.shape[1], grey.shape[0])))
-    log = np.log2(cv2.GaussianBlur(light, (0, 0), BLUR))
-    square = np.ones((2 * HALF + 1, 2 * HALF + 1), np.uint8)
-    return _Picture(log.astype(np.float32), cv2.erode(grey, square), cv2.dilate(grey, square))
-
-
-def _excess(seen: Sightings, problem: Problem, depth: Array, pictures: list[_Picture], one: int, uneven: bool) -> Array | None:
-    """(3, rows, columns) stops by which patches of picture `one` are brighter than others show them: by all others, by every second, and by
-    the rest. NaN: not told. None: there is nothing to compare."""
-    own, mine = pictures[one], seen.frame == one
+def _excess(seen: Tracks, problem: Problem, depth: Array, images: list[_Image], one: int) -> Array | None:
+    """(3, rows, columns) stops by which patches of image `one` are brighter than others show them: by all others, by every second, and by
+    the rest. NaN: not known. None: there is nothing to compare."""
+    own, mine = images[one], seen.frame == one
     height, width = own.log.shape
     rows, columns = np.arange(CELL // 2, height - HALF - 1, CELL), np.arange(CELL // 2, width - HALF - 1, CELL)
     middle = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
@@ -105,51 +102,44 @@ def _excess(seen: Sightings, problem: Problem, depth: Array, pictures: list[_Pic
     some = np.flatnonzero(np.isfinite(nearness))
     if len(some) == 0:
         return None
-    corner = np.array([[0, 0], [HALF, 0], [0, HALF]])
-    rays = rays_of(seen, problem, one, (middle[some][:, None] + corner).reshape(-1, 2).astype(np.float64))
-    steps = np.arange(-HALF, HALF + 1)
-    around = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    column, row = (middle[some][:, None] + around).transpose(2, 0, 1)
+    rays = rays_of(seen, problem, one, (middle[some][:, None] + CROSS).reshape(-1, 2).astype(np.float64))
+    column, row = (middle[some][:, None] + AROUND).transpose(2, 0, 1)
     texture, light = _split(own.log[row, column])
     slope = np.stack([cv2.Sobel(own.log, cv2.CV_32F, *order, scale=0.125)[row, column] for order in ((1, 0), (0, 1))], axis=2)
     slope -= slope.mean(1, keepdims=True)
     steer = np.linalg.inv(np.einsum("nka,nkb->nab", slope, slope) + STIFF * np.eye(2))
-    able = own.dark[row[:, 0] + HALF, column[:, 0] + HALF] > DARKEST
-    if uneven:
-        able &= own.bright[row[:, 0] + HALF, column[:, 0] + HALF] < CLIPPED
+    able = own.usable[middle[some][:, 1], middle[some][:, 0]]
     excess = np.full((len(others), len(some)), np.nan)
     for k, other in enumerate(others):
+        theirs = images[int(other)]
         to = carried(seen, problem, one, int(other), rays, np.repeat(nearness[some], 3)[:, None]).reshape(-1, 3, 2)
         step = (to[:, 1:] - to[:, :1]) / HALF  # (n, 2, 2): one pixel across and one down
-        with np.errstate(invalid="ignore"):  # behind the other camera it is NaN, and told below as out of sight
+        with np.errstate(invalid="ignore"):  # behind the other camera it is NaN, and out of sight below
             zoom = np.sqrt(np.abs(np.linalg.det(step)))
-        at = to[:, :1] + np.einsum("ka,nab->nkb", around, step)
-        there, inside = _sampled(pictures[int(other)].log, at)
+        at = to[:, :1] + np.einsum("ka,nab->nkb", AROUND, step)
+        there, inside = _sampled(theirs.log, at)
         turn = np.einsum("nab,nkb,nk->na", steer, slope, _split(there)[0] - texture)
         at = at - np.einsum("na,nab->nb", np.clip(turn, -FARTHEST, FARTHEST), step)[:, None]
-        there, still = _sampled(pictures[int(other)].log, at)
+        there, still = _sampled(theirs.log, at)
         shape, level = _split(there)
         same = ((shape - texture) ** 2).mean(1) < SAME * (texture**2).mean(1) + NOISE
-        rim = np.array(pictures[int(other)].dark.shape[::-1]) - 1  # pictures may have several shapes
-        centre = np.clip(np.nan_to_num(at[:, len(around) // 2]).round(), 0, rim).astype(int)
-        told = able & inside & still & same & (zoom > 1 / ZOOM) & (zoom < ZOOM)
-        told &= pictures[int(other)].dark[centre[:, 1], centre[:, 0]] > DARKEST
-        if uneven:
-            told &= pictures[int(other)].bright[centre[:, 1], centre[:, 0]] < CLIPPED
-        if told.sum() > 2 * VIEWS:
-            excess[k] = np.where(told, light - level - np.median((light - level)[told]), np.nan)
+        rim = np.array(theirs.log.shape[::-1]) - 1  # images may have several shapes
+        centre = np.clip(np.nan_to_num(at[:, len(AROUND) // 2]).round(), 0, rim).astype(int)
+        known = able & inside & still & same & (zoom > 1 / ZOOM) & (zoom < ZOOM) & theirs.usable[centre[:, 1], centre[:, 0]]
+        if known.sum() > 2 * VIEWS:
+            excess[k] = np.where(known, light - level - np.median((light - level)[known]), np.nan)
     out = np.full((3, len(middle)), np.nan)
-    out[0, some] = _middle(excess, VIEWS)
-    out[1, some], out[2, some] = _middle(excess[::2], 1), _middle(excess[1::2], 1)
+    out[0, some] = median_of_finite(excess, VIEWS)
+    out[1, some], out[2, some] = median_of_finite(excess[::2], 1), median_of_finite(excess[1::2], 1)
     return out.reshape(3, len(rows), len(columns))
 
 
 def _others(poses: Array, one: int) -> Array:
-    """Pictures that look about the same way, spread over how far away they were taken."""
+    """Images that look about the same way, spread over how far away they were taken."""
     step = np.linalg.norm(poses[:, :3, 3] - poses[one, :3, 3], axis=1)
     able = np.flatnonzero((poses[:, :3, 2] @ poses[one, :3, 2] > np.cos(np.deg2rad(TURN))) & (step > 0))
     able = able[np.argsort(-step[able], kind="stable")]
-    return np.asarray(able[np.unique(np.linspace(0, len(able) - 1, OTHERS).round().astype(int))] if len(able) > OTHERS else able)
+    return np.asarray(able[every(len(able), OTHERS)])
 
 
 def _nearness(place: Array, inverse: Array, cells: Array) -> Array:
@@ -160,7 +150,7 @@ def _nearness(place: Array, inverse: Array, cells: Array) -> Array:
     matrix = np.concatenate([(place[near] - cells[:, None]) / REACH, np.ones((*near.shape, 1))], axis=2)
     wanted, weight = inverse[near], np.ones(near.shape)
     plane, error = np.zeros((len(cells), 3)), np.zeros(near.shape)
-    for _ in range(3):  # an inverse depth is even over a plane's picture
+    for _ in range(3):  # an inverse depth is even over a plane's image
         normal = np.einsum("nki,nk,nkj->nij", matrix, weight, matrix) + 1e-3 * np.diag([1.0, 1.0, 1e-6])
         plane = np.linalg.solve(normal, np.einsum("nki,nk,nk->ni", matrix, weight, wanted)[..., None])[..., 0]
         error = np.abs(np.einsum("nki,ni->nk", matrix, plane) - wanted) / np.maximum(plane[:, 2:], 1e-9)
@@ -175,22 +165,14 @@ def _split(log: Array) -> tuple[Array, Array]:
 
 
 def _sampled(log: Array, at: Array) -> tuple[Array, Array]:
-    """(N, K) values at pixels (N, K, 2), and (N,) whether all lie in the picture."""
+    """(N, K) values at pixels (N, K, 2), and (N,) whether all lie in the image."""
     inside = np.asarray(((at >= 0) & (at <= [log.shape[1] - 1, log.shape[0] - 1])).all((1, 2)))
     pixels = np.nan_to_num(at, nan=-9.0).astype(np.float32)
     return cv2.remap(log, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64), inside
 
 
-def _middle(values: Array, least: int) -> Array:
-    """Median over the first axis of what is finite; NaN where this is less than `least`."""
-    ordered, count = np.sort(values, axis=0), np.isfinite(values).sum(0)  # NaN last
-    low, high = np.maximum((count - 1) // 2, 0), np.minimum(count // 2, len(values) - 1)
-    middle = 0.5 * (np.take_along_axis(ordered, low[None], 0)[0] + np.take_along_axis(ordered, high[None], 0)[0])
-    return np.where(count >= least, middle, np.nan)
-
-
 def _around(excess: Array) -> tuple[Array, Array, Array]:
-    """Of the 3×3 cells round each (rows, columns): their lower quartile, their median, and whether six of them at least are told."""
+    """Of the 3×3 cells round each (rows, columns): their lower quartile, their median, and whether six of them at least are known."""
     padded = np.pad(excess, 1, constant_values=np.nan)
     rows, columns = excess.shape
     near = np.sort([padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)], axis=0)

@@ -9,17 +9,17 @@ import pytest
 
 from fieldfuse.effects.evidence import HeldOut
 from fieldfuse.effects.light import EXPOSURE, VIGNETTING, Light
-from fieldfuse.effects.sheen import THRESHOLD, shiny
-from fieldfuse.effects.sightings import Sightings
+from fieldfuse.effects.specularity import THRESHOLD, find_specularity
+from fieldfuse.effects.tracks import Tracks
 from tests.effects.walls import AWAY, FRAMES, WIDTH, problem_of, wall
 
 PLAIN = Light({}, frozenset(), {}, {}, np.ones((FRAMES, 3)), 1.0)
 
 
-def looked(seen: Sightings, found: Light = PLAIN, wrong: float = 0.0) -> HeldOut:
+def looked(seen: Tracks, found: Light = PLAIN, wrong: float = 0.0) -> HeldOut:
     depth = np.full(len(seen.frame), AWAY)
     depth[: int(wrong * len(depth))] *= 0.5
-    return shiny(seen, problem_of(seen), np.random.default_rng(1).permutation(depth), found)
+    return find_specularity(seen, problem_of(seen), np.random.default_rng(1).permutation(depth), found)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -46,12 +46,12 @@ def test_pictures_of_several_shapes(lamp: float) -> None:
     seen = wall(lamp=lamp)
     cut = 40
     cameras = [replace(c, width=c.width - 2 * cut, cx=c.cx - cut) if k % 2 else c for k, c in enumerate(seen.cameras)]
-    pictures = tuple(picture[:, cut:-cut] if k % 2 else picture for k, picture in enumerate(seen.pictures))
+    pictures = tuple(picture[:, cut:-cut] if k % 2 else picture for k, picture in enumerate(seen.images))
     odd = seen.frame % 2 == 1
     pixel = seen.pixel - np.where(odd, cut, 0)[:, None] * [1, 0]
     kept = ~odd | ((pixel[:, 0] > 2) & (pixel[:, 0] < WIDTH - 2 * cut - 2))
     parts = {name: getattr(seen, name)[kept] for name in ("frame", "point")}
-    mixed = replace(seen, cameras=cameras, pictures=pictures, pixel=pixel[kept], **parts)
+    mixed = replace(seen, cameras=cameras, images=pictures, pixel=pixel[kept], **parts)
     assert looked(mixed).found == (lamp > 0)
 
 
@@ -65,5 +65,5 @@ def test_points_that_lie_on_no_plane_tell_nothing() -> None:
     """As on a small object between much that is empty: no patch has a depth."""
     seen = wall(lamp=0.08)
     depth = AWAY * np.random.default_rng(0).uniform(0.2, 5.0, len(seen.frame))
-    found = shiny(seen, problem_of(seen), depth, PLAIN)
+    found = find_specularity(seen, problem_of(seen), depth, PLAIN)
     assert not found.found and found.evidence.number == 0

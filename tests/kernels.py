@@ -1,0 +1,29 @@
+"""Compiles what numba caches on disk, before workers start that would each compile the same: `python -m tests.kernels`."""
+
+from __future__ import annotations
+
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+
+def fits() -> None:
+    from fieldfuse.training import numba_warm
+
+    for decoder in ("deferred", "per_sample"):
+        numba_warm.run(decoder, 16, 16)
+
+
+def matching() -> None:
+    from fieldfuse.stereo import quick
+
+    quick.warm_up()
+
+
+def main() -> None:
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+        for done in [pool.submit(fits), pool.submit(matching)]:
+            done.result()
+
+
+if __name__ == "__main__":
+    main()
