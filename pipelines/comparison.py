@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import platform
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -224,6 +222,7 @@ def put_comparison(it: Compared, found: dict[str, Any], mesh_facts: dict[str, An
     """Write compare.json and compare.html; answers the former. `start`: of the command, by the monotonic clock."""
     from fieldfuse.evaluation.compare import compare_data
     from fieldfuse.evaluation.compare_page import write_comparison
+    from fieldfuse.evaluation.machine import machine
     from fieldfuse.evaluation.pictures import method_pictures
 
     job, views, scene = it.job, it.views, it.scene
@@ -257,7 +256,7 @@ def put_comparison(it: Compared, found: dict[str, Any], mesh_facts: dict[str, An
         },
         "methods": [describe_method(it, name, found, mesh_facts) for name in it.renders],
         "matching": found["matching"],
-        "machine": machine(job),
+        "machine": machine(job.settings.threads, job.settings.device),
         "seconds_total": round(time.monotonic() - start + job.stages.fresh_seconds(), 3),
     }
     shown = {name: renders.pictures for name, renders in it.renders.items()}
@@ -297,7 +296,7 @@ def describe_method(it: Compared, name: str, found: dict[str, Any], mesh_facts: 
 def shown_meshes(it: Compared) -> list[MeshPictures]:
     """Pictures of the meshes from outside, and from a test view."""
     from fieldfuse.evaluation.compare_meshes import cut_box, from_outside, mesh_pictures
-    from fieldfuse.export.field_surface import at_most
+    from fieldfuse.export.surface import at_most
 
     meshes, truth = it.meshes()
     if not meshes:
@@ -311,16 +310,3 @@ def shown_meshes(it: Compared) -> list[MeshPictures]:
         *mesh_pictures(meshes, truth, [outside], voxel, cut_box(scene.centre, scene.half_size)),
         *mesh_pictures(meshes, truth, [inside], voxel),
     ]
-
-
-def machine(job: Job) -> dict[str, Any]:
-    """What the times were measured on; a load above the cores means that they are upper bounds."""
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    return {
-        "system": platform.platform(),
-        "cores": os.cpu_count(),
-        "threads": job.settings.threads or os.cpu_count(),
-        "device": job.settings.device,
-        "load": None if load is None else round(load, 2),
-        "measured": time.strftime("%Y-%m-%d %H:%M"),
-    }

@@ -142,7 +142,7 @@ class Live:
 
     def _furnish(self) -> None:
         """Controls, the capture's cameras, and where a visitor begins: at the first of them."""
-        from fieldfuse.export.field_surface import spread
+        from fieldfuse.export.surface import spread
 
         gui, scene, views = self.server.gui, self.server.scene, self.shown.views
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -36,10 +36,10 @@ def render(
 
     options = gather(None, config, pairs, device=device, threads=threads)
     bound_threads(options)
-    from fieldfuse.pipelines.render_path import render_run
+    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.render_path import Shot, render_run
 
-    what: dict[str, Any] = {"views": views, "cameras": cameras, "frames": frames, "image_size": image_size, "baked": baked}
-    data = render_run(target, out, options, **what, to=to, fps=fps, quiet=quiet)
+    data = render_run(target, out, options, Shot(views, cameras, frames, image_size, baked, to, fps), make_progress(quiet))
     if json:
         import json as writer
 

@@ -7,6 +7,7 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,12 +18,12 @@ from fieldfuse.capture import nerf_json
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json, remove
 from fieldfuse.memory_limits import require_pictures
-from fieldfuse.pipelines.console import make_progress
-from fieldfuse.pipelines.job import Job, open_job
-from fieldfuse.pipelines.pictures import Camera, camera_of, orbit_cameras, pictures
+from fieldfuse.pipelines.job import open_job
+from fieldfuse.pipelines.pictures import camera_of, orbit_cameras, pictures
 from fieldfuse.pipelines.reconstruct import BEFORE, stand
 from fieldfuse.pipelines.rendered import file_name, write_png
 from fieldfuse.pipelines.steps_results import fit_radiance_field
+from fieldfuse.progress import Progress
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Views
@@ -32,21 +33,21 @@ NUMBERED = re.compile(r"\d{4,}_.*\.png")
 MAX_CAMERAS = 100_000
 
 
-def render_run(
-    target: Path,
-    out: Path | None,
-    options: dict[str, Any],
-    *,
-    views: str,
-    cameras: Path | None,
-    to: Path | None,
-    frames: int,
-    fps: float,
-    image_size: int | None,
-    baked: bool,
-    quiet: bool,
-) -> dict[str, Any]:
-    """Render what is asked for; the field of a run's folder is taken as it is.
+@dataclass(frozen=True)
+class Shot:
+    """What is rendered: along `views` (an orbit of so many `frames`, or test) or by the `cameras` of a file, with this long side."""
+
+    views: str = "orbit"
+    cameras: Path | None = None
+    frames: int = 90
+    image_size: int | None = None
+    baked: bool = False
+    to: Path | None = None
+    fps: float = 30.0
+
+
+def render_run(target: Path, out: Path | None, options: dict[str, Any], shot: Shot, progress: Progress) -> dict[str, Any]:
+    """Render a shot; the field of a run's folder is taken as it is.
 
     Returns:
         how many `pictures` of which `width` and `height`, the `seconds` it took, the path `to`, and how many `others` lie there besides.
@@ -55,60 +56,44 @@ def render_run(
         InputError: an unknown path of cameras, cameras that cannot be used, a folder without a field and without its source.
         OutputError: the result cannot be written.
     """
-    if views not in ("orbit", "test"):
-        raise InputError(f"--views is {views!r}; it must be orbit or test")
-    if to is not None and to.suffix and to.suffix.lower() not in VIDEO:
-        raise InputError(f"--to {to} must be an .mp4 file or a folder")
-    given = read_cameras(cameras) if cameras is not None else None
-    with open_job(target, out, options, make_progress(quiet), (*BEFORE, "field")) as job:
-        _, _, _, scene, ready = stand(job)
-        field, _ = fit_radiance_field(job, ready, scene)
+    if shot.views not in ("orbit", "test"):
+        raise InputError(f"--views is {shot.views!r}; it must be orbit or test")
+    if shot.to is not None and shot.to.suffix and shot.to.suffix.lower() not in VIDEO:
+        raise InputError(f"--to {shot.to} must be an .mp4 file or a folder")
+    given = read_cameras(shot.cameras) if shot.cameras is not None else None
+    with open_job(target, out, options, progress, (*BEFORE, "field")) as job:
+        _, _, _, scene, views = stand(job)
+        field, _ = fit_radiance_field(job, views, scene)
         if given is not None:
-            names, lenses, poses = given[0], given[1], scene.working_from_input.poses(given[2])
-        elif views == "test":
-            names, lenses, poses = test_cameras(ready)
+            own, (names, lenses, poses) = "cameras", given
+            poses = scene.working_from_input.poses(poses)
+        elif shot.views == "test":
+            own, (names, lenses, poses) = "test", test_cameras(views)
         else:
-            names, lenses, poses = orbit_cameras(ready, scene, frames)
-        lenses = [sized(lens, image_size) for lens in lenses]
-        own = job.folder / "renders" / (
-            "orbit.mp4" if given is None and views == "orbit" else "cameras" if given is not None else "test"
-        )
-        place = to or own
+            own, (names, lenses, poses) = "orbit.mp4", orbit_cameras(views, scene, shot.frames)
+        lenses = [sized(lens, shot.image_size) for lens in lenses]
+        place = shot.to or job.folder / "renders" / own
         require_pictures(lenses, kept=False)
         start = time.monotonic()
         job.progress.begin("render")
-        others = write(job, camera_of(job, field, ready, scene, baked), names, lenses, poses, place, fps, alone=to is None)
+        frames = pictures(camera_of(job, field, views, scene, shot.baked), lenses, poses, job.progress)
+        others = 0
+        if place.suffix.lower() in VIDEO:
+            from fieldfuse.export.video import write_video
+
+            if len({(lens.width, lens.height) for lens in lenses}) > 1:
+                raise InputError("a video needs pictures of one size and these cameras differ; give a folder with --to, or --image-size")
+            write_video(place, frames, shot.fps)
+        else:
+            # The command's own folder: its pictures take the place of those that an earlier command left there, when all are rendered.
+            with _replacing(place) if shot.to is None else nullcontext(place) as folder:
+                stems = (f"{index:04d}_{file_name(Path(name).stem)}" for index, name in enumerate(names))
+                written = {write_png(folder / f"{stem}.png", frame).name for stem, frame in zip(stems, frames, strict=True)}
+            others = sum(path.name not in written for path in place.glob("*.png"))
         seconds = time.monotonic() - start
         job.progress.finish("render", seconds, False)
     size = {"width": lenses[0].width, "height": lenses[0].height}
     return {"pictures": len(names), **size, "seconds": round(seconds, 3), "to": str(place), "others": others}
-
-
-def write(
-    job: Job, camera: Camera, names: list[str], lenses: list[Intrinsics], poses: Array, to: Path, fps: float, alone: bool = False
-) -> int:
-    """Render every camera and write it as it comes.
-
-    Args:
-        alone: the pictures take the place of those that an earlier command left in the folder, when all are rendered.
-
-    Returns:
-        how many other pictures lie in the folder.
-    """
-    frames = pictures(camera, lenses, poses, job.progress)
-    if to.suffix.lower() in VIDEO:
-        from fieldfuse.export.video import write_video
-
-        if len({(lens.width, lens.height) for lens in lenses}) > 1:
-            raise InputError("a video needs pictures of one size and these cameras differ; give a folder with --to, or --image-size")
-        write_video(to, frames, fps)
-        return 0
-    with _replacing(to) if alone else nullcontext(to) as folder:
-        written = {
-            write_png(folder / f"{index:04d}_{file_name(Path(name).stem)}.png", frame).name
-            for index, (name, frame) in enumerate(zip(names, frames, strict=True))
-        }
-    return sum(path.name not in written for path in to.glob("*.png"))
 
 
 @contextmanager

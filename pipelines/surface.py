@@ -12,7 +12,7 @@ import numpy as np
 from fieldfuse import memory
 from fieldfuse.camera import Array, Similarity
 from fieldfuse.errors import InputError
-from fieldfuse.export.field_surface import Originals, at_most, surface_of_field, whole_mesh
+from fieldfuse.export.surface import Originals, at_most, surface_of_field, whole_mesh
 from fieldfuse.memory_limits import require_pictures
 from fieldfuse.pipelines.fit_files import fit_left_out
 from fieldfuse.pipelines.job import Job

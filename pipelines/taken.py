@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fieldfuse.errors import InputError
-from fieldfuse.export.field_surface import Originals
+from fieldfuse.export.surface import Originals
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Capture, Views

@@ -219,8 +219,8 @@ def make_direct(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[Mad
 
 def make_surface(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[Made]:
     """Fuse depth into a surface: the sensor's, or what matching found for the run."""
-    from fieldfuse.export.field_surface import whole_mesh
     from fieldfuse.export.mesh import write_mesh
+    from fieldfuse.export.surface import whole_mesh
 
     voxel = ground.settings.tsdf.voxel_size if spec["base_voxel"] is None else spec["base_voxel"] * spec["wanted"]["voxel_size"]
     path = scratch / "mesh.ply"

@@ -192,8 +192,8 @@ def tradeoff_run(target: Path, out: Path | None, options: dict[str, Any], choice
         InputError: no test views, an axis that cannot be varied, times that are no numbers.
         Interrupted: the user asked to stop; what was measured is written.
     """
+    from fieldfuse.evaluation.machine import machine
     from fieldfuse.evaluation.tradeoff_page import write_tradeoff
-    from fieldfuse.pipelines.comparison import machine
     from fieldfuse.pipelines.steps_stereo import match_pictures
     from fieldfuse.pipelines.summary import base_data, warnings_of
 
@@ -229,7 +229,7 @@ def tradeoff_run(target: Path, out: Path | None, options: dict[str, Any], choice
                 "rows": rows,
                 "left_out": [one.name for one in planned if (one.id, one.seed) not in done],
                 "refused": refused,
-                "machine": machine(job),
+                "machine": machine(job.settings.threads, job.settings.device),
             }
             data = write_tradeoff(job.folder.path, data)
     return data

@@ -143,15 +143,14 @@ def test_only_what_was_seen_is_asked_for() -> None:
 
 def test_meshes_are_read_and_what_is_none_is_refused(tmp_path: Path) -> None:
     mesh = Mesh.create(ball().vertices, ball().triangles, np.random.default_rng(0).integers(0, 255, (2562, 3)))
-    for suffix in (".ply", ".obj", ".glb"):
+    for suffix in (".ply", ".obj"):
         path = tmp_path / f"mesh{suffix}"
         write_mesh(path, mesh)
         back = read_mesh(path)
         assert np.allclose(np.sort(back.vertices, axis=0), np.sort(mesh.vertices, axis=0), atol=1e-6)
         assert len(back.triangles) == len(mesh.triangles)
-    for suffix in (".ply", ".glb"):  # in glTF they are linear
-        back = read_mesh(tmp_path / f"mesh{suffix}")
-        assert np.array_equal(back.colours[back.triangles], mesh.colours[mesh.triangles])
+    back = read_mesh(tmp_path / "mesh.ply")
+    assert np.array_equal(back.colours[back.triangles], mesh.colours[mesh.triangles])
     write_mesh(tmp_path / "empty.ply", Mesh.empty())
     (tmp_path / "text.ply").write_text("no mesh at all")
     (tmp_path / "cut.ply").write_bytes((tmp_path / "mesh.ply").read_bytes()[:4000])

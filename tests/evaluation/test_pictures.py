@@ -18,7 +18,7 @@ from fieldfuse.evaluation.pictures import (
     method_pictures,
     moving_pictures,
 )
-from fieldfuse.export.field_surface import spread
+from fieldfuse.export.surface import spread
 from fieldfuse.stereo.left_out import LeftOut
 from tests.evaluation.samples import draw, make_views
 

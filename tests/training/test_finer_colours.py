@@ -11,9 +11,9 @@ import torch
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import Interrupted
 from fieldfuse.progress import Progress
+from fieldfuse.render.color_backprojection import COLOURS, recoloured
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import render_view
-from fieldfuse.render.recolour import COLOURS, recoloured
 from fieldfuse.training import finer_colours as module
 from fieldfuse.training.finer_colours import PIXELS, finer_colours
 from fieldfuse.training.levels import finer

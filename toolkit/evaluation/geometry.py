@@ -13,7 +13,6 @@ import trimesh
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation.score import in_image
-from fieldfuse.tone import encode, shares
 from fieldfuse.tsdf.mesh import Mesh, ray_scene
 
 SAMPLES = 200_000  # on each surface: F-scores of the same meshes then repeat within some thousandths
@@ -26,7 +25,7 @@ Region = tuple[Array, Array]  # lowest and highest corner (3,)
 
 
 def read_mesh(path: Path | str) -> Mesh:
-    """The triangles of a .ply, .obj or .glb file, with vertex colours where there are any.
+    """The triangles of a .ply or .obj file, with vertex colours where there are any.
 
     Raises:
         InputError: missing, too large, damaged, or without triangles.
@@ -35,7 +34,10 @@ def read_mesh(path: Path | str) -> Mesh:
     try:
         if path.stat().st_size > MOST_BYTES:
             raise InputError(f"the mesh {path} is larger than the {MOST_BYTES / 2**30:.0f} GB that are read; thin it out")
-        mesh = _read_glb(path) if path.suffix.lower() == ".glb" else _read_other(path)
+        loaded = trimesh.load_mesh(path, process=False)
+        visual: Any = loaded.visual
+        colours = np.asarray(visual.vertex_colors)[:, :3] if visual.kind == "vertex" else None
+        mesh = Mesh.create(np.asarray(loaded.vertices), np.asarray(loaded.faces), colours)
     except OSError as error:
         raise InputError(f"cannot read the mesh {path}: {error.strerror or error}") from error
     except InputError:
@@ -45,32 +47,6 @@ def read_mesh(path: Path | str) -> Mesh:
     if len(mesh.triangles) == 0:
         raise InputError(f"the mesh {path} has no triangles; write it with its faces")
     return mesh
-
-
-def _read_other(path: Path) -> Mesh:
-    loaded = trimesh.load_mesh(path, process=False)
-    visual: Any = loaded.visual
-    colours = np.asarray(visual.vertex_colors)[:, :3] if visual.kind == "vertex" else None
-    return Mesh.create(np.asarray(loaded.vertices), np.asarray(loaded.faces), colours)
-
-
-def _read_glb(path: Path) -> Mesh:
-    """All parts where the file puts them. Their vertices' colours are linear, and trimesh keeps them apart where a part has a material."""
-    scene: Any = trimesh.load_scene(str(path), process=False)
-    vertices, triangles, colours = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], []
-    for node in scene.graph.nodes_geometry:
-        place, name = scene.graph[node]
-        part = scene.geometry[name]
-        if not isinstance(part, trimesh.Trimesh):
-            continue  # points and lines
-        visual: Any = part.visual
-        kept = visual.vertex_colors if visual.kind == "vertex" else visual.vertex_attributes.get("color")
-        if kept is not None:
-            colours.append(np.round(255 * encode(np.nan_to_num(shares(np.asarray(kept)[:, :3])))).astype(np.uint8))
-        triangles.append(np.asarray(part.faces) + sum(map(len, vertices)))
-        vertices.append(np.asarray(part.vertices) @ place[:3, :3].T + place[:3, 3])
-    whole = len(colours) > 0 and sum(map(len, colours)) == sum(map(len, vertices))
-    return Mesh.create(np.concatenate(vertices), np.concatenate(triangles), np.concatenate(colours) if whole else None)
 
 
 def surface_points(mesh: Mesh, count: int, seed: int = 0) -> tuple[Array, Array]:

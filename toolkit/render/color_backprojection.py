@@ -165,8 +165,8 @@ class _Compiled:
         self.marks = np.zeros((self.threads, len(field.occupied)), np.uint16)
 
     def add(self, origins: Tensor, directions: Tensor, colours: Tensor) -> None:
+        from fieldfuse.backends.numba.color_backprojection import project_back_pass
         from fieldfuse.backends.numba.decode import rays_of
-        from fieldfuse.backends.numba.recolour import project_back_pass
 
         given = [values.float().contiguous().numpy() for values in (origins, directions, colours)]
         limits = [np.float32(value) for value in (STOP, THRESHOLD, STEEPEST, MOST)]

@@ -1,4 +1,4 @@
-"""What pictures ask of a field's colours, projected back, compiled; `recolour.project_back` is the reference."""
+"""What pictures ask of a field's colours, projected back, compiled; `color_backprojection.project_back` is the reference."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def project_back_pass(
 
     Args:
         tape: this thread's own `decode.Rays`.
-        steepest, most: see `recolour.STEEPEST` and `recolour.MOST`.
+        steepest, most: see `color_backprojection.STEEPEST` and `color_backprojection.MOST`.
         marks: (M · 512,) uint16 for `march.mark`.
     """
     channels = len(space.width)
