@@ -41,7 +41,7 @@ Finetune = Annotated[
 ]
 PosesFrom = Annotated[str | None, typer.Option("--poses", help="auto (default), given, or sfm: ignore given poses.", show_default=False)]
 Baked = Annotated[
-    bool, typer.Option("--baked", help="Take the baked field (about twice as fast on a CPU); it is made if need be.", show_default=False)
+    bool, typer.Option("--baked", help="Take the baked field, as pages have it; it is made if need be.", show_default=False)
 ]
 Config = Annotated[Path | None, typer.Option(help="YAML file with settings.", show_default=False)]
 Pairs = Annotated[

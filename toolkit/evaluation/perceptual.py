@@ -54,10 +54,9 @@ class _ArraysOnly(pickle.Unpickler):
     """Reads dictionaries of NumPy arrays; anything else that a pickle may call is refused."""
 
     def find_class(self, module: str, name: str) -> Any:
-        try:
-            return ALLOWED[module, name]
-        except KeyError as error:
-            raise pickle.UnpicklingError(f"{module}.{name} is no part of an array") from error
+        if (module, name) not in ALLOWED:
+            raise pickle.UnpicklingError(f"{module}.{name} is no part of an array")
+        return ALLOWED[module, name]
 
 
 def read_weights(path: Path) -> list[Layer] | None:
@@ -88,8 +87,7 @@ def lpips_available() -> bool:
 
 def distance(layers: list[Layer], first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     """(B, 3, H, W) pairs in [−1, 1] → (B,) LPIPS: squared differences of unit feature vectors, weighted, averaged, summed over layers."""
-    shift = first.new_tensor(SHIFT)[:, None, None]
-    scale = first.new_tensor(SCALE)[:, None, None]
+    shift, scale = (first.new_tensor(values)[:, None, None] for values in (SHIFT, SCALE))
     x = (torch.cat([first, second]) - shift) / scale
     total = first.new_zeros(len(first))
     for (kernel, bias, weight), (stride, padding, pooled) in zip(layers, LAYOUT, strict=True):
