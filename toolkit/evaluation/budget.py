@@ -25,7 +25,7 @@ FRAMES_SHARE = 0.25  # … and when a video's frames are: more of them are worth
 ENOUGH = 30.0  # seconds of fitting that textures and a page need not give way to, whatever share they are
 NEARLY = 0.8  # of the seconds that the smallest pictures would leave, where they do not leave that share
 LEAST_FIT = 2.0  # seconds
-STEADY = 5.0  # seconds of stages that count as predicted well when it is told how busy the machine is: first imports are no sign of it
+STEADY = 5.0  # seconds of stages that count as predicted well when the machine's load is judged: first imports are no sign of it
 EXPORT_SHARE = 0.25  # of the seconds, at most, that are planned for exports
 # Pictures' worth of features that a mesh takes: whatever it is of; of a megapixel of one view, for its triangles, and of all views, to make
 # their depth agree, to polish, fuse and carve; each by the pixels that are rendered, and by those of the depth that is made of them.
@@ -40,12 +40,12 @@ FRAME_COUNTS = (100, 75, 50, 36, 24)  # of a video
 MESH_VIEWS, VIDEO_FRAMES = (12, 60), (24, 90)  # fewest and most
 SIFT_FRAMES = 100
 # Pictures' worth of features that poses take: a picture, a megapixel of one and of each pair that is matched, and for each other
-# picture that is adjusted with it. Of two videos with 24 to 100 frames (0.3 and 0.9 megapixels) it tells the seconds within 60%.
+# picture that is adjusted with it. Of two videos with 24 to 100 frames (0.3 and 0.9 megapixels) the seconds are right within 60%.
 SFM_PICTURE, SFM_FEATURES, SFM_PAIR, SFM_MAPPING = 0.5, 1.6, 0.7, 0.018
 HEIF = 4.0  # times as long as choosing a frame of a video takes: decoding a picture and writing it as JPEG, two threads
 NEIGHBOURS, ALIKE = 5, 12  # pairs for each frame of a video; for each of more photos than are matched with all others
 EFFECTS_LOOKED_AT = 40  # training pictures at most that are looked at for effects; all, when one is corrected picture by picture …
-CORRECTED = 0.4  # … which this share of captures asks for
+CORRECTED = 0.4  # … which this share of captures needs
 EFFECTS_SHARE = 0.5  # of the seconds, at most, that looking for effects may take
 AGREES = 0.15  # relative error of a prediction that is still good
 LEARNING = 0.7  # of what a run shows about a factor, the part that is believed
@@ -68,12 +68,12 @@ COST = {
     "report": ("decode", 75.0),
 }
 KINDS = ("decode", "features", "ray", "fit", "score")
-COUNTED = 4  # raised when a stage's work is counted in another way: what was learnt before says nothing then
+COUNTED = 4  # raised when a stage's work is counted in another way: what was learnt before is of no use then
 
 
 @dataclass(frozen=True)
 class Work:
-    """What a capture asks for.
+    """How much work a capture is.
 
     Attributes:
         frames, width, height: pictures that are used, and their size as they lie on disk. total: of a video's frames, else `frames`.
@@ -85,7 +85,7 @@ class Work:
     test: int
     posed: bool
     depth: bool
-    outlined: bool  # depth, alpha or points tell where the scene is; nothing has to be triangulated
+    outlined: bool  # depth, alpha or points show where the scene is; nothing has to be triangulated
     video: bool = False
     total: int = 0
     effects: bool = False  # they are looked for
@@ -219,7 +219,7 @@ def mesh_work(work: Work, choice: Choice) -> tuple[float, float]:
 
 
 def most_export_seconds(speed: Speed, work: Work, choice: Choice, mesh_views: int, video_frames: int) -> float:
-    """What exports take when nothing of them is left out: more than that they cannot use."""
+    """What exports take when all of them are made: more than that they cannot use."""
     once, each = mesh_work(work, choice)
     video = video_rays(work, replace(choice, video_frames=video_frames)) * EXPORT_RAY * speed.seconds("render", 1.0)
     return speed.factors.get("export", 1.0) * ((once + mesh_views * each) * speed.units["features"] + video)
@@ -231,7 +231,7 @@ def least_export_seconds(speed: Speed, work: Work, choice: Choice) -> float:
 
 
 def predict(speed: Speed, work: Work, choice: Choice) -> dict[str, float]:
-    """Stage → seconds, the fit left out."""
+    """Stage → seconds, without the fit."""
     return {stage: speed.seconds(stage, amount) for stage, amount in amounts(work, choice).items() if amount > 0}
 
 

@@ -120,7 +120,7 @@ def seen_surface(
     region: Region | None = None,
     samples: int = SAMPLES,
 ) -> tuple[Array, float]:
-    """Points of the true surface that a reconstruction is asked for: those that some camera saw, in the region.
+    """Points of the true surface that a reconstruction should have: those that some camera saw, in the region.
 
     Returns:
         (N, 3) points, and their share of the whole true surface.

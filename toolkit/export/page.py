@@ -107,7 +107,7 @@ def page(field: BakedField, tour: Tour, title: str) -> str:
 
 
 def packed(field: BakedField, tour: Tour) -> tuple[dict[str, Any], bytes]:
-    """What the scripts are told, and the arrays one after the other, each filled up to whole words."""
+    """What the scripts need to know, and the arrays one after the other, each filled up to whole words."""
     arrays = field.arrays
     small, large = decoder_blocks(field)
     given: list[tuple[str, Array]] = [

@@ -15,7 +15,7 @@ from fieldfuse.errors import InputError, OutputError
 from fieldfuse.files import atomic_path
 from fieldfuse.tsdf.mesh import as_bytes
 
-QUALITY = "18"  # constant rate factor of H.264: hardly to be told from what was rendered
+QUALITY = "18"  # constant rate factor of H.264: hardly different from what was rendered
 SMPTE_170M, BT_709, LIMITED = 6, 1, 1  # ITU-T H.273: the matrix that both writers use, what is nearest to sRGB, 16 … 235
 PROBE = 2**16  # bytes
 

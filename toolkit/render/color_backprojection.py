@@ -31,12 +31,12 @@ COLOURS = 3  # the first features are logits of the colour
 CHUNK = 2048  # rays at a time, in torch: what they meet then stays in the processor's cache …
 AT_ONCE = 16384  # … and on a device of its own, where it takes hundreds of launches whatever their number: 0.2 GB
 PER_VOXEL = 1.2  # rays along a voxel's side: 1.7 give 0.1 dB more for twice the time
-MOST_RAYS = 2_000_000  # pictures are left out evenly until there are no more …
+MOST_RAYS = 2_000_000  # images are skipped evenly until there are no more …
 MOST_WITHIN = 4_000_000  # … with alpha of those that show something: every side of an object is seen by few of them
 STEEPEST = 0.05  # least slope of colour over logit that is divided by
 MOST = 2.0  # logits that a ray may ask for
 VALID = 0.99
-BESIDE = 4  # pixels beside what a picture shows within which it asks for its background's colour, about three voxels
+BESIDE = 4  # pixels beside what an image shows within which its background's colour counts, about three voxels
 
 
 class Recoloured(NamedTuple):
@@ -85,8 +85,8 @@ def recoloured(
     Args:
         views: held-out ones are not looked at, nor masked pixels. Pictures with alpha ask for their background's colour where they are
             see-through, up to `BESIDE` pixels from what they show: what bulges over a silhouette shows best what is behind it.
-        depth: at which a voxel's size in pixels tells how densely rays are taken, working units.
-        engine: auto | numba | torch. The compiled one runs on the CPU and knows the deferred decoder alone.
+        depth: at which a voxel's size in pixels decides how densely rays are taken, working units.
+        engine: auto | numba | torch. The compiled one runs on the CPU, with the deferred decoder alone.
         relaxation: ω. With 1 every corner gets what its rays ask for in the mean, which is too little where neighbours are asked for the
             opposite. Below 2, passes one after the other do not diverge where the way from logits to colours is straight (as in SIRT).
         in_place: the colours of `field` itself change, once all rays were asked: no second copy of its features is made.
