@@ -282,9 +282,9 @@ def test_table_for_the_terminal() -> None:
     data, _ = sample()
     text = report_text(data)
     rows = {line.split("  ")[1].strip() if line.startswith("  ") else line: line for line in text.splitlines() if line}
-    assert f"{data['evaluation']['field']['psnr']:.2f}" in rows["field"] and "0.4 s" in rows["field"]
+    assert f"{data['evaluation']['field']['psnr']:.2f}" in rows["Field"] and "0.4 s" in rows["Field"]
     assert f"{data['evaluation']['tsdf']['ssim']:.3f}" in rows["TSDF"]
-    assert "nearest training picture" in text and "50.0% of the pixels" in text
+    assert "Nearest training photo" in text and "50.0% of the pixels" in text
     assert "13 frames, 12 of 13 with a pose" in text and "6 min 12 s in all" in text
     assert max(map(len, text.splitlines())) <= 100
     assert report_text(report_data(data)) == text

@@ -134,7 +134,6 @@ ELSEWHERE = {
     "toolkit/poses/worker.py": "as above",
     "toolkit/evaluation/budget.py": "a cache: what cannot be written is not remembered",
     "toolkit/simulate/demo.py": "one video, for people, through `atomic_path`",
-    "toolkit/evaluation/tradeoff_page.py": "plots are drawn into memory, files go through `atomic_path`",
     "toolkit/evaluation/plots.py": "draws into memory",
     "pipelines/doctor.py": "a probe in a temporary folder",
 }

@@ -10,6 +10,7 @@ import numpy as np
 
 from fieldfuse import __version__
 from fieldfuse.errors import InputError
+from fieldfuse.evaluation import words
 from fieldfuse.evaluation.pictures import Pictures
 from fieldfuse.evaluation.words import SCORE
 from fieldfuse.files import atomic_path, write_json
@@ -20,6 +21,7 @@ POSES = ("source", "registered", "total", "models")
 STAGE = ("name", "seconds", "peak_memory_mb", "cached")
 FIELD = ("voxel_size", "blocks", "voxels", "bytes")
 POINT = ("seconds", "psnr")
+METHODS = (("field", "Field"), ("network", "Networks alone"), ("tsdf", "TSDF"))
 SFM_NOTE = (
     "Camera poses were estimated from all images, test views included; "
     "the colours of test views were never shown to anything that fits appearance."
@@ -122,6 +124,32 @@ def report_data(data: dict[str, Any], folder: Path | None = None) -> dict[str, A
         timeline=parts(data.get("timeline"), POINT, "timeline"),
         exports=_exports(data.get("exports"), folder),
     )
+
+
+def score_rows(data: dict[str, Any]) -> list[dict[str, Any]]:
+    """Rows of the table of headline numbers: `title`, `note`, scores (`part`: PSNR alone), and for each measure whether a row is the `best`
+    (when there are two to compare)."""
+    rows = []
+    for key, title in METHODS:
+        score = data["evaluation"].get(key)
+        if score is None:
+            continue
+        note = ""
+        if (frames := score.get("key_frames")) is not None:
+            note = f"{words.counted(frames, 'key frame')} fused in {words.duration(score.get('seconds'))}, nothing fitted"
+        rows.append({**score, "title": title, "note": note, "part": False})
+        if score.get("psnr_masked") is not None:
+            note = f"where it has surface: {words.share(score.get('coverage'))} of the pixels"
+            rows.append({"title": title, "note": note, "psnr": score["psnr_masked"], "part": True})
+    floor = data["evaluation"]["nearest_image"]
+    if floor is not None and floor["psnr"] is not None:
+        rows.append({"title": "Nearest training photo", "note": "shown unchanged: the floor", "psnr": floor["psnr"], "part": True})
+    rivals = [row for row in rows if not row["part"]]
+    for measure, better in (("psnr", max), ("ssim", max), ("lpips", min), ("depth_abs_err", min), ("seconds_per_view", min)):
+        known = [row[measure] for row in rivals if row.get(measure) is not None]
+        for row in rivals:
+            row.setdefault("best", {})[measure] = len(known) > 1 and row.get(measure) == better(known)
+    return rows
 
 
 def write_page(folder: Path, name: str, data: dict[str, Any], html: str) -> tuple[Path, Path]:

@@ -11,9 +11,9 @@ from fieldfuse.evaluation import words
 from fieldfuse.evaluation.page import data_uri, render, tile, view_values
 from fieldfuse.evaluation.pictures import Pictures, ViewPictures
 from fieldfuse.evaluation.plots import psnr_over_time, stage_bars
+from fieldfuse.evaluation.report import METHODS, score_rows
 
 WALK = "/field.html"  # the export that is linked at the top
-METHODS = (("field", "Field"), ("network", "Networks alone"), ("tsdf", "TSDF"))
 
 
 def render_page(data: dict[str, Any], pictures: Pictures) -> str:
@@ -22,7 +22,7 @@ def render_page(data: dict[str, Any], pictures: Pictures) -> str:
     levels = {"TSDF": (evaluation["tsdf"] or {}).get("psnr"), "nearest photo": (evaluation["nearest_image"] or {}).get("psnr")}
     # The plots are our own text but for stage names, which matplotlib escapes.
     time_plot, stage_plot = psnr_over_time(data["timeline"], levels), stage_bars(data["stages"])
-    rows, exports = comparison(data), export_rows(data)
+    rows, exports = score_rows(data), export_rows(data)
     return render(
         "report.html.j2",
         data,
@@ -60,31 +60,6 @@ def view_block(data: dict[str, Any], view: ViewPictures) -> dict[str, Any]:
                     text += f" · depth error {words.significant(one['depth_abs_err'])} {words.unit_of(data)}"
                 scores.append(text if len(view.methods) > 1 else text.removeprefix(f"{title} "))
     return {"name": view.name, "scores": scores, "rows": rows, "tall": view.truth.shape[0] / view.truth.shape[1]}
-
-
-def comparison(data: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows of the table of headline numbers, and for each measure whether a row is the best (when there are two to compare)."""
-    rows = []
-    for key, title in METHODS:
-        score = data["evaluation"].get(key)
-        if score is None:
-            continue
-        note = ""
-        if (frames := score.get("key_frames")) is not None:
-            note = f"{words.counted(frames, 'key frame')} fused in {words.duration(score.get('seconds'))}, nothing fitted"
-        rows.append({**score, "title": title, "note": note, "part": False})
-        if score.get("psnr_masked") is not None:
-            note = f"where it has surface: {words.share(score.get('coverage'))} of the pixels"
-            rows.append({"title": title, "note": note, "psnr": score["psnr_masked"], "part": True})
-    floor = data["evaluation"]["nearest_image"]
-    if floor is not None and floor["psnr"] is not None:
-        rows.append({"title": "Nearest training photo", "note": "shown unchanged: the floor", "psnr": floor["psnr"], "part": True})
-    rivals = [row for row in rows if not row["part"]]
-    for measure, better in (("psnr", max), ("ssim", max), ("lpips", min), ("depth_abs_err", min), ("seconds_per_view", min)):
-        known = [row[measure] for row in rivals if row.get(measure) is not None]
-        for row in rivals:
-            row.setdefault("best", {})[measure] = len(known) > 1 and row.get(measure) == better(known)
-    return rows
 
 
 def headline(data: dict[str, Any]) -> list[tuple[str, str, str]]:

@@ -11,10 +11,9 @@ from rich.table import Table
 from rich.text import Text
 
 from fieldfuse.evaluation import words
-from fieldfuse.evaluation.report import report_data
+from fieldfuse.evaluation.report import report_data, score_rows
 
 WIDEST = 100  # characters
-METHODS = (("field", "field"), ("network", "networks alone"), ("tsdf", "TSDF"))
 LABELS, COLUMN = 60, 22  # columns for the names of a comparison's measures, and for each method
 NARROW_LABELS, NARROW = 40, 17  # the same on a terminal that is too narrow for these: what is longer is wrapped
 
@@ -23,25 +22,20 @@ def report_text(data: dict[str, Any], width: int = WIDEST) -> str:
     """One row a method (field, networks alone, TSDF, nearest image), then facts of the run, in lines of at most `width` characters; the
     facts alone when nothing was scored. `data` as for `write_report`."""
     data = report_data(data)
-    evaluation = data["evaluation"]
+    rows = score_rows(data)
     out = Table(box=box.SIMPLE_HEAD, title_justify="left", caption_justify="left", caption_style="")
-    depth = any((evaluation.get(key) or {}).get("depth_abs_err") is not None for key, _ in METHODS)
+    depth = any(row.get("depth_abs_err") is not None for row in rows)
     for name in ("", "PSNR", "SSIM", "LPIPS", *([f"depth error\n({words.unit_of(data)})"] if depth else []), "render\na view"):
         out.add_column(name, justify="left" if name == "" else "right", no_wrap=name != "")  # the names give way, never a number
-    for key, title in METHODS:
-        score = evaluation.get(key)
-        if score is None:
+    for row in rows:
+        if row["part"]:
+            out.add_row(f"  {row['note']}" if row["title"] == "TSDF" else row["title"], words.decimal(row["psnr"]))
             continue
-        cells = [words.decimal(score["psnr"]), words.decimal(score["ssim"], 3), words.decimal(score["lpips"], 3)]
-        cells += [words.significant(score["depth_abs_err"])] if depth else []
-        out.add_row(title, *cells, words.duration(score["seconds_per_view"]))
-        if score.get("key_frames") is not None:
-            out.add_row(f"  {words.counted(score['key_frames'], 'key frame')} in {words.duration(score.get('seconds'))}")
-        if score.get("psnr_masked") is not None:
-            out.add_row(f"  on its surface, {words.share(score.get('coverage'))} of the pixels", words.decimal(score["psnr_masked"]))
-    floor = evaluation.get("nearest_image")
-    if floor is not None and floor.get("psnr") is not None:
-        out.add_row("nearest training picture", words.decimal(floor["psnr"]))
+        cells = [words.decimal(row["psnr"]), words.decimal(row["ssim"], 3), words.decimal(row["lpips"], 3)]
+        cells += [words.significant(row["depth_abs_err"])] if depth else []
+        out.add_row(row["title"], *cells, words.duration(row["seconds_per_view"]))
+        if row["note"]:
+            out.add_row(f"  {row['note']}")
     facts = _facts(data)
     out.caption = Text("\n".join(facts))
     return _printed(out, width) if out.row_count else "".join(f"{line}\n" for line in facts)
