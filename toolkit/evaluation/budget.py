@@ -253,7 +253,9 @@ def choose(speed: Speed, work: Work, total: float, most_frames: int = 150) -> Ch
         left = {size: total * (1 - EXPORT_SHARE) - taken[size] for size in sizes}
         most = max(left.values())
         least = min(FIT_SHARE * total, NEARLY * most)
-        fitting = [size for size in sizes if left[size] >= least and _rays(speed, left[size]) >= _wanted_rays(work, Choice(size, count))]
+        training = (1 - work.test / max(work.frames, 1)) * min(work.frames, count or work.frames)
+        rays = {size: RAYS_A_PIXEL * training * work.pixels(size) for size in sizes}
+        fitting = [size for size in sizes if left[size] >= least and left[size] / speed.units["fit"] >= rays[size]]
         if fitting:
             return Choice(max(fitting), count)
     return Choice(SIZES[0], counts[-1])
@@ -263,17 +265,6 @@ def left_for_fit(speed: Speed, work: Work, seconds: float) -> float:
     """What pictures as `choose` takes them and the least that is exported leave of `seconds`."""
     choice = choose(speed, work, seconds)
     return seconds - sum(predict(speed, work, choice).values()) - least_export_seconds(speed, work, choice)
-
-
-def _rays(speed: Speed, seconds: float) -> float:
-    """That a fit has in so many seconds."""
-    return seconds / speed.units["fit"]
-
-
-def _wanted_rays(work: Work, choice: Choice) -> float:
-    """That a fit should have."""
-    training = (1 - work.test / max(work.frames, 1)) * min(work.frames, choice.max_frames or work.frames)
-    return RAYS_A_PIXEL * training * work.pixels(choice.image_size)
 
 
 def fit_seconds(total: float, spent: float, rest: float) -> float:
