@@ -23,10 +23,9 @@ from fieldfuse.effects.effect_specs import parse
 from fieldfuse.errors import InputError
 from fieldfuse.files import atomic_path, read_json, write_json
 from fieldfuse.progress import SILENT, Progress
-from fieldfuse.simulate.capture_files import TRUTH
 from fieldfuse.simulate.film import Shot
 from fieldfuse.simulate.settings import SceneFile, scene_file
-from fieldfuse.simulate.simulate import prepare, simulate
+from fieldfuse.simulate.simulate import TRUTH, prepare, simulate
 from fieldfuse.tone import Tone
 
 WIDTH, HEIGHT, FRAMES, FPS, SIDE = 256, 192, 16, 5.0, 1

@@ -122,7 +122,7 @@ def tsdf_frames(voxel_size: float = 0.02, frames: int = 6, rounds: int = 3) -> d
     """`tsdf_loop.compare_with_bare_loop` on images of a corrugated wall at 320×240; None where Open3D cannot be used."""
     try:
         from benchmarks.tsdf_loop import compare_with_bare_loop
-        from fieldfuse.tsdf.frames import DepthFrame
+        from fieldfuse.tsdf.volume import DepthFrame
     except (ImportError, OSError):
         return None
     camera = Intrinsics(320, 240, 272.0, 272.0, 160.0, 120.0)

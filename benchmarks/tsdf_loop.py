@@ -12,8 +12,7 @@ import open3d.core as o3c
 
 from fieldfuse.camera import invert
 from fieldfuse.errors import InputError
-from fieldfuse.tsdf.frames import DepthFrame
-from fieldfuse.tsdf.volume import BLOCK, DEVICE, TRUNCATION, TsdfVolume
+from fieldfuse.tsdf.volume import BLOCK, DEVICE, TRUNCATION, DepthFrame, TsdfVolume
 
 
 def bare_loop_seconds(

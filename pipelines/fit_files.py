@@ -6,7 +6,7 @@ from typing import Any
 
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.kept import MATCHED, NOTES, read_kept
-from fieldfuse.stereo.left_out import LeftOut
+from fieldfuse.stereo.transients import LeftOut
 
 FIT_NOTES = "fit_notes.json"  # what a reader of the numbers has to know of the fit; there only when there is something
 LEFT_OUT = "left_out.safetensors"  # pixels that the fit did without, since they show what moves; there only when they were looked for
@@ -27,7 +27,7 @@ def fit_matched(job: Job) -> dict[str, Any] | None:
 
 def fit_left_out(job: Job) -> LeftOut | None:
     """The pixels that this run's fit did without, since they show what moves; None: they were not looked for."""
-    from fieldfuse.stereo.left_out import load_left_out
+    from fieldfuse.stereo.transients import load_left_out
 
     record = job.stages.records.get("field")
     return load_left_out(job.folder / LEFT_OUT) if record is not None and LEFT_OUT in record.outputs else None

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene
     from fieldfuse.render.field import Field
-    from fieldfuse.stereo.left_out import LeftOut
+    from fieldfuse.stereo.transients import LeftOut
     from fieldfuse.training.fit import FitResult
 
 
@@ -91,7 +91,7 @@ def fit_radiance_field(job: Job, views: Views, scene: Scene, go_on: bool = False
     from fieldfuse.pipelines.steps_network import direct_result, make_network_field, uses_network
     from fieldfuse.pipelines.steps_stereo import views_for_fit
     from fieldfuse.render.field import Field
-    from fieldfuse.stereo.left_out import load_left_out, save_left_out
+    from fieldfuse.stereo.transients import load_left_out, save_left_out
     from fieldfuse.training.guided import fit_guided
     from fieldfuse.training.network_start import network_start
     from fieldfuse.volume.grid_host import host_for

@@ -24,9 +24,9 @@ def match_pictures(job: Job, scene: Scene, views: Views) -> list[StereoDepth]:
         InputError: the pictures cannot be matched.
         Interrupted: the user asked to stop.
     """
-    from fieldfuse.stereo.bare import continued
     from fieldfuse.stereo.maps import load_stereo, save_stereo
     from fieldfuse.stereo.match import stereo_depths
+    from fieldfuse.stereo.plane_completion import continued
 
     path = job.folder / "stereo" / "depths.safetensors"
     training = views.subset(np.flatnonzero(~views.test))
@@ -63,7 +63,7 @@ def views_for_fit(job: Job, scene: Scene, views: Views) -> tuple[Views, list[str
         InputError: the pictures are to be matched, and cannot be.
         Interrupted: the user asked to stop.
     """
-    from fieldfuse.stereo.quick import with_depths
+    from fieldfuse.stereo.fast_mvs import with_depths
 
     wanted = job.settings.fit.depth_from if job.settings.fit.depth > 0 else "off"
     if wanted == "off":

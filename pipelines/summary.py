@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene
     from fieldfuse.render.field import Field
-    from fieldfuse.stereo.left_out import LeftOut
+    from fieldfuse.stereo.transients import LeftOut
 
 SEEN_BY_SFM = (
     "poses were estimated from all images, the held-out ones included, so scores are slightly optimistic"

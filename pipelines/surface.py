@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from fieldfuse.poses.scene import Scene
     from fieldfuse.render.field import Field
     from fieldfuse.stereo.match import StereoDepth
-    from fieldfuse.tsdf.fuse import Points
     from fieldfuse.tsdf.mesh import Mesh
+    from fieldfuse.tsdf.volume import Points
 
 MOST_TRIANGLES = 2_000_000
 MOST_SPARSE = 20_000  # points that go with exported cameras
@@ -51,8 +51,7 @@ def fuse_training_frames(
         pictures, and the files written. `pictures.facts`: voxel size and range (working units), frames, blocks, seconds with decoding.
     """
     from fieldfuse.export.mesh import mesh_facts
-    from fieldfuse.tsdf.fuse import fuse_capture
-    from fieldfuse.tsdf.stereo_frames import fuse_stereo
+    from fieldfuse.tsdf.fuse import fuse_capture, fuse_stereo
 
     settings = job.settings.tsdf
     start = time.monotonic()

@@ -255,7 +255,7 @@ def fuse(ground: Ground, method: str, settings: TsdfSettings) -> TsdfVolume:
         with_depth = [int(index) for index in ground.used if ground.posed.frames[int(index)].depth is not None]
         return fuse_capture(ground.posed, ground.scene.working_from_input, with_depth, settings, tones=ground.views.toned())
     from fieldfuse.stereo.maps import load_stereo
-    from fieldfuse.tsdf.stereo_frames import fuse_stereo
+    from fieldfuse.tsdf.fuse import fuse_stereo
 
     names, depths = load_stereo(ground.folder / "stereo" / "depths.safetensors")
     training = ground.views.subset(np.flatnonzero(~ground.views.test))

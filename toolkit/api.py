@@ -152,10 +152,9 @@ def fuse_tsdf(scene: Scene, *, depth_from: str = "auto", progress: Listener = No
         InputError: there is no depth, or the voxels are too fine for the memory.
         Interrupted: the listener asked to stop.
     """
-    from fieldfuse.stereo.bare import continued
     from fieldfuse.stereo.match import stereo_depths
-    from fieldfuse.tsdf.fuse import fuse_capture
-    from fieldfuse.tsdf.stereo_frames import fuse_stereo
+    from fieldfuse.stereo.plane_completion import continued
+    from fieldfuse.tsdf.fuse import fuse_capture, fuse_stereo
 
     if depth_from not in ("auto", "sensor", "matching"):
         raise InputError(f"depth_from is {depth_from!r}; it must be auto, sensor or matching")

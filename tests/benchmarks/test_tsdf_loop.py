@@ -9,7 +9,7 @@ from benchmarks.tsdf_loop import compare_with_bare_loop
 from fieldfuse.camera import Similarity
 from fieldfuse.capture import open_capture
 from fieldfuse.errors import InputError
-from fieldfuse.tsdf.frames import capture_depth_frames
+from fieldfuse.tsdf.fuse import capture_depth_frames
 from tests.conftest import shared_data
 from tests.tsdf.scenes import ring, sphere_frame
 

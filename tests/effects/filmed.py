@@ -12,7 +12,7 @@ from fieldfuse.camera import Array, Intrinsics, project, unproject
 from fieldfuse.effects.effect_specs import parse
 from fieldfuse.effects.light import LightTracks
 from fieldfuse.effects.models import decode_srgb
-from fieldfuse.simulate.film import Film
+from fieldfuse.simulate.film import Film, FilmCamera
 from fieldfuse.simulate.materials import TextureBank
 from fieldfuse.simulate.paths import PathSettings, plan
 from fieldfuse.simulate.procedural import random_scene
@@ -31,7 +31,8 @@ def film_tracks(bank: TextureBank, seed: int, effects: list[str], count: int = 6
     """Film `FRAMES` pictures and follow up to `count` points of each."""
     scene = random_scene(kind, np.random.default_rng(seed), bank)
     settings = PathSettings("walk", frames=FRAMES, fps=2.0, speed=0.4, shake=8.0)
-    film = Film(scene, CAMERA, plan(scene, settings, np.random.default_rng(seed)), settings.times(), parse(effects, "test"), seed, side=2)
+    motion = plan(scene, settings, np.random.default_rng(seed))
+    film = Film(scene, FilmCamera(CAMERA), motion, settings.times(), parse(effects, "test"), seed)
     shots = [film.shot(index) for index in range(FRAMES)]
     linear = [decode_srgb(torch.from_numpy(cv2.blur(shot.rgb, (3, 3)).astype(np.float32) / 255)).numpy() for shot in shots]
     rng = np.random.default_rng(seed)

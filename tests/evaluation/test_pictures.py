@@ -19,7 +19,7 @@ from fieldfuse.evaluation.pictures import (
     moving_pictures,
 )
 from fieldfuse.export.surface import spread
-from fieldfuse.stereo.left_out import LeftOut
+from fieldfuse.stereo.transients import LeftOut
 from tests.evaluation.samples import draw, make_views
 
 

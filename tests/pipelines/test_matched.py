@@ -13,8 +13,8 @@ import pytest
 from fieldfuse.camera import Intrinsics, opengl_from_world
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.summary import describe_left_out, describe_matching
-from fieldfuse.stereo import moving
-from fieldfuse.stereo.left_out import LeftOut, load_left_out
+from fieldfuse.stereo import transients
+from fieldfuse.stereo.transients import LeftOut, load_left_out
 from tests.pipelines.made import call, save_picture, write_transforms
 from tests.poses.textured import arc, render
 
@@ -78,7 +78,7 @@ def test_without_being_asked_pictures_are_matched_for_the_fit_alone(
         assert any("Matching 4 training images" in note for note in data["notes"])
     # A fit that goes on does not match them again: what was found before is told.
     before = data["field"]["matched"]
-    monkeypatch.setattr("fieldfuse.stereo.quick.guided", refuse)
+    monkeypatch.setattr("fieldfuse.stereo.fast_mvs.guided", refuse)
     answer = call(capsys, "finetune", out, "--budget", "0.5", "--threads", "1", "--quiet")
     assert answer.code == 0, answer.err
     after = read_json(out / "report.json")
@@ -91,7 +91,7 @@ def test_without_being_asked_pictures_are_matched_for_the_fit_alone(
 
 
 def test_what_moves_is_left_out_and_told(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(moving, "FEWEST", 6)
+    monkeypatch.setattr(transients, "FEWEST", 6)
     make_corner(tmp_path / "corner", 9)
     for index in (2, 6):
         path = tmp_path / "corner" / f"images/{index:03d}.png"

@@ -1,16 +1,14 @@
-"""Tiled ray casting against solids: exact by a slow float64 reference, for pictures, for scattered rays, for any number of rays."""
+"""Ray casting against solids: exact by a slow float64 reference, for rays from one place, for scattered rays, for any number of rays."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldfuse.camera import Array
-from fieldfuse.simulate import cast as caster
-from fieldfuse.simulate.cast import FAR, cast, tile_order
+from fieldfuse.simulate.cast import FAR, cast
 from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solid, Solids, rod, upright
 
 
@@ -71,33 +69,17 @@ def test_agrees_with_the_reference(seed: int, count: int, room: bool, one_origin
     np.testing.assert_allclose(distance.numpy()[check][same], np.array([t for t, _ in expected])[same], rtol=2e-4, atol=2e-4)
 
 
-def test_no_tile_misses_what_brute_force_finds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every ray of a picture, with tiles that bound their rays and with tiles that meet every solid."""
-    rng = np.random.default_rng(4)
-    solids = random_solids(rng, 40, True)
-    order, back = tile_order(70, 50)
-    assert torch.equal(order[back], torch.arange(3500))
-    v, u = np.divmod(np.arange(3500), 70)
-    directions = np.stack([(u - 35) / 50, (v - 25) / 50, np.ones(3500)], axis=1)
-    directions = torch.tensor(directions / np.linalg.norm(directions, axis=1, keepdims=True), dtype=torch.float32)[order]
-    starts = torch.tensor([[0.1, 0.2, -2.0]]) + 0.02 * torch.rand(3500, 3)
-    tiled = [cast(solids, origin, directions) for origin in (starts[:1], starts)]
-    monkeypatch.setattr(caster, "_reached", lambda solids, starts, rays: torch.ones(rays.shape[1], len(solids), dtype=torch.bool))
-    for (distance, solid), origin in zip(tiled, (starts[:1], starts), strict=True):
-        expected, which = cast(solids, origin, directions)
-        assert torch.equal(distance, expected)
-        assert torch.equal(solid, which)
-
-
-def test_tiles_meet_few_solids() -> None:
-    """The point of the tiles: in a picture of many scattered solids, few are met."""
-    rng = np.random.default_rng(5)
-    solids = Solids([upright(BOX, rng.uniform([-2, 3, -2], [2, 6, 2]), [0.1, 0.1, 0.1], 0) for _ in range(100)])
-    v, u = np.divmod(np.arange(256), 16)
-    directions = np.stack([(u - 8) / 100, np.ones(256), (v - 8) / 100], axis=1)
-    directions = torch.tensor(directions / np.linalg.norm(directions, axis=1, keepdims=True), dtype=torch.float32)
-    reached = caster._reached(solids, torch.zeros(3, 1, 1), directions.T.reshape(3, 1, 256))
-    assert 0 < reached.sum() < 15
+def test_many_rays_on_threads_are_the_same() -> None:
+    solids, rng = random_solids(np.random.default_rng(4), 40, True), np.random.default_rng(1)
+    directions = torch.nn.functional.normalize(torch.tensor(rng.normal(size=(9000, 3)), dtype=torch.float32), dim=1)
+    before = torch.get_num_threads()
+    for origins in (torch.tensor([[0.1, 0.2, -2.0]]), torch.tensor(rng.uniform(-1, 1, (9000, 3)), dtype=torch.float32)):
+        single = [cast(solids, origins[i : i + 1] if len(origins) > 1 else origins, directions[i : i + 1]) for i in range(0, 9000, 900)]
+        torch.set_num_threads(2)
+        distance, solid = cast(solids, origins, directions)
+        torch.set_num_threads(before)
+        assert torch.equal(distance[::900], torch.cat([one for one, _ in single])) and (distance < FAR).all()
+        assert torch.equal(solid[::900], torch.cat([one for _, one in single]))
 
 
 def test_surfaces_know_face_place_and_normal() -> None:

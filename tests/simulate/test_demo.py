@@ -1,4 +1,4 @@
-"""The demo's video: what it shows is what the truth says, and its path gives parallax as a hand would."""
+"""The demo: colours and light land where they belong, the video shows its truth, and its path gives parallax as a hand would."""
 
 from __future__ import annotations
 
@@ -9,11 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
-from fieldfuse.camera import Array, project, unproject
+from fieldfuse.camera import Array, Intrinsics, project, unproject
 from fieldfuse.errors import Interrupted, OutputError
 from fieldfuse.progress import Progress
 from fieldfuse.simulate import demo
-from fieldfuse.simulate.demo import Filmed, demo_scene, hand_held, write_demo_video
+from fieldfuse.simulate.demo import BakedScene, Filmed, Light, demo_scene, hand_held, write_demo_video
+from fieldfuse.simulate.solids import BALL, BOX, upright
+
+CAMERA = Intrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
+FRONT = np.array([[1, 0, 0, 0], [0, 0, 1, -3], [0, -1, 0, 0.5], [0, 0, 0, 1]], dtype=float)  # at y = −3, looking along y; z is up
+FRONT_ONLY = (-1, -1, -1, 0, -1, -1)  # a texture on the face at −y
+WALL = upright(BOX, [0, 0.1, 0.5], [2, 0.1, 1.5], FRONT_ONLY)
+EVEN = Light(lamp=(0.0, -6.0, 0.5), radius=0.01, lamp_strength=0.0, sky_strength=1.0)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -51,25 +58,6 @@ def test_every_pixel_shows_something(filmed: tuple[Filmed, list[Array]]) -> None
         assert (film.scene.depth(film.intrinsics.scaled(60, 45), pose) > 0.5).all()
 
 
-def test_points_look_alike_from_two_views(filmed: tuple[Filmed, list[Array]]) -> None:
-    """Points carried from one view to the next by true depth and poses show the same colour."""
-    film, _ = filmed
-    first, second = film.world_from_camera[1], film.world_from_camera[2]
-    a, b = (film.scene.picture(film.intrinsics, pose).astype(float) for pose in (first, second))
-    depth = film.scene.depth(film.intrinsics, first)
-    v, u = np.mgrid[4:180:5, 4:240:5].reshape(2, -1)
-    points = unproject(film.intrinsics, first, np.stack([u + 0.5, v + 0.5], axis=1), depth[v, u])
-    pixels, away = project(film.intrinsics, second, points)
-    x, y = np.floor(pixels).astype(int).T
-    inside = (x >= 0) & (y >= 0) & (x < 240) & (y < 180)
-    other = film.scene.depth(film.intrinsics, second)
-    visible = inside.copy()
-    visible[inside] = np.abs(other[y[inside], x[inside]] - away[inside]) < 0.02
-    assert visible.sum() > 300
-    difference = np.abs(a[v, u] - b[y.clip(0, 179), x.clip(0, 239)]).mean(1)
-    assert np.median(difference[visible]) < 0.5 * np.median(np.abs(a[v, u] - np.roll(b, 20, axis=1)[v, u]).mean(1))
-
-
 def test_path_is_rigid_smooth_and_has_parallax() -> None:
     poses = hand_held(48)
     rotation = poses[:, :3, :3]
@@ -105,3 +93,67 @@ def test_unwritable_place_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"):
         write_demo_video(tmp_path / "file" / "demo.mp4", frames=1, size=(64, 48))
+
+
+def quadrants() -> Array:
+    image = np.zeros((64, 64, 3), dtype=np.float32)
+    image[:32, :32], image[:32, 32:], image[32:, :32], image[32:, 32:] = (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)
+    return image
+
+
+def test_textures_are_upright_and_not_mirrored() -> None:
+    """A wall seen from its front shows its texture as one looks at a picture: the first row up, the first column left."""
+    scene = BakedScene([WALL], [quadrants()], [], EVEN)
+    picture = scene.picture(CAMERA, FRONT)
+    middle, _ = project(CAMERA, FRONT, np.array([[0.0, 0.0, 0.5]]))
+    u, v = middle[0].astype(int)
+    assert picture[v - 10, u - 10].argmax() == 0
+    assert picture[v - 10, u + 10].argmax() == 1
+    assert picture[v + 10, u - 10].argmax() == 2
+    assert picture[v + 10, u + 10].min() > 200
+
+
+def test_depth_lies_on_the_shapes_and_nothing_is_zero() -> None:
+    ball, wall = upright(BALL, [0.3, -1.0, 0.6], [0.5] * 3, 1), upright(BOX, [0, 0.1, 0.4], [1, 0.1, 1], FRONT_ONLY)
+    scene = BakedScene([ball, wall], [quadrants(), quadrants()], [0.0], EVEN)
+    depth = scene.depth(CAMERA, FRONT)
+    v, u = np.nonzero(depth)
+    points = unproject(CAMERA, FRONT, np.stack([u + 0.5, v + 0.5], axis=1), depth[v, u])
+    on_wall = np.abs(points[:, 1]) < 1e-4
+    on_ball = np.abs(np.linalg.norm(points - ball.centre, axis=1) - 0.5) < 1e-4
+    assert (on_wall | on_ball).all() and on_wall.sum() > 200 and on_ball.sum() > 200
+    assert (depth == 0).any()
+    assert (scene.picture(CAMERA, FRONT, samples=1)[depth == 0] == 0).all()
+
+
+def test_a_ball_throws_a_shadow() -> None:
+    """Behind the ball, as seen from the side, the wall is darker than without it; away from it nothing changes."""
+    lamp = Light(lamp=(0.0, -4.0, 0.5), radius=0.05, lamp_strength=0.6, sky_strength=0.1)
+    white = np.ones((600, 600, 3), dtype=np.float32)
+    ball = upright(BALL, [0.0, -1.0, 0.5], [0.3] * 3, 1)
+    aside = FRONT.copy()
+    turn = np.array([[np.cos(0.6), -np.sin(0.6), 0], [np.sin(0.6), np.cos(0.6), 0], [0, 0, 1]])
+    aside[:3, :3] = turn @ FRONT[:3, :3]
+    aside[0, 3] = 2.0
+    alone = BakedScene([WALL], [white], [], lamp).picture(CAMERA, aside).astype(float)
+    beside = BakedScene([WALL, ball], [white, white], [0.0], lamp).picture(CAMERA, aside).astype(float)
+    (behind, far), _ = project(CAMERA, aside, np.array([[0.0, 0.0, 0.5], [-0.2, 0.0, -0.6]]))
+    shadow, lit = (beside[int(v), int(u)].mean() / alone[int(v), int(u)].mean() for u, v in (behind, far))
+    assert shadow < 0.65
+    assert 0.95 < lit < 1.01
+
+
+def test_gloss_moves_with_the_view() -> None:
+    grey = np.full((64, 128, 3), 0.3, dtype=np.float32)
+    lamp = Light(lamp=(0.0, -4.0, 3.0), lamp_strength=0.5, sky_strength=0.4)
+    ball = upright(BALL, [0.0, 0.0, 0.5], [0.6] * 3, 0)
+    point = np.array([[0.0, -0.6 * np.cos(0.3), 0.5 + 0.6 * np.sin(0.3)]])
+
+    def seen(gloss: float, right: float) -> float:
+        pose = FRONT.copy()
+        pose[0, 3] = right
+        (u, v), _ = project(CAMERA, pose, point)[0][0], None
+        return float(BakedScene([ball], [grey], [gloss], lamp).picture(CAMERA, pose, samples=3)[int(v), int(u)].mean())
+
+    assert abs(seen(0.0, 0.0) - seen(0.0, 1.0)) < 4
+    assert seen(0.4, 0.0) - seen(0.4, 1.0) > 15

@@ -14,14 +14,13 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from fieldfuse.camera import Intrinsics, project, unproject
-from fieldfuse.effects.effect_specs import PRESETS, Effects, parse, preset
+from fieldfuse.effects.effect_specs import PRESETS, parse, preset
 from fieldfuse.effects.models import MotionBlur, RollingShutter, decode_srgb, encode_srgb, to_bytes
-from fieldfuse.simulate.eye import eye_of, take
-from fieldfuse.simulate.film import Film, Shot
+from fieldfuse.simulate.eye import take
+from fieldfuse.simulate.film import Film, FilmCamera, Shot
 from fieldfuse.simulate.materials import TextureBank, texture_bank
 from fieldfuse.simulate.paths import PathSettings, plan
 from fieldfuse.simulate.procedural import random_scene
-from fieldfuse.simulate.scene import Scene
 from fieldfuse.tone import share, square_radius
 
 CAMERA = Intrinsics(80, 60, 60.0, 60.0, 40.0, 30.0)
@@ -36,7 +35,7 @@ def bank() -> TextureBank:
 def filmed(bank: TextureBank, *listing: Any, kind: str = "room", depth: bool = False, seed: int = 4) -> Film:
     scene = random_scene(kind, np.random.default_rng(seed), bank)
     motion = plan(scene, PATH, np.random.default_rng(seed))
-    return Film(scene, CAMERA, motion, PATH.times(), parse(list(listing), "test"), seed, depth)
+    return Film(scene, FilmCamera(CAMERA, depth=depth), motion, PATH.times(), parse(list(listing), "test"), seed)
 
 
 def digest(shot: Shot) -> str:
@@ -221,19 +220,3 @@ def test_compression_is_what_the_file_will_hold(bank: TextureBank) -> None:
     shot, clean = filmed(bank, "compression:strong").shot(0), filmed(bank).shot(0)
     assert shot.jpeg is not None and shot.jpeg[:2] == b"\xff\xd8" and clean.jpeg is None
     assert np.abs(shot.rgb.astype(int) - clean.rgb).mean() > 1
-
-
-def test_exact_geometry_with_a_lens_and_rows(bank: TextureBank) -> None:
-    """Depth through a lens: unprojected along the lens' own rays it lies on the scene's surfaces."""
-    film = filmed(bank, "distortion", "rolling_shutter")
-    shot = film.shot(0)
-    assert isinstance(film.scene, Scene)
-    eye = eye_of(film.intrinsics, 2, torch.device("cpu"))
-    rays = (eye.directions / eye.cosine[:, None])[eye.back].numpy() * shot.depth.reshape(-1, 1)
-    points = rays @ shot.world_from_camera[:3, :3].T + shot.world_from_camera[:3, 3]
-    assert np.quantile(film.scene.clearance(torch.from_numpy(points)).abs().numpy(), 0.98) < 2e-3
-
-
-def test_effects_have_an_order_and_describe_themselves() -> None:
-    assert Effects().names() == ()
-    assert parse(["compression", "exposure", "distortion"], "x").names() == ("distortion", "exposure", "compression")

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from fieldfuse.errors import InputError
-from fieldfuse.simulate.curve import Motion, Shake
 from fieldfuse.simulate.materials import TextureBank, texture_bank
-from fieldfuse.simulate.paths import MAKERS, PathSettings, plan
+from fieldfuse.simulate.paths import MAKERS, Motion, PathSettings, Shake, plan
 from fieldfuse.simulate.procedural import KINDS, random_scene
 
 

@@ -16,13 +16,13 @@ from fieldfuse.capture.types import Views
 from fieldfuse.effects.effect_specs import STRENGTHS, parse, preset
 from fieldfuse.effects.scenery import EYES, Pedestrians, Walk
 from fieldfuse.simulate.eye import eye_of, take
-from fieldfuse.simulate.film import Film
+from fieldfuse.simulate.film import Film, FilmCamera
 from fieldfuse.simulate.materials import TextureBank, texture_bank
 from fieldfuse.simulate.mesh_scene import load_mesh_scene
 from fieldfuse.simulate.paths import PathSettings, plan
 from fieldfuse.simulate.people import Peopled, peopled
 from fieldfuse.simulate.procedural import random_scene
-from fieldfuse.stereo import moving
+from fieldfuse.stereo import transients
 from tests.simulate.test_film import CAMERA
 from tests.simulate.test_mesh_scene import wall
 from tests.simulate.test_simulate import made
@@ -37,7 +37,8 @@ def bank() -> TextureBank:
 
 def filmed(bank: TextureBank, *listing: object, camera: Intrinsics = CAMERA) -> Film:
     scene = random_scene("room", np.random.default_rng(4), bank)
-    return Film(scene, camera, plan(scene, PATH, np.random.default_rng(4)), PATH.times(), parse(list(listing), "test"), 4, True)
+    motion = plan(scene, PATH, np.random.default_rng(4))
+    return Film(scene, FilmCamera(camera, depth=True), motion, PATH.times(), parse(list(listing), "test"), 4)
 
 
 def around(mask: Array, pixels: int = 1) -> Array:
@@ -140,7 +141,7 @@ def test_what_passes_in_a_film_is_found_as_moving(bank: TextureBank) -> None:
     names, poses = [f"{shot.index:03d}" for shot in shots], np.array([shot.world_from_camera for shot in shots])
     views = Views(names, [shot.rgb for shot in shots], [camera] * len(shots), poses, np.zeros(len(shots), bool))
     median = float(np.median([np.median(shot.depth[shot.depth > 0]) for shot in shots]))
-    found = moving.moving(views, [shot.sensor_depth for shot in shots], [camera] * len(shots), median, measured=True)
+    found = transients.moving(views, [shot.sensor_depth for shot in shots], [camera] * len(shots), median, measured=True)
     truth = [shot.passed for shot in shots if shot.passed is not None]
     assert np.mean([mask.mean() for mask in truth]) > 0.05
     hit = sum(int((one & mask).sum()) for one, mask in zip(found, truth, strict=True)) / sum(int(mask.sum()) for mask in truth)

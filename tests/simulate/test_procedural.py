@@ -11,9 +11,10 @@ import torch
 from fieldfuse.camera import Array, Intrinsics, project, unproject
 from fieldfuse.errors import InputError
 from fieldfuse.simulate.cast import FAR
+from fieldfuse.simulate.eye import Rays
 from fieldfuse.simulate.materials import TextureBank, texture_bank
 from fieldfuse.simulate.procedural import KINDS, random_scene
-from fieldfuse.simulate.scene import Lamp, Rays, Scene
+from fieldfuse.simulate.scene import Lamp, Scene
 
 CAMERA = Intrinsics(96, 72, 80.0, 80.0, 48.0, 36.0)
 
@@ -95,11 +96,6 @@ def test_the_same_seed_gives_the_same_scene_and_another_another(bank: TextureBan
     assert not torch.allclose(pictures[0], pictures[2], atol=0.1)
 
 
-def test_scenes_are_diverse(bank: TextureBank) -> None:
-    counts = {len(random_scene("room", np.random.default_rng(seed), bank).solids) for seed in range(12)}
-    assert len(counts) > 5 and min(counts) > 10
-
-
 def test_a_picture_is_the_same_as_its_rays_in_any_order(bank: TextureBank) -> None:
     scene = random_scene("table", np.random.default_rng(2), bank)
     pose = looking(standing(scene), scene.focus)
@@ -143,10 +139,8 @@ def test_rays_that_hit_nothing(bank: TextureBank) -> None:
         torch.randn(300, 3, generator=torch.Generator().manual_seed(0)) * 0.1 + torch.tensor([0, 0, 1.0]), dim=1
     )
     start = torch.tensor([[0.0, 0.0, 40.0]])
-    for lit in (True, False):
-        seen = scene.see(Rays(start, up, 1e-3), lit)
-        assert (seen.distance == FAR).all() and (seen.normals == 0).all() and (seen.part == 0).all()
-        assert (seen.linear > 0).all() == lit
+    seen = scene.see(Rays(start, up, 1e-3))
+    assert (seen.distance == FAR).all() and (seen.normals == 0).all() and (seen.part == 0).all() and (seen.linear > 0).all()
     scene.background = None
     assert (scene.see(Rays(start, up, 1e-3)).linear == 0).all()
     assert len(scene.see(Rays(start, up[:0], 1e-3)).distance) == 0

@@ -10,18 +10,18 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 from safetensors.numpy import load_file
 
-from fieldfuse.camera import Similarity, project, unproject
+from fieldfuse.camera import unproject
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.ply_points import read_ply_points
-from fieldfuse.capture.prepare import prepare_views
-from fieldfuse.config import CaptureSettings
 from fieldfuse.errors import InputError, Interrupted
 from fieldfuse.progress import Progress
 from fieldfuse.simulate import procedural
 from fieldfuse.simulate.materials import texture_bank
+from fieldfuse.simulate.mesh_scene import load_mesh_scene
 from fieldfuse.simulate.settings import read_scene_file, scene_file
 from fieldfuse.simulate.simulate import simulate
 
@@ -65,29 +65,6 @@ def test_readers_open_it_and_it_says_what_the_truth_says(tmp_path: Path) -> None
         assert np.median(np.abs(depth - exact["depth"])[got]) < 0.02
 
 
-def test_prepared_views_agree_with_each_other(tmp_path: Path) -> None:
-    """The whole way of a capture: undistorted views, their depth and poses carry points onto the same colours."""
-    folder = made(tmp_path / "capture", ["distortion"], depth=True, camera={"width": 128, "height": 96}, path={"frames": 4, "fps": 8})
-    capture = open_capture(folder)
-    views = prepare_views(capture, Similarity.identity(), CaptureSettings(image_size=128, holdout=0))
-    first, second = 0, 1
-    depth = views.depths[first]
-    assert depth is not None
-    v, u = np.mgrid[6:90:3, 6:122:3].reshape(2, -1)
-    v, u = v[depth[v, u] > 0], u[depth[v, u] > 0]
-    points = unproject(views.intrinsics[first], views.world_from_camera[first], np.stack([u + 0.5, v + 0.5], axis=1), depth[v, u])
-    pixels, away = project(views.intrinsics[second], views.world_from_camera[second], points)
-    x, y = np.floor(np.nan_to_num(pixels)).astype(int).T
-    inside = (x >= 0) & (y >= 0) & (x < 128) & (y < 96)
-    other = views.depths[second]
-    assert other is not None
-    seen = inside.copy()
-    seen[inside] = np.abs(other[y[inside], x[inside]] / away[inside] - 1) < 0.02
-    assert seen.sum() > 300
-    a, b = (views.images[i].astype(int) for i in (first, second))
-    assert np.median(np.abs(a[v, u] - b[y.clip(0, 95), x.clip(0, 127)])[seen].mean(1)) < 14
-
-
 def test_same_seed_same_bytes_with_any_number_of_workers(tmp_path: Path) -> None:
     settings = scene_file({**SMALL, "depth": True, "effects": ALL, "seed": 5}, "test")
     for name, workers in (("a", 1), ("b", 3)):
@@ -128,24 +105,11 @@ def test_the_mesh_is_the_scenes(tmp_path: Path) -> None:
     assert capture.frames[0].intrinsics is not None
     pose = np.array(known["world_from_camera"])
     seen = unproject(capture.frames[0].intrinsics, pose, np.stack([u + 0.5, v + 0.5], axis=1), depth[v, u])
-    corners = mesh.triangles
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    off = [min_distance(point, corners, normal) for point in seen]
+    off = load_mesh_scene(folder / "ground_truth" / "mesh.ply").clearance(torch.from_numpy(seen)).numpy()
     assert np.quantile(off, 0.99) < 2e-3 and max(off) < 0.005
+    normal = np.cross(mesh.triangles[:, 1] - mesh.triangles[:, 0], mesh.triangles[:, 2] - mesh.triangles[:, 0])
     inward = ((mesh.triangles_center - pose[:3, 3]) * normal).sum(1)  # the room's own walls face the camera
     assert (inward[: 6 * 2 * 10] < 0).any()
-
-
-def min_distance(point: np.ndarray, corners: np.ndarray, normal: np.ndarray) -> float:
-    """Distance of a point to the nearest triangle that it projects into."""
-    height = ((point - corners[:, 0]) * normal).sum(1)
-    foot = point - height[:, None] * normal
-    inside = np.ones(len(corners), dtype=bool)
-    for i in range(3):
-        edge = corners[:, (i + 1) % 3] - corners[:, i]
-        inside &= (np.cross(edge, foot - corners[:, i]) * normal).sum(1) > -1e-6
-    return float(np.abs(height[inside]).min()) if inside.any() else 1.0
 
 
 @pytest.mark.parametrize("output", ["photos", "video"])

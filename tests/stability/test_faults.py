@@ -104,7 +104,7 @@ def test_no_module_with_a_writer_is_left_out() -> None:
     tried = "".join((ROOT / "tests" / "stability" / name).read_text(encoding="utf-8") for name in ("writers.py", "writers_more.py"))
     named = {
         # Behind `Field.save`, `save_views` and `simulate`.
-        "toolkit/volume/store.py", "toolkit/capture/views_file.py", "toolkit/simulate/capture_files.py", "toolkit/export/ply.py",
+        "toolkit/volume/store.py", "toolkit/capture/views_file.py", "toolkit/simulate/simulate.py", "toolkit/export/ply.py",
         "toolkit/nerfusion/training/validate.py",
     }  # fmt: skip
     modules = {name: name.removesuffix(".py").replace("toolkit", "fieldfuse", 1).replace("/", ".") for name in found}

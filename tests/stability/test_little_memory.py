@@ -32,7 +32,8 @@ def test_a_sensors_surface_becomes_coarser_and_what_was_asked_for_is_refused(tmp
     allow(monkeypatch, 2 * usual.blocks * BYTES_PER_BLOCK // 3)
     less = fuse_capture(capture, Similarity.identity())
     assert usual.voxel_size < less.voxel_size < 3 * usual.voxel_size and less.blocks <= less.max_blocks < usual.blocks
-    assert len(less.mesh(0.5).vertices) > 100
+    less.min_weight = 0.5
+    assert len(less.mesh().vertices) > 100
     with pytest.raises(InputError, match=r"GB for the TSDF, and .* GB are allowed; use tsdf\.voxel_size="):
         fuse_capture(capture, Similarity.identity(), settings=TsdfSettings(voxel_size=usual.voxel_size))
 

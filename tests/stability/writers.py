@@ -29,8 +29,7 @@ from fieldfuse.export.ply import write_points
 from fieldfuse.export.video import write_video
 from fieldfuse.files import write_json
 from fieldfuse.pipelines.rendered import Picture, Pictures, save_pictures, write_png, write_pngs
-from fieldfuse.tsdf.frames import DepthFrame
-from fieldfuse.tsdf.volume import TsdfVolume
+from fieldfuse.tsdf.volume import DepthFrame, TsdfVolume
 from tests.stability.hard.captures import poses, texture
 from tests.stability.hard.fields import small_field
 from tests.stability.hard.places import ball

@@ -38,9 +38,9 @@ from fieldfuse.simulate import procedural
 from fieldfuse.simulate.materials import texture_bank
 from fieldfuse.simulate.settings import scene_file
 from fieldfuse.simulate.simulate import simulate
-from fieldfuse.stereo.left_out import LeftOut, save_left_out
 from fieldfuse.stereo.maps import save_stereo
 from fieldfuse.stereo.match import StereoDepth
+from fieldfuse.stereo.transients import LeftOut, save_left_out
 from tests.capture.layouts import write_record3d, write_sens
 from tests.evaluation.test_compare_page import made, pictures
 from tests.evaluation.test_tradeoff import ladder

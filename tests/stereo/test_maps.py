@@ -24,10 +24,6 @@ def two_surfaces() -> Array:
     return depth
 
 
-def test_at_the_same_size_all_depth_stays() -> None:
-    np.testing.assert_array_equal(depth_at(found(two_surfaces()), WIDTH, HEIGHT), two_surfaces().astype(np.float32))
-
-
 @pytest.mark.parametrize("gap", [0, 1, 3])
 def test_on_more_pixels_no_depth_is_told_beside_an_edge_or_a_gap(gap: int) -> None:
     depth = two_surfaces()
@@ -65,16 +61,11 @@ def test_noise_of_what_is_far_is_no_edge() -> None:
     assert not got[:, 2 * (STEP - 1) : 2 * (STEP + 1)].any()  # the edge between the surfaces stays one
 
 
-def test_what_is_not_confident_is_unknown() -> None:
-    for size in ((WIDTH, HEIGHT), (2 * WIDTH, HEIGHT)):
-        assert not depth_at(found(two_surfaces(), confidence=0.4), *size).any()
-
-
-def test_nothing_known_stays_nothing() -> None:
+@pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (2 * WIDTH, 2 * HEIGHT)])
+def test_what_is_not_known_or_not_confident_is_unknown(size: tuple[int, int]) -> None:
     nothing = np.zeros((HEIGHT, WIDTH))
-    assert not depth_at(found(nothing), WIDTH, HEIGHT).any()
-    assert not depth_at(found(nothing), 2 * WIDTH, 2 * HEIGHT).any()
-    assert not enlarged(nothing, 2 * WIDTH, 2 * HEIGHT).any()
+    assert not depth_at(found(two_surfaces(), confidence=0.4), *size).any()
+    assert not depth_at(found(nothing), *size).any() and not enlarged(nothing, *size).any()
 
 
 def test_enlarged_maps_have_depth_up_to_the_edge() -> None:

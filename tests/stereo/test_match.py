@@ -8,15 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from fieldfuse.camera import Array, Intrinsics, pixel_grid, unproject
+from fieldfuse.camera import Array, Intrinsics, pixel_grid
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError, Interrupted
 from fieldfuse.poses.overlap import parallax, spread_parallax
 from fieldfuse.progress import Progress
 from fieldfuse.stereo import match
-from fieldfuse.stereo.cost import grey_view, plane_homography
+from fieldfuse.stereo.cost_volume import grey_view, plane_homography
 from fieldfuse.stereo.match import LENIENT, MANY, STRICT, StereoDepth, demands, inverse_depths, stereo_depths, usable_neighbours
-from fieldfuse.stereo.polish import Polisher
 from tests.poses.textured import arc, look_at, render
 from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, corner, relative_errors, views_of
 
@@ -69,18 +68,6 @@ def test_a_camera_that_moves_forward_finds_depth() -> None:
     assert np.median(errors) < 0.01 and coverage > 0.4
 
 
-def test_parallax_of_a_whole_picture_is_that_of_its_points() -> None:
-    poses = arc(3, 20.0)
-    found = spread_parallax(poses, [CAMERA] * 3, MEDIAN)
-    pixels = pixel_grid(160, 120)
-    for i, j in ((0, 1), (2, 0)):
-        points = unproject(CAMERA, poses[i], pixels, np.full(len(pixels), MEDIAN))
-        first, second = (points - poses[k][:3, 3] for k in (i, j))
-        cosine = (first * second).sum(1) / np.linalg.norm(first, axis=1) / np.linalg.norm(second, axis=1)
-        assert found[i, j] == pytest.approx(np.degrees(np.arccos(cosine)).mean(), rel=0.02)
-    assert found.diagonal().max() < 1e-5
-
-
 def test_masked_pixels_have_no_depth() -> None:
     views, _ = corner()
     part = views.subset([0, 1, 2])
@@ -100,7 +87,7 @@ def test_bare_walls_give_no_depth() -> None:
 
 def test_what_cannot_be_matched_is_refused() -> None:
     views, _ = corner()
-    with pytest.raises(InputError, match="at least two pictures"):
+    with pytest.raises(InputError, match="at least two images"):
         stereo_depths(views.subset([0]), NEAR, FAR, MEDIAN)
     with pytest.raises(InputError, match="cannot be looked for"):
         stereo_depths(views, 2.0, 1.0, MEDIAN)
@@ -141,35 +128,6 @@ def test_neighbours_from_the_same_place_are_left_out() -> None:
     assert usable_neighbours(away, [CAMERA] * 3, MEDIAN, 8) == [[1], [0], []]
 
 
-def test_depth_that_is_nearly_right_is_polished() -> None:
-    """Smooth errors of about 1% shrink; what is missing stays missing, and a view without neighbours keeps what it has."""
-    views, truth = corner()
-    polisher = Polisher(views, views.intrinsics, NEAR, FAR, MEDIAN)
-    waves = 1 + 0.012 * np.sin(np.arange(160) / 9)
-    before, after = [], []
-    for index, true in enumerate(truth):
-        given = np.where(np.arange(120)[:, None] < 6, 0, true * waves).astype(np.float32)
-        got, told = polisher.polished(index, given)
-        assert got.dtype == np.float32 and ((got > 0) == (given > 0)).all()
-        assert told.mean() > 0.5 and not told[given == 0].any()
-        known = given > 0
-        before.append(np.abs(given - true)[known] / true[known])
-        after.append(np.abs(got - true)[known] / true[known])
-    assert np.median(np.concatenate(after)) < 0.4 * np.median(np.concatenate(before))
-    # Where a sensor, of half the size, measured the same place nothing moves; where it measured another, or nothing, pictures decide.
-    free, told = polisher.polished(0, given := (truth[0] * waves).astype(np.float32))
-    sensor = truth[0][::2, ::2].copy()
-    sensor[:20], sensor[20:40] = 0, 2 * sensor[20:40]
-    held, still = polisher.polished(0, given, measured=sensor)
-    assert (held[:80] == free[:80]).mean() > 0.999 and (still[:80] == told[:80]).mean() > 0.999
-    assert (held[80:] == given[80:]).mean() > 0.99 and (free[80:] == given[80:]).mean() < 0.5  # but for edges
-    assert told[80:].mean() > 0.5 and still[80:].mean() < 0.01
-    alone = Polisher(views.subset([0]), views.intrinsics[:1], NEAR, FAR, MEDIAN)
-    got, told = alone.polished(0, truth[0])
-    np.testing.assert_array_equal(got, np.where(truth[0] > 0, truth[0], 0).astype(np.float32))
-    assert not told.any()
-
-
 def test_few_pictures_are_matched_from_farther_apart() -> None:
     """With few pictures neighbours stand 50° apart, and one of them confirms a depth; with many that is too far, and two must."""
     few, many = arc(3, 100.0), np.concatenate([arc(3, 100.0), np.tile(arc(1, 0.0), (MANY - 3, 1, 1))])
@@ -179,17 +137,6 @@ def test_few_pictures_are_matched_from_farther_apart() -> None:
     assert demands(MANY - 1) == LENIENT and demands(MANY) == STRICT and LENIENT.confirm < STRICT.confirm
     asked_so = usable_neighbours(many, [CAMERA] * len(many), MEDIAN, 8, LENIENT)
     assert {1} <= set(asked_so[0])
-
-
-def test_two_pictures_confirm_each_other_and_more_find_no_less() -> None:
-    """What few pictures find is nearly all right, though one other alone confirms it."""
-    views, truth = corner()
-    for count in (2, 3):
-        some = views.subset(list(range(count)))
-        for one, true in zip(stereo_depths(some, NEAR, FAR, MEDIAN), truth[:count], strict=True):
-            found = one.depth > 0
-            assert found.mean() > 0.3
-            assert np.mean(np.abs(one.depth[found] / true[found] - 1) < 0.02) > 0.9
 
 
 def near_and_far(noise: float = 12.0) -> tuple[Views, list[Array]]:

@@ -18,11 +18,11 @@ import torch
 from numba.core.dispatcher import Dispatcher
 
 from fieldfuse.capture.types import Views
-from fieldfuse.stereo import moving
+from fieldfuse.stereo import transients
 from fieldfuse.training import depth_start, fit
 from fieldfuse.training.guided import fit_guided
 from fieldfuse.volume.grid_host import GridHost
-from tests.stereo.test_moving import with_passer
+from tests.stereo.made import with_passer
 from tests.training.test_guided import SCENE, wanted
 
 Kernels = set[tuple[str, str]]
@@ -62,7 +62,7 @@ def missed(views: Views, decoder: str, host: GridHost | None) -> Kernels:
 
 def main(decoder: str) -> None:
     torch.set_num_threads(1)
-    moving.FEWEST = depth_start.FEW_VIEWS = 6  # six pictures are enough here …
+    transients.FEWEST = depth_start.FEW_VIEWS = 6  # six pictures are enough here …
     fit.TIMELINE_PIXELS = 256  # … and few pixels
     told = {name: sorted(missed(views, decoder, GridHost() if name == "depth" else None)) for name, views in captures().items()}
     several = [name for name, number in Counter(name for name, _ in ready()).items() if number > 1]

@@ -18,12 +18,11 @@ from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import Progress
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import make_renderer, render_view
-from fieldfuse.stereo import moving, quick
+from fieldfuse.stereo import fast_mvs, transients
 from fieldfuse.training import depth_start
 from fieldfuse.training.fit import LEAST_VIEWS
 from fieldfuse.training.guided import find_moving, fit_guided, looks_for_moving, wants_matching
-from tests.stereo.made import FAR, MEDIAN, NEAR, corner
-from tests.stereo.test_moving import PASSED, with_passer
+from tests.stereo.made import FAR, MEDIAN, NEAR, PASSED, corner, with_passer
 
 SCENE = Scene(Similarity.identity(), np.array([0.0, 0.0, 0.0]), np.full(3, 1.5), MEDIAN, NEAR, FAR, 0.0, True, False)
 
@@ -63,13 +62,13 @@ def test_depth_by_matching_makes_geometry_better() -> None:
 
 def test_matching_is_a_part_of_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
     now = steady()
-    whole, took = quick.guided, []
+    whole, took = fast_mvs.guided, []
 
     def slow(*given: object, **options: object) -> object:
         took.append([now() for _ in range(100)])  # a second
         return whole(*given, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(quick, "guided", slow)
+    monkeypatch.setattr(fast_mvs, "guided", slow)
     result = fit_guided(views(), SCENE, wanted(), ticks=now)
     assert len(took) == 1 and result.matched is not None and 1 <= result.matched["seconds"] < 1.1
     assert 3.9 < result.seconds < 4.2
@@ -85,7 +84,7 @@ def psnr(field: Field) -> float:
 
 @pytest.mark.parametrize("measured", [False, True])
 def test_a_fit_does_without_what_moves(measured: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(moving, "FEWEST", 6)
+    monkeypatch.setattr(transients, "FEWEST", 6)
     made, depths, masks = with_passer()
     given = replace(made, test=np.arange(len(made)) == 3, depths=list(depths) if measured else [])
     without = fit_guided(given, SCENE, wanted(), ticks=steady(0.005))
@@ -97,7 +96,7 @@ def test_a_fit_does_without_what_moves(measured: bool, monkeypatch: pytest.Monke
 
 
 def test_held_out_pictures_are_not_looked_at_for_what_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(moving, "FEWEST", 6)
+    monkeypatch.setattr(transients, "FEWEST", 6)
     made, _, _ = with_passer()
     views = replace(made, test=np.arange(len(made)) == 4)
     first = fit_guided(views, SCENE, wanted("budget=1"), ticks=steady()).left_out
@@ -117,13 +116,13 @@ def test_a_stop_while_looking_for_what_moves_ends_the_fit() -> None:
 
 
 def test_looking_for_what_moves_is_a_part_of_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
-    now, whole = steady(), moving.moving
+    now, whole = steady(), transients.moving
 
     def slow(*given: object, **options: object) -> object:
         assert [now() for _ in range(100)]  # a second
         return whole(*given, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(moving, "moving", slow)
+    monkeypatch.setattr(transients, "moving", slow)
     result = fit_guided(replace(views(), depths=corner()[1]), SCENE, wanted(), ticks=now)
     assert result.matched is None and result.left_out is not None and 1 <= result.left_out.seconds < 1.1
     assert 3.9 < result.seconds < 4.2
@@ -178,7 +177,7 @@ def test_progress_goes_on_from_matching_to_fitting() -> None:
     told = Told()
     fit_guided(views(), SCENE, wanted("budget=1"), told, ticks=steady())
     matching = [share for share, note in zip(told.shares, told.notes, strict=True) if "matched" in note]
-    assert matching and matching == sorted(matching) and max(matching) <= quick.SHARE + 1e-9
+    assert matching and matching == sorted(matching) and max(matching) <= fast_mvs.SHARE + 1e-9
     fitting = [share for share, note in zip(told.shares, told.notes, strict=True) if "³" in note]
     assert fitting and fitting == sorted(fitting) and fitting[-1] > 0.9 and max(told.shares) < 1.05
 

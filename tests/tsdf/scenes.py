@@ -6,7 +6,7 @@ import numpy as np
 
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.render.paths import look_at
-from fieldfuse.tsdf.frames import DepthFrame
+from fieldfuse.tsdf.volume import DepthFrame
 
 CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
 UP = np.array([0.0, 0.0, 1.0])

@@ -15,8 +15,7 @@ from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.config import TsdfSettings
 from fieldfuse.errors import InputError
 from fieldfuse.tone import Tone
-from fieldfuse.tsdf.frames import automatic_depth_max, automatic_voxel_size, capture_depth_frames
-from fieldfuse.tsdf.fuse import fuse_capture
+from fieldfuse.tsdf.fuse import automatic_depth_max, automatic_voxel_size, capture_depth_frames, fuse_capture
 from tests.conftest import shared_data
 from tests.tsdf.scenes import CAMERA, directions, ring, sphere_colour, sphere_depth
 
@@ -141,7 +140,8 @@ def test_colour_covers_the_depth_cameras_view_without_darkening(tmp_path: Path) 
     narrow = Intrinsics(160, 120, 330.0, 330.0, 80.0, 60.0)  # sees about half of the sphere's width
     capture = written(tmp_path, narrow, CAMERA, count=8)
     volume = fuse_capture(capture, Similarity.identity(), settings=TsdfSettings(voxel_size=0.02))
-    mesh = volume.mesh(0.5)
+    volume.min_weight = 0.5
+    mesh = volume.mesh()
     # Red and green add up to about 240 wherever they mix; the black that Open3D would average in makes it less.
     assert (mesh.colours[:, 0].astype(int) + mesh.colours[:, 1]).min() > 200
     frame = next(capture_depth_frames(capture, Similarity.identity()))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import open3d as o3d
 import pytest
 import trimesh
 
@@ -168,13 +167,6 @@ def test_empty_meshes_pass_through_everything() -> None:
     assert len(empty.cleaned(0.1).decimated(10).transformed(some_similarity()).triangles) == 0
     assert len(empty.components()) == 0
     assert empty.bounds().tolist() == [[0, 0, 0], [0, 0, 0]]
-
-
-def test_open3d_round_trip_keeps_positions_in_double() -> None:
-    mesh = ball(1.0, (1e6, 0, 0))
-    back = o3d.geometry.TriangleMesh(mesh.to_open3d())
-    assert np.array_equal(np.asarray(back.vertices), mesh.vertices) and np.array_equal(np.asarray(back.triangles), mesh.triangles)
-    assert np.array_equal(as_bytes(np.asarray(back.vertex_colors)), mesh.colours)
 
 
 def test_colours_as_bytes() -> None:

@@ -23,12 +23,12 @@ def self_test(settings: Settings) -> Speed:
     """Units of every kind in seconds: a megapixel decoded, an image's features found and matched, a ray rendered, a ray fitted, a megapixel
     scored."""
     from fieldfuse.progress import SILENT
-    from fieldfuse.stereo import quick
+    from fieldfuse.stereo import fast_mvs
     from fieldfuse.training import depth_start
     from fieldfuse.training.engine import warm_up
 
     warm_up(settings, SILENT)
-    quick.warm_up()
+    fast_mvs.warm_up()
     depth_start.warm_up()
     makers = {"decode": _decode, "features": _features, "ray": _ray, "fit": _fit, "score": _score}
     units = {}

@@ -11,8 +11,7 @@ from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.evaluation.geometry import distances
 from fieldfuse.evaluation.pictures import ERROR_COLOURS, coloured
 from fieldfuse.render.paths import look_at
-from fieldfuse.tsdf.mesh import Mesh
-from fieldfuse.tsdf.view import SurfaceCaster
+from fieldfuse.tsdf.mesh import Mesh, SurfaceCaster
 
 ERROR_VOXELS = 4.0  # distance from the truth that gets the brightest colour
 NOTHING = (226, 230, 235)  # where no surface is

@@ -16,7 +16,7 @@ from fieldfuse.capture.types import Views
 from fieldfuse.evaluation.metrics import as_float, has_depth
 from fieldfuse.evaluation.score import RenderedView, as_photo, entry
 from fieldfuse.export.surface import spread
-from fieldfuse.stereo.left_out import LeftOut
+from fieldfuse.stereo.transients import LeftOut
 
 ERROR_TOP = 0.2  # mean absolute difference of the three channels, in [0, 1], that gets the brightest colour
 ERROR_COLOURS = cv2.COLORMAP_INFERNO

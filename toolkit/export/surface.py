@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from fieldfuse.poses.scene import Scene
     from fieldfuse.render.field import Field
     from fieldfuse.render.image import Rendered
-    from fieldfuse.tsdf.frames import DepthFrame
     from fieldfuse.tsdf.mesh import Mesh
-    from fieldfuse.tsdf.volume import TsdfVolume
+    from fieldfuse.tsdf.volume import DepthFrame, TsdfVolume
 
 SMALL_PART = 0.002  # components of a mesh with less than this share of its area are specks
 RENDERED_SIDE = 400  # pixels; the images show what is finer (`export.mesh_size`), and rendering it takes long
@@ -42,9 +41,9 @@ class Refinement:
     """What makes rendered depth better.
 
     Attributes:
-        polish: for each view, depth (H, W) → better depth, 0 = none, and bool where images show it; see `stereo/polish.py`.
+        polish: for each view, depth (H, W) → better depth, 0 = none, and bool where images show it; see `stereo/depth_refinement.py`.
         settle: of all views the reliable depth, all depth that is opaque enough, and where images show it → better depth, 0 = none; see
-            `stereo/settle.py`.
+            `stereo/depth_refinement.py`.
     """
 
     polish: Sequence[Callable[[Array], tuple[Array, Array]]] | None = None
@@ -124,8 +123,7 @@ def surface_of_field(
         Interrupted: the user asked to stop.
     """
     from fieldfuse.render.image import make_renderer, render_view
-    from fieldfuse.stereo.polish import Polisher
-    from fieldfuse.stereo.settle import settled
+    from fieldfuse.stereo.depth_refinement import FieldDepths, Polisher, settled
 
     shown, cameras = originals.finer(views, np.flatnonzero(~views.test), settings.export)
     chosen = spread(len(shown), settings.export.mesh_views)
@@ -137,7 +135,7 @@ def surface_of_field(
     measured = seen.depths if settings.fit.depth > 0 and settings.fit.depth_from != "off" else []
     refinement = Refinement(
         [partial(polisher.polished, index, measured=measured[at] if measured else None) for at, index in enumerate(chosen)],
-        lambda depths, opaque, shown_by: settled(depths, opaque, shown_by, seen, lenses, scene.median_depth, measured, progress=progress),
+        lambda *given: settled(FieldDepths(*given), seen, lenses, scene.median_depth, measured, progress),
     )
 
     def render(lens: Intrinsics, pose: Array) -> Rendered:
@@ -168,7 +166,7 @@ def field_volume(
         InputError: no view shows a surface, or the given voxel size is too fine for the memory.
         Interrupted: the user asked to stop.
     """
-    from fieldfuse.tsdf.held import fuse_held
+    from fieldfuse.tsdf.fuse import fuse_held
 
     poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
     if len(cameras) != len(poses) or not len(poses):
@@ -190,7 +188,6 @@ def field_volume(
     del opaque, shown
     return fuse_held(
         frames if region is None else [_within(frame, region) for frame in frames],
-        len(poses),
         voxel_size,
         # What images show beyond what was rendered makes depth better, not voxels finer: those would keep its noise.
         focal=min(frame.colour_intrinsics.fx for frame in frames),
@@ -220,8 +217,8 @@ def _rendered_frame(
     What is rendered may be smaller than the camera, whose images then show what is finer.
     """
     from fieldfuse.stereo.maps import enlarged
-    from fieldfuse.tsdf.frames import DepthFrame
     from fieldfuse.tsdf.mesh import as_bytes
+    from fieldfuse.tsdf.volume import DepthFrame
 
     rendered = render(intrinsics, pose)
     depth, opacity = np.asarray(rendered.depth), np.asarray(rendered.opacity, dtype=np.float32)

@@ -15,7 +15,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from fieldfuse.stereo.smooth import DOWN, STRAIGHT, UP, summed_paths
+from fieldfuse.stereo.cost_volume import DOWN, STRAIGHT, UP, summed_paths
 from fieldfuse.threads import share, slices
 
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "nsz", "arcp"}}

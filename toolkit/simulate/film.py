@@ -6,9 +6,14 @@ vignetting → exposure → sensor noise → clipping, sRGB and 8 bits → compr
 
 from __future__ import annotations
 
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -17,14 +22,15 @@ from fieldfuse.camera import Array, Intrinsics, invert
 from fieldfuse.effects.effect_specs import Effects, generator
 from fieldfuse.effects.models import encode_srgb, to_bytes
 from fieldfuse.effects.scenery import Walk
-from fieldfuse.simulate.curve import Motion
-from fieldfuse.simulate.eye import Eye, Picture, eye_of, measure, take
+from fieldfuse.simulate.eye import Eye, Picture, Scenery, eye_of, take
+from fieldfuse.simulate.paths import Motion
 from fieldfuse.simulate.people import peopled
 from fieldfuse.simulate.scene import Scene
-from fieldfuse.simulate.seen import Scenery
 from fieldfuse.tone import share, square_radius
 
 Tensor = torch.Tensor
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 FLOOR = 0.0  # metres: of procedural scenes
 PASSED = 1e-3  # metres before what stands still
@@ -38,45 +44,42 @@ class Shot:
     seconds: float
     world_from_camera: Array  # (4, 4) float64: in the middle of the exposure, for the middle row
     rgb: Array  # (H, W, 3) uint8 sRGB
-    jpeg: bytes | None  # the picture as it was compressed, when compression is listed
+    jpeg: bytes | None  # the image as it was compressed, when compression is listed
     depth: Array  # (H, W) float32 metres along z: what a perfect camera at that pose sees; 0 = nothing
     normals: Array  # (H, W, 3) float32 unit, world axes; 0 = nothing
-    sensor_depth: Array | None  # (H, W) float32 metres: what the depth sensor tells; None when the capture has no depth
+    sensor_depth: Array | None  # (H, W) float32 metres: what the depth sensor gives; None when the capture has no depth
     passed: Array | None = None  # (H, W) bool: somebody stands before the scene here; None when passers are not listed
     facts: dict[str, Any] = field(default_factory=dict)  # parameters of the effects in this frame
+
+
+@dataclass(frozen=True)
+class FilmCamera:
+    """What films."""
+
+    intrinsics: Intrinsics  # pinhole; a listed lens distortion is put before it
+    side: int = 2  # pixels that hold an edge are the mean of side × side rays
+    depth: bool = False  # whether there is a depth sensor, too
 
 
 class Film:
     """A scene, a camera on its way through it, and the effects.
 
     Args:
-        intrinsics: pinhole; a listed lens distortion is put before it.
         times: (N,) seconds of the frames.
-        depth: whether the capture has a depth sensor.
-        side: pixels that hold an edge are the mean of side × side rays.
 
     Raises:
-        InputError: the lens distortion is not one-to-one over the picture.
+        InputError: the lens distortion is not one-to-one over the image.
     """
 
-    def __init__(
-        self,
-        scene: Scenery,
-        intrinsics: Intrinsics,
-        motion: Motion,
-        times: Array,
-        effects: Effects,
-        seed: int = 0,
-        depth: bool = False,
-        side: int = 2,
-    ) -> None:
+    def __init__(self, scene: Scenery, camera: FilmCamera, motion: Motion, times: Array, effects: Effects, seed: int = 0) -> None:
         scene = copy(scene)  # the caller's scene keeps its own background and highlights
         scene.background, scene.highlights = effects.background, effects.highlights
-        self.scene, self.motion, self.effects, self.seed, self.has_depth = scene, motion, effects, seed, depth
+        self.scene, self.motion, self.effects, self.seed, self.has_depth = scene, motion, effects, seed, camera.depth
         self.times = np.asarray(times, dtype=np.float64)
         self.world_from_camera = motion.poses(self.times)
+        intrinsics = camera.intrinsics
         self.intrinsics = intrinsics if effects.distortion is None else effects.distortion.before(intrinsics)
-        self.eye = eye_of(self.intrinsics, side, scene.device)
+        self.eye = eye_of(self.intrinsics, camera.side, scene.device)
         self._falloff: Tensor | None = None
         if effects.vignetting is not None:
             falloff = share(effects.vignetting.corner, square_radius(self.intrinsics)).astype(np.float32)
@@ -100,16 +103,17 @@ class Film:
         picture = None if moving else take(there, self.eye, pose[None])
         linear = self._gathered(seconds, facts) if picture is None else picture.linear
         rgb, jpeg = self._developed(linear, index, facts)
-        still, depth, normals = self._truth(picture if there is self.scene else None, pose)
-        passed, seen = (None if effects.passers is None else np.zeros(depth.shape, bool)), depth
-        if there is not self.scene:
+        alone = there is self.scene
+        still = picture if picture is not None and alone else take(self.scene, plain(self.eye), pose[None])
+        depth, normals = still.depth.cpu().numpy(), still.normals.cpu().numpy()
+        passed = None if effects.passers is None else np.zeros(depth.shape, bool)
+        if not alone:
             still = take(there, plain(self.eye), pose[None])
             seen = still.depth.cpu().numpy()
             passed = (seen > 0) & ((depth == 0) | (seen < depth - PASSED))
             facts["passers"] = {"share": float(passed.mean())}
         if effects.depth_offset is not None and self.has_depth:
             still = take(there, plain(self.eye), (pose @ invert(effects.depth_offset.forward()))[None])
-            seen = still.depth.cpu().numpy()
         return Shot(
             index=index,
             seconds=seconds,
@@ -118,7 +122,7 @@ class Film:
             jpeg=jpeg,
             depth=depth,
             normals=normals,
-            sensor_depth=self._sensed(seen, still, index) if self.has_depth else None,
+            sensor_depth=self._measured(still, index) if self.has_depth else None,
             passed=passed,
             facts=facts,
         )
@@ -148,7 +152,7 @@ class Film:
         return total / len(offsets)
 
     def _developed(self, linear: Tensor, index: int, facts: dict[str, Any]) -> tuple[Array, bytes | None]:
-        """Linear light on the lens → the stored picture."""
+        """Linear light on the lens → the stored image."""
         effects = self.effects
         if self._falloff is not None:
             linear = linear * self._falloff
@@ -166,15 +170,10 @@ class Film:
         facts["compression"] = {"bytes": len(jpeg)}
         return effects.compression.decode(jpeg), jpeg
 
-    def _truth(self, picture: Picture | None, pose: Array) -> tuple[Picture | None, Array, Array]:
-        """What a perfect camera sees from the frame's pose: with materials only where the depth sensor asks for them."""
-        if picture is None and self.has_depth and self.effects.depth_noise is not None:
-            picture = take(self.scene, plain(self.eye), pose[None])
-        depth, normals = measure(self.scene, self.eye, pose[None]) if picture is None else (picture.depth, picture.normals)
-        return picture, depth.cpu().numpy(), normals.cpu().numpy()
-
-    def _sensed(self, depth: Array, still: Picture | None, index: int) -> Array:
-        if self.effects.depth_noise is None or still is None:
+    def _measured(self, still: Picture, index: int) -> Array:
+        """(H, W) what the depth sensor gives."""
+        depth = still.depth.cpu().numpy()
+        if self.effects.depth_noise is None:
             return depth
         albedo, gloss = still.albedo.mean(2).cpu().numpy(), still.gloss.cpu().numpy()
         return self.effects.depth_noise.forward(depth, albedo, gloss, generator(self.seed, "depth_noise", index))
@@ -183,3 +182,32 @@ class Film:
 def plain(eye: Eye) -> Eye:
     """The same camera with one ray a pixel."""
     return eye_of(eye.intrinsics, 1, eye.directions.device)
+
+
+@contextmanager
+def drawing(workers: int | None = None) -> Iterator[Callable[[Callable[[Item], Result], Iterable[Item]], Iterator[Result]]]:
+    """A `map` whose calls run on worker threads, each with one torch thread: threads that wait for each other are far slower. Results come
+    in order, and no more are in flight than workers need.
+
+    Args:
+        workers: None: one a core, at most 4.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    count = workers or min(os.cpu_count() or 1, 4)
+    pool = ThreadPoolExecutor(count)
+
+    def in_order(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        waiting: deque[Future[Result]] = deque()
+        for item in items:
+            waiting.append(pool.submit(work, item))
+            if len(waiting) > count:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+    try:
+        yield in_order
+    finally:
+        pool.shutdown(cancel_futures=True)
+        torch.set_num_threads(before)

@@ -1,4 +1,4 @@
-"""Furniture out of solids: tables, chairs, shelves, cupboards, lamps, plants, boxes, and what lies on them."""
+"""What builders of procedural scenes share: materials by kind of surface, solids without overlap on a floor, and furniture of them."""
 
 from __future__ import annotations
 
@@ -6,11 +6,82 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fieldfuse.camera import Array
-from fieldfuse.simulate.builder import Builder, turned
-from fieldfuse.simulate.solids import BALL, CYLINDER, upright
+from fieldfuse.simulate.materials import PLAIN, WIDTHS, Material, TextureBank
+from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solid, upright
+
+WALLS = ("plaster", "paper", "posters", "bricks", "posters")
+Parts = list[tuple[ArrayLike, ArrayLike, int]]  # centre, half size and material of boxes
+FLOORS = ("planks", "terrazzo", "tiles", "cloth", "planks")
 
 
-def _parts(b: Builder, at: Array, degrees: float, parts: list[tuple[ArrayLike, ArrayLike, int]]) -> None:
+class Builder:
+    """Grows lists of solids and materials; all choices come from one generator."""
+
+    def __init__(self, rng: np.random.Generator, bank: TextureBank) -> None:
+        self.rng, self.bank = rng, bank
+        self.solids: list[Solid] = []
+        self.materials: list[Material] = []
+        self.taken: list[tuple[float, float, float]] = []  # x, y, radius on the floor
+
+    def material(
+        self, *kinds: str, tint: ArrayLike | None = None, gloss: float = 0.0, sharpness: float = 30.0, width: float | None = None
+    ) -> int:
+        """A new material of one of the kinds, with a random shift, scale and tint; its number."""
+        kind = kinds[self.rng.integers(len(kinds))]
+        choices = self.bank.kinds[kind]
+        colour = self.tint() if tint is None else np.asarray(tint)
+        texture = int(choices[self.rng.integers(len(choices))])
+        width = float(self.rng.uniform(*WIDTHS[kind])) if width is None else width
+        offset = (float(self.rng.uniform(0, 2)), float(self.rng.uniform(0, 2)))
+        red, green, blue = (float(value) for value in colour)
+        self.materials.append(Material(texture, width, offset, (red, green, blue), gloss, sharpness))
+        return len(self.materials) - 1
+
+    def tint(self, spread: float = 0.14) -> Array:
+        """A factor near white, now and then a strong one."""
+        rng = self.rng
+        level = rng.uniform(0.65, 1.15)
+        return np.clip(level * (1 + rng.normal(0, spread * (3 if rng.random() < 0.15 else 1), 3)), 0.08, 1.5)
+
+    def paint(self, gloss: float = 0.0, dark: bool = False) -> int:
+        """One even colour."""
+        colour = self.rng.uniform(0.01, 0.05, 3) if dark else self.rng.uniform(0.08, 0.85, 3)
+        return self.material(PLAIN, tint=colour, gloss=gloss, sharpness=60.0)
+
+    def faces(self, *kinds: str, count: int = 6) -> tuple[int, ...]:
+        """Another picture on every face."""
+        return tuple(self.material(*kinds) for _ in range(count))
+
+    def add(self, *solids: Solid) -> None:
+        self.solids.extend(solids)
+
+    def box(self, centre: ArrayLike, half: ArrayLike, materials: int | tuple[int, ...], degrees: float = 0.0) -> None:
+        self.add(upright(BOX, centre, half, materials, degrees))
+
+    def room(self, half: ArrayLike, walls: tuple[int, ...]) -> None:
+        """A closed room on the floor z = 0; `half` are half sizes."""
+        half = np.asarray(half)
+        self.add(upright(ROOM, [0, 0, half[2]], half, walls))
+
+    def place(self, radius: float, low: Array, high: Array, tries: int = 40) -> Array | None:
+        """(2,) a free place on the floor for something of this radius, None when none was found."""
+        for _ in range(tries):
+            at = self.rng.uniform(low, high)
+            if all(np.hypot(at[0] - x, at[1] - y) > radius + r for x, y, r in self.taken):
+                self.taken.append((float(at[0]), float(at[1]), radius))
+                return np.asarray(at)
+        return None
+
+
+def turned(offsets: ArrayLike, degrees: float) -> Array:
+    """(N, 3) offsets turned about z."""
+    angle = np.deg2rad(degrees)
+    c, s = np.cos(angle), np.sin(angle)
+    x, y, z = np.asarray(offsets, dtype=np.float64).reshape(-1, 3).T
+    return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
+
+
+def _parts(b: Builder, at: Array, degrees: float, parts: Parts) -> None:
     """Boxes given by (centre, half, material) in the furniture's own axes, its floor point at the origin."""
     centres = turned(np.array([part[0] for part in parts]), degrees) + np.array([at[0], at[1], 0.0])
     for centre, (_, half, material) in zip(centres, parts, strict=True):
@@ -22,7 +93,7 @@ def table(b: Builder, at: Array, degrees: float, half: Array, height: float) -> 
     wood = b.material("planks", "marble", "cloth")
     leg = b.material("planks", "plain")
     x, y = half[0] - 0.05, half[1] - 0.05
-    parts: list[tuple[ArrayLike, ArrayLike, int]] = [([0, 0, height - 0.02], [half[0], half[1], 0.02], wood)]
+    parts: Parts = [([0, 0, height - 0.02], [half[0], half[1], 0.02], wood)]
     parts += [([i * x, j * y, height / 2 - 0.02], [0.03, 0.03, height / 2 - 0.02], leg) for i in (-1, 1) for j in (-1, 1)]
     _parts(b, at, degrees, parts)
     things(b, at, degrees, half * 0.75, height, int(b.rng.integers(2, 6)))
@@ -30,7 +101,7 @@ def table(b: Builder, at: Array, degrees: float, half: Array, height: float) -> 
 
 def chair(b: Builder, at: Array, degrees: float) -> None:
     seat, frame = b.material("cloth", "planks"), b.material("planks", "plain")
-    parts: list[tuple[ArrayLike, ArrayLike, int]] = [([0, 0, 0.45], [0.22, 0.22, 0.025], seat)]
+    parts: Parts = [([0, 0, 0.45], [0.22, 0.22, 0.025], seat)]
     parts += [([i * 0.19, -0.19, 0.21], [0.02, 0.02, 0.215], frame) for i in (-1, 1)]
     parts += [([i * 0.19, 0.19, 0.45], [0.02, 0.02, 0.45], frame) for i in (-1, 1)]
     parts += [([0, 0.19, 0.78], [0.18, 0.015, 0.1], seat)]
@@ -42,9 +113,7 @@ def shelf(b: Builder, at: Array, degrees: float, half: Array, height: float) -> 
     wood, books, depth = b.material("planks"), b.material("books"), half[1]
     boards = int(b.rng.integers(3, 6))
     step = (height - 0.06) / boards
-    parts: list[tuple[ArrayLike, ArrayLike, int]] = [
-        ([i * (half[0] - 0.012), 0, height / 2], [0.012, depth, height / 2], wood) for i in (-1, 1)
-    ]
+    parts: Parts = [([i * (half[0] - 0.012), 0, height / 2], [0.012, depth, height / 2], wood) for i in (-1, 1)]
     parts.append(([0, depth - 0.01, height / 2], [half[0], 0.01, height / 2], wood))
     for level in range(boards + 1):
         z = 0.05 + level * step
@@ -69,10 +138,7 @@ def cupboard(b: Builder, at: Array, degrees: float, half: Array, height: float) 
 
 def sofa(b: Builder, at: Array, degrees: float) -> None:
     stuff, wide = b.material("cloth", "paper"), b.rng.uniform(0.6, 1.0)
-    parts: list[tuple[ArrayLike, ArrayLike, int]] = [
-        ([0, 0, 0.21], [wide, 0.42, 0.21], stuff),
-        ([0, 0.34, 0.6], [wide, 0.09, 0.2], stuff),
-    ]
+    parts: Parts = [([0, 0, 0.21], [wide, 0.42, 0.21], stuff), ([0, 0.34, 0.6], [wide, 0.09, 0.2], stuff)]
     parts += [([i * (wide - 0.09), 0, 0.52], [0.09, 0.42, 0.1], stuff) for i in (-1, 1)]
     _parts(b, at, degrees, parts)
     for side in (-0.5, 0.4):

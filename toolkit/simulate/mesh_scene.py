@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,10 @@ from fieldfuse.camera import Array
 from fieldfuse.effects.models import decode_srgb
 from fieldfuse.effects.scenery import Background, Highlights
 from fieldfuse.errors import InputError
-from fieldfuse.simulate.atlas import Atlas
 from fieldfuse.simulate.cast import FAR
-from fieldfuse.simulate.seen import Mesh, Rays, Seen
+from fieldfuse.simulate.eye import Rays, Seen
+from fieldfuse.simulate.materials import Atlas
+from fieldfuse.simulate.solids import Mesh
 from fieldfuse.tone import shares
 
 Tensor = torch.Tensor
@@ -29,26 +31,30 @@ SUN_LIGHT, SKY_LIGHT, GROUND_LIGHT = 0.38, 0.5, 0.34  # linear
 STEPS_OF_DEPTH = 12.0  # a jump of distance by more than e^(1/12) is an edge
 
 
+@dataclass(frozen=True)
+class TexturedMesh:
+    """Triangles with their textures, z up."""
+
+    vertices: Array  # (V, 3) metres
+    triangles: Array  # (F, 3)
+    texture: Array  # (F,) number in the atlas of each triangle
+    places: Array  # (F, 3, 2) texture place of each corner, from the upper left
+    tint: Array  # (F, 3, 3) linear factor at each corner
+    gloss: Array  # (F,)
+
+
 class MeshScene:
-    """A mesh under the sky and a sun, z up.
+    """A mesh under the sky and a sun."""
 
-    Args:
-        vertices: (V, 3) metres; triangles: (F, 3).
-        texture: (F,) int64 number in the atlas of each triangle.
-        places: (F, 3, 2) texture place of each corner, from the upper left.
-        tint: (F, 3, 3) linear factor at each corner.
-        gloss: (F,).
-    """
-
-    def __init__(self, vertices: Array, triangles: Array, atlas: Atlas, texture: Array, places: Array, tint: Array, gloss: Array) -> None:
+    def __init__(self, mesh: TexturedMesh, atlas: Atlas) -> None:
         import open3d as o3d
 
-        self._o3d = o3d
+        self._o3d, self.atlas = o3d, atlas
+        vertices, triangles, texture, places = mesh.vertices, mesh.triangles, mesh.texture, mesh.places
         self._mesh = Mesh(vertices.astype(np.float64), triangles.astype(np.int64))
         self._caster = o3d.t.geometry.RaycastingScene()
         as_tensor = o3d.core.Tensor.from_numpy
         self._caster.add_triangles(as_tensor(vertices.astype(np.float32)), as_tensor(triangles.astype(np.uint32)))
-        self.atlas = atlas
         corners = vertices[triangles]  # (F, 3, 3)
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         u, v = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
@@ -56,8 +62,7 @@ class MeshScene:
         texels = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) * size[:, 0] * size[:, 1]
         self.density = torch.from_numpy(np.sqrt(texels / np.maximum(area, 1e-12)) / size[:, 0]).float()  # texture widths a metre
         self.texture = torch.from_numpy(texture.astype(np.int64))
-        self.places, self.tint = torch.from_numpy(places).float(), torch.from_numpy(tint).float()
-        self.gloss = torch.from_numpy(gloss).float()
+        self.places, self.tint, self.gloss = (torch.from_numpy(values).float() for values in (places, mesh.tint, mesh.gloss))
         low, high = vertices.min(0), vertices.max(0)
         margin = np.minimum([0.3, 0.3, 0.3], (high - low) / 4)
         self.free = np.stack([low + margin, high - margin])
@@ -77,7 +82,7 @@ class MeshScene:
         answer = self._caster.compute_distance(self._o3d.core.Tensor.from_numpy(points.numpy().astype(np.float32)))
         return torch.from_numpy(answer.numpy())
 
-    def see(self, beam: Rays, lit: bool = True) -> Seen:
+    def see(self, beam: Rays) -> Seen:
         """What rays see. Triangles are seen from both sides; their own normal, turned to the viewer, is the surface's."""
         origins = beam.origins.expand(len(beam.directions), 3)
         rays = torch.cat([origins, beam.directions], dim=1).contiguous().numpy()
@@ -91,9 +96,6 @@ class MeshScene:
         texture = self.texture[face]
         part = (torch.log(distance) * STEPS_OF_DEPTH).long() * 97 + torch.round(normals * 2).long() @ torch.tensor([1, 5, 25])
         part = torch.where(hit, part * self.atlas.count + texture, -1)
-        if not lit:
-            nothing = torch.zeros_like(distance)
-            return Seen(nothing[:, None].expand(-1, 3), distance, normals, nothing[:, None].expand(-1, 3), nothing, part)
         uv = torch.from_numpy(answer["primitive_uvs"].numpy())
         weights = torch.stack([1 - uv[:, 0] - uv[:, 1], uv[:, 0], uv[:, 1]], dim=1)[..., None]  # (N, 3 corners, 1)
         slant = (beam.directions * normals).sum(1).abs().clamp(min=0.1).sqrt()
@@ -161,11 +163,11 @@ def load_mesh_scene(path: Path | str, up: str = "z", scale: float = 1.0) -> Mesh
         raise InputError(f"{path} has vertices or colours that are not finite or too large; repair the mesh")
     if joined["triangles"].min() < 0 or joined["triangles"].max() >= len(joined["vertices"]):
         raise InputError(f"{path} has triangles between vertices that it does not have; repair the mesh")
-    return MeshScene(atlas=Atlas(pictures, mirrored=False), **joined)
+    return MeshScene(TexturedMesh(**joined), Atlas(pictures, mirrored=False))
 
 
 def _joined(parts: list[tuple[Array, Any]], turn: Array, gltf: bool) -> tuple[list[Array], dict[str, Array]]:
-    """All textures, and the columns of `MeshScene` over all parts; `turn` (3, 3) goes from the file's axes and unit to metres."""
+    """All textures, and the columns of `TexturedMesh` over all parts; `turn` (3, 3) goes from the file's axes and unit to metres."""
     pictures: list[Array] = [np.ones((4, 4, 3), dtype=np.float32)]
     known: dict[int, int] = {}
     columns: dict[str, list[Array]] = {name: [] for name in ("vertices", "triangles", "texture", "places", "tint", "gloss")}

@@ -1,4 +1,4 @@
-"""People in a scene: figures of balls and rods who walk through what is there, for as long as a ray is asked."""
+"""People in a scene: figures of balls and rods who walk through what is there."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import torch
 
 from fieldfuse.camera import Array
 from fieldfuse.effects.scenery import STEPS, Background, Highlights, Walk
-from fieldfuse.simulate.builder import Builder, turned
-from fieldfuse.simulate.materials import Material, TextureBank, texture_bank
+from fieldfuse.simulate.eye import Rays, Scenery, Seen
+from fieldfuse.simulate.furniture import Builder, turned
+from fieldfuse.simulate.materials import Material, Materials, TextureBank, texture_bank
 from fieldfuse.simulate.scene import Lamp, Scene
-from fieldfuse.simulate.seen import Mesh, Rays, Scenery, Seen
-from fieldfuse.simulate.solids import BALL, Solid, rod, upright
+from fieldfuse.simulate.solids import BALL, Mesh, Solid, Solids, rod, upright
 
 AMBIENT = ((0.75, 0.75, 0.75), (0.4, 0.4, 0.4))  # of people in a mesh, which has its light in its colours
 STRIDE = 0.22  # of the height
@@ -32,19 +32,15 @@ class Peopled:
     def device(self) -> torch.device:
         return self.scene.device
 
-    def see(self, beam: Rays, lit: bool = True) -> Seen:
+    def see(self, beam: Rays) -> Seen:
         """What rays see: of scene and people what is nearer."""
-        there, they = self.scene.see(beam, lit), self.people.see(beam, lit)
+        there, they = self.scene.see(beam), self.people.see(beam)
         nearer = they.distance < there.distance
         wide = nearer[:, None]
-        return Seen(
-            linear=torch.where(wide, they.linear, there.linear),
-            distance=torch.where(nearer, they.distance, there.distance),
-            normals=torch.where(wide, they.normals, there.normals),
-            albedo=torch.where(wide, they.albedo, there.albedo),
-            gloss=torch.where(nearer, they.gloss, there.gloss),
-            part=torch.where(nearer, -they.part, there.part),
-        )
+        part = torch.where(nearer, -they.part, there.part)
+        linear, normals, albedo = (torch.where(wide, getattr(they, of), getattr(there, of)) for of in ("linear", "normals", "albedo"))
+        distance, gloss = (torch.where(nearer, getattr(they, of), getattr(there, of)) for of in ("distance", "gloss"))
+        return Seen(linear, distance, normals, albedo, gloss, part)
 
     def clearance(self, points: torch.Tensor) -> torch.Tensor:
         return self.scene.clearance(points)
@@ -69,7 +65,7 @@ def peopled(scene: Scenery, walks: Sequence[Walk], seconds: float) -> Scenery:
         materials += builder.materials
     lamps: list[Lamp] = scene.lamps if isinstance(scene, Scene) else []
     ambient = scene.ambient if isinstance(scene, Scene) else AMBIENT
-    people = Scene.build("people", solids, materials, bank, lamps=lamps, ambient=ambient, free=scene.free, focus=scene.focus)
+    people = Scene("people", Solids(solids), Materials(materials), bank, lamps, ambient, scene.free, scene.focus)
     return Peopled(scene, people.to(scene.device))
 
 

@@ -1,4 +1,4 @@
-"""A procedural scene: solids, materials, lamps; pictures, depth and normals of it along any rays, on any torch device."""
+"""A procedural scene: solids, materials, lamps; images, depth and normals of it along any rays, on any torch device."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.effects.models import encode_srgb
 from fieldfuse.effects.scenery import Background, Highlights
 from fieldfuse.simulate.cast import cast
-from fieldfuse.simulate.eye import eye_of, take
-from fieldfuse.simulate.materials import Material, Materials, TextureBank
-from fieldfuse.simulate.seen import Mesh, Rays, Seen
-from fieldfuse.simulate.solids import ROOM, Solid, Solids
-from fieldfuse.simulate.tessellate import tessellate
+from fieldfuse.simulate.eye import Rays, Seen, eye_of, take
+from fieldfuse.simulate.materials import Materials, TextureBank
+from fieldfuse.simulate.solids import ROOM, Mesh, Solids, tessellate
 
 Tensor = torch.Tensor
 
@@ -33,7 +31,7 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Rendered:
-    """One picture with its truth."""
+    """One image with its truth."""
 
     rgb: Tensor  # (H, W, 3) float32 sRGB in [0, 1]
     depth: Tensor  # (H, W) float32 metres along z at pixel centres, 0 where nothing is hit
@@ -46,7 +44,7 @@ class Scene:
 
     Attributes:
         ambient: (above, below) linear light from all directions, on surfaces that face up and down.
-        free: (2, 3) box in which a camera can move without leaving the scene; what stands in it is told by `clearance`.
+        free: (2, 3) box in which a camera can move without leaving the scene; `clearance` finds what stands in it.
         focus: (3,) what there is to look at.
         background: what rays see that hit nothing; None: black, at no cost.
         highlights: the lamps' reflection on glossy materials; None: none, at no cost.
@@ -62,10 +60,6 @@ class Scene:
     focus: Array
     background: Background | None = None
     highlights: Highlights | None = None
-
-    @classmethod
-    def build(cls, kind: str, solids: list[Solid], materials: list[Material], bank: TextureBank, **rest: object) -> Scene:
-        return cls(kind, Solids(solids), Materials(materials), bank, **rest)  # type: ignore[arg-type]
 
     @property
     def device(self) -> torch.device:
@@ -85,7 +79,7 @@ class Scene:
         return tessellate(self.solids.items)
 
     def render(self, intrinsics: Intrinsics, world_from_camera: Array, side: int = EDGE_SIDE) -> Rendered:
-        """A camera's picture, depth and normals, through its lens.
+        """A camera's image, depth and normals, through its lens.
 
         Args:
             world_from_camera: (4, 4).
@@ -94,8 +88,8 @@ class Scene:
         picture = take(self, eye_of(intrinsics, side, self.device), world_from_camera[None])
         return Rendered(encode_srgb(picture.linear), picture.depth, picture.normals)
 
-    def see(self, beam: Rays, lit: bool = True) -> Seen:
-        """What rays see: light, distance, normals and material, one row a ray. Not `lit`: distance and normals only."""
+    def see(self, beam: Rays) -> Seen:
+        """What rays see: light, distance, normals and material, one row a ray."""
         origins, directions = beam.origins, beam.directions
         distance, solid = cast(self.solids, origins, directions)
         hit = (solid >= 0).nonzero()[:, 0]
@@ -111,10 +105,6 @@ class Scene:
         start = origins if len(origins) == 1 else at_hits(origins)
         points = start + far[:, None] * ray
         face, place, normals = self.solids.surface(number, points)
-        if not lit:
-            nothing = torch.zeros_like(distance)
-            dark = nothing[:, None].expand(-1, 3)
-            return Seen(dark, distance, spread_out(normals), dark, nothing, spread_out(number * 6 + face + 1))
         slant = (ray * normals).sum(1).abs().clamp(min=0.1).sqrt()  # between the narrow and the wide side of the footprint
         material = self.solids.materials[number, face]
         albedo = self.materials.albedo(self.bank, material, place, far * beam.spread / slant)

@@ -1,4 +1,4 @@
-"""Scene files: YAML that tells what is filmed, by which camera, along which path, and through which effects."""
+"""Scene files: YAML with what is filmed, by which camera, along which path, and through which effects."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class SceneFile:
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     camera: CameraSettings = default(default_factory=CameraSettings)
     path: PathSettings = default(default_factory=PathSettings)
-    output: Annotated[str, one_of(*OUTPUTS)] = "frames"  # frames (with transforms.json), photos (pictures alone) or video
+    output: Annotated[str, one_of(*OUTPUTS)] = "frames"  # frames (with transforms.json), photos (images alone) or video
     depth: bool = False  # a depth camera beside the colour camera
     side: Annotated[int, Field(ge=1, le=8)] = 2  # pixels that hold an edge are the mean of side × side rays
     mesh: MeshSettings = default(default_factory=MeshSettings)
@@ -80,12 +80,8 @@ def scene_file(data: dict[str, Any], where: str) -> SceneFile:
     """
     settings = checked(SceneFile, {key: value for key, value in data.items() if key != "effects"}, where)
     settings.effects = data.get("effects")
-    _check(settings, where)
-    return settings
-
-
-def _check(settings: SceneFile, where: str) -> None:
     if settings.depth and settings.output != "frames":
         raise InputError(f"{where}: depth needs `output: frames`; {settings.output} have nowhere to put it")
     if settings.output == "video" and (settings.camera.width % 2 or settings.camera.height % 2):
         raise InputError(f"{where}: videos need an even width and height; correct camera.width and camera.height")
+    return settings

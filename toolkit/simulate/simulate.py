@@ -1,27 +1,33 @@
-"""A scene file becomes a capture with its ground truth: all of the folder, or nothing of it."""
+"""A scene file becomes a capture, its images or video, depth and `transforms.json`, with the ground truth beside: all of it, or nothing."""
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from safetensors.numpy import save
 
+from fieldfuse.camera import Array, Intrinsics, opengl_from_world
 from fieldfuse.effects.effect_specs import Effects, parse
-from fieldfuse.errors import InputError
-from fieldfuse.files import atomic_path
+from fieldfuse.errors import InputError, OutputError
+from fieldfuse.files import atomic_path, write_json
 from fieldfuse.progress import SILENT, Progress
-from fieldfuse.simulate.capture_files import writing
-from fieldfuse.simulate.film import Film
+from fieldfuse.simulate.eye import Scenery
+from fieldfuse.simulate.film import Film, FilmCamera, Shot, drawing
 from fieldfuse.simulate.mesh_scene import SUFFIXES, load_mesh_scene
 from fieldfuse.simulate.paths import plan
 from fieldfuse.simulate.procedural import random_scene
-from fieldfuse.simulate.seen import Scenery
 from fieldfuse.simulate.settings import SceneFile
-from fieldfuse.simulate.workers import drawing
+from fieldfuse.simulate.solids import Mesh
 
 SCENE, PATH = 0, 1  # streams of random numbers
+TRUTH = "ground_truth"
+DEPTH_STEPS = 1000.0  # stored depth values a metre
+MOST_STEPS = 65535
 
 
 def open_scene(settings: SceneFile, beside: Path) -> Scenery:
@@ -44,7 +50,7 @@ def prepare(settings: SceneFile, beside: Path, effects: Effects) -> Film:
     """All that is needed to film: scene, path, camera and effects.
 
     Raises:
-        InputError: as for `open_scene`, or the path does not fit into the scene, or the lens not over the picture.
+        InputError: as for `open_scene`, or the path does not fit into the scene, or the lens not over the image.
     """
     for name in ("depth_noise", "depth_offset"):
         if getattr(effects, name) is not None and not settings.depth:
@@ -53,7 +59,8 @@ def prepare(settings: SceneFile, beside: Path, effects: Effects) -> Film:
     motion = plan(scene, settings.path, np.random.default_rng([settings.seed, PATH]))
     if effects.background is not None:
         effects = replace(effects, background=replace(effects.background, seed=effects.background.seed + settings.seed))
-    return Film(scene, settings.camera.intrinsics(), motion, settings.path.times(), effects, settings.seed, settings.depth, settings.side)
+    camera = FilmCamera(settings.camera.intrinsics(), settings.side, settings.depth)
+    return Film(scene, camera, motion, settings.path.times(), effects, settings.seed)
 
 
 def simulate(
@@ -87,19 +94,99 @@ def simulate(
     suffix = ".png" if listed.compression is None else ".jpg"
     with (
         atomic_path(out) as temporary,
-        writing(temporary, film.intrinsics, settings.path.fps, settings.output, suffix) as writer,
+        closing(CaptureWriter(temporary, film.intrinsics, settings.path.fps, settings.output, suffix)) as writer,
         drawing(workers) as side_by_side,
     ):
         for done, shot in enumerate(side_by_side(film.shot, range(len(film)))):
             progress.check()
             writer.add(shot)
             progress.update(done + 1, len(film))
-        writer.finish(_about(settings), film.effects.describe(), film.scene.mesh())
+        about = {name: value for name, value in asdict(settings).items() if name != "effects"}  # which stand in a file of their own
+        writer.finish(about, film.effects.describe(), film.scene.mesh())
     return film
 
 
-def _about(settings: SceneFile) -> dict[str, Any]:
-    """The scene file with all defaults filled in; effects stand in a file of their own."""
-    about = asdict(settings)
-    about.pop("effects")
-    return about
+class CaptureWriter:
+    """Writes the shots of one capture into a folder, in order.
+
+    Args:
+        output: "frames", "photos" or "video".
+        suffix: ".jpg" when images are compressed, else ".png".
+    """
+
+    def __init__(self, folder: Path, intrinsics: Intrinsics, fps: float, output: str, suffix: str) -> None:
+        self.folder, self.intrinsics, self.output, self.suffix = folder, intrinsics, output, suffix
+        self.entries, self.poses, self.facts = (list[dict[str, Any]]() for _ in range(3))
+        self._video: cv2.VideoWriter | None = None
+        for name in (f"{TRUTH}/frames", *(() if output == "video" else ("images",))):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        if output == "video":
+            size = (intrinsics.width, intrinsics.height)
+            self._video = cv2.VideoWriter(str(folder / "video.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+            if not self._video.isOpened():
+                raise OutputError(f"cannot write {folder / 'video.mp4'}: OpenCV has no mp4 encoder; see `fieldfuse doctor`")
+
+    def add(self, shot: Shot) -> None:
+        """Write one frame."""
+        name = f"{shot.index:06d}"
+        truth = f"{TRUTH}/frames/{name}.safetensors"
+        entry: dict[str, Any] = {"file_path": f"images/{name}{self.suffix}"}
+        if self._video is not None:
+            self._video.write(cv2.cvtColor(shot.rgb, cv2.COLOR_RGB2BGR))
+        elif shot.jpeg is not None:
+            (self.folder / entry["file_path"]).write_bytes(shot.jpeg)
+        else:
+            self._png(entry["file_path"], cv2.cvtColor(shot.rgb, cv2.COLOR_RGB2BGR))
+        if shot.sensor_depth is not None:
+            entry["depth_file_path"] = f"depth/{name}.png"
+            (self.folder / "depth").mkdir(exist_ok=True)
+            steps = np.round(shot.sensor_depth.astype(np.float64) * DEPTH_STEPS)  # 0 where there is none or it is too far (65.5 m)
+            self._png(entry["depth_file_path"], np.where((steps > 0) & (steps < MOST_STEPS), steps, 0).astype(np.uint16))
+        entry["transform_matrix"] = opengl_from_world(shot.world_from_camera).tolist()
+        self.entries.append(entry)
+        exact = {"depth": np.ascontiguousarray(shot.depth), "normals": shot.normals.astype(np.float16)}
+        if shot.passed is not None:
+            exact["passers"] = shot.passed.astype(np.uint8)
+        (self.folder / truth).write_bytes(save(exact))
+        picture = {"video_index": shot.index} if self.output == "video" else {"picture": entry["file_path"]}
+        self.poses.append({**picture, "truth": truth, "seconds": shot.seconds, "world_from_camera": shot.world_from_camera.tolist()})
+        self.facts.append({**picture, **shot.facts})
+
+    def finish(self, about: dict[str, Any], effects: dict[str, Any], mesh: Mesh) -> None:
+        """Write what describes all frames; `transforms.json` as instant-ngp and nerfstudio read it: OpenGL axes, pixel centres at +0.5."""
+        self.close()
+        lens, truth = self.intrinsics, self.folder / TRUTH
+        if self.output == "frames":
+            size = {"w": lens.width, "h": lens.height, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
+            bent = dict(zip(("k1", "k2", "p1", "p2", "k3"), lens.distortion, strict=False))
+            scale = {"integer_depth_scale": 1 / DEPTH_STEPS} if any("depth_file_path" in entry for entry in self.entries) else {}
+            model = {"camera_model": "OPENCV" if lens.distorted else "PINHOLE"}
+            write_json(self.folder / "transforms.json", {**model, **size, **bent, **scale, "frames": self.entries})
+        write_json(truth / "cameras.json", {"intrinsics": lens.to_dict(), "frames": self.poses})
+        write_json(truth / "effects.json", {"effects": effects, "frames": self.facts})
+        write_json(truth / "scene.json", about)
+        write_mesh(truth / "mesh.ply", mesh)
+
+    def close(self) -> None:
+        """Release open files; harmless after `finish`."""
+        if self._video is not None:
+            self._video.release()
+
+    def _png(self, name: str, picture: Array) -> None:
+        _, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+        (self.folder / name).write_bytes(data.tobytes())
+
+
+def write_mesh(path: Path, mesh: Mesh) -> None:
+    """Binary PLY with `double` positions; nothing but vertices and triangles."""
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(mesh.vertices)}\n"
+        "property double x\nproperty double y\nproperty double z\n"
+        f"element face {len(mesh.triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.zeros(len(mesh.triangles), dtype=[("count", "u1"), ("corner", "<i4", (3,))])
+    faces["count"], faces["corner"] = 3, mesh.triangles
+    with path.open("wb") as file:
+        file.write(header.encode("ascii"))
+        file.write(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
+        file.write(faces.tobytes())

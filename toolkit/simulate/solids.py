@@ -1,8 +1,11 @@
-"""Convex solids that a procedural scene is made of: boxes, rooms (a box seen from inside), ellipsoids and cylinders."""
+"""Convex solids that a procedural scene is made of: boxes, rooms (a box seen from inside), ellipsoids and cylinders; and their
+triangles."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -15,6 +18,15 @@ Tensor = torch.Tensor
 BOX, ROOM, BALL, CYLINDER = "box", "room", "ball", "cylinder"
 KINDS = (BOX, ROOM, BALL, CYLINDER)
 THINNEST = 5e-4  # metres: half sizes below this lose the face that was hit in float32
+ROUND = 48  # corners of a circle in triangles: its flat sides lie within 0.2% of the radius
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles of a scene's surfaces."""
+
+    vertices: Array  # (V, 3) float64 metres
+    triangles: Array  # (F, 3) int64, counter-clockwise from outside
 
 
 @dataclass(frozen=True)
@@ -61,20 +73,21 @@ class Solids:
 
     def __init__(self, solids: list[Solid], device: torch.device | str = "cpu") -> None:
         self.items = sorted(solids, key=lambda solid: KINDS.index(solid.kind))
-        self.ranges: dict[str, tuple[int, int]] = {}  # kind → first and past-the-last number
-        first = 0
-        for kind in KINDS:
-            count = sum(solid.kind == kind for solid in self.items)
-            self.ranges[kind] = (first, first + count)
-            first += count
+        ends = np.cumsum([sum(solid.kind == kind for solid in self.items) for kind in KINDS]).tolist()
+        self.ranges = dict(zip(KINDS, pairwise([0, *ends]), strict=True))  # kind → first and past-the-last number
+        half = np.array([np.maximum(solid.half, THINNEST) for solid in self.items]).reshape(-1, 3)
+        # Of a sphere around each: a ball's is its largest half size, and a room is met by every ray.
+        balls, rooms = slice(*self.ranges[BALL]), slice(*self.ranges[ROOM])
+        radius = 1.001 * np.linalg.norm(half, axis=1)
+        radius[balls], radius[rooms] = 1.001 * half[balls].max(axis=1, initial=0), np.inf
 
-        def stack(rows: list[Array], *shape: int) -> Tensor:
+        def stack(rows: object, *shape: int) -> Tensor:
             return torch.tensor(np.array(rows, dtype=np.float32).reshape(-1, *shape), device=device)
 
         self.centre = stack([solid.centre for solid in self.items], 3)  # (P, 3)
-        self.half = stack([np.maximum(solid.half, THINNEST) for solid in self.items], 3)  # (P, 3)
+        self.half, self.radius, self.ends = stack(half, 3), stack(radius), torch.tensor(ends, device=device)  # (P, 3), (P,), (4,)
         self.rotation = stack([solid.rotation for solid in self.items], 3, 3)  # (P, 3, 3)
-        faces = [_faces(solid.materials) for solid in self.items]
+        faces = [[solid.materials[min(face, len(solid.materials) - 1)] for face in range(6)] for solid in self.items]
         self.materials = torch.tensor(faces, dtype=torch.int64, device=device).reshape(-1, 6)  # (P, 6)
 
     def __len__(self) -> int:
@@ -156,5 +169,31 @@ class Solids:
         return torch.cat(out, dim=1).amin(1)
 
 
-def _faces(materials: tuple[int, ...]) -> list[int]:
-    return [materials[min(face, len(materials) - 1)] for face in range(6)]
+def tessellate(solids: list[Solid]) -> Mesh:
+    """Each solid on its own, counter-clockwise from the visible side. Round ones are inscribed polyhedra."""
+    vertices, triangles, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
+    for solid in solids:
+        unit, faces = _unit(solid.kind)
+        vertices.append((unit * solid.half) @ solid.rotation.T + solid.centre)
+        triangles.append((faces[:, ::-1] if solid.kind == ROOM else faces) + count)
+        count += len(unit)
+    return Mesh(np.concatenate(vertices), np.concatenate(triangles))
+
+
+@lru_cache(maxsize=8)
+def _unit(kind: str) -> tuple[Array, Array]:
+    """Vertices and triangles of the solid with half sizes of 1; round ones are turned about z, ring by ring from the top."""
+    if kind in (BOX, ROOM):
+        corners = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)])
+        quads = np.array([[4, 6, 7, 5], [0, 1, 3, 2], [2, 3, 7, 6], [0, 4, 5, 1], [1, 5, 7, 3], [0, 2, 6, 4]])
+        return corners, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    down = np.linspace(0, np.pi, ROUND // 2 + 1)
+    heights, radii = (np.cos(down), np.sin(down)) if kind == BALL else (np.array([1.0, 1, -1, -1]), np.array([0.0, 1, 1, 0]))
+    radii = np.where(radii > 1e-9, radii, 0)
+    angle = 2 * np.pi * np.arange(ROUND) / ROUND
+    rings = np.stack(np.broadcast_arrays(np.outer(radii, np.cos(angle)), np.outer(radii, np.sin(angle)), heights[:, None]), axis=-1)
+    here = np.arange(len(radii) - 1)[:, None] * ROUND + np.arange(ROUND)
+    following = np.roll(here, -1, axis=1)
+    lower = np.stack([here, here + ROUND, following + ROUND], axis=-1)[radii[1:] > 0]  # a ring of radius 0 is a point
+    upper = np.stack([here, following + ROUND, following], axis=-1)[radii[:-1] > 0]
+    return rings.reshape(-1, 3), np.concatenate([lower, upper]).reshape(-1, 3)

@@ -1,10 +1,12 @@
-"""Depth maps by matching at the size of a picture, and as a file."""
+"""Depth maps by matching at the size of an image, and as a file."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -58,8 +60,8 @@ def save_stereo(path: Path | str, names: Sequence[str], depths: Sequence[StereoD
     for index, found in enumerate(depths):
         tensors[f"depth.{index}"] = np.ascontiguousarray(found.depth, dtype=np.float32)
         tensors[f"confidence.{index}"] = np.round(found.confidence * 255).astype(np.uint8)
-    about = {"names": list(names), "cameras": [found.intrinsics.to_dict() for found in depths]}
-    about["noise"] = [found.noise for found in depths]
+    cameras, noises = [found.intrinsics.to_dict() for found in depths], [found.noise for found in depths]
+    about = {"names": list(names), "cameras": cameras, "noise": noises}
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, metadata={"stereo": json.dumps(about)})
 
@@ -70,22 +72,32 @@ def load_stereo(path: Path | str) -> tuple[list[str], list[StereoDepth]]:
     Raises:
         InputError: missing or damaged.
     """
+    with opened(path, "stereo") as (file, about):
+        names, cameras = [str(name) for name in about["names"]], [Intrinsics.from_dict(camera) for camera in about["cameras"]]
+        noises = [float(noise) for noise in about.get("noise", [0.0] * len(cameras))]  # older files have none
+        if len(noises) != len(cameras) or not all(0 <= noise < np.inf for noise in noises):
+            raise ValueError("the noise of the depth maps cannot be")
+        out = []
+        for index, (camera, noise) in enumerate(zip(cameras, noises, strict=True)):
+            depth, confidence = file.get_tensor(f"depth.{index}"), file.get_tensor(f"confidence.{index}")
+            shape = (camera.height, camera.width)
+            if depth.shape != shape or confidence.shape != shape or depth.dtype != np.float32 or not np.isfinite(depth).all():
+                raise ValueError(f"the depth map {index} does not fit its camera")
+            out.append(StereoDepth(depth, confidence.astype(np.float32) / 255, camera, noise))
+        if len(names) != len(out):
+            raise ValueError("there are not as many names as depth maps")
+        return names, out
+
+
+@contextmanager
+def opened(path: Path | str, key: str) -> Iterator[tuple[Any, Any]]:
+    """A safetensors file and what stands as JSON under `key` in its header; whatever is wrong with either while it is read is refused.
+
+    Raises:
+        InputError: missing or damaged.
+    """
     try:
         with safe_open(str(path), framework="numpy") as file:
-            about = json.loads(file.metadata()["stereo"])
-            names, cameras = [str(name) for name in about["names"]], [Intrinsics.from_dict(camera) for camera in about["cameras"]]
-            noises = [float(noise) for noise in about.get("noise", [0.0] * len(cameras))]  # older files have none
-            if len(noises) != len(cameras) or not all(0 <= noise < np.inf for noise in noises):
-                raise ValueError("the noise of the depth maps cannot be")
-            out = []
-            for index, (camera, noise) in enumerate(zip(cameras, noises, strict=True)):
-                depth, confidence = file.get_tensor(f"depth.{index}"), file.get_tensor(f"confidence.{index}")
-                shape = (camera.height, camera.width)
-                if depth.shape != shape or confidence.shape != shape or depth.dtype != np.float32 or not np.isfinite(depth).all():
-                    raise ValueError(f"the depth map {index} does not fit its camera")
-                out.append(StereoDepth(depth, confidence.astype(np.float32) / 255, camera, noise))
-            if len(names) != len(out):
-                raise ValueError("there are not as many names as depth maps")
-            return names, out
+            yield file, json.loads(file.metadata()[key])
     except (InputError, SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         raise InputError(f"{path} cannot be read ({first_line(error)}); remove it and run the command again") from error

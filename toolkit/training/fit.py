@@ -22,7 +22,7 @@ from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.field import Field
-from fieldfuse.stereo.left_out import LeftOut
+from fieldfuse.stereo.transients import LeftOut
 from fieldfuse.training import room
 from fieldfuse.training.behind import sky_behind
 from fieldfuse.training.depth import FINE, ROUGH

@@ -21,8 +21,8 @@ from fieldfuse.memory import give_back
 from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.field import Field
-from fieldfuse.stereo import moving, quick
-from fieldfuse.stereo.left_out import LeftOut
+from fieldfuse.stereo import fast_mvs, transients
+from fieldfuse.stereo.transients import LeftOut
 from fieldfuse.training import depth_start
 from fieldfuse.training.engine import fit_device, warm_up
 from fieldfuse.training.fit import DEFAULT_BUDGET, Clock, FitResult, fit_field
@@ -90,15 +90,15 @@ def fit_guided(
     if not (matching or looks_for_moving(views, settings) or depth_start.starts_by_depth(views, settings)):
         return fit_field(views, scene, settings, progress, ticks=ticks, **begin)
     warm_up(settings, progress)
-    quick.warm_up()
+    fast_mvs.warm_up()
     depth_start.warm_up()
     budget, clock = settings.fit.budget or DEFAULT_BUDGET, Clock(ticks)
     notes: list[str] = []
     known, matched, matched_for = views, None, 0.0
     if matching:
         try:
-            part = Part(progress, 0.0, quick.SHARE * budget, budget)
-            known, matched = quick.guided(views, scene.near, scene.far, scene.median_depth, budget, part)
+            part = Part(progress, 0.0, fast_mvs.SHARE * budget, budget)
+            known, matched = fast_mvs.guided(views, scene.near, scene.far, scene.median_depth, budget, part)
         except InputError as error:
             notes.append(f"the field was fitted to colours alone: {error}")
         matched_for = clock.seconds()
@@ -126,7 +126,7 @@ def fit_guided(
 
 
 def find_moving(
-    views: Views, matched: quick.Matched | None, scene: Scene, budget: float, progress: Progress = SILENT
+    views: Views, matched: fast_mvs.Matched | None, scene: Scene, budget: float, progress: Progress = SILENT
 ) -> LeftOut | None:
     """What moves in the training pictures of `views`, by the depth that was `matched`, or by their own; None: no depth is known, by
     matching of too few pictures, or they are too many for a fit of `budget` seconds.
@@ -135,12 +135,12 @@ def find_moving(
         Interrupted: the user asked to stop.
     """
     training = np.flatnonzero(~views.test)
-    some, side = views.subset(training), moving.plan(len(training), budget)
+    some, side = views.subset(training), transients.plan(len(training), budget)
     telling = sum(depth is not None for depth in some.depths)
-    if side is None or telling < (moving.FEWEST if views.matched else 1):
+    if side is None or telling < (transients.FEWEST if views.matched else 1):
         return None
     at = {int(index): place for place, index in enumerate(training)}
     found = None if matched is None else {at[index]: one for index, one in matched.depths.items()}
-    depths, cameras = moving.depths_at(some, side, found)
-    masks = moving.moving(some, depths, cameras, scene.median_depth, not views.matched, progress)
-    return LeftOut.of(some.names, moving.bounded(masks))
+    depths, cameras = transients.depths_at(some, side, found)
+    masks = transients.moving(some, depths, cameras, scene.median_depth, not views.matched, progress)
+    return LeftOut.of(some.names, transients.bounded(masks))

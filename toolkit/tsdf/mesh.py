@@ -1,4 +1,4 @@
-"""A triangle mesh in NumPy arrays: move it between frames, remove what is not surface, smooth it, thin it out."""
+"""A triangle mesh in NumPy arrays: move it between frames, remove what is not surface, smooth it, thin it out; and views of it."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ import open3d.core as o3c
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from fieldfuse.camera import Array, Similarity
+from fieldfuse.camera import Array, Intrinsics, Similarity
 from fieldfuse.errors import InputError
 
 HASTE = (3, 5, 7, 10)  # of thinning out: the most careful that gets there is taken, each going on where the one before ended …
 OVER = 0.05  # … when there are no more than so many triangles too many
+RAYS_AT_ONCE = 1 << 20
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -94,15 +96,22 @@ class Mesh:
             min_area_share: components with less than this share of the whole area go; the largest one always stays.
         """
         degenerate = (self.triangles[:, [0, 1, 2]] == self.triangles[:, [1, 2, 0]]).any(axis=1) | (self.areas() <= 0)
-        mesh = replace(self, triangles=self.triangles[~degenerate])
-        mesh = replace(mesh, triangles=mesh.triangles[_first_of_each(np.sort(mesh.triangles, axis=1))])
+        triangles = self.triangles[~degenerate]
+        rows = np.sort(triangles, axis=1)
+        order, new = np.lexsort(rows.T), np.ones(len(rows), bool)  # stable, so that of equal rows the first comes first
+        new[1:] = (np.diff(rows[order], axis=0) != 0).any(axis=1)
+        mesh = replace(self, triangles=triangles[np.sort(order[new])])
         if min_area_share > 0 and len(mesh.triangles):
             label = mesh.components()
             area = np.bincount(label, weights=mesh.areas())
             keep = area >= min_area_share * area.sum()
             keep[np.argmax(area)] = True
             mesh = replace(mesh, triangles=mesh.triangles[keep[label]])
-        return mesh.compacted()
+        used = np.zeros(len(mesh.vertices), bool)
+        used[mesh.triangles.reshape(-1)] = True
+        number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+        normals = None if mesh.normals is None else mesh.normals[used]
+        return Mesh(mesh.vertices[used], number[mesh.triangles].astype(np.int32), mesh.colours[used], normals)
 
     def ordered(self) -> Mesh:
         """The same mesh, vertices and triangles in an order that only their values decide.
@@ -146,14 +155,6 @@ class Mesh:
         normals = None if self.normals is None else replace(self, vertices=vertices, normals=None).with_normals().normals
         return replace(self, vertices=vertices, normals=normals)
 
-    def compacted(self) -> Mesh:
-        """Without vertices that no triangle uses; the order of the others is kept."""
-        used = np.zeros(len(self.vertices), bool)
-        used[self.triangles.reshape(-1)] = True
-        number = np.cumsum(used, dtype=np.int32) - np.int32(1)
-        normals = None if self.normals is None else self.normals[used]
-        return Mesh(self.vertices[used], number[self.triangles].astype(np.int32), self.colours[used], normals)
-
     def decimated(self, max_triangles: int) -> Mesh:
         """At most about `max_triangles` triangles, by quadric edge collapse (Garland and Heckbert 1997); as it is when it has no more.
 
@@ -167,17 +168,13 @@ class Mesh:
             if len(triangles) <= (1 + OVER) * max_triangles:
                 break
         thin = Mesh.create(points, triangles).cleaned()
-        thin = replace(thin, colours=self._colours_at(thin.vertices))
-        return thin if self.normals is None else thin.with_normals()
-
-    def _colours_at(self, points: Array) -> Array:
-        """(N, 3) uint8 colours of the places of this mesh that are nearest to (N, 3) points."""
         middle = self.bounds().mean(axis=0)
-        found = ray_scene(self, middle).compute_closest_points(o3c.Tensor.from_numpy((points - middle).astype(np.float32)))
+        found = ray_scene(self, middle).compute_closest_points(o3c.Tensor.from_numpy((thin.vertices - middle).astype(np.float32)))
         share = found["primitive_uvs"].numpy()
         share = np.concatenate([1 - share.sum(axis=1, keepdims=True), share], axis=1)
         corners = self.colours[self.triangles[found["primitive_ids"].numpy().astype(np.int64)]]
-        return np.round(np.einsum("nck,nc->nk", corners, share)).clip(0, 255).astype(np.uint8)
+        thin = replace(thin, colours=np.round(np.einsum("nck,nc->nk", corners, share)).clip(0, 255).astype(np.uint8))
+        return thin if self.normals is None else thin.with_normals()
 
     def with_normals(self) -> Mesh:
         """As it is if it has normals, else with those of the triangles around each vertex, by area."""
@@ -195,22 +192,15 @@ class Mesh:
             out.vertex_normals = o3d.utility.Vector3dVector(self.normals)
         return out
 
+
 def places(positions: Array, *others: Array | None) -> Array:
     """(N,) int64 indices that sort (N, 3) `positions` by x, then y, then z; `others` (N, C) decide between equal ones."""
     order = np.lexsort(positions.T[::-1])
-    told = positions[order]
-    if len(told) > 1 and (told[1:] == told[:-1]).all(axis=1).any():
+    there = positions[order]
+    if len(there) > 1 and (there[1:] == there[:-1]).all(axis=1).any():
         columns = np.concatenate([positions, *(np.asarray(other, np.float64) for other in others if other is not None)], axis=1)
         order = np.lexsort(columns.T[::-1])
     return np.asarray(order)
-
-
-def _first_of_each(rows: Array) -> Array:
-    """Ascending indices of the rows (N, C) that equal none before them."""
-    order = np.lexsort(rows.T)  # stable, so that of equal rows the first comes first
-    new = np.ones(len(rows), bool)
-    new[1:] = (np.diff(rows[order], axis=0) != 0).any(axis=1)
-    return np.sort(order[new])
 
 
 def as_bytes(colours: Array) -> Array:
@@ -224,6 +214,57 @@ def as_bytes(colours: Array) -> Array:
 def ray_scene(mesh: Mesh, origin: Array) -> o3d.t.geometry.RaycastingScene:
     """The mesh, shifted by −`origin`, ready for rays and distances."""
     scene = o3d.t.geometry.RaycastingScene()
-    vertices = np.ascontiguousarray(mesh.vertices - origin, dtype=np.float32)
-    scene.add_triangles(o3c.Tensor.from_numpy(vertices), o3c.Tensor.from_numpy(mesh.triangles.astype(np.uint32)))
+    if len(mesh.triangles):
+        vertices = np.ascontiguousarray(mesh.vertices - origin, dtype=np.float32)
+        scene.add_triangles(o3c.Tensor.from_numpy(vertices), o3c.Tensor.from_numpy(mesh.triangles.astype(np.uint32)))
     return scene
+
+
+@dataclass(frozen=True)
+class MeshView:
+    """What a camera sees of a mesh."""
+
+    rgb: Array  # (H, W, 3) float32 in [0, 1]; 0 where there is no surface
+    depth: Array  # (H, W) float32 along z; 0 where there is no surface
+    mask: Array  # (H, W) bool: there is surface
+
+    @property
+    def opacity(self) -> Array:
+        """(H, W) float32: 1 where there is surface, as a rendered field has it."""
+        return self.mask.astype(np.float32)
+
+
+class SurfaceCaster:
+    """A mesh prepared for ray casting (on the CPU, with Open3D's Embree scene)."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh, self.scene = mesh, ray_scene(mesh, np.zeros(3))
+
+    def render(self, intrinsics: Intrinsics, world_from_camera: Array) -> MeshView:
+        """The view of a camera without lens distortion (its pinhole is used)."""
+        height, width = intrinsics.height, intrinsics.width
+        rgb = np.zeros((height, width, 3), np.float32)
+        depth = np.zeros((height, width), np.float32)
+        if len(self.mesh.triangles) == 0:
+            return MeshView(rgb, depth, depth > 0)
+        step = max(1, RAYS_AT_ONCE // width)
+        for top in range(0, height, step):
+            rows = slice(top, min(top + step, height))
+            rgb[rows], depth[rows] = self._rows(intrinsics, np.asarray(world_from_camera, dtype=np.float64), rows)
+        return MeshView(rgb, depth, depth > 0)
+
+    def _rows(self, intrinsics: Intrinsics, pose: Array, rows: slice) -> tuple[Array, Array]:
+        v, u = np.mgrid[rows, 0 : intrinsics.width].astype(np.float64)
+        # Directions with z = 1 in the camera's frame, so that the ray's parameter is depth along z.
+        camera = np.stack([(u + 0.5 - intrinsics.cx) / intrinsics.fx, (v + 0.5 - intrinsics.cy) / intrinsics.fy, np.ones_like(u)], axis=-1)
+        directions = camera @ pose[:3, :3].T
+        rays = np.concatenate([np.broadcast_to(pose[:3, 3], directions.shape), directions], axis=-1).astype(np.float32)
+        hits = self.scene.cast_rays(o3c.Tensor.from_numpy(rays))
+        distance = hits["t_hit"].numpy()
+        hit = np.isfinite(distance) & (distance > 0)
+        corner = self.mesh.triangles[hits["primitive_ids"].numpy()[hit]]  # (hits, 3)
+        second, third = np.moveaxis(hits["primitive_uvs"].numpy()[hit], -1, 0)
+        share = np.stack([1 - second - third, second, third], axis=-1).astype(np.float32)
+        rgb = np.zeros((*hit.shape, 3), np.float32)
+        rgb[hit] = np.einsum("nk,nkc->nc", share, self.mesh.colours[corner].astype(np.float32) / 255)
+        return np.clip(rgb, 0, 1), np.where(hit, distance, 0).astype(np.float32)

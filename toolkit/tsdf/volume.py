@@ -4,7 +4,7 @@ What Open3D 0.20 does and this file takes care of:
 - `integrate` reads the depth pixel by cutting the decimals off, so it needs the matrix with pixel centres at +0.5, while
   `compute_unique_block_coordinates` unprojects whole pixel numbers and needs centres at whole numbers; with one matrix for
   both the surface moves by half a pixel.
-- 16-bit depth with 8-bit colour is its fastest pair of types (others convert each picture); depth is stored in 1/60000 of the range.
+- 16-bit depth with 8-bit colour is its fastest pair of types (others convert each image); depth is stored in 1/60000 of the range.
 - A frame without valid depth raises; the weight threshold is exclusive, so 3 needs four observations.
 - `VoxelBlockGrid.ray_cast` can hang on the CPU, leaves tiles empty, and its depth is off by up to a voxel: views are rendered by ray
   casting the extracted mesh.
@@ -26,9 +26,7 @@ import open3d.core as o3c
 from fieldfuse import memory
 from fieldfuse.camera import Array, Intrinsics, invert
 from fieldfuse.errors import InputError
-from fieldfuse.tsdf.frames import DepthFrame
-from fieldfuse.tsdf.mesh import Mesh, as_bytes, places
-from fieldfuse.tsdf.view import MeshView, SurfaceCaster
+from fieldfuse.tsdf.mesh import Mesh, MeshView, SurfaceCaster, as_bytes, places
 
 BLOCK = 8
 TRUNCATION = 4.0  # half width of the band around the surface, in voxels
@@ -41,6 +39,17 @@ DEVICE = o3c.Device("CPU:0")
 
 
 @dataclass(frozen=True)
+class DepthFrame:
+    """One RGB-D image ready for fusion. Both cameras are pinholes at the same place; their sizes and focal lengths may differ."""
+
+    depth: Array  # (H, W) float32 along z, working units, 0 = missing
+    colour: Array  # (h, w, 3) uint8 RGB
+    depth_intrinsics: Intrinsics
+    colour_intrinsics: Intrinsics
+    world_from_camera: Array  # (4, 4) float64
+
+
+@dataclass(frozen=True)
 class Points:
     """Coloured surface points with normals."""
 
@@ -50,12 +59,11 @@ class Points:
 
 
 def default_weight_threshold(sightings: float) -> float:
-    """Voxels seen this often or less are left out: none that were seen while blocks were seen by up to 50 frames on average, then those
+    """Voxels seen this often or less are excluded: none that were seen while blocks were seen by up to 50 frames on average, then those
     seen once.
 
-    Open3D's own 3 (at least four sightings) is far stricter. Already 2.5 costs a capture whose places are seen 8 to 50 times 1 to 6% of its
-    surface and 0.7 to 5 dB in whole rendered pictures, and what is left is hardly more accurate (held-out views of a real kitchen and of a
-    simulated room).
+    Open3D's own 3 (at least four sightings) is far stricter: already 2.5 costs 1 to 6% of the surface and 0.7 to 5 dB in whole rendered
+    images where places are seen 8 to 50 times, and what is left is hardly more accurate.
     """
     return 0.5 if sightings <= 50 else 1.5
 
@@ -97,12 +105,10 @@ class TsdfVolume:
     def blocks(self) -> int:
         return int(self.grid.hashmap().size())
 
-    @property
-    def weight_threshold(self) -> float:
-        """What `mesh` and `points` go by unless told otherwise: `min_weight`, else by sightings (see `default_weight_threshold`)."""
-        if self.min_weight is not None:
-            return self.min_weight
-        return default_weight_threshold(self.touches / max(self.blocks, 1))
+    def _threshold(self) -> float:
+        """Voxels seen as often or less do not count in what is extracted: `min_weight`, else by sightings."""
+        self.require_frames()
+        return default_weight_threshold(self.touches / max(self.blocks, 1)) if self.min_weight is None else self.min_weight
 
     @property
     def bytes(self) -> int:
@@ -141,10 +147,12 @@ class TsdfVolume:
             self._activate(keys)
             keys = self._keys_in_view(frame)
         colour = o3d.t.geometry.Image(np.ascontiguousarray(frame.colour))
-        matrix = o3c.Tensor(frame.depth_intrinsics.matrix())
-        colour_matrix = o3c.Tensor(_colour_matrix(frame.colour_intrinsics, frame.depth_intrinsics))
+        matrix, colour_matrix = frame.depth_intrinsics.matrix(), frame.colour_intrinsics.matrix_integer_centres()
+        # Open3D projects the depth pixel's corner and rounds: half a depth pixel on, half a colour pixel off.
+        colour_matrix[:2, 2] += 0.5 * np.diag(colour_matrix)[:2] / np.diag(matrix)[:2]
+        lenses = o3c.Tensor(matrix), o3c.Tensor(colour_matrix)
         for piece in self._pieces(keys):
-            self.grid.integrate(piece, depth, colour, matrix, colour_matrix, extrinsic, self._read_scale, self.depth_max, TRUNCATION)
+            self.grid.integrate(piece, depth, colour, *lenses, extrinsic, self._read_scale, self.depth_max, TRUNCATION)
         self.frames += 1
         return True
 
@@ -153,15 +161,13 @@ class TsdfVolume:
         keys = self._touched(self._quantised(frame.depth), frame.depth_intrinsics, o3c.Tensor(invert(frame.world_from_camera)))
         return np.zeros((0, 3), np.int32) if keys is None else keys.numpy()
 
-    def mesh(self, weight_threshold: float | None = None) -> Mesh:
-        """The surface, uncleaned, in the working frame; voxels seen `weight_threshold` times or less do not count (None: the default).
+    def mesh(self) -> Mesh:
+        """The surface, uncleaned, in the working frame.
 
         Raises:
             InputError: no frame with valid depth was fused.
         """
-        self.require_frames()
-        threshold = self.weight_threshold if weight_threshold is None else weight_threshold
-        mesh = self.grid.extract_triangle_mesh(threshold)
+        mesh = self.grid.extract_triangle_mesh(self._threshold())
         if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
             return Mesh.empty()
         vertex = mesh.vertex
@@ -169,15 +175,13 @@ class TsdfVolume:
             vertex.positions.numpy(), mesh.triangle.indices.numpy(), as_bytes(vertex.colors.numpy()), _unit(vertex.normals.numpy())
         ).ordered()
 
-    def points(self, weight_threshold: float | None = None) -> Points:
+    def points(self) -> Points:
         """Surface points where the distance changes sign along a lattice edge, in the working frame, by x, y, z.
 
         Raises:
             InputError: no frame with valid depth was fused.
         """
-        self.require_frames()
-        threshold = self.weight_threshold if weight_threshold is None else weight_threshold
-        cloud = self.grid.extract_point_cloud(threshold)
+        cloud = self.grid.extract_point_cloud(self._threshold())
         if "positions" not in cloud.point or len(cloud.point.positions) == 0:
             return Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)))
         point = cloud.point
@@ -206,7 +210,7 @@ class TsdfVolume:
         matrix = o3c.Tensor(intrinsics.matrix_integer_centres())
         try:
             return self.grid.compute_unique_block_coordinates(depth, matrix, extrinsic, self._scale, self.depth_max, TRUNCATION)
-        except RuntimeError as error:  # Open3D's way to say that no pixel it looked at has depth
+        except RuntimeError as error:  # Open3D's error where no pixel that it looked at has depth
             if "No block is touched" not in str(error):
                 raise
             return None
@@ -264,14 +268,6 @@ def too_fine(voxel_size: float, blocks: int, max_blocks: int) -> InputError:
         f"a voxel size of {voxel_size:g} needs more than {blocks * BYTES_PER_BLOCK / 2**30:.1f} GB for the TSDF, and"
         f" {max_blocks * BYTES_PER_BLOCK / 2**30:.1f} GB are allowed; use tsdf.voxel_size={max(fits, 1.1 * voxel_size):.2g} or larger"
     )
-
-
-def _colour_matrix(colour: Intrinsics, depth: Intrinsics) -> Array:
-    """(3, 3) K for `integrate`, which projects the depth pixel's corner and rounds: half a depth pixel on, half a colour pixel off."""
-    matrix = colour.matrix_integer_centres()
-    matrix[0, 2] += 0.5 * colour.fx / depth.fx
-    matrix[1, 2] += 0.5 * colour.fy / depth.fy
-    return matrix
 
 
 def _unit(vectors: Array) -> Array:

@@ -22,8 +22,8 @@ from fieldfuse.nerfusion.training.datasets.dtu import dtu_scene, dtu_scenes
 from fieldfuse.nerfusion.training.datasets.scanned_objects import scanned_object_folders, scanned_object_scene
 from fieldfuse.nerfusion.training.datasets.scannet import scannet_folders, scannet_scene
 from fieldfuse.nerfusion.training.datasets.synthetic import synthetic_folders, synthetic_scene
+from fieldfuse.simulate.eye import Rays
 from fieldfuse.simulate.mesh_scene import load_mesh_scene
-from fieldfuse.simulate.seen import Rays
 from tests.capture.layouts import LAYOUTS
 from tests.nerfusion.training import layouts
 

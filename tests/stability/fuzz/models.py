@@ -21,9 +21,9 @@ from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_file import read_baked, write_baked
 from fieldfuse.render.image import render_view
 from fieldfuse.simulate.settings import read_scene_file
-from fieldfuse.stereo.left_out import LeftOut, load_left_out, save_left_out
 from fieldfuse.stereo.maps import load_stereo, save_stereo
 from fieldfuse.stereo.match import StereoDepth
+from fieldfuse.stereo.transients import LeftOut, load_left_out, save_left_out
 from tests.nerfusion.training.tiny import tiny_settings
 from tests.stability.hard.fields import small_field
 

@@ -15,8 +15,7 @@ from fieldfuse.errors import FieldfuseError, InputError, PoseError
 from fieldfuse.poses.given import given_poses
 from fieldfuse.poses.scene import describe_scene
 from fieldfuse.render.paths import look_at
-from fieldfuse.tsdf.frames import DepthFrame
-from fieldfuse.tsdf.volume import TsdfVolume
+from fieldfuse.tsdf.volume import DepthFrame, TsdfVolume
 from tests.stability.hard.captures import flat, no_opacity, one_pixel, poses, prepared, saturated, texture, write_capture
 from tests.stability.hard.errors import absolute, not_finite, refused
 from tests.stability.hard.within import Within

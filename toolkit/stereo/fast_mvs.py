@@ -1,7 +1,7 @@
-"""Small depth maps in little time: what a fit of a capture without depth is guided by.
+"""Small depth maps in little time, which guide the fit of a capture without depth.
 
-Matching in full takes 0.2 to 0.8 s a picture, and most of what it is worth to a fit is there at a third of the pixels: light that ends
-about where the surface is, from the first steps on. Size and number of the pictures follow from counts alone, so that a run is the same on
+Matching in full takes 0.2 to 0.8 s an image, and most of what it is worth to a fit is there at a third of the pixels: light that ends
+about where the surface is, from the first steps on. Size and number of the images follow from counts alone, so that a run is the same on
 a slow machine, or a busy one.
 """
 
@@ -15,24 +15,24 @@ import numpy as np
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.types import Views
 from fieldfuse.progress import SILENT, Progress
-from fieldfuse.stereo import consensus
-from fieldfuse.stereo.bare import continued
 from fieldfuse.stereo.maps import depth_at
 from fieldfuse.stereo.match import LENIENT, LONG_SIDE, StereoDepth, stereo_depths
+from fieldfuse.stereo.plane_completion import continued
+from fieldfuse.stereo.transients import consensus
 
 SHARE = 0.15  # of the fit's seconds that matching is meant to take …
-MOST_SHARE = 0.25  # … and may take with the smallest pictures before some of them are left out
+MOST_SHARE = 0.25  # … and may take with the smallest images before some of them are skipped
 LEAST_SIDE = 128
-PIXEL_SECONDS = 3e-6  # of a pixel of the smallest pictures, one thread …
-GROWTH = 2.4  # … and the exponent of a picture's seconds over its side: larger ones take more planes, too
-FEWEST, SPARSEST = 24, 4  # at least so many pictures, and every so manieth, are matched when some are left out: neighbours must stay near
+PIXEL_SECONDS = 3e-6  # of a pixel of the smallest images, one thread …
+GROWTH = 2.4  # … and the exponent of an image's seconds over its side: larger ones take more planes, too
+FEWEST, SPARSEST = 24, 4  # where only every n-th image is matched: fewest images, and largest n; neighbours must stay near
 
 
 @dataclass(frozen=True)
 class Matched:
     """What matching gave a fit."""
 
-    views: int  # pictures that were matched
+    views: int  # images that were matched
     pixels: int  # long side of their depth maps
     share: float  # of their pixels that have depth
     bare: float  # share of their pixels whose depth is that of a plane that goes on, not matched itself; part of `share`
@@ -43,13 +43,14 @@ class Matched:
 
 
 def view_seconds(side: float, aspect: float) -> float:
-    """Seconds that a nominal machine takes to match a picture with this long side, whose short side is `aspect` of it."""
+    """Seconds that a nominal machine takes to match an image with this long side, whose short side is `aspect` of it."""
     return PIXEL_SECONDS * aspect * LEAST_SIDE**2 * (side / LEAST_SIDE) ** GROWTH
 
 
 def plan(views: int, budget: float, aspect: float = 0.75) -> tuple[int, int] | None:
-    """Long side of the depth maps, and every so manieth picture is matched, for a fit to `views` pictures of `budget` seconds; None: they
-    are too many for so short a fit."""
+    """Long side of the depth maps and n, where every n-th image is matched, for a fit to `views` images of `budget` seconds; None: they
+    are too
+    many for so short a fit."""
     if views < 2:
         return None
     least = view_seconds(LEAST_SIDE, aspect)
@@ -63,15 +64,15 @@ def plan(views: int, budget: float, aspect: float = 0.75) -> tuple[int, int] | N
 def guided(
     views: Views, near: float, far: float, median_depth: float, budget: float, progress: Progress = SILENT
 ) -> tuple[Views, Matched | None]:
-    """The views with the depth of training pictures that matching finds within a share of a fit's `budget` seconds.
+    """The views with the depth of training images that matching finds within a share of a fit's `budget` seconds.
 
-    Held-out pictures are not looked at.
+    Held-out images are not looked at.
 
     Args:
         near, far, median_depth: of the scene, working units.
 
     Raises:
-        InputError: no two training pictures can be matched, or there is no memory for it.
+        InputError: no two training images can be matched, or there is no memory for it.
         Interrupted: the user asked to stop.
     """
     training = np.flatnonzero(~views.test)
@@ -82,7 +83,7 @@ def guided(
     side, every = chosen
     matched = training[::every]
     some = views.subset(matched)
-    found = stereo_depths(some, near, far, median_depth, long_side=side, asked=LENIENT, progress=progress)
+    found = stereo_depths(some, near, far, median_depth, long_side=side, required=LENIENT, progress=progress)
     whole = continued(found, some, median_depth, progress, LENIENT)
     out = replace(with_depths(views, matched, whole), rough=True)
     share = float(np.mean([np.mean(out.depths[index] > 0) for index in matched]))
@@ -92,7 +93,7 @@ def guided(
 
 
 def with_depths(views: Views, indices: Array, found: list[StereoDepth]) -> Views:
-    """Views where the pictures `indices` have the depth that was `found` for them, one after the other, and the others none."""
+    """Views where the images `indices` have the depth that was `found` for them, one after the other, and the others none."""
     depths: list[Array | None] = [None] * len(views)
     for index, one in zip(indices, found, strict=True):
         camera = views.intrinsics[index]
@@ -101,13 +102,12 @@ def with_depths(views: Views, indices: Array, found: list[StereoDepth]) -> Views
 
 
 def warm_up() -> None:
-    """Have the kernels compiled, or loaded, by matching three small pictures, letting a plane go on in them, and having them agree."""
-    consensus.warm_up()
+    """Have the kernels compiled, or loaded, by matching three small images, letting a plane go on in them, and having them agree."""
     noise = np.random.default_rng(0).integers(0, 256, (24, 48, 3)).astype(np.uint8)
     camera = Intrinsics(32, 24, 32.0, 32.0, 16.0, 12.0)
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = np.arange(3) / 8  # 4 pixels at a depth of 1
-    pictures = [np.ascontiguousarray(noise[:, 4 * i : 4 * i + 32]) for i in range(3)]
-    views = Views(["a", "b", "c"], pictures, [camera] * 3, poses, np.zeros(3, bool))
-    wall = np.ones((24, 32), np.float32)
+    images, wall = [np.ascontiguousarray(noise[:, 4 * i : 4 * i + 32]) for i in range(3)], np.ones((24, 32), np.float32)
+    views = Views(["a", "b", "c"], images, [camera] * 3, poses, np.zeros(3, bool))
     continued([replace(one, depth=wall, confidence=0.5 * wall) for one in stereo_depths(views, 0.5, 4.0, 1.0)], views, 1.0)
+    consensus(camera, poses[0], [wall] * 3, images, [camera] * 3, poses)

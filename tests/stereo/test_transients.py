@@ -16,32 +16,10 @@ from fieldfuse.camera import Array, Intrinsics, project, unproject
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError, Interrupted
 from fieldfuse.progress import Progress
-from fieldfuse.stereo import moving
-from fieldfuse.stereo.consensus import AGREED, SAME, consensus
-from fieldfuse.stereo.left_out import LeftOut, load_left_out, save_left_out
+from fieldfuse.stereo import transients
 from fieldfuse.stereo.match import StereoDepth, stereo_depths
-from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, corner
-
-PASSED = {1: (20, 30), 4: (95, 50)}  # picture → left and top of somebody who stands before it
-WIDE, TALL = 38, 60
-
-
-def with_passer() -> tuple[Views, list[Array], list[Array]]:
-    """The corner with somebody before two of its pictures, the exact depth with them, and where they are."""
-    views, depths = corner()
-    images, with_them, masks = list(views.images), list(depths), []
-    stripes = np.array([[(200, 40, 30), (30, 60, 180)][row // 6 % 2] for row in range(TALL)], np.uint8)[:, None]
-    for index in range(len(views)):
-        mask = np.zeros((CAMERA.height, CAMERA.width), bool)
-        if index in PASSED:
-            left, top = PASSED[index]
-            part = (slice(top, top + TALL), slice(left, left + WIDE))
-            mask[part] = True
-            images[index], with_them[index] = images[index].copy(), with_them[index].copy()
-            images[index][part] = stripes
-            with_them[index][part] = 1.2
-        masks.append(mask)
-    return replace(views, images=images), with_them, masks
+from fieldfuse.stereo.transients import AGREED, SAME, LeftOut, consensus, load_left_out, save_left_out
+from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, PASSED, TALL, WIDE, corner, with_passer
 
 
 @lru_cache(maxsize=2)
@@ -50,8 +28,8 @@ def matched(passer: bool) -> tuple[Views, list[StereoDepth]]:
     return views, stereo_depths(views, NEAR, FAR, MEDIAN)
 
 
-def found_in(views: Views, depths: list[Array], measured: bool) -> list[Array]:
-    return moving.moving(views, depths, [CAMERA] * len(views), MEDIAN, measured)
+def found_in(views: Views, depths: list[Array | None], measured: bool) -> list[Array]:
+    return transients.moving(views, depths, [CAMERA] * len(views), MEDIAN, measured)
 
 
 def recall(found: list[Array], truth: list[Array]) -> float:
@@ -86,7 +64,7 @@ def test_where_nothing_moves_nothing_is_found() -> None:
 
 def test_a_picture_without_depth_is_looked_at_too() -> None:
     views, depths, truth = with_passer()
-    found = moving.moving(views, [None if index in PASSED else depth for index, depth in enumerate(depths)], [CAMERA] * len(views), MEDIAN)
+    found = found_in(views, [None if index in PASSED else depth for index, depth in enumerate(depths)], False)
     assert recall(found, truth) > 0.9 and false_share(found, truth) < 0.005
 
 
@@ -107,16 +85,9 @@ def test_what_a_sensor_misses_does_not_move() -> None:
 def test_masked_pixels_are_not_looked_at() -> None:
     views, depths, truth = with_passer()
     masked = replace(views, valid=[None if not mask.any() else ~mask for mask in truth], depths=list(depths))
-    small, cameras = moving.depths_at(masked, 160)
+    small, cameras = transients.depths_at(masked, 160)
     assert all(one is not None and not one[mask].any() for one, mask in zip(small, truth, strict=True))
-    assert not any(mask.any() for mask in moving.moving(masked, small, cameras, MEDIAN, True))
-
-
-def test_three_pictures_cannot_tell_of_a_fourth_without_depth() -> None:
-    views, depths, _ = with_passer()
-    known = [depth if index < AGREED else None for index, depth in enumerate(depths)]
-    found = moving.moving(views, known, [CAMERA] * len(views), MEDIAN)
-    assert len(found) == len(views) and not any(mask.any() for mask in found)
+    assert not any(mask.any() for mask in transients.moving(masked, small, cameras, MEDIAN, True))
 
 
 def test_looking_can_be_stopped() -> None:
@@ -126,28 +97,28 @@ def test_looking_can_be_stopped() -> None:
 
     views, depths, _ = with_passer()
     with pytest.raises(Interrupted):
-        moving.moving(views, depths, [CAMERA] * len(views), MEDIAN, True, Stopping())
+        transients.moving(views, depths, [CAMERA] * len(views), MEDIAN, True, Stopping())
 
 
 @given(st.integers(1, 5000), st.floats(1, 3600))
 def test_size_follows_from_counts(views: int, budget: float) -> None:
-    side, (least, most) = moving.plan(views, budget), moving.SIDES
+    side, (least, most) = transients.plan(views, budget), transients.SIDES
     if side is None:
-        assert views * moving.VIEW_SECONDS * (least / most) ** 2 > moving.MOST_SHARE * budget
+        assert views * transients.VIEW_SECONDS * (least / most) ** 2 > transients.MOST_SHARE * budget
         return
     assert least <= side <= most and side % 8 == 0
-    assert views * moving.VIEW_SECONDS * (side / most) ** 2 <= moving.MOST_SHARE * budget * (1 + 1e-9)
-    longer = moving.plan(views, 2 * budget)
+    assert views * transients.VIEW_SECONDS * (side / most) ** 2 <= transients.MOST_SHARE * budget * (1 + 1e-9)
+    longer = transients.plan(views, 2 * budget)
     assert longer is not None and longer >= side
 
 
 def test_depths_come_from_matching_or_from_the_views() -> None:
     views, depths = corner()
-    own, cameras = moving.depths_at(replace(views, depths=[depths[0], *[None] * 6]), 80)
+    own, cameras = transients.depths_at(replace(views, depths=[depths[0], *[None] * 6]), 80)
     assert own[1:] == [None] * 6 and own[0] is not None and own[0].shape == (60, 80) and cameras[0] == CAMERA.scaled(80, 60)
     assert np.isin(own[0], depths[0]).all()
     small = StereoDepth(np.full((48, 64), 2, np.float32), np.ones((48, 64), np.float32), CAMERA.scaled(64, 48))
-    taken, cameras = moving.depths_at(replace(views, depths=list(depths)), 80, {2: small})
+    taken, cameras = transients.depths_at(replace(views, depths=list(depths)), 80, {2: small})
     assert [depth is not None for depth in taken] == [index == 2 for index in range(7)]
     assert taken[2] is not None and taken[2].shape == (48, 64) and {camera.width for camera in cameras} == {64}
 

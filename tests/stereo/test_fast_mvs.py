@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldfuse.capture.types import Views
-from fieldfuse.stereo import quick
+from fieldfuse.stereo import fast_mvs
 from fieldfuse.stereo.match import LONG_SIDE
 from tests.simulate.test_procedural import plain_operations
 from tests.stereo.made import FAR, MEDIAN, NEAR, corner
@@ -19,25 +19,25 @@ from tests.stereo.made import FAR, MEDIAN, NEAR, corner
 
 @given(st.integers(2, 2000), st.floats(1, 2000), st.floats(0.3, 1))
 def test_size_and_number_follow_from_counts(views: int, budget: float, aspect: float) -> None:
-    chosen, least = quick.plan(views, budget, aspect), quick.view_seconds(quick.LEAST_SIDE, aspect)
+    chosen, least = fast_mvs.plan(views, budget, aspect), fast_mvs.view_seconds(fast_mvs.LEAST_SIDE, aspect)
     if chosen is None:
-        assert views * least > quick.MOST_SHARE * budget
+        assert views * least > fast_mvs.MOST_SHARE * budget
         return
     side, every = chosen
     matched = -(-views // every)
-    assert quick.LEAST_SIDE <= side <= LONG_SIDE and every >= 1
-    assert every == 1 or (side == quick.LEAST_SIDE and views // every >= quick.FEWEST and every <= quick.SPARSEST)
-    assert matched * quick.view_seconds(side, aspect) <= quick.MOST_SHARE * budget + least
-    longer = quick.plan(views, 2 * budget, aspect)
+    assert fast_mvs.LEAST_SIDE <= side <= LONG_SIDE and every >= 1
+    assert every == 1 or (side == fast_mvs.LEAST_SIDE and views // every >= fast_mvs.FEWEST and every <= fast_mvs.SPARSEST)
+    assert matched * fast_mvs.view_seconds(side, aspect) <= fast_mvs.MOST_SHARE * budget + least
+    longer = fast_mvs.plan(views, 2 * budget, aspect)
     assert longer is not None and longer[0] >= side and longer[1] <= every
 
 
 def test_what_is_chosen_for_usual_captures() -> None:
-    assert quick.plan(1, 60) is None
-    assert quick.plan(8, 60) == (LONG_SIDE, 1)
-    assert quick.plan(50, 30) == (184, 1) and quick.plan(50, 30, 9 / 16) == (208, 1)
-    assert quick.plan(300, 20) == (quick.LEAST_SIDE, 3)
-    assert quick.plan(300, 10) is None
+    assert fast_mvs.plan(1, 60) is None
+    assert fast_mvs.plan(8, 60) == (LONG_SIDE, 1)
+    assert fast_mvs.plan(50, 30) == (184, 1) and fast_mvs.plan(50, 30, 9 / 16) == (208, 1)
+    assert fast_mvs.plan(300, 20) == (fast_mvs.LEAST_SIDE, 3)
+    assert fast_mvs.plan(300, 10) is None
 
 
 def with_held_out() -> Views:
@@ -47,8 +47,8 @@ def with_held_out() -> Views:
 
 def test_depth_is_found_and_held_out_pictures_are_not_looked_at() -> None:
     views, truth = with_held_out(), corner()[1]
-    known, matched = quick.guided(views, NEAR, FAR, MEDIAN, 2.0)
-    assert matched is not None and matched.views == 6 and quick.LEAST_SIDE <= matched.pixels < 160
+    known, matched = fast_mvs.guided(views, NEAR, FAR, MEDIAN, 2.0)
+    assert matched is not None and matched.views == 6 and fast_mvs.LEAST_SIDE <= matched.pixels < 160
     assert known.rough and not views.rough and known.subset([0, 1]).rough
     assert known.depths[3] is None and 0.3 < matched.share < 1
     errors = [
@@ -58,17 +58,17 @@ def test_depth_is_found_and_held_out_pictures_are_not_looked_at() -> None:
     ]
     assert len(errors) == 6 and np.median(np.concatenate(errors)) < 0.01
     other = replace(views, images=[np.zeros_like(image) if i == 3 else image for i, image in enumerate(views.images)])
-    again, _ = quick.guided(other, NEAR, FAR, MEDIAN, 2.0)
+    again, _ = fast_mvs.guided(other, NEAR, FAR, MEDIAN, 2.0)
     for one, two in zip(known.depths, again.depths, strict=True):
         assert (one is None and two is None) or np.array_equal(one, two)  # type: ignore[arg-type]
 
 
 def test_some_pictures_are_left_out_of_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(quick, "FEWEST", 3)
-    known, matched = quick.guided(with_held_out(), NEAR, FAR, MEDIAN, 0.5)
+    monkeypatch.setattr(fast_mvs, "FEWEST", 3)
+    known, matched = fast_mvs.guided(with_held_out(), NEAR, FAR, MEDIAN, 0.5)
     assert matched is not None and matched.views == 3
     assert [depth is not None for depth in known.depths] == [True, False, True, False, False, True, False]
-    views, matched = quick.guided(with_held_out(), NEAR, FAR, MEDIAN, 0.2)
+    views, matched = fast_mvs.guided(with_held_out(), NEAR, FAR, MEDIAN, 0.2)
     assert matched is None and not any(depth is not None for depth in views.depths)
 
 
@@ -78,15 +78,12 @@ def test_a_small_picture_takes_about_what_is_reckoned_with() -> None:
     A slower one than the nominal, where a hundred rounds of arithmetic on 320×240 rays take 0.09 s, is given as much longer.
     """
     views = with_held_out()
-    quick.guided(views, NEAR, FAR, MEDIAN, 1.0)
+    fast_mvs.guided(views, NEAR, FAR, MEDIAN, 1.0)
     start = time.process_time()
-    _, matched = quick.guided(views, NEAR, FAR, MEDIAN, 1.0)
+    _, matched = fast_mvs.guided(views, NEAR, FAR, MEDIAN, 1.0)
     between = time.process_time()
     plain_operations(320 * 240)
     slower = max(1.0, (time.process_time() - between) / 0.09)
     each = (between - start) / 6
-    assert matched is not None and matched.pixels == quick.LEAST_SIDE and each < 8 * slower * quick.view_seconds(quick.LEAST_SIDE, 0.75)
-
-
-def test_warming_up_finds_something_to_match() -> None:
-    quick.warm_up()
+    assert matched is not None and matched.pixels == fast_mvs.LEAST_SIDE
+    assert each < 8 * slower * fast_mvs.view_seconds(fast_mvs.LEAST_SIDE, 0.75)

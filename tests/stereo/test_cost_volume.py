@@ -5,20 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fieldfuse.backends.numba.stereo_cost import NOISE, UNKNOWN, best_half
 from fieldfuse.camera import Array, Intrinsics, pixel_grid, project, unproject
-from fieldfuse.stereo.correlate import NOISE
-from fieldfuse.stereo.cost import UNKNOWN, GreyView, Matcher, best_half, grey_view, plane_homography, sweep
+from fieldfuse.stereo.cost_volume import SOFT_EDGE, GreyView, Matcher, grey_view, smoothed_planes
 from tests.stereo.made import CAMERA, corner
 
-
-def test_a_plane_maps_pixels_as_projection_does() -> None:
-    views, _ = corner()
-    first, second = (grey_view(views.images[i], CAMERA, views.world_from_camera[i]) for i in (0, 3))
-    pixels = pixel_grid(160, 120)[::97]
-    points = unproject(CAMERA, views.world_from_camera[0], pixels, np.full(len(pixels), 2.5))
-    expected, _ = project(CAMERA, views.world_from_camera[3], points)
-    mapped = np.c_[pixels - 0.5, np.ones(len(pixels))] @ plane_homography(first, second, 1 / 2.5).T
-    assert np.allclose(mapped[:, :2] / mapped[:, 2:] + 0.5, expected, atol=1e-8)
+PATHS = [(way * down, way * right) for way in (1, -1) for down, right in ((0, 1), (1, 0), (1, 1), (1, -1))]  # (rows, columns)
 
 
 def slow_cost(view: GreyView, other: GreyView, inverse_depth: Array, half: int = 3) -> Array:
@@ -54,7 +46,7 @@ def test_cost_is_what_its_definition_says() -> None:
         alike = (cost < 0) == (expected < 0)
         assert alike.mean() > 0.995 and (cost >= 0).mean() > 0.4  # a point on the very border may round either way
         assert np.abs(cost - expected)[alike].max() < 2e-3
-    volume = sweep(first, [second], np.array([0.1, 0.3]))
+    volume = Matcher(first, [second]).volume(np.array([0.1, 0.3]))
     cost = Matcher(first, [second]).costs(np.full((120, 160), 0.3))[0]
     assert np.array_equal(volume[:, :, 1], np.where(cost < 0, np.float32(UNKNOWN), cost))
 
@@ -74,32 +66,11 @@ def test_pictures_of_any_width(width: int) -> None:
     assert np.abs(cost - expected).max() < 2e-3
     for count in (3, 16, 21):  # planes, of which `GROUP` come at once
         planes = np.linspace(0.4, 1.6, count)
-        volume = sweep(first, [second, first], planes)
+        volume = Matcher(first, [second, first]).volume(planes)
         matcher = Matcher(first, [second, first])
         for d, plane in enumerate(planes):
             assert np.array_equal(volume[..., d], matcher.cost(np.full((11, width), plane)))
     assert (Matcher(first, []).cost(inverse_depth) == UNKNOWN).all()
-
-
-def test_cost_is_correlation() -> None:
-    rng = np.random.default_rng(0)
-    camera = Intrinsics(40, 30, 30.0, 30.0, 20.0, 15.0)
-    grey = rng.integers(0, 256, (30, 40)).astype(np.uint8)
-    here, plane = GreyView(grey, camera, np.eye(4)), np.ones((30, 40), np.float32)
-
-    def cost_of(other: Array, pose: Array) -> Array:
-        return Matcher(here, [GreyView(other, camera, pose)]).costs(plane)[0]
-
-    inner = slice(4, -4), slice(4, -4)
-    assert cost_of(grey // 2 + 20, np.eye(4))[inner].max() < 0.01  # brightness and contrast do not matter
-    assert cost_of(255 - grey, np.eye(4))[inner].min() > 0.99
-    other = rng.integers(0, 256, (30, 40)).astype(np.uint8)
-    expected = 0.5 - 0.5 * np.corrcoef(grey[7:14, 7:14].ravel(), other[7:14, 7:14].ravel())[0, 1]
-    assert cost_of(other, np.eye(4))[10, 10] == pytest.approx(expected, abs=0.005)
-    aside = np.eye(4)
-    aside[0, 3] = 20 / 30  # 20 pixels at a depth of 1: the left half of the picture was left behind
-    cost = cost_of(other, aside)
-    assert (cost[:, :19] == -1).all() and (cost[:, 21:] >= 0).all()
 
 
 @pytest.mark.parametrize("far", [1e3, 1e12, 1e25, 1e38])
@@ -130,3 +101,43 @@ def test_the_better_half_counts(count: int) -> None:
         known = np.sort(costs[:, y, x][costs[:, y, x] >= 0])
         expected = known[: (len(known) + 1) // 2].mean() if len(known) else 0.5
         assert out[y, x] == pytest.approx(expected, abs=1e-6)
+
+
+def slow_total(cost: Array, grey: Array, small: float, large: float) -> Array:
+    """Costs along all paths, pixel by pixel from the definition."""
+    height, width, planes = cost.shape
+    total = np.zeros(cost.shape)
+    for down, right in PATHS:
+        line = np.full(cost.shape, np.nan)
+        rows = range(height) if down >= 0 else range(height - 1, -1, -1)
+        columns = range(width) if right >= 0 else range(width - 1, -1, -1)
+        for y in rows:
+            for x in columns:
+                before = y - down, x - right
+                if not (0 <= before[0] < height and 0 <= before[1] < width):
+                    line[y, x] = cost[y, x]
+                    continue
+                past = line[before]
+                jump = max(large / (1 + abs(grey[y, x] - grey[before]) / SOFT_EDGE), 1.5 * small)
+                for d in range(planes):
+                    options = [past[d], past.min() + jump]
+                    options += [past[n] + small for n in (d - 1, d + 1) if 0 <= n < planes]
+                    line[y, x, d] = cost[y, x, d] + min(options) - past.min()
+        total += line
+    return total
+
+
+def test_semi_global_matching_against_its_definition() -> None:
+    rng = np.random.default_rng(2)
+    cost, grey = rng.random((7, 9, 6)).astype(np.float32), rng.uniform(0, 60, (7, 9)).astype(np.float32)
+    total = slow_total(cost, grey, 0.05, 0.8)
+    plane = smoothed_planes(cost, grey, 0.05, 0.8)
+    assert np.array_equal(np.abs(plane - total.argmin(axis=2)) <= 0.5, np.ones((7, 9), bool))
+
+
+def test_fractions_of_a_plane() -> None:
+    planes = np.arange(12)
+    true = np.linspace(3.0, 8.0, 60).reshape(6, 10)
+    cost = ((planes - true[..., None]) ** 2 / 400).astype(np.float32)
+    plane = smoothed_planes(cost, np.zeros((6, 10), np.float32), small=0.0, large=0.0)
+    assert np.abs(plane - true).max() < 0.02

@@ -1,4 +1,4 @@
-"""Depth of what is bare: walls with texture at their edges alone, made and matched; and what must not be made up."""
+"""Planes that go on where nothing was matched: walls with texture at their edges alone; what must not be made up; and what images show."""
 
 from __future__ import annotations
 
@@ -9,28 +9,20 @@ import cv2
 import numpy as np
 import pytest
 
+from fieldfuse.backends.numba.stereo_cost import UNKNOWN
 from fieldfuse.camera import Array, Intrinsics, pixel_grid, unproject
 from fieldfuse.capture.types import Views
-from fieldfuse.stereo import bare
-from fieldfuse.stereo.bare import continued
+from fieldfuse.stereo import plane_completion
+from fieldfuse.stereo.consistency import DepthMaps
+from fieldfuse.stereo.cost_volume import grey_view
 from fieldfuse.stereo.match import StereoDepth, stereo_depths
-from fieldfuse.stereo.plane_maps import depth_of, numbers_of
-from fieldfuse.stereo.planes import ON, Points, find_planes
-from tests.poses.textured import PLANES, arc, render, texture
-from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, relative_errors, views_of
+from fieldfuse.stereo.plane_completion import Unsure, best_placed, continued, matching_costs, shown_planes
+from fieldfuse.stereo.planes import ON, Points, depth_of, find_planes, in_camera, numbers_of, points_of
+from tests.poses.textured import look_at
+from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, filmed, relative_errors, views_of
 
+HOLE = slice(60, 100), slice(30, 80)
 Made = tuple[Views, list[Array], list[StereoDepth]]
-
-
-def filmed(paint: dict[int, tuple[int, int]]) -> tuple[Views, list[Array]]:
-    """Seven pictures of the corner, some of whose sides are painted in one grey but for a frame so wide, and their exact depth."""
-    textures = [texture(index) for index in range(len(PLANES))]
-    for side, (grey, frame) in paint.items():
-        textures[side][frame : 512 - frame, frame : 512 - frame] = grey
-    planes = [(*plane, painted) for plane, painted in zip(PLANES, textures, strict=True)]
-    poses = arc(7, 36.0)
-    made = [render(pose, CAMERA, planes) for pose in poses]
-    return views_of(poses, [picture for picture, _ in made]), [depth for _, depth in made]
 
 
 @lru_cache(maxsize=1)
@@ -62,19 +54,11 @@ def test_what_was_matched_stays_and_the_rest_is_confident_as_far_as_others_agree
         assert (now.confidence[~matched & (now.depth > 0)] >= 0.5).all() and now.depth.dtype == now.confidence.dtype == np.float32
 
 
-def test_the_same_again() -> None:
+def test_masked_pixels_stay_without_depth() -> None:
     views, _, found = room()
-    for one, two in zip(continued(found, views, MEDIAN), continued(found, views, MEDIAN), strict=True):
-        assert np.array_equal(one.depth, two.depth)
-
-
-def test_masks_are_kept() -> None:
-    views, _, found = room()
-    valid = [np.ones((120, 160), bool) for _ in range(len(views))]
-    for mask in valid:
-        mask[:40] = False
-    masked = [replace(one, depth=np.where(mask, one.depth, 0)) for one, mask in zip(found, valid, strict=True)]
-    more = continued(masked, replace(views, valid=valid), MEDIAN)
+    mask = np.arange(120)[:, None] * np.ones((1, 160)) >= 40
+    masked = [replace(one, depth=np.where(mask, one.depth, 0)) for one in found]
+    more = continued(masked, replace(views, valid=[mask] * len(views)), MEDIAN)
     assert all((one.depth[:40] == 0).all() for one in more)
     assert any((one.depth[40:] > 0).sum() > (was.depth[40:] > 0).sum() for one, was in zip(more, masked, strict=True))
 
@@ -123,29 +107,22 @@ def test_what_looks_different_from_elsewhere_is_no_wall() -> None:
     assert share[0] > 0.6 and share[1] < 0.2 * share[0]
 
 
-def test_one_picture_or_none_that_sees_the_same_is_left_as_it_was() -> None:
+def test_what_has_no_neighbours_is_left_as_it_was() -> None:
     views, _, found = room()
     assert continued(found[:1], views.subset([0]), MEDIAN)[0] is found[0]
-    empty = [replace(one, depth=np.zeros_like(one.depth), confidence=np.zeros_like(one.confidence)) for one in found]
-    assert all((one.depth == 0).all() for one in continued(empty, views, MEDIAN))
-
-
-def test_a_picture_that_looks_elsewhere_is_left_as_it_was() -> None:
-    views, _, found = room()
-    away = np.diag([-1.0, 1.0, -1.0, 1.0])  # turned round
-    poses = np.concatenate([views.world_from_camera, (views.world_from_camera[0] @ away)[None]])
+    away = views.world_from_camera[0] @ np.diag([-1.0, 1.0, -1.0, 1.0])  # turned round
+    poses = np.concatenate([views.world_from_camera, away[None]])
     more = continued([*found, found[0]], views_of(poses, [*views.images, views.images[0]]), MEDIAN)
     assert np.array_equal(more[-1].depth, found[0].depth) and np.array_equal(more[-1].confidence, found[0].confidence)
-    before, after = ([(one.depth > 0).mean() for one in many] for many in (found, more[:-1]))
-    assert np.mean(after) > np.mean(before) + 0.1
+    assert np.mean([(one.depth > 0).mean() for one in more[:-1]]) > np.mean([(one.depth > 0).mean() for one in found]) + 0.1
 
 
 def test_a_plane_aslant_tells_no_depth() -> None:
     planes = np.array([[0.0, 1.0, 0.0, 1.0]])  # a floor below the camera
     camera = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
-    depth = depth_of(np.zeros((120, 160), np.int32), camera, planes, bare.SLANT)
+    depth = depth_of(np.zeros((120, 160), np.int32), camera, planes, plane_completion.SLANT)
     rows = (np.arange(120) + 0.5 - 60) / 150
-    expected = np.arctan(rows) > np.deg2rad(90 - bare.SLANT)  # of the middle column, whose rays do not lean to the side
+    expected = np.arctan(rows) > np.deg2rad(90 - plane_completion.SLANT)  # of the middle column, whose rays do not lean to the side
     assert np.array_equal(depth[:, 80] > 0, expected) and np.allclose(depth[expected, 80], 1 / rows[expected], rtol=1e-5)
 
 
@@ -153,7 +130,7 @@ def test_who_votes_for_which_plane() -> None:
     """The first plane that is near enough; none is an answer, too, and what has no depth does not vote."""
     planes = np.array([[0.0, 0.0, 1.0, 2.0], [0.0, 0.0, -1.0, -2.1], [0.0, 1.0, 0.0, 1.0]])  # the last is seen from above its edge, aslant
     depth = np.array([[2.0, 2.05, 2.1, 2.3, 0.0]], np.float32)
-    voter = numbers_of(depth, Intrinsics(5, 1, 100.0, 100.0, 2.5, 0.5), planes, bare.ON, 80.0)
+    voter = numbers_of(depth, Intrinsics(5, 1, 100.0, 100.0, 2.5, 0.5), planes, plane_completion.ON, 80.0)
     assert voter.tolist() == [[0, 0, 1, len(planes), -1]]
 
 
@@ -166,7 +143,7 @@ def test_votes_spread_as_by_opencv() -> None:
     votes = (random.random((60, 100, 3)) > 0.9).astype(np.float32)
     theirs = cv2.ximgproc.createDTFilter(guide, 50.0, 30.0, mode=cv2.ximgproc.DTF_RF)
     expected = np.stack([theirs.filter(np.ascontiguousarray(votes[..., channel])) for channel in range(3)], axis=2)
-    bare.spread_along(guide, votes, 50.0, 30.0)
+    plane_completion.spread_along(guide, votes, 50.0, 30.0)
     np.testing.assert_allclose(votes, expected, atol=3e-6)
 
 
@@ -200,3 +177,93 @@ def test_too_few_points_have_no_planes() -> None:
     assert find_planes(Points(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 2)))).shape == (0, 4)
     line = np.column_stack([np.linspace(-1, 1, 50), np.zeros(50), np.ones(50)])
     assert find_planes(Points(line, np.ones(50), np.zeros(50, np.int64), line[:, :2])).shape[1] == 4
+
+
+@pytest.fixture(scope="module")
+def corner() -> tuple[list[Unsure], list[Array], Array]:
+    """Views of the corner whose exact depth is sure, it, and its planes."""
+    views, truth = filmed({})
+    exact = [depth.astype(np.float32) for depth in truth]
+    greys = [grey_view(picture, CAMERA, pose) for picture, pose in zip(views.images, views.world_from_camera, strict=True)]
+    nobody = np.zeros(exact[0].shape, bool)
+    made = [Unsure(grey, picture, depth, depth, nobody) for grey, picture, depth in zip(greys, views.images, exact, strict=True)]
+    planes = find_planes(points_of(DepthMaps(exact, views.intrinsics, views.world_from_camera)), on=0.003)
+    return made, exact, planes
+
+
+def unsure(views: list[Unsure], index: int, where: Array, guess: Array) -> list[Unsure]:
+    """The views, of which one is not sure in a part of its picture."""
+    one = views[index]
+    changed = replace(one, sure=np.where(where, np.float32(0), one.sure), guess=np.where(where, guess, one.guess).astype(np.float32))
+    return [*views[:index], changed, *views[index + 1 :]]
+
+
+def hole() -> Array:
+    out = np.zeros((CAMERA.height, CAMERA.width), bool)
+    out[HOLE] = True
+    return out
+
+
+def test_costs_are_lowest_where_things_are(corner: tuple[list[Unsure], list[Array], Array]) -> None:
+    views, exact, _ = corner
+    true = exact[3]
+    none = np.zeros_like(true)
+    others = [views[index].grey for index in (1, 2, 4, 5)]
+    costs = matching_costs(views[3].grey, others, [true, 1.05 * true, 0.9 * true, none])
+    assert costs.shape == (*true.shape, 4) and (costs[..., 3] == 1).all()
+    seen = true > 0
+    assert np.median(costs[..., 0][seen]) < 0.02 < 0.1 < np.median(costs[..., 2][seen])
+    assert (costs[..., 0] < costs[..., 1])[seen].mean() > 0.97
+    alone = matching_costs(views[3].grey, [], [true, none])
+    assert (alone[..., 0][seen] == UNKNOWN).all() and (alone[..., 1] == 1).all()
+
+
+def test_the_plane_that_pictures_show_is_taken_whatever_was_guessed(corner: tuple[list[Unsure], list[Array], Array]) -> None:
+    views, exact, planes = corner
+    where = hole() & (exact[3] > 0)
+    some = unsure(views, 3, where, 0.6 * exact[3])
+    which = shown_planes(3, some, planes, np.full(len(planes), 0.05))
+    assert (which[~where] == -1).all()
+    local = in_camera(planes, views[3].grey.world_from_camera)
+    right = np.abs(depth_of(which, CAMERA, local, 85.0) / np.where(where, exact[3], 1) - 1) < 0.005
+    assert right[where].mean() > 0.9
+
+
+def test_a_guess_that_pictures_show_is_kept_from_planes_that_they_do_not(corner: tuple[list[Unsure], list[Array], Array]) -> None:
+    """Only a plane that passes far before all of it is there to be taken."""
+    views, exact, _ = corner
+    pose = views[3].grey.world_from_camera
+    normal = pose[:3, 2]
+    before = np.append(normal, normal @ (pose[:3, 3] + 0.4 * float(np.median(exact[3][HOLE])) * normal))[None]
+    where = hole() & (exact[3] > 0)
+    which = shown_planes(3, unsure(views, 3, where, exact[3]), before, np.array([0.05]))
+    assert (which == -1).mean() > 0.99
+
+
+def test_a_guess_that_other_views_hold_stays_where_nothing_is_recognised(corner: tuple[list[Unsure], list[Array], Array]) -> None:
+    """Such as a bare leg of a table before a bare floor, whose plane is sure all around it."""
+    views, exact, planes = corner
+    grey = np.full((CAMERA.height, CAMERA.width, 3), 120, np.uint8)
+    bare = [replace(one, image=grey, grey=grey_view(grey, CAMERA, one.grey.world_from_camera)) for one in views]
+    where = hole() & (exact[3] > 0)
+    free = unsure(bare, 3, where, 0.8 * exact[3])
+    held = [*free[:3], replace(free[3], held=where), *free[4:]]
+    took, kept = (shown_planes(3, each, planes, np.full(len(planes), 0.05))[where] >= 0 for each in (free, held))
+    assert took.mean() > 0.5 > 0.2 > kept.mean()
+
+
+def test_nothing_is_asked_where_nothing_was_guessed(corner: tuple[list[Unsure], list[Array], Array]) -> None:
+    views, exact, planes = corner
+    missing = unsure(views, 3, hole(), np.zeros_like(exact[3]))
+    assert (shown_planes(3, missing, planes, np.full(len(planes), 0.05)) == -1).all()
+    assert best_placed(3, views) == []  # all is sure
+
+
+def test_who_sees_it_from_elsewhere_is_asked(corner: tuple[list[Unsure], list[Array], Array]) -> None:
+    """Not who stands in the same place, nor who looks away."""
+    views, exact, _ = corner
+    pose = views[3].grey.world_from_camera
+    back = look_at(pose[:3, 3] + [0.5, 0, 0], pose[:3, 3] + [0.5, 0, 0] - pose[:3, 2])
+    more = [*unsure(views, 3, hole(), exact[3]), views[3], replace(views[0], grey=replace(views[0].grey, world_from_camera=back))]
+    chosen = best_placed(3, more)
+    assert chosen and set(chosen) <= {0, 1, 2, 4, 5, 6} and len(set(chosen)) == len(chosen)

@@ -1,4 +1,4 @@
-"""Depth maps of a corner, with the faults that fields have, made to agree."""
+"""Depth maps of a corner, with the faults that fields have, polished and made to agree."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import pytest
 
 from fieldfuse.camera import Array
 from fieldfuse.capture.types import Views
-from fieldfuse.errors import Interrupted
-from fieldfuse.progress import Progress
-from fieldfuse.stereo.settle import settled
-from tests.stereo.made import CAMERA, MEDIAN
-from tests.stereo.test_bare import filmed
+from fieldfuse.stereo.depth_refinement import FieldDepths, Polisher, settled
+from fieldfuse.stereo.plane_completion import Unsure
+from tests.stereo import made as exact
+from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, filmed
 
 FLOOR_OR_WALL = slice(70, 100), slice(20, 70)  # rows, columns
 
@@ -32,7 +31,7 @@ def made(
     measured: Sequence[Array | None] = (),
 ) -> list[Array]:
     told = [np.ones(depth.shape, bool) for depth in depths] if told is None else told
-    return settled(depths, depths if guesses is None else guesses, told, views, [CAMERA] * len(views), MEDIAN, measured)
+    return settled(FieldDepths(depths, depths if guesses is None else guesses, told), views, [CAMERA] * len(views), MEDIAN, measured)
 
 
 def off(depth: Array, truth: Array, where: Array) -> Array:
@@ -52,7 +51,7 @@ def guessed(views: Views, truth: list[Array]) -> tuple[list[Array], list[Array]]
 @pytest.mark.parametrize(("planar", "share"), [(2.0, 0.98), (0.6, 0.97)])
 def test_exact_depth_stays(corner: tuple[Views, list[Array]], monkeypatch: pytest.MonkeyPatch, planar: float, share: float) -> None:
     """Where pictures are asked, a plane may be taken at their borders for what stands before it: few others see what they show."""
-    monkeypatch.setattr("fieldfuse.stereo.settle.PLANAR", planar)
+    monkeypatch.setattr("fieldfuse.stereo.depth_refinement.PLANAR", planar)
     views, truth = corner
     for depth, true in zip(made(views, truth), truth, strict=True):
         assert (depth > 0)[true > 0].mean() > 0.97 and depth.dtype == np.float32
@@ -93,7 +92,7 @@ def test_no_plane_goes_where_nothing_was(corner: tuple[Views, list[Array]]) -> N
 
 def test_beside_what_is_sure_no_plane_goes_far_from_what_was(corner: tuple[Views, list[Array]], monkeypatch: pytest.MonkeyPatch) -> None:
     """In scenes that are not of planes, where pictures are not asked."""
-    monkeypatch.setattr("fieldfuse.stereo.settle.PLANAR", 2.0)
+    monkeypatch.setattr("fieldfuse.stereo.depth_refinement.PLANAR", 2.0)
     views, truth = corner
     hole = np.zeros(truth[0].shape, bool)
     hole[FLOOR_OR_WALL] = True
@@ -123,9 +122,11 @@ def test_of_what_is_round_planes_go_no_farther_than_beside_what_is_sure(
     """Pictures are asked which plane they show in a scene of planes, and there alone."""
     views, truth = corner
     asked: list[int] = []
-    monkeypatch.setattr(
-        "fieldfuse.stereo.settle.shown_planes", lambda index, maps, *_: asked.append(index) or np.full(maps[0].sure.shape, -1, np.int32)
-    )
+    def none_shown(index: int, maps: list[Unsure], *_: object) -> Array:
+        asked.append(index)
+        return np.full(maps[0].sure.shape, -1, np.int32)
+
+    monkeypatch.setattr("fieldfuse.stereo.depth_refinement.shown_planes", none_shown)
     v, u = np.mgrid[: truth[0].shape[0], : truth[0].shape[1]]
     bent = [(depth * (1 + 0.05 * np.sin(u / 9) * np.cos(v / 9))).astype(np.float32) for depth in truth]
     round_ = made(views, bent)
@@ -163,12 +164,30 @@ def test_a_view_alone_is_left_as_it_was(corner: tuple[Views, list[Array]]) -> No
     assert np.array_equal(made(views.subset(np.array([0])), truth[:1])[0], truth[0])
 
 
-def test_stops_when_asked(corner: tuple[Views, list[Array]]) -> None:
-    views, truth = corner
-
-    class Stop(Progress):
-        def check(self) -> None:
-            raise Interrupted("stop")
-
-    with pytest.raises(Interrupted):
-        settled(truth, truth, [depth > 0 for depth in truth], views, [CAMERA] * len(views), MEDIAN, progress=Stop())
+def test_depth_that_is_nearly_right_is_polished() -> None:
+    """Smooth errors of about 1% shrink; what is missing stays missing, and a view without neighbours keeps what it has."""
+    views, truth = exact.corner()
+    polisher = Polisher(views, views.intrinsics, NEAR, FAR, MEDIAN)
+    waves = 1 + 0.012 * np.sin(np.arange(160) / 9)
+    before, after = [], []
+    for index, true in enumerate(truth):
+        given = np.where(np.arange(120)[:, None] < 6, 0, true * waves).astype(np.float32)
+        got, told = polisher.polished(index, given)
+        assert got.dtype == np.float32 and ((got > 0) == (given > 0)).all()
+        assert told.mean() > 0.5 and not told[given == 0].any()
+        known = given > 0
+        before.append(np.abs(given - true)[known] / true[known])
+        after.append(np.abs(got - true)[known] / true[known])
+    assert np.median(np.concatenate(after)) < 0.4 * np.median(np.concatenate(before))
+    # Where a sensor, of half the size, measured the same place nothing moves; where it measured another, or nothing, pictures decide.
+    free, told = polisher.polished(0, given := (truth[0] * waves).astype(np.float32))
+    sensor = truth[0][::2, ::2].copy()
+    sensor[:20], sensor[20:40] = 0, 2 * sensor[20:40]
+    held, still = polisher.polished(0, given, measured=sensor)
+    assert (held[:80] == free[:80]).mean() > 0.999 and (still[:80] == told[:80]).mean() > 0.999
+    assert (held[80:] == given[80:]).mean() > 0.99 and (free[80:] == given[80:]).mean() < 0.5  # but for edges
+    assert told[80:].mean() > 0.5 and still[80:].mean() < 0.01
+    alone = Polisher(views.subset([0]), views.intrinsics[:1], NEAR, FAR, MEDIAN)
+    got, told = alone.polished(0, truth[0])
+    np.testing.assert_array_equal(got, np.where(truth[0] > 0, truth[0], 0).astype(np.float32))
+    assert not told.any()
