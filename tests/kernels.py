@@ -14,9 +14,9 @@ def fits() -> None:
 
 
 def matching() -> None:
-    from fieldfuse.stereo import quick
+    from fieldfuse.stereo import fast_mvs
 
-    quick.warm_up()
+    fast_mvs.warm_up()
 
 
 def main() -> None:
