@@ -57,9 +57,9 @@ def _decode() -> Piece:
     _, data = cv2.imencode(".jpg", texture(480, 640))
 
     def work() -> None:
-        picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
-        assert picture is not None
-        cv2.resize(picture, (320, 240), interpolation=cv2.INTER_AREA)
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        assert image is not None
+        cv2.resize(image, (320, 240), interpolation=cv2.INTER_AREA)
 
     return work, 640 * 480 / 1e6
 
@@ -73,7 +73,7 @@ def _features() -> Piece:
     def work() -> None:
         _, found = finder.detectAndCompute(grey, None)
         unit = found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)
-        for _ in range(3):  # as many pairs as there are for each picture
+        for _ in range(3):  # as many pairs as there are for each image
             mutual_matches(unit, unit)
 
     return work, 1.0

@@ -51,7 +51,7 @@ def orbit(world_from_camera: Array, centre: Array, frames: int = 90) -> Array:
 
 
 def look_at(positions: Array, target: Array, up: Array) -> Array:
-    """(N, 4, 4) poses at (N, 3) positions that look at (3,) or (N, 3) targets, the picture's upper side towards `up`."""
+    """(N, 4, 4) poses at (N, 3) positions that look at (3,) or (N, 3) targets, the image's upper side towards `up`."""
     positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
     forward = _unit(np.broadcast_to(target, positions.shape) - positions)
     right = np.cross(forward, up)
@@ -69,7 +69,7 @@ def _before(poses: Array, target: Array, phase: Array) -> Array:
     middle = np.median(positions, axis=0)
     right, down, forward = (_unit(poses[:, :3, axis].mean(axis=0)) for axis in range(3))
     offset = positions - middle
-    # The spread within which most cameras are: beyond them there are no pictures.
+    # The spread within which most cameras are: beyond them there are no images.
     width, height = (np.quantile(np.abs(offset @ axis), 0.7) for axis in (right, down))
     distance = max(float((target - middle) @ forward), 2 * width, 2 * height, 1e-6)
     at = middle + np.cos(phase)[:, None] * width * right + np.sin(phase)[:, None] * height * down

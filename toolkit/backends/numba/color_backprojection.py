@@ -1,4 +1,4 @@
-"""What pictures ask of a field's colours, projected back, compiled; `color_backprojection.project_back` is the reference."""
+"""What images ask of a field's colours, projected back, compiled; `color_backprojection.project_back` is the reference."""
 
 from __future__ import annotations
 
